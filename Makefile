@@ -1,0 +1,42 @@
+# The README's two commands are `make demo` and `make test`; each sets itself up.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+RUN := $(VENV)/.installed
+DEV := $(VENV)/.installed-dev
+
+.PHONY: demo test test-full bench lint openapi clean
+.DELETE_ON_ERROR:
+
+$(RUN): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "heliopsf needs Python 3.11 or newer, found " + sys.version.split()[0] + ": make PYTHON=/path/to/python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	touch $@
+
+$(DEV): $(RUN)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: $(RUN)
+	$(BIN)/heliopsf demo $(if $(IMAGE),--image "$(IMAGE)")
+
+test: $(DEV)
+	$(BIN)/python -m pytest -m "not slow" tests
+
+test-full: $(DEV)
+	$(BIN)/python -m pytest tests
+
+bench: $(DEV)
+	$(BIN)/python tests/bench.py
+
+lint: $(DEV)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+openapi: $(DEV)
+	$(BIN)/python -m service.openapi openapi/openapi.json
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache .hypothesis

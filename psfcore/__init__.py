@@ -1,0 +1,1 @@
+"""Point-spread functions of solar imagers: building, applying and removing them."""

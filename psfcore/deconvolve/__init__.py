@@ -1,0 +1,1 @@
+"""Deconvolution methods, one file each, all called as ``method(image, psf, ...) -> Deconvolved``."""

@@ -1,0 +1,1 @@
+"""Diffraction by what stands in the beam."""

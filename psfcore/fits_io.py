@@ -1,0 +1,328 @@
+"""FITS in and out: images, products of deconvolution, and point-spread functions.
+
+Pixels cross this border as native float64 [y, x]. Files written hold float32, carry CHECKSUM and DATASUM,
+and are the same bytes for the same content: no time of writing enters them.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.io.fits.verify import VerifyError
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.header import (
+    FitsLimits,
+    HeaderSummary,
+    optional_exposure_s,
+    optional_number,
+    optional_text,
+    read_psf_summary,
+    read_summary,
+)
+from psfcore.image import Image, MaskBit
+from psfcore.psf import Psf, cumulative_curve, radial_profile
+
+CardValue = str | int | float | bool
+Cards = Mapping[str, tuple[CardValue, str]]
+
+_CHECKSUM_COMMENT = "computed when the file was written"
+_SATURATION_KEYS = ("SATURATE", "DATASAT")
+_FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 15, 16))
+# Cards that describe how the input's pixels were stored, or figures of pixels that are no longer these.
+_STORAGE_CARD = re.compile(
+    r"SIMPLE|XTENSION|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|EXTEND|GROUPS|INHERIT|EXTNAME|EXTVER|EXTLEVEL|END|"
+    r"BSCALE|BZERO|BLANK|CHECKSUM|DATASUM|ZHECKSUM|ZDATASUM|"
+    r"TFIELDS|THEAP|T(TYPE|FORM|UNIT|NULL|SCAL|ZERO|DISP|DIM)\d+|"
+    r"ZIMAGE|ZSIMPLE|ZEXTEND|ZTENSION|ZBITPIX|ZNAXIS\d*|ZPCOUNT|ZGCOUNT|ZTILE\d+|ZCMPTYPE|ZNAME\d+|ZVAL\d+|"
+    r"ZQUANTIZ|ZDITHER0|ZBLANK|ZSCALE|ZZERO|ZMASKCMP|ZBLOCKED|"
+    r"DATAMIN|DATAMAX|DATAMEAN|DATAMEDN|DATARMS|DATASTD|DATASKEW|DATAKURT|DATACENT|DATAP\d\d"
+)
+# What opening or decompressing a damaged data unit raises, depending on where the damage is.
+_PIXEL_TROUBLE = (OSError, ValueError, TypeError, KeyError, IndexError, VerifyError, zlib.error, EOFError)
+_CARD_TROUBLE = (VerifyError, ValueError, TypeError, IndexError, OverflowError)
+
+
+# --- images -----------------------------------------------------------------------------------------------
+
+
+def read_image(path: str | Path, limits: FitsLimits, *, saturation_dn: float | None = None) -> Image:
+    """The first 2-D image of a file, with its mask.
+
+    saturation_dn: level in DN from which a pixel counts as saturated, besides the header's SATURATE or
+    DATASAT (in the image's own unit); divided by the exposure where the unit is DN/s.
+    Raises HeaderError for what headers show, DataError: "unreadable-pixels", "no-exposure", "all-nan",
+    "all-saturated", "no-signal", "too-small".
+    """
+    summary = read_summary(path, limits)
+    pixels, header = _read_pixels(path, summary)
+    unit, exposure_s = optional_text(header, "BUNIT"), optional_exposure_s(header)
+    level = _saturation_level(header, unit, exposure_s, saturation_dn)
+    mask = np.where(np.isfinite(pixels), 0, int(MaskBit.NONFINITE)).astype(np.uint8)
+    if level is not None:
+        mask[pixels >= level] |= int(MaskBit.SATURATED)  # False for NaN
+    image = Image(pixels=pixels, mask=mask, header=header, unit=unit, exposure_s=exposure_s)
+    _check_signal(image, stored_as_integer=summary.bitpix > 0)
+    return image
+
+
+def _read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.float64], fits.Header]:
+    try:
+        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True) as hdus:
+            hdu = hdus[summary.hdu]
+            header = hdu.header.copy()
+            data = hdu.data
+            pixels = np.array(data, dtype=np.float64)
+    except _PIXEL_TROUBLE as error:
+        message = f"expected pixels in HDU {summary.hdu} of {Path(path).name}; got: {error!s:.120}"
+        raise DataError("unreadable-pixels", message) from None
+    if pixels.shape != summary.shape:
+        message = f"expected {summary.shape} pixels as the header declares; got {pixels.shape}"
+        raise DataError("unreadable-pixels", message)
+    return pixels, header
+
+
+def _saturation_level(
+    header: fits.Header, unit: str | None, exposure_s: float | None, saturation_dn: float | None
+) -> float | None:
+    """Lowest saturated value in the image's own unit, or None where no level is known."""
+    levels = [optional_number(header, key) for key in _SATURATION_KEYS]
+    if saturation_dn is not None:
+        if (unit or "").replace(" ", "").lower() != "dn/s":
+            levels.append(saturation_dn)
+        elif exposure_s is not None:
+            levels.append(saturation_dn / exposure_s)
+        else:
+            message = (
+                "expected XPOSURE or EXPTIME, to compare DN/s with a saturation level in DN; got neither"
+            )
+            raise DataError("no-exposure", message)
+    known = [level for level in levels if level is not None and level > 0]
+    return min(known, default=None)
+
+
+def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
+    valid = image.pixels[image.valid]
+    if valid.size == 0:
+        finite = (image.mask & MaskBit.NONFINITE) == 0
+        if not finite.any():
+            raise DataError("all-nan", "expected finite pixels; got only NaN, infinite or BLANK")
+        level = image.pixels[finite].min()
+        raise DataError("all-saturated", f"expected pixels below saturation; all are at {level:g} or above")
+    smallest, largest = float(valid.min()), float(valid.max())
+    if largest <= 0:
+        raise DataError("no-signal", f"expected pixels above zero; the largest is {largest:g}")
+    if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
+        message = f"expected pixels below saturation; all are {largest:g}, a converter's full scale"
+        raise DataError("all-saturated", message)
+
+
+def write_image(
+    path: str | Path,
+    image: Image,
+    *,
+    cards: Cards,
+    history: Sequence[str] = (),
+    mask: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write a product: float32 pixels under the input's header and WCS, `cards`, `history`, and the mask.
+
+    mask: plane [y, x] to store instead of image.mask. Storage cards of the input are dropped and DATAMIN,
+    DATAMAX and DATAMEAN are computed anew (median, rms and percentiles are dropped).
+    """
+    header = _kept_header(image.header)
+    pixels = image.pixels.astype(np.float32)
+    finite = pixels[np.isfinite(pixels)]
+    if finite.size:
+        header["DATAMIN"] = (float(finite.min()), "smallest finite pixel")
+        header["DATAMAX"] = (float(finite.max()), "largest finite pixel")
+        header["DATAMEAN"] = (float(finite.mean(dtype=np.float64)), "mean of finite pixels")
+    for key, (value, comment) in cards.items():
+        header[key] = (_ascii(value) if isinstance(value, str) else value, _ascii(comment))
+    for line in history:
+        header.add_history(_ascii(line))
+    plane = image.mask if mask is None else np.ascontiguousarray(mask, dtype=np.uint8)
+    _write(path, [fits.PrimaryHDU(pixels, header), _mask_hdu(plane)])
+
+
+def read_mask(path: str | Path) -> NDArray[np.uint8] | None:
+    """The mask plane [y, x] of a product, or None where the file has none."""
+    with fits.open(path, memmap=False) as hdus:
+        if "MASK" not in hdus:
+            return None
+        return np.array(hdus["MASK"].data["MASK"][0], dtype=np.uint8)
+
+
+def _mask_hdu(mask: NDArray[np.uint8]) -> fits.BinTableHDU:
+    # sunpy.map.Map makes a map of every HDU whose data has two axes or more, so an image extension would
+    # turn the product into a list of maps. A table of one row has one axis to it, and TDIM keeps the shape.
+    ny, nx = mask.shape
+    column = fits.Column(name="MASK", format=f"{mask.size}B", dim=f"({nx},{ny})", array=mask[None])
+    hdu = fits.BinTableHDU.from_columns([column], name="MASK")
+    for bit in MaskBit:
+        hdu.header[f"MBIT{bit.bit_length() - 1}"] = (bit.name or "", f"meaning of value {int(bit)}")
+    return hdu
+
+
+def _kept_header(source: fits.Header) -> fits.Header:
+    """All cards but storage ones, in order; a card that cannot be read is kept as HISTORY text."""
+    kept = fits.Header()
+    for card in source.cards:
+        if _STORAGE_CARD.fullmatch(card.keyword):
+            continue
+        readable = _readable(card)
+        if readable is None:
+            kept.add_history("card kept as text: " + _ascii(card.image.rstrip()))
+        else:
+            kept.append(readable, end=True)
+    return kept
+
+
+def _readable(card: fits.Card) -> fits.Card | None:
+    try:
+        if isinstance(card.value, float) and not np.isfinite(card.value):
+            return None
+        value = _ascii(card.value) if isinstance(card.value, str) else card.value
+        copy = fits.Card(card.keyword, value, _ascii(card.comment))
+        copy.verify("silentfix")
+        fits.Card.fromstring(copy.image)
+    except _CARD_TROUBLE:
+        return None
+    return copy
+
+
+def _ascii(text: str) -> str:
+    """FITS allows printable ASCII only; anything else becomes '?', line ends become spaces."""
+    return "".join(c if " " <= c <= "~" else " " if c.isspace() else "?" for c in text)
+
+
+def _write(path: str | Path, hdus: list[Any]) -> None:
+    hdus[0].header["EXTEND"] = True
+    for hdu in hdus:
+        hdu.verify("silentfix")
+        hdu.add_checksum(when=_CHECKSUM_COMMENT)
+    # An open file, because astropy would compress by the name's ending.
+    with Path(path).open("wb") as file:
+        fits.HDUList(hdus).writeto(file, output_verify="silentfix")
+
+
+# --- point-spread functions -------------------------------------------------------------------------------
+
+
+def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = None) -> None:
+    """Write a PSF: primary HDU the kernel, an image HDU a component, tables PROFILE and INSTRUMENT.
+
+    Weights are float32: their rounding, 6e-8 of each, moves the sum by less than 1e-7.
+    instrument_file: the TOML text that the PSF was built from, kept word for word.
+    """
+    hdus: list[Any] = [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))]
+    for name, kernel in psf.components.items():
+        component = fits.ImageHDU(kernel.astype(np.float32), name=_ascii(name).upper())
+        component.header["PSFSUM"] = (float(kernel.sum()), "sum of weights on this array")
+        hdus.append(component)
+    hdus.append(_profile_hdu(psf))
+    if instrument_file is not None:
+        hdus.append(_instrument_hdu(instrument_file))
+    _write(path, hdus)
+
+
+def _psf_header(psf: Psf) -> fits.Header:
+    header = fits.Header()
+    header["PSFNAME"] = (_ascii(psf.name), "name of this point-spread function")
+    header["PSFVERS"] = (_ascii(psf.version), "its version")
+    header["PSFSTAT"] = (_ascii(psf.status), "draft or released")
+    header["PSFSUM"] = (psf.total, "sum of weights on this array")
+    header["REACH"] = (psf.reach_px, "[pixel] farthest pixel from the centre")
+    if psf.instrument is not None:
+        header["INSTRUME"] = (_ascii(psf.instrument), "instrument description")
+    if psf.wavelength_angstrom is not None:
+        header["WAVELNTH"] = (psf.wavelength_angstrom, "[Angstrom] wavelength")
+    for axis, size in ((1, psf.kernel.shape[1]), (2, psf.kernel.shape[0])):
+        header[f"CRPIX{axis}"] = (size // 2 + 1.0, "[pixel] centre, counted from 1")
+        if psf.plate_scale_arcsec is not None:
+            header[f"CDELT{axis}"] = (psf.plate_scale_arcsec, "[arcsec] pixel scale")
+            header[f"CUNIT{axis}"] = "arcsec"
+    for key, value in psf.provenance.items():
+        if key != "instrument_toml":
+            header.add_history(_ascii(f"{key}: {value}"))
+    return header
+
+
+def _profile_hdu(psf: Psf) -> fits.BinTableHDU:
+    radius, weight = radial_profile(psf.kernel)
+    columns = [
+        fits.Column(name="radius_px", format="D", unit="pixel", array=radius),
+        fits.Column(name="mean_weight", format="D", array=weight),
+        fits.Column(name="cumulative_pct", format="D", unit="%", array=cumulative_curve(psf.kernel, radius)),
+    ]
+    return fits.BinTableHDU.from_columns(columns, name="PROFILE")
+
+
+def _instrument_hdu(text: bytes) -> fits.BinTableHDU:
+    values = np.frombuffer(text, dtype=np.uint8)[None]
+    column = fits.Column(name="TOML", format=f"{values.size}B", array=values)
+    return fits.BinTableHDU.from_columns([column], name="INSTRUMENT")
+
+
+def read_psf(path: str | Path, limits: FitsLimits) -> Psf:
+    """A PSF from the first 2-D image of a file; metadata from its cards, or the file's stem as its name.
+
+    Weights are taken as they are, centre at [n // 2, n // 2]. Raises HeaderError, DataError
+    "unreadable-pixels", and what Psf checks ("psf-not-centred", "psf-sum", ...).
+    """
+    summary = read_psf_summary(path, limits)
+    kernel, header = _read_pixels(path, summary)
+    own = "PSFNAME" in header
+    components, provenance = _read_extras(path, limits) if own else ({}, {})
+    return Psf(
+        kernel=kernel,
+        name=optional_text(header, "PSFNAME") or Path(path).name.split(".")[0],
+        version=optional_text(header, "PSFVERS") or "unversioned",
+        instrument=optional_text(header, "INSTRUME") if own else summary.instrument,
+        status=optional_text(header, "PSFSTAT") or "user",
+        plate_scale_arcsec=_psf_scale_arcsec(header),
+        wavelength_angstrom=summary.wavelnth,
+        components=components,
+        provenance={"file": Path(path).name, **provenance},
+    )
+
+
+def _psf_scale_arcsec(header: fits.Header) -> float | None:
+    """|CDELT1| where the header says, or leaves open, that it is in arcsec."""
+    step = optional_number(header, "CDELT1")
+    unit = optional_text(header, "CUNIT1") or "arcsec"
+    return abs(step) if step and unit.lower() == "arcsec" else None
+
+
+def _read_extras(
+    path: str | Path, limits: FitsLimits
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
+    """Components and the instrument's text of a file that write_psf wrote."""
+    components: dict[str, NDArray[np.float64]] = {}
+    provenance: dict[str, Any] = {}
+    try:
+        with fits.open(path, memmap=False) as hdus:
+            provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
+            for hdu in _extensions(hdus, limits):
+                if isinstance(hdu, fits.ImageHDU) and hdu.shape == hdus[0].shape:
+                    components[hdu.name] = np.array(hdu.data, dtype=np.float64)
+                elif hdu.name == "INSTRUMENT":
+                    text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
+                    provenance["instrument_toml"] = text.decode("utf-8")
+    except _PIXEL_TROUBLE as error:
+        message = f"expected readable extensions in {Path(path).name}; got: {error!s:.120}"
+        raise DataError("unreadable-pixels", message) from None
+    return components, provenance
+
+
+def _extensions(hdus: fits.HDUList, limits: FitsLimits) -> Iterator[Any]:
+    if len(hdus) > limits.max_hdus:
+        raise DataError("too-many-hdus", f"expected at most {limits.max_hdus} HDUs; got {len(hdus)}")
+    yield from hdus[1:]

@@ -1,0 +1,53 @@
+"""An image with a mask that says why a pixel is not to be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+
+SMALLEST_SIDE_PX = 16
+
+
+class MaskBit(IntFlag):
+    """Bits of the mask plane. Negative values are data (noise about zero) and have no bit."""
+
+    NONFINITE = 1
+    SATURATED = 2
+
+
+@dataclass(frozen=True)
+class Image:
+    """Pixels [y, x] (float64, in `unit`), mask [y, x] (bits of MaskBit), header, exposure in seconds.
+
+    Raises DataError: "not-2d", "too-small", "mask-shape", "unmasked-nonfinite".
+    """
+
+    pixels: NDArray[np.float64]
+    mask: NDArray[np.uint8]
+    header: Header
+    unit: str | None
+    exposure_s: float | None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pixels", np.ascontiguousarray(self.pixels, dtype=np.float64))
+        object.__setattr__(self, "mask", np.ascontiguousarray(self.mask, dtype=np.uint8))
+        if self.pixels.ndim != 2:
+            raise DataError("not-2d", f"expected an image of two axes; got {self.pixels.ndim}")
+        if min(self.pixels.shape) < SMALLEST_SIDE_PX:
+            ny, nx = self.pixels.shape
+            raise DataError("too-small", f"expected at least {SMALLEST_SIDE_PX} px a side; got {nx} x {ny}")
+        if self.mask.shape != self.pixels.shape:
+            raise DataError("mask-shape", f"expected a mask of {self.pixels.shape}; got {self.mask.shape}")
+        if not np.isfinite(self.pixels[(self.mask & MaskBit.NONFINITE) == 0]).all():
+            raise DataError("unmasked-nonfinite", "expected every NaN or infinite pixel to be masked")
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """True where a pixel can be trusted, [y, x]."""
+        return self.mask == 0

@@ -1,0 +1,1 @@
+"""Instrument descriptions: one TOML file each, found by `files`, checked by `model`."""

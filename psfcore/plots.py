@@ -1,0 +1,167 @@
+"""Pictures for people: an image before and after, and a point-spread function.
+
+Drawn on figures of their own with the Agg canvas, so that threads and processes do not meet in pyplot.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import FuncNorm, LinearSegmentedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from psfcore.psf import Psf, crop_centred, cumulative_curve, radial_profile
+
+PANEL_PX = 640
+CHANGE_LIMIT_PCT = 100.0
+_GOLD = LinearSegmentedColormap.from_list(
+    "euv_gold",
+    [
+        (0.0, "#000000"),
+        (0.18, "#2e1500"),
+        (0.40, "#7d4400"),
+        (0.62, "#c98612"),
+        (0.82, "#f3c34d"),
+        (1.0, "#fffbe8"),
+    ],
+)
+_GOLD.set_bad("#3a4a5a")
+_CHANGE = LinearSegmentedColormap.from_list(
+    "change", ["#123a7a", "#3f7fc1", "#b9d5ea", "#f7f7f4", "#f6c9a4", "#d5642f", "#7d1a12"]
+)
+_CHANGE.set_bad("#3a4a5a")
+_COLOURS = {"TOTAL": "#1b1b1b", "DIFFRACTION": "#7b3fa0", "SCATTER": "#e0a100"}
+_INK = "#222222"
+
+Plane = NDArray[np.floating]
+
+
+def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str = "DN/s") -> None:
+    """Three panels [y, x], first row at the bottom: before, after (same stretch), change in percent."""
+    step = max(1, -(-max(before.shape) // PANEL_PX))
+    small_before, small_after = _binned(before, step), _binned(after, step)
+    stretch = _stretch(small_before, small_after)
+    change = _change_pct(small_before, small_after)
+    figure = Figure(figsize=(15.6, 5.55), dpi=100, facecolor="white")
+    figure.text(0.045, 0.955, title, fontsize=13, color=_INK, va="center", weight="bold")
+    extent = (-0.5, before.shape[1] - 0.5, -0.5, before.shape[0] - 0.5)
+    panels: list[tuple[str, Plane, LinearSegmentedColormap, Normalize, str]] = [
+        ("Before", small_before, _GOLD, stretch, unit),
+        ("After", small_after, _GOLD, stretch, unit),
+        ("Change", change, _CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT), "% of before"),
+    ]
+    for index, (name, data, colours, norm, label) in enumerate(panels):
+        axes = figure.add_axes((0.045 + 0.318 * index, 0.085, 0.266, 0.79))
+        drawn = axes.imshow(
+            data, origin="lower", cmap=colours, norm=norm, extent=extent, interpolation="nearest"
+        )
+        axes.set_title(name, fontsize=11, color=_INK, loc="left")
+        axes.set_xlabel("x (px)")
+        if index == 0:
+            axes.set_ylabel("y (px)")
+        else:
+            axes.set_yticks([])
+        _colourbar(figure, axes, drawn, label, beyond="both" if name == "Change" else "max")
+    FigureCanvasAgg(figure).print_png(str(path), pil_kwargs={"compress_level": 3})
+
+
+def psf_png(psf: Psf, path: str | Path) -> None:
+    """Three panels: the centre on a logarithmic scale, weight by radius, light beyond a radius."""
+    figure = Figure(figsize=(15.6, 5.2), dpi=100, facecolor="white", layout="constrained")
+    heading = f"PSF {psf.name} {psf.version} ({psf.status}), sum {psf.total:.4f} on this array"
+    figure.suptitle(heading, fontsize=14, color=_INK, weight="bold", x=0.01, ha="left")
+    image_axes, profile_axes, curve_axes = figure.subplots(1, 3)
+    _draw_centre(figure, image_axes, psf)
+    kernels = {"TOTAL": psf.kernel, **psf.components}
+    for name, kernel in kernels.items():
+        radius, weight = radial_profile(kernel)
+        style: dict[str, Any] = {"color": _COLOURS.get(name, "#2b8a6e"), "label": name.capitalize()}
+        style["linewidth"] = 2.0 if name == "TOTAL" else 1.3
+        # The centre, at radius 0, is drawn at half a pixel: a logarithmic axis has no zero.
+        shown = weight > 0
+        profile_axes.loglog(np.maximum(radius, 0.5)[shown], weight[shown], **style)
+        radii = np.geomspace(0.5, radius[-1], 400)
+        curve_axes.semilogx(radii, cumulative_curve(kernel, radii), **style)
+    profile_axes.set(
+        xlabel="Radius (px)", ylabel="Mean weight (fraction per pixel)", title="Weight by radius"
+    )
+    curve_axes.set(xlabel="Radius (px)", ylabel="Light beyond radius (%)", title="Light beyond a radius")
+    curve_axes.set_ylim(bottom=0)
+    for axes in (profile_axes, curve_axes):
+        axes.grid(which="major", color="#dddddd", linewidth=0.7)
+        axes.legend(frameon=False)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    FigureCanvasAgg(figure).print_png(str(path))
+
+
+def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:
+    size = min(129, *psf.kernel.shape)
+    centre = crop_centred(psf.kernel, (size, size))
+    half = size // 2
+    peak = float(centre.max())
+    norm = LogNorm(max(float(centre.min()), peak * 1e-7), peak, clip=True)
+    extent = (-half - 0.5, size - half - 0.5, -half - 0.5, size - half - 0.5)
+    drawn = axes.imshow(
+        centre, origin="lower", cmap="magma", norm=norm, extent=extent, interpolation="nearest"
+    )
+    axes.set(xlabel="x from centre (px)", ylabel="y from centre (px)", title=f"Central {size} px")
+    figure.colorbar(drawn, ax=axes, label="Weight (fraction per pixel)", shrink=0.85)
+
+
+def _binned(plane: Plane, step: int) -> NDArray[np.float64]:
+    """Means of step x step pixels; NaN only where all of them are. An incomplete last row is dropped."""
+    ny, nx = plane.shape[0] // step, plane.shape[1] // step
+    data = np.asarray(plane[: ny * step, : nx * step], dtype=np.float32)
+    finite = np.isfinite(data)
+    if finite.all():
+        return _block_sum(data, step) / step**2
+    count = _block_sum(finite.astype(np.float32), step)
+    total = _block_sum(np.where(finite, data, np.float32(0)), step)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _block_sum(data: NDArray[np.float32], step: int) -> NDArray[np.float64]:
+    total = np.zeros((data.shape[0] // step, data.shape[1] // step))
+    for row in range(step):
+        for column in range(step):
+            total += data[row::step, column::step]
+    return total
+
+
+def _stretch(before: Plane, after: Plane) -> FuncNorm:
+    """One square-root-like stretch for both: 0 to the 99.7th percentile of the brighter of the two."""
+    finite = [plane[np.isfinite(plane)] for plane in (before, after)]
+    top = max((float(np.percentile(values, 99.7)) for values in finite if values.size), default=1.0)
+    top = top if top > 0 else 1.0
+    return FuncNorm((_root, _square), vmin=0.0, vmax=top, clip=True)
+
+
+def _root(value: Any) -> Any:
+    return np.sqrt(np.maximum(value, 0))
+
+
+def _square(value: Any) -> Any:
+    return np.square(value)
+
+
+def _change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
+    """100 (after / before - 1), NaN where before is not above zero."""
+    ratio = np.full(before.shape, np.nan)
+    np.divide(after, before, out=ratio, where=before > 0)
+    return np.asarray(100 * (ratio - 1))
+
+
+def _colourbar(figure: Figure, axes: Any, drawn: Any, label: str, *, beyond: str) -> None:
+    box = axes.get_position()
+    width = 0.0085
+    bar_axes = figure.add_axes((box.x1 + 0.006, box.y0, width, box.height))
+    bar = figure.colorbar(drawn, cax=bar_axes, extend=beyond, extendfrac=0.02)
+    bar.set_label(label, fontsize=10)
+    bar.outline.set_linewidth(0.5)
+    bar_axes.tick_params(labelsize=8.5)
+    axes.tick_params(labelsize=8.5)

@@ -1,0 +1,158 @@
+"""A point-spread function, and the figures read off it.
+
+Reach and normalisation: light is counted over all pixels of a 2048 px grid round the centre, to 1448 px,
+on which a PSF sums to 1. A smaller array holds what falls on it, sums to less and is never renormalised.
+
+| symbol | name | unit |
+|---|---|---|
+| r | radius_px, pixel centre to pixel centre | px |
+| C(R) | cumulative_curve: 100 (1 - sum of weights with r <= R) | % |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from psfcore.errors import DataError
+from psfcore.image import Image
+
+REACH_GRID_PX = 2048
+LARGEST_SUM = 1 + 1e-3
+SMALLEST_SUM = 0.05
+PLATE_SCALE_TOLERANCE = 0.01
+_ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0}
+
+Kernel = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Psf:
+    """Weights [y, x] (fraction of a point's light per pixel) round [ny // 2, nx // 2], and their origin.
+
+    `components` are kernels with the same centring ("DIFFRACTION", "SCATTER"); `provenance` is free,
+    JSON-able text and numbers. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative",
+    "psf-sum", "psf-not-centred".
+    """
+
+    kernel: Kernel
+    name: str
+    version: str
+    instrument: str | None
+    status: str
+    plate_scale_arcsec: float | None = None
+    wavelength_angstrom: float | None = None
+    components: dict[str, Kernel] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kernel", np.ascontiguousarray(self.kernel, dtype=np.float64))
+        _check_weights(self.kernel)
+        _check_centre(self.kernel)
+
+    @property
+    def total(self) -> float:
+        """Sum of all weights on this array: 1 on the full reach, less on a smaller array."""
+        return float(self.kernel.sum())
+
+    @property
+    def reach_px(self) -> float:
+        """Distance of the farthest pixel from the centre, px."""
+        ny, nx = self.kernel.shape
+        return float(np.hypot(ny // 2, nx // 2))
+
+
+def _check_weights(kernel: Kernel) -> None:
+    if kernel.ndim != 2 or min(kernel.shape, default=0) < 1:
+        raise DataError("psf-not-2d", f"expected weights on two axes; got shape {kernel.shape}")
+    if not np.isfinite(kernel).all():
+        bad = int(np.count_nonzero(~np.isfinite(kernel)))
+        raise DataError("psf-nonfinite", f"expected finite weights; got {bad} that are NaN or infinite")
+    largest, smallest, total = float(kernel.max()), float(kernel.min()), float(kernel.sum())
+    if smallest < -1e-12 * max(largest, 0.0):
+        raise DataError("psf-negative", f"expected weights >= 0; the smallest is {smallest:.3g}")
+    if not SMALLEST_SUM < total <= LARGEST_SUM:
+        wanted = f"a sum of 1 on the full reach, less when cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
+        raise DataError("psf-sum", f"expected {wanted}; got {total:.6g}: divide the weights first")
+
+
+def _check_centre(kernel: Kernel) -> None:
+    peak = np.unravel_index(int(kernel.argmax()), kernel.shape)
+    centre = tuple(n // 2 for n in kernel.shape)
+    if max(abs(int(p) - c) for p, c in zip(peak, centre, strict=True)) > 1:
+        found = tuple(int(p) for p in peak)
+        hint = " (the corner origin of a Fourier transform: shift it first)" if found == (0, 0) else ""
+        raise DataError("psf-not-centred", f"expected the peak at [y, x] = {centre}; got {found}{hint}")
+
+
+def crop_centred(kernel: Kernel, shape: tuple[int, int]) -> Kernel:
+    """The middle of `kernel` with its centre at [n // 2] of the new, not larger, shape. Not renormalised."""
+    ny, nx = shape
+    top, left = kernel.shape[0] // 2 - ny // 2, kernel.shape[1] // 2 - nx // 2
+    return kernel[top : top + ny, left : left + nx].copy()
+
+
+def squared_radii(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """r^2 [y, x] (px^2, whole numbers) from the pixel [ny // 2, nx // 2]."""
+    dy = np.arange(shape[0], dtype=np.int64) - shape[0] // 2
+    dx = np.arange(shape[1], dtype=np.int64) - shape[1] // 2
+    return np.asarray(dy[:, None] ** 2 + dx[None, :] ** 2)
+
+
+def encircled_energy(kernel: Kernel, radii_px: ArrayLike) -> NDArray[np.float64]:
+    """Sum of the weights with r <= R for each R of `radii_px`; same shape as `radii_px`."""
+    by_square = np.bincount(squared_radii(kernel.shape).ravel(), weights=kernel.ravel())
+    inside = np.concatenate(([0.0], np.cumsum(by_square)))
+    radii = np.asarray(radii_px, dtype=np.float64)
+    # A radius such as sqrt(2) squares to 2.0000000000000004 or 1.9999999999999998: allow for the rounding.
+    squares = np.floor(radii**2 * (1 + 1e-12)).astype(np.int64)
+    filled = np.where(radii < 0, 0, np.clip(squares + 1, 0, by_square.size))
+    return np.asarray(inside[filled])
+
+
+def cumulative_curve(kernel: Kernel, radii_px: ArrayLike) -> NDArray[np.float64]:
+    """Percent of a point's light that lands farther than each R (px), or off the array."""
+    return np.asarray(100.0 * (1.0 - encircled_energy(kernel, radii_px)))
+
+
+def radial_profile(kernel: Kernel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(radius_px, mean weight) over rings one pixel wide: ring k holds the pixels whose r rounds to k."""
+    ring = np.rint(np.sqrt(squared_radii(kernel.shape))).astype(np.int64).ravel()
+    count = np.bincount(ring)
+    mean = np.bincount(ring, weights=kernel.ravel()) / np.maximum(count, 1)
+    occupied = count > 0
+    return np.flatnonzero(occupied).astype(np.float64), mean[occupied]
+
+
+def check_compatible(image: Image, psf: Psf) -> None:
+    """Raise DataError "plate-scale-mismatch" when the scales are known and differ by over 1 %."""
+    if psf.plate_scale_arcsec is None:
+        return
+    for axis in (1, 2):
+        scale = _pixel_scale_arcsec(image, axis)
+        if scale is None:
+            continue
+        if abs(scale / psf.plate_scale_arcsec - 1) > PLATE_SCALE_TOLERANCE:
+            wanted = f"{psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it"
+            raise DataError(
+                "plate-scale-mismatch", f"expected {wanted}; got CDELT{axis} = {scale:g} arcsec/px"
+            )
+
+
+def _pixel_scale_arcsec(image: Image, axis: int) -> float | None:
+    step = image.header.get(f"CDELT{axis}")
+    unit = str(image.header.get(f"CUNIT{axis}", "arcsec")).strip().lower()
+    if isinstance(step, bool) or not isinstance(step, (int, float)) or step == 0 or not np.isfinite(step):
+        return None
+    factor = _ARCSEC_PER_UNIT.get(unit or "arcsec")
+    return None if factor is None else abs(float(step)) * factor
+
+
+def sample_radii(kernel: Kernel) -> Sequence[float]:
+    """The radii (px) at which reports quote the cumulative curve and which lie on this array."""
+    reach = float(np.sqrt(squared_radii(kernel.shape).max()))
+    return [radius for radius in (0.5, 1.5, 3.5, 10.0, 11.5, 30.0, 100.0, 300.0, 1000.0) if radius <= reach]

@@ -1,0 +1,1 @@
+"""Diffuse scattering by the mirrors."""

@@ -1,0 +1,43 @@
+"""Diffuse scatter as a softened power law.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light":
+
+    s(r) = a / (b + r)^c  for r > 0,   s(0) = 1 - total,   total = sum over r > 0 on the full reach    Eq. (1)
+
+The amplitude is derived from the total and never given: `total` means the 2048 px grid, to 1448 px.
+
+| symbol | name | unit |
+|---|---|---|
+| a | amplitude | px^c |
+| b | b_px | px |
+| c | c | - |
+| r | radius from pixel centre to pixel centre | px |
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.psf import REACH_GRID_PX, squared_radii
+
+
+def amplitude_for_total(b_px: float, c: float, total: float, *, reach_grid_px: int = REACH_GRID_PX) -> float:
+    """a of Eq. (1) for which the light at r > 0 on a grid of `reach_grid_px` a side sums to `total`."""
+    shape = _falloff(b_px, c, reach_grid_px)
+    centre = reach_grid_px // 2
+    return float(total / (shape.sum() - shape[centre, centre]))
+
+
+def scatter_kernel(b_px: float, c: float, total: float, size: int) -> NDArray[np.float64]:
+    """Eq. (1) on (size, size), centre at [size // 2, size // 2] holding 1 - total.
+
+    Sums to 1 for size 2048 and to less on a smaller array.
+    """
+    kernel = amplitude_for_total(b_px, c, total) * _falloff(b_px, c, size)  # Eq. (1)
+    kernel[size // 2, size // 2] = 1 - total
+    return kernel
+
+
+def _falloff(b_px: float, c: float, size: int) -> NDArray[np.float64]:
+    return np.asarray((b_px + np.sqrt(squared_radii((size, size)))) ** -c)

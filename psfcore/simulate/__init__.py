@@ -1,0 +1,1 @@
+"""Scenes and observations whose truth is known."""

@@ -1,0 +1,186 @@
+"""A synthetic EUV scene of the Sun: made up, yet with the contrasts and scales that a PSF acts on.
+
+Everything is drawn in units of the field's longer edge, so that a scene keeps its look at any size:
+quiet-Sun texture (lognormal, power over many scales), two active regions with bright moss and thin loops,
+a dark coronal hole, a filament, a limb, and a corona beyond it that falls off with height.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, zoom
+
+Plane = NDArray[np.float64]
+
+QUIET_DN_PER_S = 420.0
+SKY_DN_PER_S = 12.0
+_LIMB_CENTRE = (1.52, 0.30)  # x, y in field edges
+_LIMB_RADIUS = 1.33
+_CORONA_HEIGHT = 0.22
+
+
+@dataclass(frozen=True)
+class _Region:
+    """An active region: centre and size in field edges, moss in DN/s, number of loop bundles."""
+
+    x: float
+    y: float
+    size: float
+    moss_dn_per_s: float
+    bundles: int
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """Loops side by side: middle between the feet, half distance of the feet, height (field edges), tilt
+    (radians), and light."""
+
+    x: float
+    y: float
+    span: float
+    rise: float
+    lean: float
+    light: float
+
+
+_REGIONS = (_Region(0.78, 0.24, 0.13, 2300.0, 34), _Region(0.44, 0.31, 0.075, 1800.0, 16))
+
+
+def solar_scene(shape: tuple[int, int], seed: int) -> Plane:
+    """True intensities [y, x] in DN/s, positive, the same for the same shape and seed."""
+    rng = np.random.default_rng(seed)
+    x, y = _coordinates(shape)
+    height = _LIMB_RADIUS - np.hypot(x - _LIMB_CENTRE[0], y - _LIMB_CENTRE[1])  # inside the disc: > 0
+    on_disc = 1 / (1 + np.exp(-height / 0.0015))
+    quiet = QUIET_DN_PER_S * _texture(shape, rng) * _large_scale(x, y)
+    brightening = 1 + 1.3 * np.exp(-np.abs(height) / 0.02)
+    scene = on_disc * quiet * brightening + (1 - on_disc) * _corona(x, y, height, rng)
+    scene += _bright_points(shape, rng) * on_disc
+    for region in _REGIONS:
+        scene += _moss(x, y, region, shape, rng) + _loops(shape, region, rng)
+    return np.asarray(scene * (1 - 0.85 * _filament(x, y)) + SKY_DN_PER_S)
+
+
+def _coordinates(shape: tuple[int, int]) -> tuple[Plane, Plane]:
+    edge = max(shape)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return x / edge, y / edge
+
+
+def _octaves(shape: tuple[int, int], rng: np.random.Generator, *, slope: float, coarsest: float) -> Plane:
+    """Gaussian noise, rms 1, whose amplitude grows with scale to the power `slope`.
+
+    A sum of smooth random planes, each on half the scale of the one before, down to a pixel.
+    """
+    edge = max(shape)
+    total = np.zeros(shape)
+    scale = coarsest * edge
+    while scale >= 1:
+        coarse = tuple(int(np.ceil(n / scale)) + 3 for n in shape)
+        plane = zoom(rng.standard_normal(coarse), scale, order=3 if scale > 1 else 1)
+        first = tuple(int(rng.integers(0, max(1, p - n))) for p, n in zip(plane.shape, shape, strict=True))
+        cut = plane[first[0] : first[0] + shape[0], first[1] : first[1] + shape[1]]
+        total += (scale / edge) ** slope * cut
+        scale /= 2
+    return np.asarray((total - total.mean()) / total.std())
+
+
+def _texture(shape: tuple[int, int], rng: np.random.Generator) -> Plane:
+    """Network and cells: lognormal, mean about 1."""
+    fine = _octaves(shape, rng, slope=0.45, coarsest=0.10)
+    ridges = 1 - np.minimum(np.abs(_octaves(shape, rng, slope=0.9, coarsest=0.07)), 1)
+    return np.exp(0.5 * fine - 0.13) * (0.75 + 0.5 * ridges**2)
+
+
+def _large_scale(x: Plane, y: Plane) -> Plane:
+    """A coronal hole at the top right, dark to a tenth, and a brighter belt where the regions are."""
+    hole = np.exp(-((((x - 0.80) / 0.19) ** 2 + ((y - 0.80 + 0.3 * (x - 0.8)) / 0.17) ** 2) ** 2))
+    belt = 1 + 0.9 * np.exp(-(((y - 0.27) / 0.20) ** 2))
+    return (1 - 0.88 * hole) * belt
+
+
+def _corona(x: Plane, y: Plane, height: Plane, rng: np.random.Generator) -> Plane:
+    """Off the limb: falls off with height, streaked along the radius."""
+    angle = np.arctan2(y - _LIMB_CENTRE[1], _LIMB_CENTRE[0] - x)
+    bins = np.linspace(-0.9, 0.9, 4000)
+    rays = gaussian_filter(rng.standard_normal(bins.size), 12) * 5
+    rays += gaussian_filter(rng.standard_normal(bins.size), 60) * 14
+    rays += gaussian_filter(rng.standard_normal(bins.size), 250) * 24
+    streaks = np.exp(0.32 * np.interp(angle, bins, rays))
+    steepness = 1.2 + 1.5 * np.maximum(y - 0.5, 0)
+    falloff = np.exp(-steepness * np.maximum(-height, 0) / _CORONA_HEIGHT)
+    return np.asarray(900.0 * falloff * streaks)
+
+
+def _moss(x: Plane, y: Plane, region: _Region, shape: tuple[int, int], rng: np.random.Generator) -> Plane:
+    """Fine bright patches where loops are rooted, and the haze of the region."""
+    r = np.hypot(x - region.x, (y - region.y) * 1.5) / region.size
+    patches = np.exp(1.1 * _octaves(shape, rng, slope=0.5, coarsest=0.05) - 1.0)
+    outline = np.exp(-((r + 0.35 * _octaves(shape, rng, slope=1.1, coarsest=0.2)) ** 2))
+    haze = 0.16 * np.exp(-(r**2) / 5)
+    return np.asarray(region.moss_dn_per_s * (0.5 * patches * outline + haze))
+
+
+def _loops(shape: tuple[int, int], region: _Region, rng: np.random.Generator) -> Plane:
+    """Bundles of thin arcs that share their footpoints, most strands about one pixel wide."""
+    edge = max(shape)
+    layers = [np.zeros(shape) for _ in range(3)]
+    for _ in range(region.bundles):
+        bundle = _draw_bundle(region, rng)
+        for _ in range(int(rng.integers(6, 16))):
+            x, y, light = _strand(bundle, edge, rng)
+            column, row = np.rint(x * edge).astype(int), np.rint(y * edge).astype(int)
+            seen = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+            np.add.at(layers[int(rng.choice(3, p=[0.4, 0.3, 0.3]))], (row[seen], column[seen]), light[seen])
+    widths_px = [max(0.7, width * edge) for width in (0.0004, 0.0011, 0.0035)]
+    strands = [gaussian_filter(layer, width) for layer, width in zip(layers, widths_px, strict=True)]
+    return np.asarray(region.moss_dn_per_s * sum(strands))
+
+
+def _draw_bundle(region: _Region, rng: np.random.Generator) -> _Bundle:
+    """Long bundles are rarer, rooted nearer the edge of the region, and fainter."""
+    reach = rng.random() ** 2
+    span = region.size * (0.18 + 1.1 * reach)
+    return _Bundle(
+        x=region.x + region.size * rng.normal(0, 0.35) * (1 + reach),
+        y=region.y + region.size * rng.normal(0, 0.35),
+        span=span,
+        rise=span * rng.uniform(0.5, 1.7),
+        lean=rng.normal(-0.1, 0.4),
+        light=rng.lognormal(0, 0.5) * (0.35 - 0.22 * reach),
+    )
+
+
+def _strand(bundle: _Bundle, edge: int, rng: np.random.Generator) -> tuple[Plane, Plane, Plane]:
+    """Points along one strand, about three a pixel, in field edges, with their light."""
+    span = bundle.span * rng.normal(1, 0.05)
+    rise = bundle.rise * rng.normal(1, 0.13)
+    t = np.linspace(0, np.pi, max(16, int(3 * (2 * span + 2 * rise) * edge)))
+    along, up = span * np.cos(t), rise * np.sin(t)
+    lean = bundle.lean + rng.normal(0, 0.03)
+    x = bundle.x + along * np.cos(lean) - up * np.sin(lean + 0.3) + rng.normal(0, 0.03) * bundle.span
+    y = bundle.y + along * np.sin(lean) + up * np.cos(lean + 0.3) + rng.normal(0, 0.03) * bundle.span
+    # Brightest at the feet, and unevenly filled along the way.
+    filling = np.exp(0.7 * np.interp(t, np.linspace(0, np.pi, 9), rng.standard_normal(9)))
+    light = bundle.light * rng.lognormal(0, 0.7) * (0.12 + 0.88 * np.abs(np.cos(t)) ** 2) * filling
+    return x, y, np.asarray(0.4 * light)
+
+
+def _bright_points(shape: tuple[int, int], rng: np.random.Generator) -> Plane:
+    """Scattered compact brightenings."""
+    plane = np.zeros(shape)
+    edge = max(shape)
+    count = 60
+    rows, columns = rng.integers(0, shape[0], count), rng.integers(0, shape[1], count)
+    np.add.at(plane, (rows, columns), rng.lognormal(8.6, 0.7, count))
+    return gaussian_filter(plane, max(0.8, 0.0009 * edge)) + 0.5 * gaussian_filter(plane, 0.003 * edge)
+
+
+def _filament(x: Plane, y: Plane) -> Plane:
+    """0 to 1: a dark winding channel across the disc."""
+    spine = 0.52 + 0.035 * np.sin(9 * x) + 0.018 * np.sin(23 * x + 1)
+    ends = np.exp(-(((x - 0.62) / 0.15) ** 4))
+    return np.asarray(ends * np.exp(-(((y - spine) / 0.013) ** 2)))

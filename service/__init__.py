@@ -1,0 +1,1 @@
+"""HTTP: the application, the client and the command line."""

@@ -1,0 +1,220 @@
+"""The ``heliopsf`` command."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from psfcore.errors import DataError
+from service.client import DEFAULT_SERVER, Heliopsf, Operations, ServiceError
+from workers.settings import Settings, software_version
+
+Report = Callable[[str, int, int], None]
+SERVER = click.option(
+    "--server", envvar="HELIOPSF_SERVER", help=f"Service to use [default: {DEFAULT_SERVER}]"
+)
+LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(software_version(), prog_name="heliopsf")
+def main() -> None:
+    """Point-spread functions of solar EUV telescopes, and images freed of their stray light."""
+
+
+@main.command()
+@click.option("--host", default="127.0.0.1", show_default=True)
+@click.option("--port", default=8765, show_default=True, help="0 takes a free port")
+@click.option("--data", type=click.Path(file_okay=False, path_type=Path), help="Folder for everything kept")
+def serve(host: str, port: int, data: Path | None) -> None:
+    """Serve over HTTP until interrupted.
+
+    With no broker set (HELIOPSF_BROKER_URL) a worker is started beside the service.
+    """
+    from service.server import serve as run
+
+    settings = _settings(data)
+    where = settings.data_dir.resolve()
+    try:
+        run(settings, host, port, lambda url: click.echo(f"heliopsf serves {url} (data in {where})"))
+    except OSError as error:
+        raise click.ClickException(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+
+
+@main.command()
+@click.option("--processes", type=click.IntRange(1), help="Worker processes [default: 1]")
+@click.option("--data", type=click.Path(file_okay=False, path_type=Path), help="Folder for everything kept")
+@click.option("--stop-with-parent", is_flag=True, hidden=True)
+def worker(processes: int | None, data: Path | None, stop_with_parent: bool) -> None:
+    """Run jobs from the broker until interrupted. Start as many as there are machines."""
+    import os
+
+    from service.server import environment
+
+    # The worker's module reads its settings when Celery imports it, so they go by the environment.
+    update: dict[str, Any] = {} if processes is None else {"worker_processes": processes}
+    os.environ |= environment(_settings(data).model_copy(update=update))
+    from workers.worker import main as run
+
+    run(stop_with_parent)
+
+
+@main.command()
+@click.argument("image", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path))
+@click.option("--psf", metavar="ID|FILE", help="PSF id, or a PSF file [default: the image's instrument]")
+@click.option("--steps", type=click.IntRange(1, 200), help="Richardson-Lucy steps [default: 20]")
+@click.option("--preview", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture too (PNG)")
+@SERVER
+@LOCAL
+def deconvolve(
+    image: Path,
+    output: Path,
+    psf: str | None,
+    steps: int | None,
+    preview: Path | None,
+    server: str | None,
+    local: bool,
+) -> None:
+    """Deconvolve IMAGE with the PSF of its instrument, or with one that you name."""
+    _check_writable(output, preview)
+    with _errors(), _connection(server, local) as service, _progress_bar() as report:
+        psf_id = service.upload_psf(psf)["id"] if psf and Path(psf).is_file() else psf
+        product = service.deconvolve(
+            image, output, psf_id=psf_id, steps=steps, preview=preview, progress=report
+        )
+    details = product["details"]
+    click.echo(f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}")
+    click.echo(
+        f"flux x{details['flux_ratio']:.4f}, brightest 1 % of pixels {details['bright_change_pct']:+.1f} %, "
+        f"darkest 1 % {_percent(details['dark_change_pct'])}"
+    )
+
+
+@main.group()
+def psf() -> None:
+    """Build and list PSFs."""
+
+
+@psf.command("build")
+@click.option("--instrument", required=True, help="Name of a shipped instrument file, as hri_euv")
+@click.option("--size", default=2048, show_default=True, help="Edge of the array in pixels")
+@click.option("-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path))
+@click.option("--preview", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture too (PNG)")
+@SERVER
+@LOCAL
+def psf_build(
+    instrument: str, size: int, output: Path, preview: Path | None, server: str | None, local: bool
+) -> None:
+    """Build the PSF of an instrument."""
+    _check_writable(output, preview)
+    with _errors(), _connection(server, local) as service, _progress_bar() as report:
+        built = service.build_psf(instrument, output, size=size, preview=preview, progress=report)
+    click.echo(f"{output}: {built['name']} {built['version']} ({built['status']})")
+    for radius, percent in built["details"]["cumulative_curve_pct"].items():
+        click.echo(f"  light beyond {radius:>5} px  {percent:6.2f} %")
+
+
+@psf.command("list")
+@click.option("--instrument", help="Only this instrument's")
+@SERVER
+def psf_list(instrument: str | None, server: str | None) -> None:
+    """List the PSF versions of a service."""
+    with _errors(), Heliopsf(server) as service:
+        rows = list(service.psfs(**({"instrument": instrument} if instrument else {})))
+    if not rows:
+        click.echo("no PSF yet: `heliopsf psf build` makes one, and so does the first deconvolution")
+    for row in rows:
+        size = "x".join(map(str, row["details"]["shape"]))
+        click.echo(f"{row['id'][:12]}  {row['name']}  {row['version']}  {row['status']}  {size}")
+
+
+@main.command()
+@click.option(
+    "--image", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="An image of yours"
+)
+@click.option(
+    "--output",
+    default="heliopsf-demo",
+    show_default=True,
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder for the results",
+)
+def demo(image: Path | None, output: Path) -> None:
+    """Show the whole way: a service, an upload, a deconvolution, the product and its picture."""
+    from service.demo import run
+
+    with _errors(), _progress_bar() as report:
+        found = run(image, output, report)
+    click.echo("\n".join(found))
+
+
+def _settings(data: Path | None) -> Settings:
+    return Settings() if data is None else Settings(data_dir=data)
+
+
+@contextmanager
+def _connection(server: str | None, local: bool) -> Iterator[Operations]:
+    """A service over HTTP, or one that lives in this process."""
+    if not local:
+        with Heliopsf(server) as remote:
+            remote.health()
+            yield remote
+        return
+    from service.local import local_service
+
+    with local_service() as service:
+        yield service
+
+
+def _check_writable(*files: Path | None) -> None:
+    """Say so before the work, not after it, where a result could not be written."""
+    for file in files:
+        if file is not None and not file.resolve().parent.is_dir():
+            raise click.ClickException(f"cannot write {file}: there is no folder {file.resolve().parent}")
+
+
+def _percent(value: float | None) -> str:
+    return "n/a (no light)" if value is None else f"{value:+.1f} %"
+
+
+@contextmanager
+def _errors() -> Iterator[None]:
+    """Errors of the user's in one line, without a traceback."""
+    try:
+        yield
+    except (ServiceError, DataError, TimeoutError, OSError) as error:
+        raise click.ClickException(str(error)) from error
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Report]:
+    """A bar on a terminal; nothing where the output is no terminal."""
+    if not sys.stderr.isatty():
+        yield lambda stage, step, steps: None
+        return
+    lock = threading.Lock()
+    started = time.monotonic()
+
+    def report(stage: str, step: int, steps: int) -> None:
+        done = step / steps
+        bar = "#" * round(30 * done) + "-" * (30 - round(30 * done))
+        with lock:
+            sys.stderr.write(f"\r{stage:<18} [{bar}] {step}/{steps}  {time.monotonic() - started:5.1f} s ")
+            sys.stderr.flush()
+
+    try:
+        yield report
+    finally:
+        sys.stderr.write("\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,255 @@
+"""A client for scripts: ``with Heliopsf("http://127.0.0.1:8765") as sun: sun.deconvolve("in.fits", "out.fits")``."""
+
+from __future__ import annotations
+
+import os
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import httpx
+
+DEFAULT_SERVER = "http://127.0.0.1:8765"
+Progress = Callable[[str, int, int], None]
+
+
+class ServiceError(Exception):
+    """The service refused a request, a job failed, or no service is there; the message says why."""
+
+    def __init__(self, message: str, *, status: int | None = None, code: str | None = None) -> None:
+        super().__init__(message)
+        self.status, self.code = status, code
+
+
+class Operations(ABC):
+    """What can be asked of a service, whether it is reached over HTTP or lives in this process."""
+
+    @abstractmethod
+    def upload_image(self, path: str | Path) -> dict[str, Any]:
+        """Upload a FITS image; returns its description, with its ``id``."""
+
+    @abstractmethod
+    def upload_psf(
+        self, path: str | Path, *, name: str | None = None, version: str | None = None
+    ) -> dict[str, Any]:
+        """Upload a PSF of your own; returns its description, with its ``id``."""
+
+    @abstractmethod
+    def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
+        """Ask for a job; returns it as it is then, which is ended where an equal one was done before."""
+
+    @abstractmethod
+    def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
+        """Wait for a job's end; returns it completed. Raises ``ServiceError`` where it ended otherwise."""
+
+    @abstractmethod
+    def get(self, address: str) -> dict[str, Any]:
+        """The description at an address of the service, as ``/v1/products/...``."""
+
+    @abstractmethod
+    def download(self, address: str, path: str | Path) -> None:
+        """Write the file at an address of the service to ``path``."""
+
+    def deconvolve(
+        self,
+        image: str | Path,
+        output: str | Path | None = None,
+        *,
+        psf_id: str | None = None,
+        steps: int | None = None,
+        preview: str | Path | None = None,
+        progress: Progress | None = None,
+    ) -> dict[str, Any]:
+        """Upload an image, have it deconvolved and download the product; returns its description."""
+        method = {"name": "richardson-lucy"} | ({} if steps is None else {"steps": steps})
+        image_id = self.upload_image(image)["id"]
+        job = self.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
+        product = self.get(self.wait(job, progress=progress)["result"])
+        self._fetch(product, output, preview)
+        return product
+
+    def build_psf(
+        self,
+        instrument: str,
+        output: str | Path | None = None,
+        *,
+        size: int = 2048,
+        preview: str | Path | None = None,
+        progress: Progress | None = None,
+    ) -> dict[str, Any]:
+        """Have the PSF of an instrument built and download it; returns its description."""
+        job = self.submit("psf-build", instrument=instrument, size=size)
+        psf = self.get(self.wait(job, progress=progress)["result"])
+        self._fetch(psf, output, preview)
+        return psf
+
+    def _fetch(self, result: dict[str, Any], output: str | Path | None, preview: str | Path | None) -> None:
+        if output is not None:
+            self.download(result["file"], output)
+        if preview is not None:
+            self.download(result["preview"], preview)
+
+    @staticmethod
+    def _ended(job: dict[str, Any]) -> dict[str, Any]:
+        """The job, where it is completed; else what it died of."""
+        if job["phase"] == "ERROR":
+            raise ServiceError(job["error"]["message"], code=job["error"]["code"])
+        if job["phase"] == "ABORTED":
+            raise ServiceError(f"job {job['id']} was cancelled", code="cancelled")
+        return job
+
+
+class Heliopsf(Operations):
+    """A heliopsf service, over HTTP."""
+
+    def __init__(self, server: str | None = None, *, transport: httpx.BaseTransport | None = None) -> None:
+        self.server = server or os.environ.get("HELIOPSF_SERVER", DEFAULT_SERVER)
+        self._http = httpx.Client(base_url=self.server, timeout=60, transport=transport)
+
+    def __enter__(self) -> Heliopsf:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._http.close()
+
+    def health(self) -> dict[str, Any]:
+        """What ``/healthz`` says."""
+        return self._json("GET", "/healthz")
+
+    def wait_until_up(self, timeout_s: float = 60.0) -> None:
+        """Wait until a service that was just started answers; ``ServiceError`` where it does not in time."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                self.health()
+                return
+            except ServiceError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.1)
+
+    def upload_image(self, path: str | Path) -> dict[str, Any]:
+        """Upload a FITS image; returns its description, with its ``id``."""
+        return self._upload("/v1/images", Path(path), {})
+
+    def upload_psf(
+        self, path: str | Path, *, name: str | None = None, version: str | None = None
+    ) -> dict[str, Any]:
+        """Upload a PSF of your own; returns its description, with its ``id``."""
+        return self._upload("/v1/psfs", Path(path), {"name": name, "version": version})
+
+    def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
+        """Ask for a job; returns it as it is then, which is ended where an equal one was done before."""
+        return self._json("POST", "/v1/jobs", json={"kind": kind, "parameters": parameters})
+
+    def job(self, job_id: str) -> dict[str, Any]:
+        """A job as it is now."""
+        return self._json("GET", f"/v1/jobs/{job_id}")
+
+    def cancel(self, job_id: str) -> dict[str, Any]:
+        """Cancel a job."""
+        return self._json("DELETE", f"/v1/jobs/{job_id}")
+
+    def wait(
+        self, job: dict[str, Any], *, progress: Progress | None = None, timeout_s: float | None = None
+    ) -> dict[str, Any]:
+        """Wait for a job's end; returns it completed.
+
+        Raises ``ServiceError`` where it failed or was cancelled, ``TimeoutError`` after ``timeout_s``.
+        """
+        started = time.monotonic()
+        while job["phase"] in ("QUEUED", "EXECUTING"):
+            if timeout_s is not None and time.monotonic() - started > timeout_s:
+                raise TimeoutError(f"job {job['id']} is {job['phase']} after {timeout_s:g} s")
+            time.sleep(0.1)
+            job = self.job(job["id"])
+            if progress is not None and job["progress"]["steps"]:
+                progress(job["progress"]["stage"], job["progress"]["step"], job["progress"]["steps"])
+        return self._ended(job)
+
+    def get(self, address: str) -> dict[str, Any]:
+        """The description at an address of the service."""
+        return self._json("GET", address)
+
+    def product(self, product_id: str) -> dict[str, Any]:
+        """The description of a product."""
+        return self._json("GET", f"/v1/products/{product_id}")
+
+    def psf(self, psf_id: str) -> dict[str, Any]:
+        """The description of a PSF version."""
+        return self._json("GET", f"/v1/psfs/{psf_id}")
+
+    def psfs(self, **filters: str) -> Iterator[dict[str, Any]]:
+        """All PSF versions, newest first."""
+        return self._all("/v1/psfs", filters)
+
+    def products(self, **filters: str) -> Iterator[dict[str, Any]]:
+        """All products, newest first."""
+        return self._all("/v1/products", filters)
+
+    def download(self, address: str, path: str | Path) -> None:
+        """Download a file of the service; ``path`` is written only once it is whole."""
+        target = Path(path)
+        partial = target.with_name(target.name + ".part")
+        try:
+            with self._http.stream("GET", address) as response:
+                if response.is_error:
+                    response.read()
+                    raise _refused(response)
+                with partial.open("wb") as file:
+                    for chunk in response.iter_bytes():
+                        file.write(chunk)
+            partial.replace(target)
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from error
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def _upload(self, address: str, path: Path, query: dict[str, str | None]) -> dict[str, Any]:
+        known = {key: value for key, value in query.items() if value is not None}
+        with path.open("rb") as file:
+            return self._json(
+                "POST",
+                address,
+                params={"filename": path.name, **known},
+                content=iter(lambda: file.read(2**20), b""),
+                headers={"Content-Type": "application/fits", "Content-Length": str(path.stat().st_size)},
+            )
+
+    def _all(self, address: str, filters: dict[str, str]) -> Iterator[dict[str, Any]]:
+        page = self._json("GET", address, params={"limit": "200", **filters})
+        while True:
+            yield from page["items"]
+            if page["next"] is None:
+                return
+            page = self._json("GET", page["next"])
+
+    def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
+        try:
+            response = self._http.request(method, address, **options)
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from error
+        if response.is_error:
+            raise _refused(response)
+        body: dict[str, Any] = response.json()
+        return body
+
+    def _unreachable(self, error: httpx.TransportError) -> ServiceError:
+        return ServiceError(f"no answer from {self.server} ({error}); `heliopsf serve` starts a service")
+
+
+def _refused(response: httpx.Response) -> ServiceError:
+    if response.headers.get("content-type", "").startswith("application/problem+json"):
+        problem = response.json()
+        code = str(problem["type"]).removeprefix("urn:heliopsf:")
+        return ServiceError(problem["detail"], status=response.status_code, code=code)
+    return ServiceError(f"the service answered {response.status_code}", status=response.status_code)

@@ -1,0 +1,61 @@
+"""``heliopsf demo``: the whole way of one image, with everything real and nothing left running."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from service.client import Heliopsf, Progress
+
+
+def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
+    """Serve on a free port, upload, deconvolve, download, stop; returns what to tell the user."""
+    output.mkdir(parents=True, exist_ok=True)
+    if image is None:
+        image = output / "simulated.fits"
+        _simulate(image)
+    product_file, picture = output / f"{image.stem}-deconvolved.fits", output / f"{image.stem}-preview.png"
+    with (output / "server.log").open("w") as log:
+        server = subprocess.Popen(
+            [sys.executable, "-m", "service.cli", "serve", "--port", "0", "--data", str(output / "data")],
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        )
+        try:
+            with Heliopsf(_address(server, output)) as service:
+                product = service.deconvolve(image, product_file, preview=picture, progress=progress)
+        finally:
+            server.terminate()
+            server.wait(60)
+    change = product["details"]
+    return [
+        f"image    {image}",
+        f"product  {product_file}",
+        f"picture  {picture}",
+        f"PSF      {product['psf_version']} (id {product['psf_id'][:12]}, in the product's header)",
+        f"change   brightest 1 % of pixels {change['bright_change_pct']:+.1f} %, "
+        f"flux of the frame x{change['flux_ratio']:.4f}",
+    ]
+
+
+def _address(server: subprocess.Popen[str], output: Path) -> str:
+    """The address that the server announces once it listens."""
+    assert server.stdout is not None
+    line = server.stdout.readline()
+    if " serves " not in line:
+        raise OSError(f"the demo's server did not start; see {output / 'server.log'}")
+    address = line.split(" serves ")[1].split()[0]
+    with Heliopsf(address) as service:
+        service.wait_until_up()
+    return address
+
+
+def _simulate(path: Path) -> None:
+    # Imported here, so that a demo of an image of your own does not load it.
+    from psfcore.build import build_psf
+    from psfcore.instruments.model import load_instrument
+    from psfcore.simulate.observe import demo_image
+
+    demo_image(path, build_psf(load_instrument("hri_euv")))

@@ -1,0 +1,19 @@
+"""Downloads: a stored file with its hash as ETag."""
+
+from __future__ import annotations
+
+from fastapi import Request
+from fastapi.responses import FileResponse, Response
+
+from workers.store import Store
+
+FITS_TYPE = "application/fits"
+
+
+def send(request: Request, store: Store, digest: str, media_type: str, filename: str | None) -> Response:
+    """The file, or 304 where the client has it already."""
+    headers = {"ETag": f'"{digest}"', "Cache-Control": "private, max-age=31536000, immutable"}
+    known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
+    if "*" in known or headers["ETag"] in known:
+        return Response(status_code=304, headers=headers)
+    return FileResponse(store.path(digest), media_type=media_type, filename=filename, headers=headers)

@@ -1,0 +1,114 @@
+"""Jobs: ``/v1/jobs``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from pydantic import BaseModel, Field
+
+from psfcore.errors import DataError
+from service.paging import Cursor, Limit, Page, page, position
+from service.problems import RESPONSES, Problem
+from service.state import Shared
+from workers import queue
+from workers.catalogue import DEFAULT_OWNER, JobRow
+from workers.contract import JobError, JobRequest, Phase
+from workers.intake import resolve
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
+STATUS_OF = {"no-such-image": 404, "no-such-psf": 404, "no-psf-for-instrument": 409}
+RESULTS = {"deconvolve": "/v1/products", "psf-build": "/v1/psfs"}
+
+
+class Progress(BaseModel):
+    """How far a job is."""
+
+    stage: str
+    step: int
+    steps: int
+
+
+class JobView(BaseModel):
+    """A job."""
+
+    id: str
+    kind: str
+    phase: Phase
+    created_at: float
+    started_at: float | None
+    ended_at: float | None
+    attempt: int
+    cancel_requested: bool
+    progress: Progress
+    parameters: dict[str, Any] = Field(description="with every default and the PSF filled in")
+    result: str | None = Field(description="address of what the job made")
+    error: JobError | None
+
+    @classmethod
+    def of(cls, row: JobRow) -> JobView:
+        """The view of a row."""
+        return cls(
+            id=row.id,
+            kind=row.kind,
+            phase=Phase(row.phase),
+            created_at=row.created_at,
+            started_at=row.started_at,
+            ended_at=row.ended_at,
+            attempt=row.attempt,
+            cancel_requested=row.cancel_requested,
+            progress=Progress(stage=row.stage, step=row.step, steps=row.steps),
+            parameters=row.parameters,
+            result=f"{RESULTS[row.kind]}/{row.result_id}" if row.result_id else None,
+            error=JobError.model_validate(row.error) if row.error else None,
+        )
+
+
+@router.post(
+    "",
+    status_code=202,
+    summary="Ask for a PSF build or a deconvolution",
+    responses={200: {"model": JobView, "description": "An equal request was made before; this is its job."}},
+)
+def submit_job(body: JobRequest, response: Response, state: Shared) -> JobView:
+    """Write the job down and submit it. An equal request is answered with the job that it already has."""
+    try:
+        parameters, request_key = resolve(body, state.catalogue, DEFAULT_OWNER)
+    except DataError as error:
+        raise Problem(STATUS_OF.get(error.code, 422), error.code, error.message) from error
+    row, new = state.catalogue.submit(body.kind, parameters, request_key)
+    if new and queue.submit(state.broker, row.id):
+        state.catalogue.mark_submitted(row.id)
+    response.status_code = 202 if new else 200
+    response.headers["Location"] = f"/v1/jobs/{row.id}"
+    return JobView.of(row)
+
+
+@router.get("", summary="List jobs")
+def list_jobs(
+    request: Request, state: Shared, phase: Phase | None = None, limit: Limit = 50, cursor: Cursor = None
+) -> Page[JobView]:
+    """Jobs, newest first."""
+    rows = state.catalogue.page(JobRow, limit=limit + 1, after=position(cursor), phase=phase)
+    return page(request, rows, limit, JobView.of)
+
+
+@router.get("/{job_id}", summary="One job: phase, progress, result or error")
+def get_job(job_id: str, state: Shared) -> JobView:
+    """The job as it is now."""
+    return JobView.of(_find(state, job_id))
+
+
+@router.delete("/{job_id}", status_code=202, summary="Cancel a job")
+def cancel_job(job_id: str, state: Shared) -> JobView:
+    """Cancel: a queued job ends at once, an executing one within a step, an ended one stays as it is."""
+    _find(state, job_id)
+    state.catalogue.cancel(job_id)
+    return JobView.of(_find(state, job_id))
+
+
+def _find(state: Shared, job_id: str) -> JobRow:
+    row = state.catalogue.job(job_id)
+    if row is None:
+        raise Problem(404, "no-such-job", f"there is no job with id {job_id}")
+    return row

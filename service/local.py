@@ -1,0 +1,125 @@
+"""The service's work in this process, for ``--local``: the same tasks on a catalogue of its own."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from psfcore.header import FitsLimits, read_summary
+from service.client import Operations, Progress, ServiceError
+from service.jobs import JobView
+from service.products import ProductView
+from service.psfs import PsfView
+from workers.catalogue import DEFAULT_OWNER, Catalogue, ProductRow, PsfRow
+from workers.contract import JobRequest
+from workers.intake import image_row, resolve, uploaded_psf_row
+from workers.runner import Runner
+from workers.settings import Settings
+from workers.store import Store, sha256_of
+
+
+class LocalService(Operations):
+    """The operations of a service, done here and now."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._store = Store(settings.data_dir)
+        self._catalogue = Catalogue(settings.catalogue_url)
+        self._catalogue.create_tables()
+        self._runner = Runner(settings, self._catalogue, self._store)
+
+    def close(self) -> None:
+        """Close the catalogue."""
+        self._catalogue.close()
+
+    def upload_image(self, path: str | Path) -> dict[str, Any]:
+        """Take an image in; its header is checked as a service would."""
+        source = Path(path)
+        summary = read_summary(source, FitsLimits(max_pixels=self._settings.max_pixels))
+        sha256 = self._keep(source)
+        row = image_row(DEFAULT_OWNER, sha256, source.stat().st_size, source.name, summary)
+        self._catalogue.add(row)
+        return {"id": row.id, "header": row.summary}
+
+    def upload_psf(
+        self, path: str | Path, *, name: str | None = None, version: str | None = None
+    ) -> dict[str, Any]:
+        """Take a PSF in."""
+        source = Path(path)
+        summary = read_summary(source, FitsLimits(max_pixels=self._settings.max_pixels))
+        sha256 = self._keep(source)
+        row = uploaded_psf_row(
+            DEFAULT_OWNER,
+            sha256,
+            source.stat().st_size,
+            source.name,
+            summary,
+            name=name,
+            version=version,
+        )
+        return PsfView.of(self._catalogue.add(row)[0]).model_dump(mode="json")
+
+    def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
+        """Write a job down; ``wait`` runs it."""
+        body = {"kind": kind, "parameters": parameters}
+        try:
+            request: JobRequest = TypeAdapter(JobRequest).validate_python(body)
+        except ValidationError as error:
+            faults = (f"{'/'.join(map(str, e['loc'][1:]))}: {e['msg']}" for e in error.errors())
+            raise ServiceError("; ".join(faults)) from error
+        row, _ = self._catalogue.submit(kind, *resolve(request, self._catalogue, DEFAULT_OWNER))
+        return JobView.of(row).model_dump(mode="json")
+
+    def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
+        """Run the job here; returns it completed, or raises ``ServiceError``."""
+        self._runner.run(job["id"], progress)
+        row = self._catalogue.job(job["id"])
+        assert row is not None
+        return self._ended(JobView.of(row).model_dump(mode="json"))
+
+    def get(self, address: str) -> dict[str, Any]:
+        """The description at an address of the service."""
+        row = self._row(address)
+        view = ProductView.of(row) if isinstance(row, ProductRow) else PsfView.of(row)
+        return view.model_dump(mode="json")
+
+    def download(self, address: str, path: str | Path) -> None:
+        """Copy a file out."""
+        description, _, part = address.rpartition("/")
+        row = self._row(description)
+        digest = row.file_sha256 if part == "file" else row.preview_sha256
+        assert digest is not None
+        shutil.copyfile(self._store.path(digest), path)
+
+    def _row(self, address: str) -> ProductRow | PsfRow:
+        _, collection, identity = address.rsplit("/", 2)
+        row: ProductRow | PsfRow | None
+        if collection == "products":
+            row = self._catalogue.get(ProductRow, identity)
+        else:
+            row = self._catalogue.get(PsfRow, identity)
+        assert row is not None
+        return row
+
+    def _keep(self, source: Path) -> str:
+        with self._store.temporary() as copy:
+            shutil.copyfile(source, copy)
+            return self._store.keep(copy, sha256_of(copy))
+
+
+@contextmanager
+def local_service() -> Iterator[LocalService]:
+    """A local service on a folder that is gone afterwards."""
+    with TemporaryDirectory(prefix="heliopsf-") as folder:
+        # Built afresh, not from the environment: nothing of a server's settings belongs in here.
+        service = LocalService(Settings(data_dir=Path(folder), database_url=None))
+        try:
+            yield service
+        finally:
+            service.close()

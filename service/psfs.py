@@ -1,0 +1,144 @@
+"""PSF versions: ``/v1/psfs``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, Field
+
+from service import files, uploads
+from service.paging import Cursor, Limit, Page, page, position
+from service.problems import RESPONSES, Problem
+from service.state import Shared
+from workers.catalogue import DEFAULT_OWNER, PsfRow
+from workers.contract import Identity
+from workers.intake import uploaded_psf_row
+
+router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
+
+
+class PsfView(BaseModel):
+    """A PSF version. It never changes; a change is another version with another id."""
+
+    id: str
+    created_at: float
+    name: str
+    version: str
+    instrument: str | None
+    status: str = Field(description="draft, or uploaded")
+    origin: str = Field(description="built here, or uploaded")
+    bytes: int
+    details: dict[str, Any] = Field(description="shape, curve, parameters, where it came from")
+    file: str = Field(description="address of the FITS file")
+    preview: str | None = Field(description="address of a picture; null for an uploaded PSF")
+
+    @classmethod
+    def of(cls, row: PsfRow) -> PsfView:
+        """The view of a row."""
+        here = f"/v1/psfs/{row.id}"
+        return cls(
+            id=row.id,
+            created_at=row.created_at,
+            name=row.name,
+            version=row.version,
+            instrument=row.instrument,
+            status=row.status,
+            origin=row.origin,
+            bytes=row.bytes,
+            details=row.details,
+            file=f"{here}/file",
+            preview=f"{here}/preview" if row.preview_sha256 else None,
+        )
+
+
+@router.post(
+    "",
+    status_code=201,
+    summary="Upload a PSF of your own",
+    openapi_extra=uploads.OPENAPI_BODY,
+    responses={200: {"model": PsfView, "description": "The same file was uploaded before."}},
+)
+async def upload_psf(
+    request: Request,
+    response: Response,
+    state: Shared,
+    name: Annotated[
+        str | None, Query(max_length=80, description="default: PSFNAME, or the file's name")
+    ] = None,
+    version: Annotated[
+        str | None, Query(max_length=40, description="default: PSFVERS, or 0.0.0+hash")
+    ] = None,
+) -> PsfView:
+    """Stream a PSF in: one 2-D image, its centre at [n//2, n//2], its sum at most 1.
+
+    The header is inspected here; a job that uses the PSF says what its pixels lack.
+    """
+    async with uploads.receive(request, state.store, state.limits, state.settings.max_upload_bytes) as upload:
+        await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
+    row = uploaded_psf_row(
+        DEFAULT_OWNER,
+        upload.sha256,
+        upload.bytes,
+        upload.filename,
+        upload.summary,
+        name=name,
+        version=version,
+    )
+    row, new = await run_in_threadpool(state.catalogue.add, row)
+    response.status_code = 201 if new else 200
+    response.headers["Location"] = f"/v1/psfs/{row.id}"
+    return PsfView.of(row)
+
+
+@router.get("", summary="List PSF versions")
+def list_psfs(
+    request: Request,
+    state: Shared,
+    instrument: str | None = None,
+    name: str | None = None,
+    version: str | None = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[PsfView]:
+    """PSF versions, newest first."""
+    rows = state.catalogue.page(
+        PsfRow,
+        limit=limit + 1,
+        after=position(cursor),
+        instrument=instrument,
+        name=name,
+        version=version,
+    )
+    return page(request, rows, limit, PsfView.of)
+
+
+@router.get("/{psf_id}", summary="One PSF version")
+def get_psf(psf_id: Identity, state: Shared) -> PsfView:
+    """What is known of a PSF version."""
+    return PsfView.of(_find(state, psf_id))
+
+
+@router.get("/{psf_id}/file", summary="The PSF as FITS", response_class=Response)
+def get_psf_file(psf_id: Identity, request: Request, state: Shared) -> Response:
+    """Download the PSF; its hash is the ETag."""
+    row = _find(state, psf_id)
+    return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, f"psf-{psf_id[:12]}.fits")
+
+
+@router.get("/{psf_id}/preview", summary="A picture of the PSF", response_class=Response)
+def get_psf_preview(psf_id: Identity, request: Request, state: Shared) -> Response:
+    """The PSF, its radial profile and its cumulative curve as PNG."""
+    row = _find(state, psf_id)
+    if row.preview_sha256 is None:
+        raise Problem(404, "no-preview", "an uploaded PSF has no picture; its file can be downloaded")
+    return files.send(request, state.store, row.preview_sha256, "image/png", None)
+
+
+def _find(state: Shared, psf_id: str) -> PsfRow:
+    """The PSF's row; ``Problem`` 404 where there is none."""
+    row = state.catalogue.get(PsfRow, psf_id)
+    if row is None:
+        raise Problem(404, "no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+    return row

@@ -1,0 +1,98 @@
+"""``heliopsf serve``: the web process and, in the embedded mode, its worker beside it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import uvicorn
+
+from service.app import create_app
+from workers.settings import Settings
+
+log = logging.getLogger(__name__)
+STOP_WITHIN_S = 20.0
+
+
+def serve(settings: Settings, host: str, port: int, announce: Callable[[str], None]) -> None:
+    """Serve until interrupted. Port 0 takes a free one; ``announce`` is told the address."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        host_name = f"[{host}]" if ":" in host else host
+        address = f"http://{host_name}:{listener.getsockname()[1]}"
+        server = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning"))
+        with embedded_worker(settings):
+            announce(address)
+            server.run(sockets=[listener])
+
+
+@contextmanager
+def embedded_worker(settings: Settings) -> Iterator[None]:
+    """A worker process beside this one while the block runs; started again if it dies.
+
+    Does nothing where the broker is a real one: there, workers are started on their own.
+    """
+    if not settings.embedded:
+        yield
+        return
+    stopping = threading.Event()
+    keeper = threading.Thread(target=_keep_worker, args=(settings, stopping), name="worker keeper")
+    keeper.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        keeper.join()
+
+
+def _keep_worker(settings: Settings, stopping: threading.Event) -> None:
+    while not stopping.is_set():
+        worker = _start_worker(settings)
+        while worker.poll() is None and not stopping.wait(0.5):
+            pass
+        if stopping.is_set():
+            _stop(worker)
+        else:
+            log.error("the worker ended with code %s; starting it again", worker.returncode)
+            stopping.wait(1.0)
+
+
+def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
+    log_file = settings.data_dir / "worker.log"
+    log_file.parent.mkdir(parents=True, exist_ok=True)
+    with log_file.open("ab") as output:
+        return subprocess.Popen(
+            [sys.executable, "-m", "service.cli", "worker", "--stop-with-parent"],
+            env=os.environ | environment(settings),
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            # Control-C goes to this process alone, which then stops the worker in order.
+            start_new_session=True,
+        )
+
+
+def environment(settings: Settings) -> dict[str, str]:
+    """Settings as the variables that another process reads them from."""
+    set_here = settings.model_dump(mode="json", exclude_none=True)
+    set_here["data_dir"] = str(Path(settings.data_dir).resolve())
+    return {f"HELIOPSF_{name.upper()}": str(value) for name, value in set_here.items()}
+
+
+def _stop(worker: subprocess.Popen[bytes]) -> None:
+    worker.send_signal(signal.SIGTERM)
+    try:
+        worker.wait(STOP_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        # Its job is queued again by the next server: nothing is lost by not waiting longer.
+        os.killpg(worker.pid, signal.SIGKILL)
+        worker.wait()

@@ -1,0 +1,38 @@
+"""What the endpoints share: settings, catalogue, store and broker, made once for each application."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from celery import Celery
+from fastapi import Depends, Request
+
+from psfcore.header import FitsLimits
+from workers.catalogue import Catalogue
+from workers.settings import Settings
+from workers.store import Store
+
+
+@dataclass(frozen=True)
+class State:
+    """Handles that live as long as the application."""
+
+    settings: Settings
+    catalogue: Catalogue
+    store: Store
+    broker: Celery
+
+    @property
+    def limits(self) -> FitsLimits:
+        """Limits of the files that are taken."""
+        return FitsLimits(max_pixels=self.settings.max_pixels)
+
+
+def _state(request: Request) -> State:
+    state = request.app.state.heliopsf
+    assert isinstance(state, State)
+    return state
+
+
+Shared = Annotated[State, Depends(_state)]

@@ -1,0 +1,54 @@
+"""What tests of every layer share: real data where it is there, and small files made by simulation."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of real and practice data; the test is skipped where it is missing."""
+    folder = Path(os.environ.get("HELIOPSF_SHARED", REPOSITORY.parent / "shared"))
+    if not folder.is_dir():
+        pytest.skip(f"real data are not here: no folder {folder} (HELIOPSF_SHARED names another)")
+    return folder
+
+
+@pytest.fixture
+def psf_file(tmp_path: Path) -> Path:
+    """A PSF of 64 px: a Gaussian core of 1.2 px and a faint wide wing, sum 1."""
+    path = tmp_path / "psf.fits"
+    write_psf(path)
+    return path
+
+
+@pytest.fixture
+def image_file(tmp_path: Path) -> Path:
+    """An image of 96 x 128 px whose instrument is unknown to the software."""
+    path = tmp_path / "image.fits"
+    write_image(path)
+    return path
+
+
+def write_psf(path: Path, *, size: int = 64, scale: float = 1.0) -> None:
+    """Write a symmetric PSF that sums to ``scale``."""
+    y, x = np.indices((size, size)) - size // 2
+    r = np.hypot(x, y)
+    kernel = 0.8 * np.exp(-0.5 * (r / 1.2) ** 2) / (2 * np.pi * 1.2**2) + 0.02 / (3 + r) ** 2.5
+    fits.PrimaryHDU((scale * kernel / kernel.sum()).astype("f4")).writeto(path)
+
+
+def write_image(path: Path, *, shape: tuple[int, int] = (96, 128), seed: int = 1, **cards: object) -> None:
+    """Write an image with two blobs on a background, in DN/s."""
+    rng = np.random.default_rng(seed)
+    y, x = np.indices(shape)
+    pixels = 20 + 300 * np.exp(-((x - 40) ** 2 + (y - 50) ** 2) / 18) + rng.poisson(30, shape)
+    header = fits.Header({"TELESCOP": "TEST", "BUNIT": "DN/s", "XPOSURE": 2.0, **cards})
+    fits.PrimaryHDU(pixels.astype("f4"), header).writeto(path)

@@ -1,0 +1,124 @@
+"""Rules of the house: which way imports run, what the web process carries, and what is kept in step."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.openapi import description
+
+HERE = Path(__file__).parents[2]
+# What --local and the demo need is imported by the command line alone.
+COMMAND_LINE = {"cli.py", "local.py", "demo.py"}
+
+
+def imports(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def sources(package: str) -> list[Path]:
+    found = sorted((HERE / package).rglob("*.py"))
+    assert found
+    return found
+
+
+@pytest.mark.parametrize(
+    ("package", "forbidden"),
+    [
+        ("psfcore", ("workers", "service", "fastapi", "starlette", "celery", "sqlalchemy", "redis", "httpx")),
+        ("workers", ("service", "fastapi", "starlette", "httpx")),
+    ],
+)
+def test_imports_run_one_way(package: str, forbidden: tuple[str, ...]) -> None:
+    wrong = [
+        (str(path.relative_to(HERE)), name)
+        for path in sources(package)
+        for name in imports(path)
+        if name.split(".")[0] in forbidden
+    ]
+    assert wrong == []
+
+
+def test_the_service_imports_of_psfcore_the_header_reader_and_its_errors_alone() -> None:
+    wrong = [
+        (path.name, name)
+        for path in sources("service")
+        if path.name not in COMMAND_LINE
+        for name in imports(path)
+        if name.startswith("psfcore") and not name.startswith(("psfcore.header", "psfcore.errors"))
+    ]
+    assert wrong == []
+
+
+def test_the_web_process_carries_no_numerics_and_no_task() -> None:
+    code = "import sys, service.app, service.server; print('\\n'.join(sys.modules))"
+    loaded = set(
+        subprocess.run(
+            [sys.executable, "-c", code], check=True, capture_output=True, text=True
+        ).stdout.split()
+    )
+    assert "service.app" in loaded
+    heavy = {
+        "scipy",
+        "numba",
+        "matplotlib",
+        "workers.tasks",
+        "workers.runner",
+        "psfcore.fourier",
+        "service.local",
+    }
+    assert loaded & heavy == set()
+
+
+def test_fits_and_fourier_have_one_home_each() -> None:
+    for path in sources("psfcore"):
+        names = set(imports(path))
+        if path.name not in ("fits_io.py", "header.py"):
+            # A Header may be carried about; reading and writing files has its home.
+            assert not {n for n in names if n.startswith("astropy.io.fits")} - {
+                "astropy.io.fits",
+                "astropy.io.fits.Header",
+            }, path
+        if path.name != "fourier.py":
+            assert not {n for n in names if "fft" in n.split(".")}, path
+
+
+def test_the_description_of_the_interface_is_what_the_application_generates() -> None:
+    kept = (HERE / "openapi" / "openapi.json").read_text()
+    assert kept == description(), "`make openapi` writes it anew"
+
+
+def test_the_readme_tells_the_commands_that_ci_runs() -> None:
+    readme, ci = (HERE / "README.md").read_text(), (HERE / ".ci" / "run").read_text()
+    targets = re.findall(r"^make (.+)$", ci, flags=re.M)
+    assert targets == ["lint test"]
+    told = set(re.findall(r"make ([a-z-]+)", readme))
+    assert {"demo", "test", "lint"} <= told
+    made = set(re.findall(r"^([a-z-]+):", (HERE / "Makefile").read_text(), flags=re.M))
+    assert told <= made, "the README tells of a target that the Makefile lacks"
+
+
+def test_no_file_names_a_registry() -> None:
+    hosts = re.compile(
+        "|".join(["py" + "pi", "python" + "hosted", "index" + "-url", "npm" + "js", "docker" + r"\.io"])
+    )
+    listed = subprocess.run(["git", "ls-files"], cwd=HERE, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    named = [
+        name
+        for name in listed.stdout.split()
+        if (HERE / name).is_file() and hosts.search((HERE / name).read_text(errors="replace"))
+    ]
+    assert named == []

@@ -1,0 +1,67 @@
+"""What several tests of the physics share: real data where it is there, small PSFs, small images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from psfcore.build import build_psf
+from psfcore.header import FitsLimits
+from psfcore.image import Image, MaskBit
+from psfcore.instruments.model import load_instrument
+from psfcore.psf import Psf
+
+LIMITS = FitsLimits(max_pixels=4096 * 4096)
+
+
+@pytest.fixture(scope="session")
+def limits() -> FitsLimits:
+    return LIMITS
+
+
+@pytest.fixture(scope="session")
+def real() -> Callable[[str], Path]:
+    """Path of a real data file; skips the test where it is not at hand."""
+    shared = Path(os.environ.get("HELIOPSF_SHARED", Path(__file__).parents[3] / "shared"))
+
+    def find(name: str) -> Path:
+        path = shared / "data" / "real" / name
+        if not path.exists():
+            pytest.skip(f"real data not at hand: {path} (set HELIOPSF_SHARED)")
+        return path
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def hri_psf() -> Psf:
+    return build_psf(load_instrument("hri_euv"), threads=2)
+
+
+def gaussian(size: int, sigma_px: float) -> NDArray[np.float64]:
+    r = np.arange(size) - size // 2
+    line = np.exp(-(r**2) / (2 * sigma_px**2))
+    kernel = np.outer(line, line)
+    return kernel / kernel.sum()
+
+
+def delta(size: int) -> NDArray[np.float64]:
+    kernel = np.zeros((size, size))
+    kernel[size // 2, size // 2] = 1.0
+    return kernel
+
+
+def make_psf(kernel: NDArray[np.float64], **changes: object) -> Psf:
+    known: dict[str, object] = {"name": "t", "version": "1", "instrument": None, "status": "user"}
+    return Psf(kernel=kernel, **(known | changes))  # type: ignore[arg-type]
+
+
+def make_image(pixels: NDArray[np.float64], mask: NDArray[np.uint8] | None = None) -> Image:
+    found = np.where(np.isfinite(pixels), 0, int(MaskBit.NONFINITE)).astype(np.uint8)
+    return Image(pixels, found if mask is None else mask, fits.Header(), "DN/s", 1.0)

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from psfcore.errors import DataError
+from psfcore.instruments.files import instrument_digest, instrument_names, instrument_path, match_instrument
+from psfcore.instruments.model import load_instrument
+
+
+def test_every_shipped_instrument_loads_under_its_own_name() -> None:
+    assert "hri_euv" in instrument_names()
+    for name in instrument_names():
+        assert load_instrument(name).name == name
+
+
+def test_the_digest_is_of_the_files_bytes() -> None:
+    assert instrument_digest("hri_euv") == hashlib.sha256(instrument_path("hri_euv").read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("cards", "name"),
+    [
+        ({"DETECTOR": "HRI_EUV"}, "hri_euv"),
+        ({"DETECTOR": "hri_euv  "}, "hri_euv"),
+        ({"DETECTOR": "FSI"}, None),
+        ({"DETECTOR": 174}, None),
+        ({}, None),
+    ],
+)
+def test_headers_are_matched(cards: dict[str, object], name: str | None) -> None:
+    assert match_instrument(cards) == name
+
+
+def test_an_unknown_instrument_names_the_known_ones() -> None:
+    with pytest.raises(DataError, match="hri_euv") as caught:
+        load_instrument("../../etc/passwd")
+    assert caught.value.code == "unknown-instrument"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("wire_um = 40.0", "wire_um = -4.0", "wire_um"),
+        ("wire_um = 40.0", "wire_um = 1400.0", "wire_um"),
+        ("b_px = 6.15", "b_pix = 6.15", "b_p"),
+        ("windows = 37", 'windows = "many"', "windows"),
+        ("total = 0.411", "total = 1.5", "total"),
+        ("wavelength_angstrom = 174.0", "", "wavelength_angstrom"),
+        ('name = "hri_euv"', "name = ", "TOML"),
+    ],
+)
+def test_a_bad_file_is_one_line_that_names_the_key(tmp_path: Path, old: str, new: str, key: str) -> None:
+    text = instrument_path("hri_euv").read_text()
+    assert old in text
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(DataError) as caught:
+        load_instrument(path)
+    assert caught.value.code == "bad-instrument-file"
+    assert key in caught.value.message
+    assert "\n" not in caught.value.message
+
+
+def test_instruments_do_not_change() -> None:
+    instrument = load_instrument("hri_euv")
+    with pytest.raises(ValidationError, match="frozen"):
+        instrument.focal_length_mm = 1.0  # type: ignore[misc]

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.image import Image
+from psfcore.psf import (
+    check_compatible,
+    crop_centred,
+    cumulative_curve,
+    encircled_energy,
+    radial_profile,
+)
+from tests.psfcore.conftest import delta, gaussian, make_psf
+
+
+def with_nan(kernel: NDArray[np.float64]) -> NDArray[np.float64]:
+    kernel[0, 0] = np.nan
+    return kernel
+
+
+def with_negative(kernel: NDArray[np.float64]) -> NDArray[np.float64]:
+    kernel[0, 0] = -1e-6
+    return kernel
+
+
+@pytest.mark.parametrize(
+    ("kernel", "code", "words"),
+    [
+        (delta(32) * 3, "psf-sum", "got 3:"),
+        (delta(32) * 0.01, "psf-sum", "got 0.01"),
+        (with_nan(delta(32)), "psf-nonfinite", "got 1"),
+        (with_negative(delta(32)), "psf-negative", "-1e-06"),
+        (np.roll(delta(32), (-16, -16), (0, 1)), "psf-not-centred", "corner origin"),
+        (np.roll(delta(32), 3, 0), "psf-not-centred", r"= \(16, 16\); got \(19, 16\)"),
+        (np.ones(9) / 9, "psf-not-2d", "two axes"),
+    ],
+)
+def test_what_is_no_psf_is_refused(kernel: NDArray[np.float64], code: str, words: str) -> None:
+    with pytest.raises(DataError, match=words) as caught:
+        make_psf(kernel)
+    assert caught.value.code == code
+
+
+def test_encircled_energy_counts_by_brute_force() -> None:
+    kernel = np.random.default_rng(3).random((12, 15))
+    y, x = np.mgrid[:12, :15]
+    r2 = (y - 6) ** 2 + (x - 7) ** 2
+    radii = np.array([0.0, 0.5, 1.0, np.sqrt(2), 1.9, np.sqrt(5), np.sqrt(13), 7.3, 50.0])
+    expected = [kernel[r2 <= round(r * r, 9)].sum() for r in radii]
+    np.testing.assert_allclose(encircled_energy(kernel, radii), expected, rtol=1e-12)
+
+
+def test_cumulative_curve_of_a_delta_is_zero_and_light_off_the_array_counts() -> None:
+    np.testing.assert_allclose(cumulative_curve(delta(16), [0.0, 0.5, 5.0]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(cumulative_curve(0.8 * delta(16), [0.5, 99.0]), 20.0)
+
+
+def test_gaussian_encloses_what_its_formula_says() -> None:
+    radius = np.array([5.0, 10.0, 20.0])
+    formula = 1 - np.exp(-(radius**2) / (2 * 8.0**2))
+    np.testing.assert_allclose(encircled_energy(gaussian(129, 8.0), radius), formula, atol=0.005)
+
+
+def test_radial_profile_of_a_function_of_radius_follows_it() -> None:
+    radius, weight = radial_profile(gaussian(65, 6.0))
+    np.testing.assert_allclose(weight[:20] / weight[0], np.exp(-(radius[:20] ** 2) / 72), rtol=0.03)
+
+
+@pytest.mark.parametrize("size", [16, 17])
+@pytest.mark.parametrize("new", [8, 9])
+def test_cropping_keeps_the_centre_and_does_not_renormalise(size: int, new: int) -> None:
+    kernel = gaussian(size, 5.0)
+    part = crop_centred(kernel, (new, new))
+    assert part[new // 2, new // 2] == kernel[size // 2, size // 2]
+    assert part.sum() < 1
+
+
+@pytest.mark.parametrize(
+    ("cdelt", "cunit", "fits_together"),
+    [
+        (0.492, "arcsec", True),
+        (-0.492, "arcsec", True),
+        (0.492 / 3600, "deg", True),
+        (0.4935, "arcsec", True),
+        (4.44, "arcsec", False),
+        (0.492 * 1.02, None, False),
+        (None, None, True),
+        (0.0, "arcsec", True),
+        (7.0, "furlong", True),
+    ],
+)
+def test_plate_scales_must_agree_to_a_percent_where_known(
+    cdelt: float | None, cunit: str | None, fits_together: bool
+) -> None:
+    header = fits.Header()
+    for axis in (1, 2):
+        if cdelt is not None:
+            header[f"CDELT{axis}"] = cdelt
+        if cunit is not None:
+            header[f"CUNIT{axis}"] = cunit
+    image = Image(np.ones((16, 16)), np.zeros((16, 16), np.uint8), header, None, None)
+    psf = make_psf(delta(16), plate_scale_arcsec=0.492)
+    if fits_together:
+        assert check_compatible(image, psf) is None
+    else:
+        with pytest.raises(DataError) as caught:
+            check_compatible(image, psf)
+        assert caught.value.code == "plate-scale-mismatch"
+        assert "0.492" in caught.value.message

@@ -1,0 +1,53 @@
+"""The application in this process, and its queued jobs run on demand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from workers.catalogue import Catalogue, JobRow
+from workers.contract import Phase
+from workers.runner import Runner
+from workers.settings import Settings
+from workers.store import Store
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    return Settings(
+        data_dir=tmp_path / "data",
+        database_url=None,
+        broker_url="filesystem://",
+        max_upload_mib=2,
+        max_pixels=512 * 512,
+    )
+
+
+@pytest.fixture
+def api(settings: Settings) -> Iterator[TestClient]:
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def run_jobs(settings: Settings, api: TestClient) -> Callable[[], None]:
+    def run() -> None:
+        catalogue = Catalogue(settings.catalogue_url)
+        runner = Runner(settings, catalogue, Store(settings.data_dir))
+        for row in catalogue.page(JobRow, limit=100, phase=Phase.QUEUED):
+            runner.run(row.id)
+        catalogue.close()
+
+    return run
+
+
+def upload(api: TestClient, path: Path, where: str = "/v1/images") -> str:
+    """Upload a file raw; returns its id."""
+    answer = api.post(where, content=path.read_bytes(), headers={"Content-Type": "application/fits"})
+    assert answer.status_code in (200, 201), answer.text
+    identity: str = answer.json()["id"]
+    return identity

@@ -1,0 +1,157 @@
+"""The main job over HTTP: upload, ask, look, download; and what is already there is not done again."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+from astropy.io import fits
+from fastapi.testclient import TestClient
+
+from tests.conftest import write_image
+from tests.service.conftest import upload
+from workers.settings import Settings
+
+
+def test_an_image_in_and_a_product_out(
+    api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_file: Path
+) -> None:
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    assert image_id == hashlib.sha256(image_file.read_bytes()).hexdigest()
+    body = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id}}
+    asked = api.post("/v1/jobs", json=body)
+    assert asked.status_code == 202
+    job = api.get(asked.headers["Location"]).json()
+    assert job["phase"] == "QUEUED" and job["result"] is None
+    assert job["parameters"]["method"] == {"name": "richardson-lucy", "steps": 20}
+
+    run_jobs()
+    job = api.get(asked.headers["Location"]).json()
+    assert job["phase"] == "COMPLETED" and job["progress"]["step"] == job["progress"]["steps"] == 20
+
+    product = api.get(job["result"]).json()
+    file = api.get(product["file"])
+    assert file.headers["content-type"] == "application/fits"
+    assert hashlib.sha256(file.content).hexdigest() == product["sha256"]
+    with fits.open(io.BytesIO(file.content)) as hdus:
+        assert hdus[0].header["PSFID"] == psf_id
+    assert api.get(product["preview"]).content.startswith(b"\x89PNG")
+
+    again = api.post("/v1/jobs", json=body)
+    assert again.status_code == 200
+    assert again.json()["id"] == job["id"] and again.json()["phase"] == "COMPLETED"
+    for key in ("image_id", "psf_id"):
+        listed = api.get("/v1/products", params={key: product[key]}).json()
+        assert [item["id"] for item in listed["items"]] == [product["id"]]
+        assert api.get("/v1/products", params={key: "0" * 64}).json()["items"] == []
+
+
+def test_a_form_is_taken_as_well_as_a_body(api: TestClient, image_file: Path) -> None:
+    raw = upload(api, image_file)
+    form = api.post(
+        "/v1/images",
+        files={"note": (None, "hello"), "file": ("../../evil\\name.fits", image_file.read_bytes())},
+    )
+    assert form.status_code == 200, "the same bytes are the same image"
+    assert form.json()["id"] == raw
+    assert api.get(f"/v1/images/{raw}").json()["header"]["shape"] == [96, 128]
+
+
+def test_a_client_file_name_is_a_label_and_no_path(
+    api: TestClient, image_file: Path, settings: Settings
+) -> None:
+    form = api.post("/v1/images", files={"file": ("../../evil\\name.fits", image_file.read_bytes())})
+    assert form.json()["filename"] == "name.fits"
+    assert not [p for p in settings.data_dir.rglob("*") if "evil" in p.name or "name.fits" in p.name]
+
+
+def test_downloads_answer_to_etags(api: TestClient, psf_file: Path) -> None:
+    address = f"/v1/psfs/{upload(api, psf_file, '/v1/psfs')}/file"
+    first = api.get(address)
+    assert first.content == psf_file.read_bytes()
+    unchanged = api.get(address, headers={"If-None-Match": first.headers["ETag"]})
+    assert unchanged.status_code == 304 and not unchanged.content
+    assert api.get(address, headers={"If-None-Match": '"other"'}).status_code == 200
+    part = api.get(address, headers={"Range": "bytes=0-8"})
+    assert part.status_code == 206 and part.content == b"SIMPLE  ="
+
+
+def test_a_psf_is_built_and_listed(api: TestClient, run_jobs: Callable[[], None]) -> None:
+    body = {"kind": "psf-build", "parameters": {"instrument": "hri_euv", "size": 128}}
+    job = api.post("/v1/jobs", json=body).json()
+    run_jobs()
+    psf = api.get(api.get(f"/v1/jobs/{job['id']}").json()["result"]).json()
+    assert psf["status"] == "draft" and psf["details"]["shape"] == [128, 128]
+    listed = api.get("/v1/psfs", params={"instrument": "hri_euv"}).json()["items"]
+    assert [item["id"] for item in listed] == [psf["id"]]
+    assert api.get("/v1/psfs", params={"instrument": "aia"}).json()["items"] == []
+    assert api.get(psf["preview"]).content.startswith(b"\x89PNG")
+
+
+def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_path: Path) -> None:
+    write_image(tmp_path / "hri.fits", DETECTOR="HRI_EUV", TELESCOP="SOLO/EUI/HRI_EUV")
+    image_id = upload(api, tmp_path / "hri.fits")
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": {"image_id": image_id}})
+    assert job.status_code == 202
+    assert job.json()["parameters"]["psf_recipe"] == {"instrument": "hri_euv", "size": 2048}
+
+
+def test_cancel_before_the_start(
+    api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_file: Path
+) -> None:
+    body = {
+        "kind": "deconvolve",
+        "parameters": {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")},
+    }
+    job = api.post("/v1/jobs", json=body).json()
+    assert api.delete(f"/v1/jobs/{job['id']}").json()["phase"] == "ABORTED"
+    run_jobs()
+    assert api.get(f"/v1/jobs/{job['id']}").json()["phase"] == "ABORTED"
+    assert api.get("/v1/products").json()["items"] == []
+    assert api.post("/v1/jobs", json=body).json()["id"] != job["id"]
+
+
+def test_a_failed_job_says_why(
+    api: TestClient, run_jobs: Callable[[], None], psf_file: Path, tmp_path: Path
+) -> None:
+    fits.PrimaryHDU(fits.getdata(psf_file) * float("nan")).writeto(tmp_path / "nan.fits")
+    body = {
+        "kind": "deconvolve",
+        "parameters": {
+            "image_id": upload(api, tmp_path / "nan.fits"),
+            "psf_id": upload(api, psf_file, "/v1/psfs"),
+        },
+    }
+    job = api.post("/v1/jobs", json=body).json()
+    run_jobs()
+    error = api.get(f"/v1/jobs/{job['id']}").json()["error"]
+    assert error["fault"] == "user" and error["code"] == "all-nan" and "expected" in error["message"]
+
+
+def test_lists_come_in_pages(api: TestClient, tmp_path: Path) -> None:
+    for seed in range(5):
+        write_image(tmp_path / f"{seed}.fits", seed=seed)
+        upload(api, tmp_path / f"{seed}.fits")
+    seen: list[str] = []
+    address = "/v1/images?limit=2"
+    while address:
+        page = api.get(address).json()
+        seen += [item["id"] for item in page["items"]]
+        address = page["next"]
+    assert len(seen) == len(set(seen)) == 5
+
+
+def test_health(api: TestClient) -> None:
+    assert api.get("/healthz").json()["status"] == "ok"
+
+
+def test_a_database_that_is_away_is_503(api: TestClient, settings: Settings) -> None:
+    for file in settings.data_dir.glob("catalogue.sqlite*"):
+        file.unlink()
+    (settings.data_dir / "catalogue.sqlite").write_bytes(b"no database" * 100)
+    api.app.state.heliopsf.catalogue.close()  # connections that are open would still see the old file
+    answer = api.get("/v1/jobs")
+    assert answer.status_code == 503
+    assert answer.json()["type"] == "urn:heliopsf:database-away"

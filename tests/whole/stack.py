@@ -1,0 +1,180 @@
+"""Real processes for tests: a service, workers, a Redis and a PostgreSQL database of the test's own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+from sqlalchemy import create_engine, text
+from sqlalchemy.exc import OperationalError
+
+from service.client import Heliopsf
+
+POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
+# A lost worker is noticed soon, so that tests need not wait as long as an operator would.
+QUICK = {"HELIOPSF_LEASE_S": "3", "HELIOPSF_HEARTBEAT_S": "0.5", "HELIOPSF_RECONCILE_S": "0.5"}
+
+
+class Stack:
+    """A running service; ``workers`` are those that the test started itself (none when embedded)."""
+
+    def __init__(self, data: Path, environment: dict[str, str]) -> None:
+        self.data = data
+        self.environment = os.environ | QUICK | {"HELIOPSF_DATA_DIR": str(data)} | environment
+        self.server: subprocess.Popen[str] | None = None
+        self.workers: list[subprocess.Popen[str]] = []
+        self.client = Heliopsf()
+
+    def start_server(self) -> None:
+        self.server = subprocess.Popen(
+            [sys.executable, "-m", "service.cli", "serve", "--port", "0"],
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=(self.data.parent / "server.log").open("a"),
+            text=True,
+            start_new_session=True,
+        )
+        assert self.server.stdout is not None
+        line = self.server.stdout.readline()
+        assert " serves " in line, (self.data.parent / "server.log").read_text()
+        self.client = Heliopsf(line.split(" serves ")[1].split()[0])
+        self.client.wait_until_up()
+
+    def start_worker(self) -> subprocess.Popen[str]:
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "service.cli", "worker"],
+            env=self.environment,
+            stdout=(self.data.parent / "workers.log").open("a"),
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        self.workers.append(worker)
+        return worker
+
+    def worker_processes(self) -> list[psutil.Process]:
+        """Every worker process there is, parents and children: the embedded one's or the test's own."""
+        roots = [psutil.Process(worker.pid) for worker in self.workers if worker.poll() is None]
+        if self.server is not None and not self.workers:
+            roots = [p for p in psutil.Process(self.server.pid).children() if "worker" in p.cmdline()]
+        return [p for root in roots for p in (root, *root.children(recursive=True))]
+
+    def kill_workers(self) -> None:
+        """SIGKILL to every worker process at once, as when the power goes."""
+        processes = self.worker_processes()
+        assert processes
+        for process in processes:
+            process.kill()
+        psutil.wait_procs(processes, timeout=10)
+
+    def stop(self) -> None:
+        """Stop everything by its process id."""
+        for process in [*self.workers, *([self.server] if self.server else [])]:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+        for process in [*self.workers, *([self.server] if self.server else [])]:
+            try:
+                process.wait(40)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+                raise
+
+
+@contextmanager
+def embedded(folder: Path) -> Iterator[Stack]:
+    """A service with its worker beside it, in one folder."""
+    with _running(Stack(folder / "data", {"HELIOPSF_BROKER_URL": "filesystem://"})) as stack:
+        yield stack
+
+
+@contextmanager
+def served(folder: Path, workers: int = 1) -> Iterator[Stack]:
+    """A service on Redis and PostgreSQL, with workers of its own; skipped where either is missing."""
+    with ExitStack() as resources:
+        redis_url = resources.enter_context(_redis(folder))
+        database_url = resources.enter_context(_database())
+        stack = Stack(
+            folder / "data", {"HELIOPSF_BROKER_URL": redis_url, "HELIOPSF_DATABASE_URL": database_url}
+        )
+        resources.enter_context(_running(stack))
+        for _ in range(workers):
+            stack.start_worker()
+        yield stack
+
+
+@contextmanager
+def _running(stack: Stack) -> Iterator[Stack]:
+    try:
+        stack.start_server()
+        yield stack
+    finally:
+        stack.client.close()
+        stack.stop()
+
+
+@contextmanager
+def _redis(folder: Path) -> Iterator[str]:
+    binary = shutil.which("redis-server")
+    if binary is None:
+        pytest.skip("no redis-server on this machine")
+    port = free_port()
+    server = subprocess.Popen(
+        [binary, "--bind", "127.0.0.1", "--port", str(port), "--save", "", "--dir", str(folder)],
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        wait_for(lambda: _listens(port), "Redis listens")
+        yield f"redis://127.0.0.1:{port}/0"
+    finally:
+        server.terminate()
+        server.wait(10)
+
+
+@contextmanager
+def _database() -> Iterator[str]:
+    admin = create_engine(POSTGRES, isolation_level="AUTOCOMMIT", connect_args={"connect_timeout": 3})
+    name = f"heliopsf_test_{uuid.uuid4().hex[:12]}"
+    try:
+        with admin.connect() as connection:
+            connection.execute(text(f"CREATE DATABASE {name}"))
+    except OperationalError as error:
+        pytest.skip(f"no PostgreSQL at {admin.url} (HELIOPSF_TEST_POSTGRES names one): {error.orig}")
+    try:
+        yield admin.url.set(database=name, drivername="postgresql").render_as_string(hide_password=False)
+    finally:
+        with admin.connect() as connection:
+            connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
+        admin.dispose()
+
+
+def free_port() -> int:
+    """A port that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def wait_for(condition: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
+    """Poll until the condition holds; fails the test, naming ``what``, where it does not in time."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {timeout_s:g} s in vain: {what}"
+        time.sleep(0.05)
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0

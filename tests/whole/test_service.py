@@ -1,0 +1,149 @@
+"""The service as processes: embedded, and on Redis and PostgreSQL; with a worker that is killed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import psutil
+import pytest
+from astropy.io import fits
+
+from service.client import ServiceError
+from tests.conftest import write_image
+from tests.whole import stack as stacks
+from tests.whole.stack import Stack, wait_for
+
+MODES = {"embedded": stacks.embedded, "redis and postgresql": stacks.served}
+
+
+@pytest.fixture(params=MODES)
+def stack(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Stack]:
+    mode: AbstractContextManager[Stack] = MODES[request.param](tmp_path)
+    with mode as running:
+        yield running
+
+
+def big_image(path: Path) -> Path:
+    """An image whose deconvolution takes some seconds, so that something can happen meanwhile."""
+    write_image(path, shape=(768, 768))
+    return path
+
+
+def test_an_image_in_and_a_product_out(stack: Stack, tmp_path: Path, psf_file: Path) -> None:
+    write_image(tmp_path / "image.fits")
+    psf_id = stack.client.upload_psf(psf_file)["id"]
+    output, picture = tmp_path / "out.fits", tmp_path / "out.png"
+    product = stack.client.deconvolve(tmp_path / "image.fits", output, psf_id=psf_id, preview=picture)
+    with fits.open(output, checksum=True) as hdus:
+        assert hdus[0].header["PSFID"] == psf_id
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    again = stack.client.deconvolve(tmp_path / "image.fits", psf_id=psf_id)
+    assert again == product
+    assert [p["id"] for p in stack.client.products()] == [product["id"]]
+
+
+def test_a_killed_worker_loses_nothing_and_nothing_is_done_twice(
+    stack: Stack, tmp_path: Path, psf_file: Path
+) -> None:
+    image_id = stack.client.upload_image(big_image(tmp_path / "image.fits"))["id"]
+    psf_id = stack.client.upload_psf(psf_file)["id"]
+    method = {"name": "richardson-lucy", "steps": 200}
+    job = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
+    wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 5, "the job is at work")
+    stack.kill_workers()
+    assert stack.client.job(job["id"])["phase"] == "EXECUTING"
+    if stack.workers:
+        stack.start_worker()  # the embedded one is started again by the service itself
+    done = stack.client.wait(job, timeout_s=120)
+    assert done["attempt"] == 2
+    assert len(list(stack.client.products())) == 1
+    blobs = [p for p in (stack.data / "blobs").rglob("*") if p.is_file()]
+    assert len(blobs) == 4, "image, PSF, product, picture"
+
+
+def test_cancel_at_work(stack: Stack, tmp_path: Path, psf_file: Path) -> None:
+    image_id = stack.client.upload_image(big_image(tmp_path / "image.fits"))["id"]
+    psf_id = stack.client.upload_psf(psf_file)["id"]
+    method = {"name": "richardson-lucy", "steps": 200}
+    job = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
+    wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 2, "the job is at work")
+    stack.client.cancel(job["id"])
+    with pytest.raises(ServiceError, match="cancelled"):
+        stack.client.wait(job, timeout_s=30)
+    ended = stack.client.job(job["id"])
+    assert ended["phase"] == "ABORTED" and ended["progress"]["step"] < 200
+    assert list(stack.client.products()) == []
+
+
+def test_what_was_queued_while_everything_was_down_is_done(
+    stack: Stack, tmp_path: Path, psf_file: Path
+) -> None:
+    psf_id = stack.client.upload_psf(psf_file)["id"]
+    ids = []
+    for seed in range(3):
+        write_image(tmp_path / f"{seed}.fits", seed=seed)
+        ids.append(stack.client.upload_image(tmp_path / f"{seed}.fits")["id"])
+    jobs = [stack.client.submit("deconvolve", image_id=i, psf_id=psf_id) for i in ids]
+    own_workers = bool(stack.workers)
+    stack.kill_workers()
+    assert stack.server is not None
+    for process in psutil.Process(stack.server.pid).children(recursive=True):
+        process.kill()
+    stack.server.kill()
+    stack.server.wait()
+    stack.start_server()
+    if own_workers:
+        stack.workers.clear()
+        stack.start_worker()
+    for job in jobs:
+        assert stack.client.wait(stack.client.job(job["id"]), timeout_s=120)["phase"] == "COMPLETED"
+    assert len(list(stack.client.products())) == 3
+
+
+def test_the_command_line_over_http_and_local_agree(tmp_path: Path, psf_file: Path) -> None:
+    write_image(tmp_path / "image.fits")
+    files = {"over-http": tmp_path / "h.fits", "local": tmp_path / "l.fits"}
+    base = [
+        sys.executable,
+        "-m",
+        "service.cli",
+        "deconvolve",
+        str(tmp_path / "image.fits"),
+        "--psf",
+        str(psf_file),
+    ]
+    with stacks.embedded(tmp_path) as stack:
+        over_http = [*base, "-o", str(files["over-http"]), "--server", stack.client.server]
+        subprocess.run(over_http, check=True)
+    subprocess.run([*base, "-o", str(files["local"]), "--local"], check=True)
+    assert files["over-http"].read_bytes() == files["local"].read_bytes()
+
+
+def test_the_command_line_says_what_is_wrong_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "letter.fits").write_text("Dear editor,\n" * 300)
+    command = [
+        sys.executable,
+        "-m",
+        "service.cli",
+        "deconvolve",
+        str(tmp_path / "letter.fits"),
+        "--local",
+        "-o",
+    ]
+    answer = subprocess.run([*command, str(tmp_path / "o.fits")], capture_output=True, text=True)
+    assert answer.returncode == 1
+    assert "expected" in answer.stderr and "Traceback" not in answer.stderr
+    assert not (tmp_path / "o.fits").exists()
+    nobody = [
+        *command[:-2],
+        "--server",
+        f"http://127.0.0.1:{stacks.free_port()}",
+        "-o",
+        str(tmp_path / "o.fits"),
+    ]
+    answer = subprocess.run(nobody, capture_output=True, text=True)
+    assert answer.returncode == 1 and "heliopsf serve" in answer.stderr

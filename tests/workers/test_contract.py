@@ -1,0 +1,61 @@
+"""Identities: equal requests are equal, and whatever changes a result changes them."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from psfcore.errors import DataError
+from workers.contract import (
+    JobRequest,
+    PsfBuild,
+    RichardsonLucy,
+    canonical_hash,
+    product_identity,
+    psf_identity,
+)
+
+A, B = "a" * 64, "b" * 64
+
+
+def test_the_hash_does_not_depend_on_the_order_of_keys() -> None:
+    assert canonical_hash({"a": 1, "b": 2}) == canonical_hash({"b": 2, "a": 1})
+
+
+def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = product_identity(A, B, RichardsonLucy())
+    assert base == product_identity(A, B, RichardsonLucy(steps=20))
+    others = {
+        product_identity(B, B, RichardsonLucy()),
+        product_identity(A, A, RichardsonLucy()),
+        product_identity(A, B, RichardsonLucy(steps=19)),
+    }
+    monkeypatch.setattr(RichardsonLucy, "algorithm_version", RichardsonLucy.algorithm_version + 1)
+    others.add(product_identity(A, B, RichardsonLucy()))
+    assert len(others) == 4 and base not in others
+
+
+def test_a_built_psf_is_identified_by_its_parameters() -> None:
+    small, large = PsfBuild(instrument="hri_euv", size=256), PsfBuild(instrument="hri_euv")
+    assert psf_identity(small) != psf_identity(large)
+    with pytest.raises(DataError, match="hri_euv"):
+        psf_identity(PsfBuild(instrument="no_such"))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"kind": "bake", "parameters": {}},
+        {"kind": "deconvolve", "parameters": {}},
+        {"kind": "deconvolve", "parameters": {"image_id": "../../etc/passwd"}},
+        {"kind": "deconvolve", "parameters": {"image_id": A, "method": {"name": "magic"}}},
+        {"kind": "deconvolve", "parameters": {"image_id": A, "method": {"steps": 0}}},
+        {"kind": "deconvolve", "parameters": {"image_id": A, "stepz": 3}},
+        {"kind": "psf-build", "parameters": {"instrument": "hri_euv", "size": 63}},
+        {"kind": "psf-build", "parameters": {"instrument": "hri_euv", "size": 1_000_000}},
+    ],
+)
+def test_requests_that_cannot_be_meant_are_refused(body: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        TypeAdapter(JobRequest).validate_python(body)

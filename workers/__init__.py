@@ -1,0 +1,1 @@
+"""Jobs: their contract, catalogue, files, queue and the tasks that run the physics."""

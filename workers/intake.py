@@ -1,0 +1,105 @@
+"""From what a user asks to what is written down: rows of uploads, and requests with nothing left open."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import PurePath
+from typing import Any
+
+from psfcore.errors import DataError
+from psfcore.header import HeaderSummary
+from workers.catalogue import Catalogue, ImageRow, PsfRow
+from workers.contract import (
+    DeconvolveRequest,
+    JobRequest,
+    PsfBuild,
+    PsfBuildRequest,
+    ResolvedDeconvolve,
+    product_identity,
+    psf_identity,
+)
+
+
+def image_row(
+    owner: str, sha256: str, size_bytes: int, filename: str | None, summary: HeaderSummary
+) -> ImageRow:
+    """The row of an uploaded image."""
+    return ImageRow(
+        owner=owner,
+        id=sha256,
+        created_at=time.time(),
+        bytes=size_bytes,
+        filename=filename,
+        summary=dataclasses.asdict(summary),
+    )
+
+
+def uploaded_psf_row(
+    owner: str,
+    sha256: str,
+    size_bytes: int,
+    filename: str | None,
+    summary: HeaderSummary,
+    *,
+    name: str | None = None,
+    version: str | None = None,
+) -> PsfRow:
+    """The row of an uploaded PSF; its name and version come from the request, the header or the file."""
+    return PsfRow(
+        owner=owner,
+        id=sha256,
+        created_at=time.time(),
+        name=name or summary.psf_name or PurePath(filename or "uploaded").stem,
+        version=version or summary.psf_version or f"0.0.0+{sha256[:8]}",
+        instrument=summary.instrument,
+        status="uploaded",
+        origin="uploaded",
+        file_sha256=sha256,
+        bytes=size_bytes,
+        preview_sha256=None,
+        details={
+            "shape": list(summary.shape),
+            "plate_scale_arcsec": summary.cdelt1,
+            "wavelength_angstrom": summary.wavelnth,
+            "filename": filename,
+        },
+    )
+
+
+def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict[str, Any], str]:
+    """Parameters with nothing left open, and the identity of what the job makes.
+
+    Raises ``DataError`` with code ``no-such-image``, ``no-such-psf``, ``no-psf-for-instrument`` or
+    ``unknown-instrument``.
+    """
+    match request:
+        case PsfBuildRequest(parameters=build):
+            return build.model_dump(mode="json"), psf_identity(build)
+        case DeconvolveRequest(parameters=wanted):
+            image = catalogue.get(ImageRow, wanted.image_id, owner)
+            if image is None:
+                raise DataError("no-such-image", f"no image was uploaded with id {wanted.image_id}")
+            recipe = _default_psf(image.summary) if wanted.psf_id is None else None
+            if recipe is not None:
+                psf_id = psf_identity(recipe)
+            elif wanted.psf_id is not None and catalogue.get(PsfRow, wanted.psf_id, owner) is not None:
+                psf_id = wanted.psf_id
+            else:
+                raise DataError("no-such-psf", f"the catalogue holds no PSF with id {wanted.psf_id}")
+            resolved = ResolvedDeconvolve(
+                image_id=image.id, psf_id=psf_id, psf_recipe=recipe, method=wanted.method
+            )
+            return resolved.model_dump(mode="json"), product_identity(image.id, psf_id, wanted.method)
+
+
+def _default_psf(header: dict[str, Any]) -> PsfBuild:
+    """The PSF of the instrument that made the image: the shipped instrument file at full size."""
+    if header["instrument"] is None:
+        made_by = " ".join(str(header[k]) for k in ("telescop", "instrume", "detector") if header[k])
+        raise DataError(
+            "no-psf-for-instrument",
+            f"expected an image of an instrument whose PSF is known here, got one by "
+            f"'{made_by or 'an unnamed instrument'}'; upload its PSF and name it as psf_id",
+        )
+    return PsfBuild(instrument=header["instrument"])

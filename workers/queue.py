@@ -1,0 +1,64 @@
+"""The broker: a Celery application, and how a job's id is given to it.
+
+The broker is disposable. What it loses is submitted again from the job table, and what it delivers twice does
+nothing the second time, so nothing here has to be durable. Jobs are submitted by the task's name: the web
+process imports no task.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from celery import Celery
+from kombu.exceptions import OperationalError
+
+from workers.settings import Settings
+
+RUN_JOB = "heliopsf.run_job"
+log = logging.getLogger(__name__)
+
+
+def make_app(settings: Settings) -> Celery:
+    """A Celery application for these settings; with the embedded broker, its folders are made too."""
+    app = Celery("heliopsf", broker=settings.broker_url, set_as_current=False)
+    app.conf.update(
+        task_serializer="json",
+        accept_content=["json"],
+        task_ignore_result=True,
+        # Acknowledged late, so that a worker takes no more than it runs; redelivery does nothing.
+        task_acks_late=True,
+        worker_prefetch_multiplier=1,
+        task_default_queue="heliopsf",
+        broker_connection_retry_on_startup=True,
+        worker_hijack_root_logger=False,
+        worker_send_task_events=False,
+        broker_transport_options=_transport_options(settings),
+    )
+    return app
+
+
+def submit(app: Celery, job_id: str) -> bool:
+    """Give the job's id to the broker; False where the broker is away (the reconciler tries again)."""
+    try:
+        app.send_task(RUN_JOB, args=[job_id], retry=False)
+    except OperationalError as error:
+        log.warning("broker away, job %s stays queued: %s", job_id, error)
+        return False
+    return True
+
+
+def _transport_options(settings: Settings) -> dict[str, Any]:
+    if not settings.embedded:
+        return {"socket_connect_timeout": 5, "socket_timeout": 30}
+    broker = settings.data_dir.resolve() / "broker"
+    queue, control = broker / "queue", broker / "control"
+    for folder in (queue, control):
+        folder.mkdir(parents=True, exist_ok=True)
+    return {
+        "data_folder_in": str(queue),
+        "data_folder_out": str(queue),
+        "control_folder": str(control),
+        "store_processed": False,
+        "polling_interval": 0.1,
+    }

@@ -1,0 +1,129 @@
+"""Runs one job: claim, heartbeat, task, outcome. The only place where an exception becomes a job's error."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from sqlalchemy.exc import InterfaceError, OperationalError
+
+from psfcore.errors import DataError
+from workers import tasks
+from workers.catalogue import Catalogue, JobRow, Lease
+from workers.contract import Fault, JobError, Phase
+from workers.settings import Settings
+from workers.store import Store
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int], None]
+TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
+REPORT_EVERY_S = 0.3
+
+
+class Cancelled(Exception):
+    """The job was cancelled, or its lease lost: stop, and write nothing."""
+
+
+@dataclass
+class _Work:
+    """A claimed job at work: progress out, cancellation in."""
+
+    catalogue: Catalogue
+    lease: Lease
+    heartbeat_s: float
+    also_report: Progress | None
+    stopped: threading.Event = field(default_factory=threading.Event)
+    ended: threading.Event = field(default_factory=threading.Event)
+    last_report: float = 0.0
+
+    def beat(self) -> None:
+        """Heartbeat until the work ends; notes a cancellation."""
+        while not self.ended.wait(self.heartbeat_s):
+            try:
+                alive = self.catalogue.heartbeat(self.lease)
+            except TRANSIENT as error:
+                # If it lasts, the lease runs out and the job is given to another; nothing to do here.
+                log.warning("job %s: heartbeat not written: %s", self.lease.job_id, error)
+                continue
+            if not alive:
+                self.stopped.set()
+                return
+
+    def report(self, stage: str, step: int, steps: int) -> None:
+        """Called by tasks at each step; raises ``Cancelled`` where the work should stop."""
+        now = time.monotonic()
+        if step == steps or now - self.last_report >= REPORT_EVERY_S:
+            self.last_report = now
+            if not self.catalogue.progress(self.lease, stage, step, steps):
+                self.stopped.set()
+        if self.stopped.is_set():
+            raise Cancelled(self.lease.job_id)
+        if self.also_report is not None:
+            self.also_report(stage, step, steps)
+
+
+class Runner:
+    """Runs jobs of the catalogue in this process."""
+
+    def __init__(self, settings: Settings, catalogue: Catalogue, store: Store) -> None:
+        self._settings, self._catalogue, self._store = settings, catalogue, store
+
+    def run(self, job_id: str, on_progress: Progress | None = None) -> None:
+        """Run the job if it is queued; else do nothing (it was redelivered, cancelled or taken)."""
+        lease = self._catalogue.claim(job_id, worker=f"{socket.gethostname()}:{os.getpid()}")
+        if lease is None:
+            log.info("job %s: not queued, nothing to do", job_id)
+            return
+        job = self._catalogue.job(job_id)
+        assert job is not None
+        work = _Work(self._catalogue, lease, self._settings.heartbeat_s, on_progress)
+        heart = threading.Thread(target=work.beat, name=f"heartbeat {job_id}", daemon=True)
+        heart.start()
+        try:
+            self._attempt(job, lease, work)
+        finally:
+            work.ended.set()
+            heart.join()
+
+    def _attempt(self, job: JobRow, lease: Lease, work: _Work) -> None:
+        context = tasks.Context(
+            catalogue=self._catalogue,
+            store=self._store,
+            settings=self._settings,
+            owner=job.owner,
+            job_id=job.id,
+            report=work.report,
+        )
+        try:
+            result_id = tasks.TASKS[job.kind](context, job.parameters)
+        except Cancelled:
+            aborted = self._catalogue.abort(lease)
+            log.info("job %s: %s", job.id, "aborted" if aborted else "lease lost, left to another worker")
+        except DataError as error:
+            self._fail(lease, Fault.USER, error.code, error.message)
+        except TRANSIENT as error:
+            self._retry(job, lease, error)
+        except Exception as error:
+            log.exception("job %s failed", job.id)
+            self._fail(lease, Fault.INTERNAL, "internal-error", f"{type(error).__name__}: {error}")
+        else:
+            self._catalogue.complete(lease, result_id)
+            log.info("job %s: %s, result %s", job.id, Phase.COMPLETED, result_id)
+
+    def _retry(self, job: JobRow, lease: Lease, error: Exception) -> None:
+        log.warning("job %s: passing failure in attempt %d: %s", job.id, job.attempt, error)
+        if job.attempt < self._settings.max_attempts:
+            self._catalogue.requeue(lease)
+        else:
+            message = f"failed {job.attempt} times: {type(error).__name__}"
+            self._fail(lease, Fault.TRANSIENT, "gave-up", message)
+
+    def _fail(self, lease: Lease, fault: Fault, code: str, message: str) -> None:
+        self._catalogue.fail(lease, JobError(fault=fault, code=code, message=message))
+        log.warning("job %s: %s (%s)", lease.job_id, message, code)

@@ -1,0 +1,63 @@
+"""What the operator decides, read in this one place from ``HELIOPSF_*`` variables.
+
+The defaults are the embedded mode: a local folder, SQLite in it, and a broker without a server.
+Scientific choices are never settings: they are parameters of a job.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib.metadata import version
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+EMBEDDED_BROKER = "filesystem://"
+
+
+class Settings(BaseSettings):
+    """Everything the operator sets; each field is also the variable ``HELIOPSF_<FIELD>``."""
+
+    model_config = SettingsConfigDict(env_prefix="HELIOPSF_", frozen=True)
+
+    data_dir: Path = Field(Path("heliopsf-data"), description="folder of files, and of SQLite when embedded")
+    database_url: str | None = Field(None, description="SQLAlchemy URL; none means SQLite in data_dir")
+    broker_url: str = Field(EMBEDDED_BROKER, description="Celery broker; the default needs no server")
+    max_upload_mib: int = Field(160, ge=1, description="largest file taken, as sent")
+    max_pixels: int = Field(4096 * 4096, ge=256, description="largest image or PSF taken, by its header")
+    worker_processes: int = Field(1, ge=1)
+    worker_threads: int | None = Field(None, ge=1, description="none means cores / worker_processes")
+    heartbeat_s: float = Field(2.0, gt=0, description="how often a running job says that it is alive")
+    lease_s: float = Field(15.0, gt=0, description="silence after which a running job's worker is given up")
+    reconcile_s: float = Field(2.0, gt=0, description="how often the job table is compared with the broker")
+    resubmit_s: float = Field(30.0, gt=0, description="first wait before a queued job is submitted again")
+    max_attempts: int = Field(3, ge=1, description="starts after which a job is an error")
+
+    @property
+    def embedded(self) -> bool:
+        """True where the broker is a folder, so that ``heliopsf serve`` starts the worker itself."""
+        return self.broker_url == EMBEDDED_BROKER
+
+    @property
+    def catalogue_url(self) -> str:
+        """The database's URL, with SQLite in the data folder as default."""
+        if self.database_url is None:
+            return f"sqlite:///{self.data_dir.resolve() / 'catalogue.sqlite'}"
+        # A bare postgresql:// would ask for psycopg2; the project brings psycopg 3.
+        return self.database_url.replace("postgresql://", "postgresql+psycopg://", 1)
+
+    @property
+    def threads(self) -> int:
+        """Threads of one worker process: cores / worker processes, so that workers share the machine."""
+        return self.worker_threads or max(1, (os.cpu_count() or 1) // self.worker_processes)
+
+    @property
+    def max_upload_bytes(self) -> int:
+        """Largest file taken, in bytes."""
+        return self.max_upload_mib * 2**20
+
+
+def software_version() -> str:
+    """Version of the installed package, as products name it."""
+    return version("heliopsf")
