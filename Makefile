@@ -28,7 +28,7 @@ test-full: $(DEV)
 	$(BIN)/python -m pytest tests
 
 bench: $(DEV)
-	$(BIN)/python tests/bench.py
+	$(BIN)/python -m tests.bench
 
 lint: $(DEV)
 	$(BIN)/ruff check .

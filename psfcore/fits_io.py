@@ -7,6 +7,7 @@ and are the same bytes for the same content: no time of writing enters them.
 from __future__ import annotations
 
 import re
+import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
+from astropy.io.fits.hdu.compressed._compression import CfitsioException
 from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
@@ -24,7 +26,6 @@ from psfcore.header import (
     optional_exposure_s,
     optional_number,
     optional_text,
-    read_psf_summary,
     read_summary,
 )
 from psfcore.image import Image, MaskBit
@@ -46,7 +47,21 @@ _STORAGE_CARD = re.compile(
     r"DATAMIN|DATAMAX|DATAMEAN|DATAMEDN|DATARMS|DATASTD|DATASKEW|DATAKURT|DATACENT|DATAP\d\d"
 )
 # What opening or decompressing a damaged data unit raises, depending on where the damage is.
-_PIXEL_TROUBLE = (OSError, ValueError, TypeError, KeyError, IndexError, VerifyError, zlib.error, EOFError)
+_PIXEL_TROUBLE = (
+    CfitsioException,  # what RICE decoding raises; astropy has no public name for it
+    VerifyError,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    struct.error,
+    zlib.error,
+)
 _CARD_TROUBLE = (VerifyError, ValueError, TypeError, IndexError, OverflowError)
 
 
@@ -186,16 +201,26 @@ def _kept_header(source: fits.Header) -> fits.Header:
 
 
 def _readable(card: fits.Card) -> fits.Card | None:
+    """A copy that can be written: a value FITS does not know (NaN, "1 2 3") becomes a string."""
     try:
-        if isinstance(card.value, float) and not np.isfinite(card.value):
-            return None
-        value = _ascii(card.value) if isinstance(card.value, str) else card.value
-        copy = fits.Card(card.keyword, value, _ascii(card.comment))
+        value = _card_value(card)
+        copy = fits.Card(
+            card.keyword, _ascii(value) if isinstance(value, str) else value, _ascii(card.comment)
+        )
         copy.verify("silentfix")
         fits.Card.fromstring(copy.image)
     except _CARD_TROUBLE:
         return None
     return copy
+
+
+def _card_value(card: fits.Card) -> Any:
+    try:
+        value = card.value
+    except VerifyError:
+        value = fits.Card.fromstring(card.image).value  # making the image puts the value in quotes
+    not_a_number = isinstance(value, (float, complex)) and not np.isfinite(value)
+    return str(value) if not_a_number else value
 
 
 def _ascii(text: str) -> str:
@@ -277,7 +302,7 @@ def read_psf(path: str | Path, limits: FitsLimits) -> Psf:
     Weights are taken as they are, centre at [n // 2, n // 2]. Raises HeaderError, DataError
     "unreadable-pixels", and what Psf checks ("psf-not-centred", "psf-sum", ...).
     """
-    summary = read_psf_summary(path, limits)
+    summary = read_summary(path, limits)
     kernel, header = _read_pixels(path, summary)
     own = "PSFNAME" in header
     components, provenance = _read_extras(path, limits) if own else ({}, {})

@@ -91,11 +91,6 @@ def read_summary(path: str | os.PathLike[str], limits: FitsLimits) -> HeaderSumm
     return _summary(header, hdu, gzipped)
 
 
-def read_psf_summary(path: str | os.PathLike[str], limits: FitsLimits) -> HeaderSummary:
-    """The same for a file that holds a PSF: its first 2-D image."""
-    return read_summary(path, limits)
-
-
 # --- the walk ---------------------------------------------------------------------------------------------
 
 
@@ -140,7 +135,7 @@ class _GzipSource:
         try:
             return self._stream.read(count)
         except EOFError:
-            return b""
+            raise HeaderError("truncated-gzip", "expected a whole gzip stream; it stops short") from None
         except (OSError, zlib.error) as error:
             raise HeaderError("bad-gzip", f"expected a readable gzip stream; got: {error}") from None
 
@@ -228,7 +223,7 @@ def _check_start(block: bytes) -> None:
     if block.startswith(b"SIMPLE  ="):
         return
     if not block:
-        raise HeaderError("empty-file", "expected a FITS file; got nothing (an empty or cut gzip file)")
+        raise HeaderError("empty-file", "expected a FITS file; got a gzip file of nothing")
     if block.startswith(b"SIMPLE"[: len(block)]) and len(block) < 9:
         raise HeaderError(
             "truncated-header", f"expected a FITS header; the file stops after {len(block)} bytes"

@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import FuncNorm, LinearSegmentedColormap, LogNorm, Normalize
+from matplotlib.colors import Colormap, FuncNorm, LinearSegmentedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
 from psfcore.psf import Psf, crop_centred, cumulative_curve, radial_profile
 
 PANEL_PX = 640
 CHANGE_LIMIT_PCT = 100.0
+_NO_DATA = "#3a4a5a"
 _GOLD = LinearSegmentedColormap.from_list(
     "euv_gold",
     [
@@ -28,12 +30,10 @@ _GOLD = LinearSegmentedColormap.from_list(
         (0.82, "#f3c34d"),
         (1.0, "#fffbe8"),
     ],
-)
-_GOLD.set_bad("#3a4a5a")
+).with_extremes(bad=_NO_DATA)
 _CHANGE = LinearSegmentedColormap.from_list(
     "change", ["#123a7a", "#3f7fc1", "#b9d5ea", "#f7f7f4", "#f6c9a4", "#d5642f", "#7d1a12"]
-)
-_CHANGE.set_bad("#3a4a5a")
+).with_extremes(bad=_NO_DATA)
 _COLOURS = {"TOTAL": "#1b1b1b", "DIFFRACTION": "#7b3fa0", "SCATTER": "#e0a100"}
 _INK = "#222222"
 
@@ -49,7 +49,7 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
     figure = Figure(figsize=(15.6, 5.55), dpi=100, facecolor="white")
     figure.text(0.045, 0.955, title, fontsize=13, color=_INK, va="center", weight="bold")
     extent = (-0.5, before.shape[1] - 0.5, -0.5, before.shape[0] - 0.5)
-    panels: list[tuple[str, Plane, LinearSegmentedColormap, Normalize, str]] = [
+    panels: list[tuple[str, Plane, Colormap, Normalize, str]] = [
         ("Before", small_before, _GOLD, stretch, unit),
         ("After", small_after, _GOLD, stretch, unit),
         ("Change", change, _CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT), "% of before"),
@@ -59,19 +59,21 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
         drawn = axes.imshow(
             data, origin="lower", cmap=colours, norm=norm, extent=extent, interpolation="nearest"
         )
-        axes.set_title(name, fontsize=11, color=_INK, loc="left")
+        axes.set_title(f"{name} ({label})", fontsize=11, color=_INK, loc="left")
         axes.set_xlabel("x (px)")
         if index == 0:
             axes.set_ylabel("y (px)")
         else:
             axes.set_yticks([])
-        _colourbar(figure, axes, drawn, label, beyond="both" if name == "Change" else "max")
+        _colourbar(figure, axes, drawn, beyond="both" if name == "Change" else "max")
     FigureCanvasAgg(figure).print_png(str(path), pil_kwargs={"compress_level": 3})
 
 
 def psf_png(psf: Psf, path: str | Path) -> None:
     """Three panels: the centre on a logarithmic scale, weight by radius, light beyond a radius."""
-    figure = Figure(figsize=(15.6, 5.2), dpi=100, facecolor="white", layout="constrained")
+    figure = Figure(
+        figsize=(15.6, 5.2), dpi=100, facecolor="white", layout=ConstrainedLayoutEngine(w_pad=0.1)
+    )
     heading = f"PSF {psf.name} {psf.version} ({psf.status}), sum {psf.total:.4f} on this array"
     figure.suptitle(heading, fontsize=14, color=_INK, weight="bold", x=0.01, ha="left")
     image_axes, profile_axes, curve_axes = figure.subplots(1, 3)
@@ -91,6 +93,7 @@ def psf_png(psf: Psf, path: str | Path) -> None:
     )
     curve_axes.set(xlabel="Radius (px)", ylabel="Light beyond radius (%)", title="Light beyond a radius")
     curve_axes.set_ylim(bottom=0)
+    profile_axes.set_ylim(bottom=max(1e-12, float(psf.kernel.min()) / 100))
     for axes in (profile_axes, curve_axes):
         axes.grid(which="major", color="#dddddd", linewidth=0.7)
         axes.legend(frameon=False)
@@ -156,12 +159,11 @@ def _change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
     return np.asarray(100 * (ratio - 1))
 
 
-def _colourbar(figure: Figure, axes: Any, drawn: Any, label: str, *, beyond: str) -> None:
+def _colourbar(figure: Figure, axes: Any, drawn: Any, *, beyond: str) -> None:
     box = axes.get_position()
     width = 0.0085
     bar_axes = figure.add_axes((box.x1 + 0.006, box.y0, width, box.height))
     bar = figure.colorbar(drawn, cax=bar_axes, extend=beyond, extendfrac=0.02)
-    bar.set_label(label, fontsize=10)
     bar.outline.set_linewidth(0.5)
     bar_axes.tick_params(labelsize=8.5)
     axes.tick_params(labelsize=8.5)

@@ -11,7 +11,6 @@ on which a PSF sums to 1. A smaller array holds what falls on it, sums to less a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -150,9 +149,3 @@ def _pixel_scale_arcsec(image: Image, axis: int) -> float | None:
         return None
     factor = _ARCSEC_PER_UNIT.get(unit or "arcsec")
     return None if factor is None else abs(float(step)) * factor
-
-
-def sample_radii(kernel: Kernel) -> Sequence[float]:
-    """The radii (px) at which reports quote the cumulative curve and which lie on this array."""
-    reach = float(np.sqrt(squared_radii(kernel.shape).max()))
-    return [radius for radius in (0.5, 1.5, 3.5, 10.0, 11.5, 30.0, 100.0, 300.0, 1000.0) if radius <= reach]

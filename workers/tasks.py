@@ -197,9 +197,10 @@ def _save_product(
     result: Deconvolved,
 ) -> None:
     product = dataclasses.replace(image, pixels=result.pixels)
+    # A hash fills its card: there is no room for a comment beside it.
     cards: dict[str, tuple[Any, str]] = {
-        "PRODID": (identity, "heliopsf product id"),
-        "PSFID": (psf.id, "heliopsf PSF id"),
+        "PRODID": (identity, ""),
+        "PSFID": (psf.id, ""),
         "PSFVERS": (psf.version, "PSF version"),
         "PSFNAME": (psf.name, "PSF name"),
         "PSFSTAT": (psf.status, "PSF status"),
@@ -208,7 +209,7 @@ def _save_product(
         "DCNVSTOP": (result.stopped_because, "why the iteration stopped"),
         "DCNVALGV": (request.method.algorithm_version, "algorithm version"),
         "SWHELIO": (software_version(), "heliopsf version"),
-        "INPSHA": (request.image_id, "SHA-256 of the input file"),
+        "INPSHA": (request.image_id, ""),
     }
     history = [
         f"heliopsf {software_version()}: {request.method.name}, {result.steps_done} steps, "

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 from service.openapi import description
 
@@ -122,3 +123,36 @@ def test_no_file_names_a_registry() -> None:
         if (HERE / name).is_file() and hosts.search((HERE / name).read_text(errors="replace"))
     ]
     assert named == []
+
+
+def test_the_compose_file_fits_the_settings_and_the_commands() -> None:
+    """As far as can be checked without an engine: every variable is a setting, every command exists."""
+    from click.testing import CliRunner
+
+    from service.cli import main
+    from workers.settings import Settings
+
+    compose = yaml.safe_load((HERE / "docker-compose.yml").read_text())
+    services = compose["services"]
+    assert set(services) == {"api", "worker", "redis", "postgres"}
+    known = {f"HELIOPSF_{name.upper()}" for name in Settings.model_fields}
+    for name, service in services.items():
+        assert service["healthcheck"]["test"], name
+        assert set(service.get("volumes", [])) <= {
+            f"{v}:{p}" for v in compose["volumes"] for p in ("/data", "/var/lib/postgresql/data")
+        }
+        if name in ("api", "worker"):
+            assert set(service["environment"]) <= known
+            assert set(service["depends_on"]) == {"redis", "postgres"}
+            command = service["command"].split()
+            assert command[0] == "heliopsf"
+            assert CliRunner().invoke(main, [command[1], "--help"]).exit_code == 0
+    assert services["api"]["ports"][0].startswith("127.0.0.1:"), "reachable from this machine alone"
+
+
+def test_the_dockerfile_copies_what_there_is() -> None:
+    for line in (HERE / "Dockerfile").read_text().splitlines():
+        if line.startswith("COPY ") and "--from" not in line:
+            for source in line.split()[1:-1]:
+                assert (HERE / source).exists(), source
+                assert f"!{source}" in (HERE / ".dockerignore").read_text(), source

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import sunpy.map
 from astropy.io import fits
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits_io import read_image, read_mask, read_psf, write_image, write_psf
-from psfcore.header import FitsLimits, read_psf_summary
+from psfcore.header import FitsLimits, read_summary
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.files import instrument_path
 from psfcore.psf import Psf
@@ -28,7 +30,7 @@ AIA = "aia/aia_171_cutout_20130310.fits"
 GZ = "aia/AIA20110319_105400_0171.fits.gz"
 
 pytestmark = [
-    pytest.mark.filterwarnings("ignore::astropy.io.fits.verify.VerifyWarning"),
+    pytest.mark.filterwarnings("ignore::astropy.utils.exceptions.AstropyUserWarning"),
     pytest.mark.filterwarnings("ignore::sunpy.util.exceptions.SunpyUserWarning"),
 ]
 
@@ -153,6 +155,31 @@ def test_damaged_tiles_are_the_users_error(tmp_path: Path, limits: FitsLimits) -
     assert caught.value.code == "unreadable-pixels"
 
 
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.sampled_from(["RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS"]),
+    st.lists(
+        st.tuples(st.integers(2880, 2880 * 6), st.binary(min_size=1, max_size=20)), min_size=1, max_size=5
+    ),
+)
+def test_mutated_files_raise_nothing_but_data_errors(
+    tmp_path: Path, codec: str, changes: list[tuple[int, bytes]]
+) -> None:
+    path = tmp_path / "mutated.fits"
+    hdu = fits.CompImageHDU(ramp(32, 40).astype(np.int16), compression_type=codec, tile_shape=(8, 10))
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path, overwrite=True)
+    content = bytearray(path.read_bytes())
+    for at, new in changes:
+        content[at : at + len(new)] = new
+    path.write_bytes(content)
+    try:
+        image = read_image(path, FitsLimits(max_pixels=10**6, max_header_bytes=50_000, max_hdus=4))
+    except DataError as error:
+        assert error.code
+    else:
+        assert image.valid.any()
+
+
 # --- products ---
 
 
@@ -195,11 +222,13 @@ def test_a_product_keeps_header_and_wcs_and_opens_as_one_map(
     )
     skipped = {*changed, *storage, "PCOUNT", "GCOUNT", "NAXIS", "HISTORY", "COMMENT", "", "EXTVER", "INHERIT"}
     with fits.open(source) as hdus:
+        hdus.verify("silentfix")
         original = hdus[1 if hdus[0].header["NAXIS"] == 0 else 0].header
         for card in original.cards:
             if card.keyword in skipped or card.keyword.startswith(("DATAP", "ZNAXIS", "ZHECK", "ZDATA")):
                 continue
-            assert again.header[card.keyword] == card.value, card.keyword
+            wanted = original[card.keyword]
+            assert str(again.header[card.keyword]) == str(wanted), card.keyword
         kept = "\n".join(map(str, again.header["HISTORY"]))
         for line in original.get("HISTORY", []):
             assert str(line) in kept
@@ -237,8 +266,7 @@ def test_odd_cards_survive(tmp_path: Path, limits: FitsLimits) -> None:
     assert header["a long name"] == 7
     assert header["NOTE"] == "d?nn und lang"
     assert header["TEMPCOMM"] == "x"
-    assert "BADCARD = 1 2 3" in history
-    assert "NANCARD" in history
+    assert (header["BADCARD"], header["NANCARD"]) == ("1 2 3", "NaN")
     assert "y" * 60 in history
     assert "a comment" in map(str, header["COMMENT"])
 
@@ -301,7 +329,7 @@ def test_a_psf_comes_back_whole(tmp_path: Path, limits: FitsLimits) -> None:
     assert list(back.components) == ["DIFFRACTION", "SCATTER"]
     assert back.provenance["instrument_toml"].encode() == toml
     assert "why: test" in back.provenance["history"]
-    assert read_psf_summary(tmp_path / "a.fits", limits).shape == (64, 64)
+    assert read_summary(tmp_path / "a.fits", limits).shape == (64, 64)
     with fits.open(tmp_path / "a.fits", checksum=True) as hdus:
         assert all(hdu.verify_checksum() == 1 for hdu in hdus)
         assert hdus["PROFILE"].data["cumulative_pct"][-1] == pytest.approx(10.0, abs=1e-3)

@@ -119,7 +119,7 @@ BAD = {
     ),
     "gzip of text": (gzip.compress(b"hello" * 1000), "not-fits"),
     "gzip of nothing": (gzip.compress(b""), "empty-file"),
-    "gzip cut": (gzip.compress(good() + np.random.default_rng(0).bytes(9000))[:60], "truncated-header"),
+    "gzip cut": (gzip.compress(good() + np.random.default_rng(0).bytes(9000))[:60], "truncated-gzip"),
     "gzip broken": (b"\x1f\x8b" + bytes(100), "bad-gzip"),
     "gzip, data cut": (gzip.compress(good()[:3000]), "truncated-data"),
     "gzip, 60000 x 60000": (gzip.compress(block(*image_cards(60000, 60000))), "too-many-pixels"),

@@ -67,7 +67,7 @@ def test_gaussian_encloses_what_its_formula_says() -> None:
 
 def test_radial_profile_of_a_function_of_radius_follows_it() -> None:
     radius, weight = radial_profile(gaussian(65, 6.0))
-    np.testing.assert_allclose(weight[:20] / weight[0], np.exp(-(radius[:20] ** 2) / 72), rtol=0.03)
+    np.testing.assert_allclose(weight[:20] / weight[0], np.exp(-(radius[:20] ** 2) / 72), rtol=0.05)
 
 
 @pytest.mark.parametrize("size", [16, 17])

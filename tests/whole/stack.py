@@ -15,7 +15,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import psutil
-import pytest
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import OperationalError
 
@@ -24,6 +23,10 @@ from service.client import Heliopsf
 POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
 # A lost worker is noticed soon, so that tests need not wait as long as an operator would.
 QUICK = {"HELIOPSF_LEASE_S": "3", "HELIOPSF_HEARTBEAT_S": "0.5", "HELIOPSF_RECONCILE_S": "0.5"}
+
+
+class Missing(Exception):
+    """A server that this machine does not have."""
 
 
 class Stack:
@@ -101,7 +104,7 @@ def embedded(folder: Path) -> Iterator[Stack]:
 
 @contextmanager
 def served(folder: Path, workers: int = 1) -> Iterator[Stack]:
-    """A service on Redis and PostgreSQL, with workers of its own; skipped where either is missing."""
+    """A service on Redis and PostgreSQL, with workers of its own; ``Missing`` where either is not there."""
     with ExitStack() as resources:
         redis_url = resources.enter_context(_redis(folder))
         database_url = resources.enter_context(_database())
@@ -128,7 +131,7 @@ def _running(stack: Stack) -> Iterator[Stack]:
 def _redis(folder: Path) -> Iterator[str]:
     binary = shutil.which("redis-server")
     if binary is None:
-        pytest.skip("no redis-server on this machine")
+        raise Missing("no redis-server on this machine")
     port = free_port()
     server = subprocess.Popen(
         [binary, "--bind", "127.0.0.1", "--port", str(port), "--save", "", "--dir", str(folder)],
@@ -150,7 +153,9 @@ def _database() -> Iterator[str]:
         with admin.connect() as connection:
             connection.execute(text(f"CREATE DATABASE {name}"))
     except OperationalError as error:
-        pytest.skip(f"no PostgreSQL at {admin.url} (HELIOPSF_TEST_POSTGRES names one): {error.orig}")
+        raise Missing(
+            f"no PostgreSQL at {admin.url} (HELIOPSF_TEST_POSTGRES names one): {error.orig}"
+        ) from error
     try:
         yield admin.url.set(database=name, drivername="postgresql").render_as_string(hide_password=False)
     finally:

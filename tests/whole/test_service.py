@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
 import psutil
@@ -15,7 +15,7 @@ from astropy.io import fits
 from service.client import ServiceError
 from tests.conftest import write_image
 from tests.whole import stack as stacks
-from tests.whole.stack import Stack, wait_for
+from tests.whole.stack import Missing, Stack, wait_for
 
 MODES = {"embedded": stacks.embedded, "redis and postgresql": stacks.served}
 
@@ -23,7 +23,11 @@ MODES = {"embedded": stacks.embedded, "redis and postgresql": stacks.served}
 @pytest.fixture(params=MODES)
 def stack(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Stack]:
     mode: AbstractContextManager[Stack] = MODES[request.param](tmp_path)
-    with mode as running:
+    with ExitStack() as resources:
+        try:
+            running = resources.enter_context(mode)
+        except Missing as missing:
+            pytest.skip(str(missing))
         yield running
 
 
