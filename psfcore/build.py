@@ -1,11 +1,13 @@
 """A PSF from an instrument description.
 
 Hofmeister et al., The point-spread function of HRI_EUV, sections "Implementation" and "The combined PSF":
-the meshes' patterns are convolved with each other, the result with the diffuse scatter. All convolutions
-are linear and done on the full reach of 2048 px, on which each result is normalised.
+the pupil's and the meshes' patterns are convolved with each other, the result with the diffuse scatter.
 
-Departure: the mount and the pupil's edge are not modelled, so less light is diffracted than the paper's
-26.4 %; such a PSF is a draft and its version says so.
+Light is counted over the full reach, a grid of 2048 px, on which every kernel sums to 1. Each is computed on
+that grid and cut to the size asked for. Where more is asked for, to 4096 px, it is computed on 4096 px and
+scaled so that its inner 2048 px sum to 1: further pixels hold what falls beyond, and the whole sums to more.
+The inner 2048 px then equal those of the smaller PSF but for light that comes back into them, in a convolution,
+from beyond: 1e-5 of the light in all for HRI_EUV's diffraction.
 """
 
 from __future__ import annotations
@@ -16,14 +18,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line
+from psfcore.diffraction.combined import DIFFRACTION, available_parts, diffraction_patterns
 from psfcore.errors import DataError
 from psfcore.fourier import linear_convolve
-from psfcore.instruments.model import Instrument, Mesh
+from psfcore.instruments.model import Instrument
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
 
 SMALLEST_SIZE_PX = 64
+LARGEST_SIZE_PX = 4096
+SCATTER = "SCATTER"
+Kernel = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 
@@ -31,89 +36,112 @@ def build_psf(
     instrument: Instrument,
     *,
     size: int = REACH_GRID_PX,
+    component: str | None = None,
+    mount_image: NDArray[np.floating] | None = None,
     progress: Progress | None = None,
     threads: int = 1,
 ) -> Psf:
-    """Total PSF of `instrument` on (size, size), an even size of 64 to 2048 px, with its components.
+    """PSF of `instrument` on (size, size), an even size of 64 to 4096 px: the total, with its components.
 
-    Raises DataError "bad-size".
+    component: one of component_names() alone, as the kernel of a PSF without components.
+    mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see instruments.mask_file).
+    progress is told (step, steps), and ends the work by raising.
+    Raises DataError "bad-size", "unknown-component", "bad-mount".
     """
     _check_size(size)
-    report = progress or _silent
-    report(0, 3)
-    diffraction = diffraction_kernel(instrument, threads=threads)
-    report(1, 3)
+    names = component_names(instrument) if component is None else (component,)
+    _check_component(instrument, names)
+    grid = max(size, REACH_GRID_PX)
+    patterns = diffraction_patterns(
+        instrument,
+        size=grid,
+        wanted=names,
+        mount_image=mount_image,
+        threads=threads,
+        progress=_with_last_step(progress),
+    )
+    provenance = _provenance(instrument, patterns.notes)
+    kernels: dict[str, Kernel] = {}
+    for name in (name for name in names if name in patterns.kernels):
+        kernels[name], provenance["past_reach"][name.lower()] = _on_full_reach(patterns.kernels.pop(name))
+    del patterns
     law = instrument.scatter
-    scatter = scatter_kernel(law.b_px, law.c, law.total, REACH_GRID_PX)
-    report(2, 3)
-    total, lost = _on_full_reach(linear_convolve(scatter, diffraction, scatter.shape, threads=threads))
-    report(3, 3)
+    if law is not None and SCATTER in names:
+        kernels[SCATTER] = scatter_kernel(law.b_px, law.c, law.total, grid)
+    if component is not None:
+        kernel, kernels = kernels[component], {}
+        provenance["component"] = component
+    elif law is None:
+        kernel = kernels[DIFFRACTION]
+    else:
+        total = linear_convolve(kernels[SCATTER], kernels[DIFFRACTION], (grid, grid), threads=threads)
+        kernel, provenance["past_reach"]["total"] = _on_full_reach(total)
+    if progress is not None:
+        progress(1000, 1000)
     shape = (size, size)
     return Psf(
-        kernel=crop_centred(total, shape),
+        kernel=crop_centred(kernel, shape),
         name=instrument.name,
-        version=f"{instrument.version}-draft",
+        version=instrument.version + ("-draft" if instrument.status == "draft" else ""),
         instrument=instrument.name,
-        status="draft",
+        status=instrument.status,
         plate_scale_arcsec=instrument.detector.plate_scale_arcsec,
         wavelength_angstrom=instrument.wavelength_angstrom,
-        components={
-            "DIFFRACTION": crop_centred(diffraction, shape),
-            "SCATTER": crop_centred(scatter, shape),
-        },
-        provenance=_provenance(instrument, lost),
+        components={name: crop_centred(part, shape) for name, part in kernels.items()},
+        provenance=provenance,
     )
 
 
-def diffraction_kernel(instrument: Instrument, *, threads: int = 1) -> NDArray[np.float64]:
-    """All meshes' patterns convolved, on the full reach (2048, 2048), sum 1."""
-    lines = [_line(mesh, instrument) for mesh in instrument.meshes]
-    combined = lines[0][None, :]
-    for line in lines[1:]:
-        # Patterns are separable, so convolving their lines is convolving them.
-        combined, _ = _on_full_reach(
-            linear_convolve(combined, line[None, :], (1, REACH_GRID_PX), threads=threads)
-        )
-    return mesh_kernel(combined[0], combined[0])
+def component_names(instrument: Instrument) -> tuple[str, ...]:
+    """The components that a PSF of this instrument has."""
+    return available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
 
 
-def _line(mesh: Mesh, instrument: Instrument) -> NDArray[np.float64]:
-    return mesh_line(
-        wavelength_angstrom=instrument.wavelength_angstrom,
-        distance_mm=mesh.distance_mm,
-        pitch_um=mesh.pitch_um,
-        wire_um=mesh.wire_um,
-        windows=mesh.windows,
-        pixel_pitch_um=instrument.detector.pixel_pitch_um,
-        size=REACH_GRID_PX,
-    )
+def _with_last_step(progress: Progress | None) -> Progress:
+    """Diffraction's steps as nine tenths of the whole."""
+
+    def report(done: int, of: int) -> None:
+        if progress is not None:
+            progress(900 * done // of, 1000)
+
+    return report
 
 
-def _on_full_reach(kernel: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Weights >= 0 that sum to 1, and the share of the light that had fallen past the reach."""
+def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
+    """Weights >= 0 that sum to 1 on the full reach, and the share of the light that had fallen past it."""
     positive = np.maximum(kernel, 0.0)  # transforms leave +-1e-17 where there is no light
-    total = float(positive.sum())
-    return positive / total, 1 - total
+    inner = float(crop_centred(positive, (REACH_GRID_PX, REACH_GRID_PX)).sum())
+    return positive / inner, 1 - inner
 
 
-def _provenance(instrument: Instrument, lost: float) -> dict[str, Any]:
-    law = instrument.scatter
-    return {
-        "model": "mesh series convolved with softened power law; mount and pupil edge not modelled",
-        "scatter_basis": law.basis,
-        "scatter_b_px": law.b_px,
-        "scatter_c": law.c,
-        "scatter_total": law.total,
-        "scatter_a": amplitude_for_total(law.b_px, law.c, law.total),
-        "past_reach_before_normalising": lost,
+def _provenance(instrument: Instrument, notes: dict[str, Any]) -> dict[str, Any]:
+    law, mount = instrument.scatter, instrument.mount
+    model = "simplified-combined: entrance pupil convolved with filter-wheel mesh series"
+    about: dict[str, Any] = {
+        "model": model if law is None else f"{model}, and with a softened power law",
+        "mount_basis": "none" if mount is None else mount.basis,
+        "lines": [[line.wavelength_angstrom, line.weight] for line in instrument.lines],
+        "past_reach": {},
+        **notes,
     }
+    if law is not None:
+        about |= {
+            "scatter_basis": law.basis,
+            "scatter_b_px": law.b_px,
+            "scatter_c": law.c,
+            "scatter_total": law.total,
+            "scatter_a": amplitude_for_total(law.b_px, law.c, law.total),
+        }
+    return about
 
 
 def _check_size(size: int) -> None:
-    if size % 2 or not SMALLEST_SIZE_PX <= size <= REACH_GRID_PX:
-        wanted = f"an even size of {SMALLEST_SIZE_PX} to {REACH_GRID_PX} px"
+    if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
+        wanted = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
         raise DataError("bad-size", f"expected {wanted}; got {size}")
 
 
-def _silent(done: int, of: int) -> None:
-    """No one listens."""
+def _check_component(instrument: Instrument, names: tuple[str, ...]) -> None:
+    known = component_names(instrument)
+    if not set(names) <= set(known):
+        raise DataError("unknown-component", f"expected one of {', '.join(known)}; got {names[0]!r}")

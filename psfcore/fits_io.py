@@ -29,7 +29,7 @@ from psfcore.header import (
     read_summary,
 )
 from psfcore.image import Image, MaskBit
-from psfcore.psf import Psf, cumulative_curve, radial_profile
+from psfcore.psf import Psf, cumulative_curve, encircled_energy, plate_scale_arcsec, radial_profile
 
 CardValue = str | int | float | bool
 Cards = Mapping[str, tuple[CardValue, str]]
@@ -58,7 +58,6 @@ _PIXEL_TROUBLE = (
     AttributeError,
     ArithmeticError,
     RuntimeError,
-    MemoryError,
     struct.error,
     zlib.error,
 )
@@ -88,20 +87,33 @@ def read_image(path: str | Path, limits: FitsLimits, *, saturation_dn: float | N
     return image
 
 
+def read_plane(path: str | Path, limits: FitsLimits) -> NDArray[np.float64]:
+    """Pixels [y, x] of the first 2-D image of a file, whatever they mean; raises as read_image does for files."""
+    return _read_pixels(path, read_summary(path, limits))[0]
+
+
 def _read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.float64], fits.Header]:
     try:
-        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True) as hdus:
+        # uint=False: astropy would turn unsigned integers (BZERO 32768) before it looks for BLANK.
+        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, uint=False) as hdus:
             hdu = hdus[summary.hdu]
             header = hdu.header.copy()
             data = hdu.data
             pixels = np.array(data, dtype=np.float64)
     except _PIXEL_TROUBLE as error:
+        _raise_if_storage(error)
         message = f"expected pixels in HDU {summary.hdu} of {Path(path).name}; got: {error!s:.120}"
         raise DataError("unreadable-pixels", message) from None
     if pixels.shape != summary.shape:
         message = f"expected {summary.shape} pixels as the header declares; got {pixels.shape}"
         raise DataError("unreadable-pixels", message)
     return pixels, header
+
+
+def _raise_if_storage(error: Exception) -> None:
+    """Pass on what the operating system reports of a disk: it is no fault of the file's."""
+    if isinstance(error, OSError) and error.errno is not None:
+        raise error
 
 
 def _saturation_level(
@@ -281,12 +293,20 @@ def _psf_header(psf: Psf) -> fits.Header:
 
 
 def _profile_hdu(psf: Psf) -> fits.BinTableHDU:
+    """Mean weight by radius and light within it, of the total and of each component under its name."""
     radius, weight = radial_profile(psf.kernel)
     columns = [
         fits.Column(name="radius_px", format="D", unit="pixel", array=radius),
         fits.Column(name="mean_weight", format="D", array=weight),
+        fits.Column(name="encircled", format="D", array=encircled_energy(psf.kernel, radius)),
         fits.Column(name="cumulative_pct", format="D", unit="%", array=cumulative_curve(psf.kernel, radius)),
     ]
+    for name, kernel in psf.components.items():
+        if kernel.shape == psf.kernel.shape:
+            label = _ascii(name).lower()
+            profile, within = radial_profile(kernel)[1], encircled_energy(kernel, radius)
+            columns.append(fits.Column(name=f"{label}_mean_weight", format="D", array=profile))
+            columns.append(fits.Column(name=f"{label}_encircled", format="D", array=within))
     return fits.BinTableHDU.from_columns(columns, name="PROFILE")
 
 
@@ -312,18 +332,11 @@ def read_psf(path: str | Path, limits: FitsLimits) -> Psf:
         version=optional_text(header, "PSFVERS") or "unversioned",
         instrument=optional_text(header, "INSTRUME") if own else summary.instrument,
         status=optional_text(header, "PSFSTAT") or "user",
-        plate_scale_arcsec=_psf_scale_arcsec(header),
+        plate_scale_arcsec=plate_scale_arcsec(header),
         wavelength_angstrom=summary.wavelnth,
         components=components,
         provenance={"file": Path(path).name, **provenance},
     )
-
-
-def _psf_scale_arcsec(header: fits.Header) -> float | None:
-    """|CDELT1| where the header says, or leaves open, that it is in arcsec."""
-    step = optional_number(header, "CDELT1")
-    unit = optional_text(header, "CUNIT1") or "arcsec"
-    return abs(step) if step and unit.lower() == "arcsec" else None
 
 
 def _read_extras(

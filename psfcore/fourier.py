@@ -46,11 +46,7 @@ class Convolver:
         self.field_shape = field_shape
         self.dtype = np.dtype(dtype)
         self.threads = threads
-        needed = tuple(
-            slice(*_needed(n, size)) for n, size in zip(psf_kernel.shape, field_shape, strict=True)
-        )
-        first = tuple(part.start - n // 2 for part, n in zip(needed, psf_kernel.shape, strict=True))
-        kernel = psf_kernel[needed]
+        kernel, first = needed_kernel(psf_kernel, field_shape)
         self.length = tuple(
             _length(size, low, low + count - 1)
             for size, low, count in zip(field_shape, first, kernel.shape, strict=True)
@@ -91,6 +87,19 @@ class Convolver:
         return np.ascontiguousarray(rows[:, :nx])
 
 
+def needed_kernel(
+    psf_kernel: NDArray[np.floating], field_shape: tuple[int, int]
+) -> tuple[NDArray[np.floating], tuple[int, int]]:
+    """The part of a kernel whose offsets can join two pixels of the field, and the offset of its first."""
+    (y0, y1), (x0, x1) = (_needed(n, size) for n, size in zip(psf_kernel.shape, field_shape, strict=True))
+    return psf_kernel[y0:y1, x0:x1], (y0 - psf_kernel.shape[0] // 2, x0 - psf_kernel.shape[1] // 2)
+
+
+def real_transform(a: NDArray[np.float32], *, threads: int = 1) -> NDArray[np.complex64]:
+    """Two-dimensional transform of a real array (ny, nx): shape (ny, nx // 2 + 1)."""
+    return np.asarray(scipy.fft.rfft2(a, workers=threads))
+
+
 def _needed(kernel_size: int, field_size: int) -> tuple[int, int]:
     """Index range of the kernel whose offsets can join two pixels of the field."""
     centre = kernel_size // 2
@@ -129,3 +138,44 @@ def linear_convolve(
         target.append(slice(max(-shift, 0), max(-shift, 0) + source[-1].stop - source[-1].start))
     out[tuple(target)] = full[tuple(source)]
     return out
+
+
+class ChirpTransform:
+    """Fourier sum between two centred grids of any steps, as one convolution with a chirp (Bluestein 1970).
+
+        F[k] = sum over n of f[n] exp(-2 pi i r n' k'),  n' = n - (N - 1) / 2,  k' = k - (K - 1) / 2
+        n' k' = (n'^2 + k'^2 - (k' - n')^2) / 2
+
+    r: ratio, step times step of the two grids over what their product is measured in (a FFT has 1 / N).
+    N, K: samples, out_samples. No grid wraps: the sum is evaluated as it is written.
+    """
+
+    def __init__(self, ratio: float, samples: int, out_samples: int) -> None:
+        self.samples = samples
+        self.out_samples = out_samples
+        self._length = int(scipy.fft.next_fast_len(samples + out_samples - 1))
+        self._before = _chirp(-ratio, np.arange(samples) - (samples - 1) / 2)
+        self._after = _chirp(-ratio, np.arange(out_samples) - (out_samples - 1) / 2)
+        kernel = np.zeros(self._length, dtype=np.complex128)
+        shift = (samples - out_samples) / 2
+        kernel[:out_samples] = _chirp(ratio, np.arange(out_samples) + shift)
+        kernel[self._length - samples + 1 :] = _chirp(ratio, np.arange(1 - samples, 0) + shift)
+        self._transfer = scipy.fft.fft(kernel, overwrite_x=True)
+
+    def apply(self, f: NDArray[np.complexfloating]) -> NDArray[np.complex128]:
+        """F, shape (out_samples,), of f, shape (samples,)."""
+        if f.shape != (self.samples,):
+            raise DataError("field-shape", f"expected a field of {(self.samples,)}; got {f.shape}")
+        spectrum = scipy.fft.fft(f * self._before, n=self._length, overwrite_x=True)
+        spectrum *= self._transfer
+        sums = scipy.fft.ifft(spectrum, overwrite_x=True)[: self.out_samples]
+        return np.asarray(sums * self._after)
+
+
+def _chirp(ratio: float, n: NDArray[np.floating]) -> NDArray[np.complex128]:
+    return np.exp(1j * np.pi * ratio * n**2)
+
+
+def transform_axis(a: NDArray[np.complex64], *, axis: int, threads: int = 1) -> NDArray[np.complex64]:
+    """Forward transform along one axis, in the place of `a`, which it may overwrite."""
+    return np.asarray(scipy.fft.fft(a, axis=axis, workers=threads, overwrite_x=True))

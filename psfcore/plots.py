@@ -34,7 +34,18 @@ _GOLD = LinearSegmentedColormap.from_list(
 _CHANGE = LinearSegmentedColormap.from_list(
     "change", ["#123a7a", "#3f7fc1", "#b9d5ea", "#f7f7f4", "#f6c9a4", "#d5642f", "#7d1a12"]
 ).with_extremes(bad=_NO_DATA)
-_COLOURS = {"TOTAL": "#1b1b1b", "DIFFRACTION": "#7b3fa0", "SCATTER": "#e0a100"}
+# Colour, width and dashes of a component's curve; reference and parts stand behind the sums.
+_CURVES: dict[str, tuple[str, float, Any]] = {
+    "TOTAL": ("#111111", 2.4, "-"),
+    "DIFFRACTION": ("#7b3fa0", 2.0, "-"),
+    "SCATTER": ("#e0a100", 2.0, "-"),
+    "ENTRANCE": ("#1f6fb4", 1.3, "-"),
+    "ENTRANCE_MESH": ("#2b9a77", 1.3, "-"),
+    "MOUNT": ("#d5642f", 1.3, "-"),
+    "FILTER_WHEEL": ("#c24a8c", 1.3, "-"),
+    "AIRY": ("#8a8a8a", 1.6, (0, (4, 2))),
+}
+_OTHER_CURVE = ("#2b8a6e", 1.3, "-")
 _INK = "#222222"
 
 Plane = NDArray[np.floating]
@@ -70,36 +81,64 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
 
 
 def psf_png(psf: Psf, path: str | Path) -> None:
-    """Three panels: the centre on a logarithmic scale, weight by radius, light beyond a radius."""
+    """Three panels: the centre on a logarithmic scale, weight by radius, light beyond a radius.
+
+    The curves are those of the total and of each component, an Airy pattern among them as the reference.
+    """
     figure = Figure(
-        figsize=(15.6, 5.2), dpi=100, facecolor="white", layout=ConstrainedLayoutEngine(w_pad=0.1)
+        figsize=(15.6, 5.6),
+        dpi=100,
+        facecolor="white",
+        layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08),
     )
-    heading = f"PSF {psf.name} {psf.version} ({psf.status}), sum {psf.total:.4f} on this array"
+    heading = f"PSF {psf.name} {psf.version} ({psf.status}), sum {psf.total:.4f} on {psf.kernel.shape[1]} px"
     figure.suptitle(heading, fontsize=14, color=_INK, weight="bold", x=0.01, ha="left")
-    image_axes, profile_axes, curve_axes = figure.subplots(1, 3)
+    image_axes, profile_axes, curve_axes = figure.subplots(1, 3, width_ratios=(1.12, 1, 1))
     _draw_centre(figure, image_axes, psf)
     kernels = {"TOTAL": psf.kernel, **psf.components}
-    for name, kernel in kernels.items():
-        radius, weight = radial_profile(kernel)
-        style: dict[str, Any] = {"color": _COLOURS.get(name, "#2b8a6e"), "label": name.capitalize()}
-        style["linewidth"] = 2.0 if name == "TOTAL" else 1.3
-        # The centre, at radius 0, is drawn at half a pixel: a logarithmic axis has no zero.
-        shown = weight > 0
-        profile_axes.loglog(np.maximum(radius, 0.5)[shown], weight[shown], **style)
-        radii = np.geomspace(0.5, radius[-1], 400)
-        curve_axes.semilogx(radii, cumulative_curve(kernel, radii), **style)
+    lowest = []
+    for name in sorted(kernels, key=lambda name: _curve(name)[1]):
+        kernel = kernels[name]
+        colour, width, dashes = _curve(name)
+        style: dict[str, Any] = {"color": colour, "linewidth": width, "linestyle": dashes}
+        radius, weight = _smoothed_profile(kernel)
+        profile_axes.loglog(radius, weight, **style)
+        lowest.append(float(weight[-1]) if weight.size else 1.0)
+        radii = np.geomspace(0.5, psf.reach_px, 400)
+        label = name.capitalize().replace("_", " ") + (" (open aperture)" if name == "AIRY" else "")
+        curve_axes.semilogx(radii, cumulative_curve(kernel, radii), label=label, **style)
     profile_axes.set(
         xlabel="Radius (px)", ylabel="Mean weight (fraction per pixel)", title="Weight by radius"
     )
     curve_axes.set(xlabel="Radius (px)", ylabel="Light beyond radius (%)", title="Light beyond a radius")
     curve_axes.set_ylim(bottom=0)
-    profile_axes.set_ylim(bottom=max(1e-12, float(psf.kernel.min()) / 100))
+    profile_axes.set_ylim(bottom=max(1e-13, 0.3 * min(lowest)), top=1.5)
     for axes in (profile_axes, curve_axes):
+        axes.set_xlim(0.5, psf.reach_px)
         axes.grid(which="major", color="#dddddd", linewidth=0.7)
-        axes.legend(frameon=False)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=len(kernels), frameon=False, reverse=True)
     FigureCanvasAgg(figure).print_png(str(path))
+
+
+def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Radius (px) and mean weight over rings of a pixel, from 17 px on of a seventeenth of the radius.
+
+    The centre stands at half a pixel: a logarithmic axis has no zero. Rings without light are left out.
+    """
+    ring, mean = radial_profile(np.asarray(kernel, dtype=np.float64))
+    group = np.where(ring < 17, ring, 17 + np.floor(17 * np.log(np.maximum(ring, 17) / 17))).astype(int)
+    pixels = np.maximum(ring, 0.5)  # in proportion: those of a ring
+    light = np.bincount(group, weights=mean * pixels)
+    count = np.bincount(group, weights=pixels)
+    radius = np.bincount(group, weights=pixels**2)
+    shown = light > 0
+    return radius[shown] / count[shown], light[shown] / count[shown]
+
+
+def _curve(name: str) -> tuple[str, float, Any]:
+    return _CURVES.get(name, _OTHER_CURVE)
 
 
 def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:

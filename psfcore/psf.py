@@ -15,15 +15,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from astropy.io.fits import Header
 from numpy.typing import ArrayLike, NDArray
 
 from psfcore.errors import DataError
+from psfcore.header import optional_number, optional_text
 from psfcore.image import Image
 
 REACH_GRID_PX = 2048
 LARGEST_SUM = 1 + 1e-3
 SMALLEST_SUM = 0.05
 PLATE_SCALE_TOLERANCE = 0.01
+CENTRE_TOLERANCE = 1e-3  # of the largest weight: pixels that share the peak may differ by rounding
 _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0}
 
 Kernel = NDArray[np.float64]
@@ -55,7 +58,7 @@ class Psf:
 
     @property
     def total(self) -> float:
-        """Sum of all weights on this array: 1 on the full reach, less on a smaller array."""
+        """Sum of all weights on this array: 1 on the full reach, less on a smaller array, more on a larger."""
         return float(self.kernel.sum())
 
     @property
@@ -71,7 +74,9 @@ def _check_weights(kernel: Kernel) -> None:
     if not np.isfinite(kernel).all():
         bad = int(np.count_nonzero(~np.isfinite(kernel)))
         raise DataError("psf-nonfinite", f"expected finite weights; got {bad} that are NaN or infinite")
-    largest, smallest, total = float(kernel.max()), float(kernel.min()), float(kernel.sum())
+    largest, smallest = float(kernel.max()), float(kernel.min())
+    # Light counts over the full reach; an array beyond it may hold more.
+    total = float(crop_centred(kernel, _within_reach(kernel.shape)).sum())
     if smallest < -1e-12 * max(largest, 0.0):
         raise DataError("psf-negative", f"expected weights >= 0; the smallest is {smallest:.3g}")
     if not SMALLEST_SUM < total <= LARGEST_SUM:
@@ -79,10 +84,15 @@ def _check_weights(kernel: Kernel) -> None:
         raise DataError("psf-sum", f"expected {wanted}; got {total:.6g}: divide the weights first")
 
 
+def _within_reach(shape: tuple[int, ...]) -> tuple[int, int]:
+    return min(shape[0], REACH_GRID_PX), min(shape[1], REACH_GRID_PX)
+
+
 def _check_centre(kernel: Kernel) -> None:
-    peak = np.unravel_index(int(kernel.argmax()), kernel.shape)
-    centre = tuple(n // 2 for n in kernel.shape)
-    if max(abs(int(p) - c) for p, c in zip(peak, centre, strict=True)) > 1:
+    """The centre holds the largest weight: a peak one pixel off would shift every deconvolved image by it."""
+    centre = (kernel.shape[0] // 2, kernel.shape[1] // 2)
+    if kernel[centre] < kernel.max() * (1 - CENTRE_TOLERANCE):
+        peak = np.unravel_index(int(kernel.argmax()), kernel.shape)
         found = tuple(int(p) for p in peak)
         hint = " (the corner origin of a Fourier transform: shift it first)" if found == (0, 0) else ""
         raise DataError("psf-not-centred", f"expected the peak at [y, x] = {centre}; got {found}{hint}")
@@ -114,8 +124,11 @@ def encircled_energy(kernel: Kernel, radii_px: ArrayLike) -> NDArray[np.float64]
 
 
 def cumulative_curve(kernel: Kernel, radii_px: ArrayLike) -> NDArray[np.float64]:
-    """Percent of a point's light that lands farther than each R (px), or off the array."""
-    return np.asarray(100.0 * (1.0 - encircled_energy(kernel, radii_px)))
+    """Percent of a point's light that lands farther than each R (px), or off the array.
+
+    Not below 0: an array larger than the full reach holds more than all of the light.
+    """
+    return np.asarray(100.0 * np.maximum(1.0 - encircled_energy(kernel, radii_px), 0.0))
 
 
 def radial_profile(kernel: Kernel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -132,7 +145,7 @@ def check_compatible(image: Image, psf: Psf) -> None:
     if psf.plate_scale_arcsec is None:
         return
     for axis in (1, 2):
-        scale = _pixel_scale_arcsec(image, axis)
+        scale = plate_scale_arcsec(image.header, axis)
         if scale is None:
             continue
         if abs(scale / psf.plate_scale_arcsec - 1) > PLATE_SCALE_TOLERANCE:
@@ -142,10 +155,8 @@ def check_compatible(image: Image, psf: Psf) -> None:
             )
 
 
-def _pixel_scale_arcsec(image: Image, axis: int) -> float | None:
-    step = image.header.get(f"CDELT{axis}")
-    unit = str(image.header.get(f"CUNIT{axis}", "arcsec")).strip().lower()
-    if isinstance(step, bool) or not isinstance(step, (int, float)) or step == 0 or not np.isfinite(step):
-        return None
-    factor = _ARCSEC_PER_UNIT.get(unit or "arcsec")
-    return None if factor is None else abs(float(step)) * factor
+def plate_scale_arcsec(header: Header, axis: int = 1) -> float | None:
+    """|CDELT| of an axis in arcsec/px; None where there is none, or CUNIT is no angle. No CUNIT: arcsec."""
+    step = optional_number(header, f"CDELT{axis}")
+    factor = _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{axis}") or "arcsec").lower())
+    return None if not step or factor is None else abs(step) * factor

@@ -28,8 +28,12 @@ class Health(BaseModel):
 
 @health.get("/healthz", summary="Is the service up?", responses=problems.RESPONSES)
 def healthz(state: Shared) -> Health:
-    """200 where the process and its database answer; 503 where the database does not."""
+    """200 where the process, its reconciler and its database are up; 503 where one is not."""
     state.catalogue.ping()
+    if not state.reconciler.alive:
+        raise problems.Problem(
+            503, "reconciler-stopped", "queued jobs are not submitted; restart the service"
+        )
     return Health(status="ok", version=software_version())
 
 
@@ -41,9 +45,10 @@ def create_app(settings: Settings) -> FastAPI:
         settings.data_dir.mkdir(parents=True, exist_ok=True)
         catalogue = Catalogue(settings.catalogue_url)
         catalogue.create_tables()
-        broker = queue.make_app(settings)
-        app.state.heliopsf = State(settings, catalogue, Store(settings.data_dir), broker)
-        reconciler = Reconciler(catalogue, broker, settings)
+        store = Store(settings.data_dir)
+        store.sweep()
+        reconciler = Reconciler(catalogue, queue.make_app(settings), settings)
+        app.state.heliopsf = State(settings, catalogue, store, reconciler)
         reconciler.start()
         yield
         reconciler.stop()

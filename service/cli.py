@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import Any, get_args
 
 import click
+from pydantic import ValidationError
 
 from psfcore.errors import DataError
-from service.client import DEFAULT_SERVER, Heliopsf, Operations, ServiceError
+from service import cli_diffraction
+from service.client import DEFAULT_SERVER, Heliopsf, Operations, ServiceError, percent
+from workers.contract import Component
 from workers.settings import Settings, software_version
 
 Report = Callable[[str, int, int], None]
@@ -43,6 +48,12 @@ def serve(host: str, port: int, data: Path | None) -> None:
     settings = _settings(data)
     where = settings.data_dir.resolve()
     try:
+        where.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=where):
+            pass
+    except OSError as error:
+        raise click.ClickException(f"cannot keep data in {where}: {error.strerror or error}") from error
+    try:
         run(settings, host, port, lambda url: click.echo(f"heliopsf serves {url} (data in {where})"))
     except OSError as error:
         raise click.ClickException(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
@@ -51,8 +62,8 @@ def serve(host: str, port: int, data: Path | None) -> None:
 @main.command()
 @click.option("--processes", type=click.IntRange(1), help="Worker processes [default: 1]")
 @click.option("--data", type=click.Path(file_okay=False, path_type=Path), help="Folder for everything kept")
-@click.option("--stop-with-parent", is_flag=True, hidden=True)
-def worker(processes: int | None, data: Path | None, stop_with_parent: bool) -> None:
+@click.option("--stop-with-parent", type=int, metavar="PID", hidden=True)
+def worker(processes: int | None, data: Path | None, stop_with_parent: int | None) -> None:
     """Run jobs from the broker until interrupted. Start as many as there are machines."""
     import os
 
@@ -86,15 +97,15 @@ def deconvolve(
     """Deconvolve IMAGE with the PSF of its instrument, or with one that you name."""
     _check_writable(output, preview)
     with _errors(), _connection(server, local) as service, _progress_bar() as report:
-        psf_id = service.upload_psf(psf)["id"] if psf and Path(psf).is_file() else psf
+        psf_id = _psf_id(service, psf)
         product = service.deconvolve(
             image, output, psf_id=psf_id, steps=steps, preview=preview, progress=report
         )
     details = product["details"]
     click.echo(f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}")
     click.echo(
-        f"flux x{details['flux_ratio']:.4f}, brightest 1 % of pixels {details['bright_change_pct']:+.1f} %, "
-        f"darkest 1 % {_percent(details['dark_change_pct'])}"
+        f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
+        f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}"
     )
 
 
@@ -104,22 +115,55 @@ def psf() -> None:
 
 
 @psf.command("build")
-@click.option("--instrument", required=True, help="Name of a shipped instrument file, as hri_euv")
+@click.option(
+    "--instrument", required=True, metavar="NAME|FILE", help="hri_euv, or an instrument file (TOML)"
+)
 @click.option("--size", default=2048, show_default=True, help="Edge of the array in pixels")
+@click.option(
+    "--component", type=click.Choice(get_args(Component)), help="One part alone [default: the whole PSF]"
+)
 @click.option("-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path))
 @click.option("--preview", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture too (PNG)")
 @SERVER
 @LOCAL
 def psf_build(
-    instrument: str, size: int, output: Path, preview: Path | None, server: str | None, local: bool
+    instrument: str,
+    size: int,
+    component: str | None,
+    output: Path,
+    preview: Path | None,
+    server: str | None,
+    local: bool,
 ) -> None:
     """Build the PSF of an instrument."""
     _check_writable(output, preview)
-    with _errors(), _connection(server, local) as service, _progress_bar() as report:
-        built = service.build_psf(instrument, output, size=size, preview=preview, progress=report)
+    with (
+        _errors(),
+        _mask_beside(instrument) as mask,
+        _connection(server, local) as service,
+        _progress_bar() as report,
+    ):
+        built = service.build_psf(
+            instrument,
+            output,
+            size=size,
+            component=component,
+            mask=mask,
+            preview=preview,
+            progress=report,
+        )
     click.echo(f"{output}: {built['name']} {built['version']} ({built['status']})")
-    for radius, percent in built["details"]["cumulative_curve_pct"].items():
-        click.echo(f"  light beyond {radius:>5} px  {percent:6.2f} %")
+    for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
+        click.echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
+
+
+@psf.command("show")
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture (PNG)")
+def psf_show(file: Path, plot: Path | None) -> None:
+    """Say what a PSF file holds: its numbers, and a picture."""
+    with _errors():
+        click.echo("\n".join(cli_diffraction.show(file, plot)))
 
 
 @psf.command("list")
@@ -133,7 +177,7 @@ def psf_list(instrument: str | None, server: str | None) -> None:
         click.echo("no PSF yet: `heliopsf psf build` makes one, and so does the first deconvolution")
     for row in rows:
         size = "x".join(map(str, row["details"]["shape"]))
-        click.echo(f"{row['id'][:12]}  {row['name']}  {row['version']}  {row['status']}  {size}")
+        click.echo(f"{row['id']}  {row['name']}  {row['version']}  {row['status']}  {size}")
 
 
 @main.command()
@@ -157,7 +201,13 @@ def demo(image: Path | None, output: Path) -> None:
 
 
 def _settings(data: Path | None) -> Settings:
-    return Settings() if data is None else Settings(data_dir=data)
+    try:
+        return Settings() if data is None else Settings(data_dir=data)
+    except ValidationError as error:
+        faults = (
+            f"HELIOPSF_{str(e['loc'][0]).upper()}: {e['msg']}; got {e['input']!r}" for e in error.errors()
+        )
+        raise click.ClickException("; ".join(faults)) from error
 
 
 @contextmanager
@@ -181,8 +231,24 @@ def _check_writable(*files: Path | None) -> None:
             raise click.ClickException(f"cannot write {file}: there is no folder {file.resolve().parent}")
 
 
-def _percent(value: float | None) -> str:
-    return "n/a (no light)" if value is None else f"{value:+.1f} %"
+def _psf_id(service: Operations, psf: str | None) -> str | None:
+    """The id of the PSF that the user named: a file is uploaded, an id taken as it is."""
+    if psf is None or re.fullmatch(r"[0-9a-f]{64}", psf):
+        return psf
+    if not Path(psf).is_file():
+        raise click.ClickException(f"--psf: expected a PSF id (64 hexadecimal digits) or a file; got {psf!r}")
+    uploaded: str = service.upload_psf(psf)["id"]
+    return uploaded
+
+
+@contextmanager
+def _mask_beside(instrument: str) -> Iterator[Path | None]:
+    """The mask image that an instrument file of the user's names, as FITS; None where there is none."""
+    if not instrument.endswith(".toml"):
+        yield None
+        return
+    with TemporaryDirectory() as folder:
+        yield cli_diffraction.mask_as_fits(Path(instrument), Path(folder))
 
 
 @contextmanager
@@ -190,7 +256,9 @@ def _errors() -> Iterator[None]:
     """Errors of the user's in one line, without a traceback."""
     try:
         yield
-    except (ServiceError, DataError, TimeoutError, OSError) as error:
+    except DataError as error:
+        raise click.ClickException(error.message) from error
+    except (ServiceError, TimeoutError, OSError) as error:
         raise click.ClickException(str(error)) from error
 
 
@@ -214,6 +282,10 @@ def _progress_bar() -> Iterator[Report]:
         yield report
     finally:
         sys.stderr.write("\n")
+
+
+for command in cli_diffraction.COMMANDS:
+    main.add_command(command)
 
 
 if __name__ == "__main__":

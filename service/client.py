@@ -13,6 +13,7 @@ from typing import Any
 import httpx
 
 DEFAULT_SERVER = "http://127.0.0.1:8765"
+PATIENCE_S = 30.0
 Progress = Callable[[str, int, int], None]
 
 
@@ -73,15 +74,28 @@ class Operations(ABC):
 
     def build_psf(
         self,
-        instrument: str,
+        instrument: str | Path,
         output: str | Path | None = None,
         *,
         size: int = 2048,
+        component: str | None = None,
+        mask: str | Path | None = None,
         preview: str | Path | None = None,
         progress: Progress | None = None,
     ) -> dict[str, Any]:
-        """Have the PSF of an instrument built and download it; returns its description."""
-        job = self.submit("psf-build", instrument=instrument, size=size)
+        """Have the PSF of an instrument built and download it; returns its description.
+
+        ``instrument`` is the name of a shipped one, or the path of an instrument file (TOML); ``mask`` the FITS
+        image that such a file's mount names; ``component`` one part alone, as ``diffraction``.
+        """
+        wanted: dict[str, Any] = {"size": size, "component": component}
+        if isinstance(instrument, Path) or instrument.endswith(".toml"):
+            wanted["instrument_file"] = Path(instrument).read_text("utf-8")
+        else:
+            wanted["instrument"] = instrument
+        if mask is not None:
+            wanted["mask_id"] = self.upload_image(mask)["id"]
+        job = self.submit("psf-build", **wanted)
         psf = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(psf, output, preview)
         return psf
@@ -171,10 +185,21 @@ class Heliopsf(Operations):
             if timeout_s is not None and time.monotonic() - started > timeout_s:
                 raise TimeoutError(f"job {job['id']} is {job['phase']} after {timeout_s:g} s")
             time.sleep(0.1)
-            job = self.job(job["id"])
+            job = self._job_patiently(job["id"])
             if progress is not None and job["progress"]["steps"]:
                 progress(job["progress"]["stage"], job["progress"]["step"], job["progress"]["steps"])
         return self._ended(job)
+
+    def _job_patiently(self, job_id: str) -> dict[str, Any]:
+        """The job; a service that is away for a moment (a restart) does not end the wait for it."""
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                return self.job(job_id)
+            except ServiceError as error:
+                if error.status not in (None, 502, 503) or time.monotonic() > deadline:
+                    raise
+                time.sleep(0.5)
 
     def get(self, address: str) -> dict[str, Any]:
         """The description at an address of the service."""
@@ -245,6 +270,11 @@ class Heliopsf(Operations):
 
     def _unreachable(self, error: httpx.TransportError) -> ServiceError:
         return ServiceError(f"no answer from {self.server} ({error}); `heliopsf serve` starts a service")
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A change as people read it; None is a change of nothing."""
+    return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
 
 
 def _refused(response: httpx.Response) -> ServiceError:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
-from service.client import Heliopsf, Progress
+from service.client import Heliopsf, Progress, percent
 
 
 def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
@@ -19,6 +20,8 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
     with (output / "server.log").open("w") as log:
         server = subprocess.Popen(
             [sys.executable, "-m", "service.cli", "serve", "--port", "0", "--data", str(output / "data")],
+            # Whatever service the environment names, the demo keeps to itself.
+            env={key: value for key, value in os.environ.items() if not key.startswith("HELIOPSF_")},
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
@@ -35,8 +38,8 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
         f"product  {product_file}",
         f"picture  {picture}",
         f"PSF      {product['psf_version']} (id {product['psf_id'][:12]}, in the product's header)",
-        f"change   brightest 1 % of pixels {change['bright_change_pct']:+.1f} %, "
-        f"flux of the frame x{change['flux_ratio']:.4f}",
+        f"change   brightest 1 % of pixels {percent(change['bright_change_pct'])}, "
+        f"flux of the frame {percent(change['flux_change_pct'], 3)}",
     ]
 
 

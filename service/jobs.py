@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from service.paging import Cursor, Limit, Page, page, position
 from service.problems import RESPONSES, Problem
 from service.state import Shared
-from workers import queue
 from workers.catalogue import DEFAULT_OWNER, JobRow
 from workers.contract import JobError, JobRequest, Phase
 from workers.intake import resolve
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
+JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 STATUS_OF = {"no-such-image": 404, "no-such-psf": 404, "no-psf-for-instrument": 409}
 RESULTS = {"deconvolve": "/v1/products", "psf-build": "/v1/psfs"}
 
@@ -71,14 +71,14 @@ class JobView(BaseModel):
     responses={200: {"model": JobView, "description": "An equal request was made before; this is its job."}},
 )
 def submit_job(body: JobRequest, response: Response, state: Shared) -> JobView:
-    """Write the job down and submit it. An equal request is answered with the job that it already has."""
+    """Write the job down; it is submitted from there. An equal request gets the job that it already has."""
     try:
         parameters, request_key = resolve(body, state.catalogue, DEFAULT_OWNER)
     except DataError as error:
         raise Problem(STATUS_OF.get(error.code, 422), error.code, error.message) from error
     row, new = state.catalogue.submit(body.kind, parameters, request_key)
-    if new and queue.submit(state.broker, row.id):
-        state.catalogue.mark_submitted(row.id)
+    if new:
+        state.reconciler.wake()
     response.status_code = 202 if new else 200
     response.headers["Location"] = f"/v1/jobs/{row.id}"
     return JobView.of(row)
@@ -94,13 +94,13 @@ def list_jobs(
 
 
 @router.get("/{job_id}", summary="One job: phase, progress, result or error")
-def get_job(job_id: str, state: Shared) -> JobView:
+def get_job(job_id: JobId, state: Shared) -> JobView:
     """The job as it is now."""
     return JobView.of(_find(state, job_id))
 
 
 @router.delete("/{job_id}", status_code=202, summary="Cancel a job")
-def cancel_job(job_id: str, state: Shared) -> JobView:
+def cancel_job(job_id: JobId, state: Shared) -> JobView:
     """Cancel: a queued job ends at once, an executing one within a step, an ended one stays as it is."""
     _find(state, job_id)
     state.catalogue.cancel(job_id)

@@ -42,7 +42,7 @@ def position(cursor: str | None) -> tuple[float, str] | None:
         at = (float(created_at), identity)
     except (binascii.Error, ValueError) as error:
         raise _no_cursor() from error
-    if not math.isfinite(at[0]):
+    if not math.isfinite(at[0]) or not at[1].isalnum():
         raise _no_cursor()
     return at
 

@@ -16,6 +16,8 @@ from workers.catalogue import DEFAULT_OWNER, PsfRow
 from workers.contract import Identity
 from workers.intake import uploaded_psf_row
 
+PRINTABLE = r"^[^\x00-\x1f\x7f]+$"
+Filter = Annotated[str | None, Query(max_length=80, pattern=PRINTABLE)]
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
 
@@ -65,10 +67,11 @@ async def upload_psf(
     response: Response,
     state: Shared,
     name: Annotated[
-        str | None, Query(max_length=80, description="default: PSFNAME, or the file's name")
+        str | None,
+        Query(max_length=80, pattern=PRINTABLE, description="default: PSFNAME, or the file's name"),
     ] = None,
     version: Annotated[
-        str | None, Query(max_length=40, description="default: PSFVERS, or 0.0.0+hash")
+        str | None, Query(max_length=40, pattern=PRINTABLE, description="default: PSFVERS, or 0.0.0+hash")
     ] = None,
 ) -> PsfView:
     """Stream a PSF in: one 2-D image, its centre at [n//2, n//2], its sum at most 1.
@@ -96,9 +99,9 @@ async def upload_psf(
 def list_psfs(
     request: Request,
     state: Shared,
-    instrument: str | None = None,
-    name: str | None = None,
-    version: str | None = None,
+    instrument: Filter = None,
+    name: Filter = None,
+    version: Filter = None,
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[PsfView]:

@@ -30,9 +30,18 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
         host_name = f"[{host}]" if ":" in host else host
         address = f"http://{host_name}:{listener.getsockname()[1]}"
         server = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning"))
+        # The server passes a signal on once it has shut down; as exceptions they let the worker be stopped too.
+        signal.signal(signal.SIGTERM, _raise_exit)
         with embedded_worker(settings):
             announce(address)
-            server.run(sockets=[listener])
+            try:
+                server.run(sockets=[listener])
+            except KeyboardInterrupt:
+                log.info("interrupted")
+
+
+def _raise_exit(_signal: int, _frame: object) -> None:
+    raise SystemExit(0)
 
 
 @contextmanager
@@ -56,7 +65,12 @@ def embedded_worker(settings: Settings) -> Iterator[None]:
 
 def _keep_worker(settings: Settings, stopping: threading.Event) -> None:
     while not stopping.is_set():
-        worker = _start_worker(settings)
+        try:
+            worker = _start_worker(settings)
+        except OSError as error:
+            log.error("the worker could not be started, trying again: %s", error)
+            stopping.wait(5.0)
+            continue
         while worker.poll() is None and not stopping.wait(0.5):
             pass
         if stopping.is_set():
@@ -71,7 +85,7 @@ def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
     log_file.parent.mkdir(parents=True, exist_ok=True)
     with log_file.open("ab") as output:
         return subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "worker", "--stop-with-parent"],
+            [sys.executable, "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
             env=os.environ | environment(settings),
             stdin=subprocess.DEVNULL,
             stdout=output,

@@ -1,15 +1,15 @@
-"""What the endpoints share: settings, catalogue, store and broker, made once for each application."""
+"""What the endpoints share: settings, catalogue, store and reconciler, made once for each application."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Annotated
 
-from celery import Celery
 from fastapi import Depends, Request
 
 from psfcore.header import FitsLimits
 from workers.catalogue import Catalogue
+from workers.reconciler import Reconciler
 from workers.settings import Settings
 from workers.store import Store
 
@@ -21,7 +21,7 @@ class State:
     settings: Settings
     catalogue: Catalogue
     store: Store
-    broker: Celery
+    reconciler: Reconciler
 
     @property
     def limits(self) -> FitsLimits:

@@ -28,6 +28,15 @@ FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
 FORM_BYTES = 2**16  # what a form may add to the file
 START_BYTES = max(map(len, FITS_STARTS))
 OPENAPI_BODY: dict[str, Any] = {
+    "parameters": [
+        {
+            "name": "filename",
+            "in": "query",
+            "required": False,
+            "description": "a label for people, where the file is the body itself",
+            "schema": {"type": "string"},
+        }
+    ],
     "requestBody": {
         "required": True,
         "description": "The FITS file, as the body itself or as the part `file` of a form.",
@@ -41,7 +50,7 @@ OPENAPI_BODY: dict[str, Any] = {
                 }
             },
         },
-    }
+    },
 }
 
 

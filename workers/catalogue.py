@@ -7,6 +7,7 @@ Times are seconds since 1970 (UTC).
 
 from __future__ import annotations
 
+import json
 import time
 import uuid
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import (
     JSON,
+    BigInteger,
     Engine,
     Index,
     Select,
@@ -49,7 +51,7 @@ class ImageRow(Base):
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     created_at: Mapped[float] = mapped_column(index=True)
-    bytes: Mapped[int]
+    bytes: Mapped[int] = mapped_column(BigInteger)
     filename: Mapped[str | None]
     summary: Mapped[dict[str, Any]]
 
@@ -67,7 +69,7 @@ class PsfRow(Base):
     status: Mapped[str]
     origin: Mapped[str]  # built | uploaded
     file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int]
+    bytes: Mapped[int] = mapped_column(BigInteger)
     preview_sha256: Mapped[str | None] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
@@ -84,7 +86,7 @@ class ProductRow(Base):
     psf_id: Mapped[str] = mapped_column(String(64), index=True)
     psf_version: Mapped[str]
     file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int]
+    bytes: Mapped[int] = mapped_column(BigInteger)
     preview_sha256: Mapped[str] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
@@ -144,8 +146,8 @@ AnyRow = TypeVar("AnyRow", ImageRow, PsfRow, ProductRow, JobRow)
 def open_engine(url: str) -> Engine:
     """An engine with the settings each database needs for many small concurrent writers."""
     if not url.startswith("sqlite"):
-        return create_engine(url, pool_pre_ping=True)
-    engine = create_engine(url, connect_args={"timeout": 30})
+        return create_engine(url, pool_pre_ping=True, json_serializer=_strict_json)
+    engine = create_engine(url, connect_args={"timeout": 30}, json_serializer=_strict_json)
 
     @event.listens_for(engine, "connect")
     def _pragmas(connection: Any, _record: Any) -> None:
@@ -158,10 +160,16 @@ def open_engine(url: str) -> Engine:
     @event.listens_for(engine, "begin")
     def _begin(connection: Any) -> None:
         # IMMEDIATE waits for the write lock at the start; a deferred transaction that reads first and
-        # writes later would fail with "database is locked" instead of waiting.
-        connection.exec_driver_sql("BEGIN IMMEDIATE")
+        # writes later would fail with "database is locked" instead of waiting. Readers need no lock.
+        reads = connection.get_execution_options().get("read_only", False)
+        connection.exec_driver_sql("BEGIN" if reads else "BEGIN IMMEDIATE")
 
     return engine
+
+
+def _strict_json(value: Any) -> str:
+    """JSON without NaN and infinity, which PostgreSQL refuses and clients cannot read."""
+    return json.dumps(value, allow_nan=False)
 
 
 class Catalogue:
@@ -170,6 +178,9 @@ class Catalogue:
     def __init__(self, url: str) -> None:
         self._engine = open_engine(url)
         self._session: sessionmaker[Session] = sessionmaker(self._engine, expire_on_commit=False)
+        self._reading: sessionmaker[Session] = sessionmaker(
+            self._engine.execution_options(read_only=True), expire_on_commit=False
+        )
 
     def create_tables(self) -> None:
         """Make the tables that are not there yet."""
@@ -181,7 +192,7 @@ class Catalogue:
 
     def ping(self) -> None:
         """Raise ``sqlalchemy.exc.SQLAlchemyError`` where the database does not answer."""
-        with self._session() as session:
+        with self._reading() as session:
             session.execute(select(1))
 
     # Images, PSFs, products -------------------------------------------------------------------------
@@ -200,7 +211,7 @@ class Catalogue:
 
     def get(self, table: type[Row], identity: str, owner: str = DEFAULT_OWNER) -> Row | None:
         """The row of this identity, or None."""
-        with self._session() as session:
+        with self._reading() as session:
             return session.get(table, (owner, identity))
 
     def page(
@@ -220,7 +231,7 @@ class Catalogue:
         if after is not None:
             query = query.where(tuple_(table.created_at, table.id) < after)
         query = query.order_by(table.created_at.desc(), table.id.desc()).limit(limit)
-        with self._session() as session:
+        with self._reading() as session:
             return session.scalars(query).all()
 
     # Jobs -------------------------------------------------------------------------------------------
@@ -233,7 +244,7 @@ class Catalogue:
             JobRow.owner == owner, JobRow.request_key == request_key, JobRow.phase.in_(LIVE)
         )
         for _ in range(3):  # the equal job may end badly between the two statements
-            with self._session() as session:
+            with self._reading() as session:
                 existing = session.scalars(live).first()
             if existing is not None:
                 return existing, False
@@ -256,7 +267,7 @@ class Catalogue:
 
     def job(self, job_id: str) -> JobRow | None:
         """The job's row, or None."""
-        with self._session() as session:
+        with self._reading() as session:
             return session.get(JobRow, job_id)
 
     def mark_submitted(self, job_id: str) -> None:
@@ -312,8 +323,10 @@ class Catalogue:
         )
 
     def requeue(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED under the lease, after a passing failure."""
-        return self._set(_held(lease), phase=Phase.QUEUED, submitted_at=None, lease=None)
+        """EXECUTING -> QUEUED under the lease, after a passing failure: submitted again after the usual wait."""
+        return self._set(
+            _held(lease), phase=Phase.QUEUED, submitted_at=time.time(), submissions=JobRow.attempt, lease=None
+        )
 
     def abort(self, lease: Lease) -> bool:
         """EXECUTING -> ABORTED under the lease, once the worker has stopped."""
@@ -368,7 +381,7 @@ class Catalogue:
             JobRow.phase == Phase.QUEUED,
             or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < now - resubmit_s),
         )
-        with self._session() as session:
+        with self._reading() as session:
             rows = session.scalars(query.order_by(JobRow.created_at)).all()
         return [
             row.id

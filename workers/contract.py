@@ -11,9 +11,9 @@ import json
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from psfcore.instruments.files import instrument_digest
+from psfcore.instruments.files import instrument_path
 
 Identity = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256, 64 hexadecimal digits")]
 
@@ -65,12 +65,28 @@ class RichardsonLucy(_Parameters):
     steps: int = Field(20, ge=1, le=200, description="iterations; the paper uses 20")
 
 
-class PsfBuild(_Parameters):
-    """Build a PSF from an instrument file that ships with the software."""
+Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
 
-    algorithm_version: ClassVar[int] = 1
-    instrument: str = Field(description="name of a shipped instrument file, for example hri_euv")
-    size: int = Field(2048, ge=64, le=2048, multiple_of=2, description="edge of the PSF's array in pixels")
+
+class PsfBuild(_Parameters):
+    """Build a PSF from an instrument file: one that ships with the software, or one of the user's."""
+
+    algorithm_version: ClassVar[int] = 2
+    instrument: str | None = Field(None, description="name of a shipped instrument file, as hri_euv")
+    instrument_file: str | None = Field(
+        None, max_length=65536, description="or the text of an instrument file of your own (TOML)"
+    )
+    mask_id: Identity | None = Field(
+        None, description="an uploaded FITS image, where the file's mount names a mask image"
+    )
+    size: int = Field(2048, ge=64, le=4096, multiple_of=2, description="edge of the PSF's array in pixels")
+    component: Component | None = Field(None, description="one part alone; none: the whole PSF")
+
+    @model_validator(mode="after")
+    def _one_instrument(self) -> PsfBuild:
+        if (self.instrument is None) == (self.instrument_file is None):
+            raise ValueError("expected one of instrument and instrument_file")
+        return self
 
 
 class Deconvolve(_Parameters):
@@ -113,6 +129,14 @@ def canonical_hash(content: dict[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def instrument_text(build: PsfBuild) -> str:
+    """The instrument file of a build: the user's own, or the shipped one of that name."""
+    if build.instrument_file is not None:
+        return build.instrument_file
+    assert build.instrument is not None
+    return instrument_path(build.instrument).read_text("utf-8")
+
+
 def psf_identity(build: PsfBuild) -> str:
     """Identity of a built PSF: the instrument file's bytes, the parameters and the algorithm's version.
 
@@ -121,8 +145,8 @@ def psf_identity(build: PsfBuild) -> str:
     return canonical_hash(
         {
             "kind": "psf-build",
-            "instrument_file": instrument_digest(build.instrument),
-            "parameters": build.model_dump(mode="json"),
+            "instrument_file": hashlib.sha256(instrument_text(build).encode()).hexdigest(),
+            "parameters": build.model_dump(mode="json", include={"mask_id", "size", "component"}),
             "algorithm_version": build.algorithm_version,
         }
     )

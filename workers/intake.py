@@ -9,6 +9,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.header import HeaderSummary
+from psfcore.instruments.model import parse_instrument
 from workers.catalogue import Catalogue, ImageRow, PsfRow
 from workers.contract import (
     DeconvolveRequest,
@@ -16,6 +17,7 @@ from workers.contract import (
     PsfBuild,
     PsfBuildRequest,
     ResolvedDeconvolve,
+    instrument_text,
     product_identity,
     psf_identity,
 )
@@ -70,11 +72,14 @@ def uploaded_psf_row(
 def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict[str, Any], str]:
     """Parameters with nothing left open, and the identity of what the job makes.
 
-    Raises ``DataError`` with code ``no-such-image``, ``no-such-psf``, ``no-psf-for-instrument`` or
-    ``unknown-instrument``.
+    Raises ``DataError`` with code ``no-such-image``, ``no-such-psf``, ``no-psf-for-instrument``,
+    ``unknown-instrument`` or ``bad-instrument-file``.
     """
     match request:
         case PsfBuildRequest(parameters=build):
+            parse_instrument(instrument_text(build), build.instrument or "instrument_file")
+            if build.mask_id is not None and catalogue.get(ImageRow, build.mask_id, owner) is None:
+                raise DataError("no-such-image", f"no image was uploaded with id {build.mask_id}")
             return build.model_dump(mode="json"), psf_identity(build)
         case DeconvolveRequest(parameters=wanted):
             image = catalogue.get(ImageRow, wanted.image_id, owner)

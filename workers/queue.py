@@ -11,7 +11,8 @@ import logging
 from typing import Any
 
 from celery import Celery
-from kombu.exceptions import OperationalError
+from kombu.exceptions import KombuError, OperationalError
+from redis.exceptions import RedisError
 
 from workers.settings import Settings
 
@@ -26,8 +27,9 @@ def make_app(settings: Settings) -> Celery:
         task_serializer="json",
         accept_content=["json"],
         task_ignore_result=True,
-        # Acknowledged late, so that a worker takes no more than it runs; redelivery does nothing.
-        task_acks_late=True,
+        # Acknowledged early: the job table is the truth, and a worker that holds unacknowledged messages
+        # does not survive the loss of its broker (kombu 5.7).
+        task_acks_late=False,
         worker_prefetch_multiplier=1,
         task_default_queue="heliopsf",
         broker_connection_retry_on_startup=True,
@@ -42,7 +44,7 @@ def submit(app: Celery, job_id: str) -> bool:
     """Give the job's id to the broker; False where the broker is away (the reconciler tries again)."""
     try:
         app.send_task(RUN_JOB, args=[job_id], retry=False)
-    except OperationalError as error:
+    except (OperationalError, KombuError, RedisError, OSError) as error:
         log.warning("broker away, job %s stays queued: %s", job_id, error)
         return False
     return True

@@ -29,11 +29,12 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
 
 
 class Reconciler:
-    """A thread that reconciles every ``settings.reconcile_s`` seconds."""
+    """A thread that reconciles every ``settings.reconcile_s`` seconds, and at once when it is woken."""
 
     def __init__(self, catalogue: Catalogue, app: Celery, settings: Settings) -> None:
         self._catalogue, self._app, self._settings = catalogue, app, settings
-        self._stop = threading.Event()
+        self._wake = threading.Event()
+        self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="reconciler", daemon=True)
 
     def start(self) -> None:
@@ -42,14 +43,25 @@ class Reconciler:
 
     def stop(self) -> None:
         """Stop the thread and wait for it."""
-        self._stop.set()
+        self._stopping = True
+        self._wake.set()
         self._thread.join()
 
+    def wake(self) -> None:
+        """There is something to submit now."""
+        self._wake.set()
+
+    @property
+    def alive(self) -> bool:
+        """True while the thread runs."""
+        return self._thread.is_alive()
+
     def _loop(self) -> None:
-        while not self._stop.is_set():
+        while not self._stopping:
+            self._wake.clear()
             try:
                 reconcile(self._catalogue, self._app, self._settings)
             except SQLAlchemyError as error:
                 # The database may be restarting; the next pass finds out.
                 log.warning("reconciler: database away: %s", error)
-            self._stop.wait(self._settings.reconcile_s)
+            self._wake.wait(self._settings.reconcile_s)

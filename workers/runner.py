@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from sqlalchemy.exc import InterfaceError, OperationalError
+from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 
 from psfcore.errors import DataError
 from workers import tasks
@@ -47,7 +47,7 @@ class _Work:
         while not self.ended.wait(self.heartbeat_s):
             try:
                 alive = self.catalogue.heartbeat(self.lease)
-            except TRANSIENT as error:
+            except SQLAlchemyError as error:
                 # If it lasts, the lease runs out and the job is given to another; nothing to do here.
                 log.warning("job %s: heartbeat not written: %s", self.lease.job_id, error)
                 continue
@@ -60,8 +60,12 @@ class _Work:
         now = time.monotonic()
         if step == steps or now - self.last_report >= REPORT_EVERY_S:
             self.last_report = now
-            if not self.catalogue.progress(self.lease, stage, step, steps):
-                self.stopped.set()
+            try:
+                if not self.catalogue.progress(self.lease, stage, step, steps):
+                    self.stopped.set()
+            except SQLAlchemyError as error:
+                # Work that was done is not thrown away for a database that is away for a moment.
+                log.warning("job %s: progress not written: %s", self.lease.job_id, error)
         if self.stopped.is_set():
             raise Cancelled(self.lease.job_id)
         if self.also_report is not None:
@@ -103,7 +107,7 @@ class Runner:
         try:
             result_id = tasks.TASKS[job.kind](context, job.parameters)
         except Cancelled:
-            aborted = self._catalogue.abort(lease)
+            aborted = self._persist(lambda: self._catalogue.abort(lease))
             log.info("job %s: %s", job.id, "aborted" if aborted else "lease lost, left to another worker")
         except DataError as error:
             self._fail(lease, Fault.USER, error.code, error.message)
@@ -111,19 +115,36 @@ class Runner:
             self._retry(job, lease, error)
         except Exception as error:
             log.exception("job %s failed", job.id)
-            self._fail(lease, Fault.INTERNAL, "internal-error", f"{type(error).__name__}: {error}")
+            # What went wrong may name files and statements: it is for the operator's log alone.
+            message = (
+                f"the software failed ({type(error).__name__}); the worker's log has it under job {job.id}"
+            )
+            self._fail(lease, Fault.INTERNAL, "internal-error", message)
         else:
-            self._catalogue.complete(lease, result_id)
+            self._persist(lambda: self._catalogue.complete(lease, result_id))
             log.info("job %s: %s, result %s", job.id, Phase.COMPLETED, result_id)
 
     def _retry(self, job: JobRow, lease: Lease, error: Exception) -> None:
         log.warning("job %s: passing failure in attempt %d: %s", job.id, job.attempt, error)
         if job.attempt < self._settings.max_attempts:
-            self._catalogue.requeue(lease)
+            self._persist(lambda: self._catalogue.requeue(lease))
         else:
             message = f"failed {job.attempt} times: {type(error).__name__}"
             self._fail(lease, Fault.TRANSIENT, "gave-up", message)
 
     def _fail(self, lease: Lease, fault: Fault, code: str, message: str) -> None:
-        self._catalogue.fail(lease, JobError(fault=fault, code=code, message=message))
+        error = JobError(fault=fault, code=code, message=message)
+        self._persist(lambda: self._catalogue.fail(lease, error))
         log.warning("job %s: %s (%s)", lease.job_id, message, code)
+
+    def _persist(self, write: Callable[[], bool]) -> bool:
+        """Write a job's outcome, trying for as long as the lease may last while the database is away."""
+        deadline = time.monotonic() + self._settings.lease_s
+        while True:
+            try:
+                return write()
+            except TRANSIENT as error:
+                if time.monotonic() > deadline:
+                    raise
+                log.warning("outcome not written yet: %s", error)
+                time.sleep(0.5)

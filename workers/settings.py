@@ -24,7 +24,7 @@ class Settings(BaseSettings):
     data_dir: Path = Field(Path("heliopsf-data"), description="folder of files, and of SQLite when embedded")
     database_url: str | None = Field(None, description="SQLAlchemy URL; none means SQLite in data_dir")
     broker_url: str = Field(EMBEDDED_BROKER, description="Celery broker; the default needs no server")
-    max_upload_mib: int = Field(160, ge=1, description="largest file taken, as sent")
+    max_upload_mib: int = Field(160, ge=1, le=65_536, description="largest file taken, as sent")
     max_pixels: int = Field(4096 * 4096, ge=256, description="largest image or PSF taken, by its header")
     worker_processes: int = Field(1, ge=1)
     worker_threads: int | None = Field(None, ge=1, description="none means cores / worker_processes")
@@ -33,6 +33,11 @@ class Settings(BaseSettings):
     reconcile_s: float = Field(2.0, gt=0, description="how often the job table is compared with the broker")
     resubmit_s: float = Field(30.0, gt=0, description="first wait before a queued job is submitted again")
     max_attempts: int = Field(3, ge=1, description="starts after which a job is an error")
+
+    @classmethod
+    def apart(cls, data_dir: Path) -> Settings:
+        """Defaults on a folder, whatever the environment says: for work beside any service."""
+        return cls(_env_prefix="HELIOPSF_APART_", data_dir=data_dir)
 
     @property
     def embedded(self) -> bool:
@@ -50,12 +55,17 @@ class Settings(BaseSettings):
     @property
     def threads(self) -> int:
         """Threads of one worker process: cores / worker processes, so that workers share the machine."""
-        return self.worker_threads or max(1, (os.cpu_count() or 1) // self.worker_processes)
+        return self.worker_threads or max(1, cores() // self.worker_processes)
 
     @property
     def max_upload_bytes(self) -> int:
         """Largest file taken, in bytes."""
         return self.max_upload_mib * 2**20
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def software_version() -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,12 @@ class Store:
         self._tmp = folder / "tmp"
         self._blobs.mkdir(parents=True, exist_ok=True)
         self._tmp.mkdir(parents=True, exist_ok=True)
+
+    def sweep(self, older_than_s: float = 86_400.0) -> None:
+        """Remove temporary files that a killed process left behind."""
+        for path in self._tmp.iterdir():
+            if time.time() - path.stat().st_mtime > older_than_s:
+                path.unlink(missing_ok=True)
 
     def path(self, digest: str) -> Path:
         """Where the file of this SHA-256 is, or would be."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from psfcore import plots
 from psfcore.build import build_psf
@@ -20,13 +22,18 @@ from psfcore.errors import DataError
 from psfcore.fits_io import read_image, read_psf, write_image, write_psf
 from psfcore.header import FitsLimits
 from psfcore.image import Image, MaskBit
-from psfcore.instruments.files import instrument_path
-from psfcore.instruments.model import load_instrument
-from psfcore.psf import Psf, check_compatible, cumulative_curve
+from psfcore.instruments.model import Instrument, parse_instrument
+from psfcore.psf import Psf, cumulative_curve
 from workers.catalogue import Catalogue, ImageRow, ProductRow, PsfRow
-from workers.contract import PsfBuild, ResolvedDeconvolve, product_identity, psf_identity
+from workers.contract import (
+    PsfBuild,
+    ResolvedDeconvolve,
+    instrument_text,
+    product_identity,
+    psf_identity,
+)
 from workers.settings import Settings, software_version
-from workers.store import Store, sha256_of
+from workers.store import Store
 
 CURVE_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -69,7 +76,6 @@ def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
     context.report("reading", 0, request.method.steps)
     image = read_image(context.store.path(request.image_id), context.limits)
     psf = _read_psf_cached(context.store.path(psf_row.file_sha256), context.limits)
-    check_compatible(image, psf)
     result = richardson_lucy(
         image,
         psf,
@@ -108,11 +114,13 @@ def _built_psf(context: Context, build: PsfBuild) -> PsfRow:
     row = context.catalogue.get(PsfRow, identity, context.owner)
     if row is not None:
         return row
-    file = instrument_path(build.instrument)
-    instrument = load_instrument(build.instrument)
+    text = instrument_text(build)
+    instrument = parse_instrument(text, build.instrument or "instrument_file")
     psf = build_psf(
         instrument,
         size=build.size,
+        component=build.component and build.component.upper(),
+        mount_image=_mount_image(context, build, instrument),
         threads=context.settings.threads,
         progress=lambda step, steps: context.report("building the PSF", step, steps),
     )
@@ -122,14 +130,14 @@ def _built_psf(context: Context, build: PsfBuild) -> PsfRow:
         provenance={
             **psf.provenance,
             "psf_id": identity,
-            "instrument_file_sha256": sha256_of(file),
-            "parameters": build.model_dump(mode="json"),
+            "instrument_file_sha256": hashlib.sha256(text.encode()).hexdigest(),
+            "parameters": build.model_dump(mode="json", exclude={"instrument_file"}, exclude_none=True),
             "algorithm_version": build.algorithm_version,
             "software_version": software_version(),
         },
     )
     with context.store.temporary() as path, context.store.temporary() as picture:
-        write_psf(path, psf, instrument_file=file.read_bytes())
+        write_psf(path, psf, instrument_file=text.encode())
         plots.psf_png(psf, picture)
         row = psf_row(
             psf,
@@ -141,6 +149,23 @@ def _built_psf(context: Context, build: PsfBuild) -> PsfRow:
             preview_sha256=context.store.keep(picture),
         )
     return context.catalogue.add(row)[0]
+
+
+def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> NDArray[np.float64] | None:
+    """The pixels of the mask image that the instrument's mount names, which the user uploaded."""
+    named = None if instrument.mount is None else instrument.mount.mask_image
+    if named is None and build.mask_id is None:
+        return None
+    if named is None:
+        raise DataError(
+            "mask-not-named", "mask_id: expected an instrument file with mount.mask_image; got none"
+        )
+    if build.mask_id is None:
+        raise DataError(
+            "mask-missing",
+            f"mount.mask_image: expected {named.file} to be uploaded and its id given as mask_id; got none",
+        )
+    return read_image(context.store.path(build.mask_id), context.limits).pixels
 
 
 def psf_row(
@@ -252,7 +277,7 @@ def _title(image: Image, psf: PsfRow) -> str:
 
 
 def _statistics(image: Image, result: Deconvolved) -> dict[str, Any]:
-    """What changed: flux of the frame, and the change in bright and in dark pixels.
+    """What changed: flux of the frame (negative pixels count as 0), and the change in bright and in dark pixels.
 
     Bright and dark are the pixels at and above the 99th percentile of the input, and at and below the first.
     """
@@ -260,8 +285,10 @@ def _statistics(image: Image, result: Deconvolved) -> dict[str, Any]:
     low, high = np.percentile(before, [1, 99])
     dark, bright = before <= low, before >= high
     return {
-        "flux_ratio": float(after.sum() / before.sum()),
-        "bright_change_pct": float(100 * (after[bright].sum() / before[bright].sum() - 1)),
+        "flux_change_pct": 100 * (result.flux_out / result.flux_in - 1),
+        "last_step_change": result.last_change,
+        "negative_pixels": result.negative_pixels,
+        "bright_change_pct": _change_pct(before[bright], after[bright]),
         "dark_change_pct": _change_pct(before[dark], after[dark]),
         "masked_pixels": {
             str(bit.name).lower(): int(np.count_nonzero(image.mask & bit.value)) for bit in MaskBit

@@ -48,10 +48,10 @@ def _runner() -> Runner:
     return Runner(settings, Catalogue(settings.catalogue_url), Store(settings.data_dir))
 
 
-def main(stop_with_parent: bool = False) -> None:
-    """Run a worker in this process until it is told to stop."""
-    if stop_with_parent:
-        threading.Thread(target=_stop_with, args=(os.getppid(),), daemon=True).start()
+def main(parent: int | None = None) -> None:
+    """Run a worker in this process until it is told to stop, or until the process ``parent`` is gone."""
+    if parent is not None:
+        threading.Thread(target=_stop_with, args=(parent,), daemon=True).start()
     pool = ["--pool", "prefork", "--concurrency", str(settings.worker_processes)]
     quiet = ["--without-gossip", "--without-mingle", "--without-heartbeat"]
     app.worker_main(["worker", "--loglevel", "INFO", *pool, *quiet])

@@ -1,4 +1,7 @@
-"""An instrument as its TOML file describes it, checked key by key."""
+"""An instrument as its TOML file describes it, checked key by key.
+
+Units stand in the keys. Angles are in degrees from +x of the detector towards +y.
+"""
 
 from __future__ import annotations
 
@@ -12,31 +15,87 @@ from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_path
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=100_000)]
+Share = Annotated[float, Field(gt=0, lt=1)]
 
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class GainMode(_Frozen):
+    """What a readout mode does to a photon. ``basis`` says how far the figures can be trusted."""
+
+    saturation_dn: Positive | None = None
+    photon_gain_dn: Positive | None = None
+    read_noise_dn: Positive | None = None
+    basis: Literal["published", "measured", "assumed"]
+
+
 class Detector(_Frozen):
-    """The sensor. `saturation_dn` maps a gain mode, as GAINCOMB spells it, to its level in DN."""
+    """The sensor. ``gain_modes`` is keyed by the mode as GAINCOMB spells it."""
 
     pixel_pitch_um: Positive
     pixels: Count
     readout_pixels: Count
     plate_scale_arcsec: Positive
-    saturation_dn: dict[str, Positive] = {}
+    gain_modes: dict[str, GainMode] = {}
+
+
+class Aperture(_Frozen):
+    """The entrance pupil: a disc, or a ring where the centre is obscured."""
+
+    diameter_mm: Positive
+    obscuration_diameter_mm: Annotated[float, Field(ge=0)] = 0.0
+
+    @model_validator(mode="after")
+    def _ring(self) -> Aperture:
+        if self.obscuration_diameter_mm >= self.diameter_mm:
+            raise ValueError(f"obscuration_diameter_mm must be less than diameter_mm {self.diameter_mm}")
+        return self
+
+
+class Line(_Frozen):
+    """A wavelength of the bandpass and its share of the light (shares are normalised to their sum)."""
+
+    wavelength_angstrom: Positive
+    weight: Positive
+
+
+class Mirror(_Frozen):
+    """A conic mirror: sag r^2 / (R (1 + sqrt(1 - (1 + K) r^2 / R^2)))."""
+
+    name: str
+    radius_mm: Positive
+    conic: Number
+    diameter_mm: Positive
+    figure: Literal["concave", "convex"]
+
+
+class Distances(_Frozen):
+    """Distances along the light's way, as the drawings give them."""
+
+    aperture_to_primary_mm: Positive
+    primary_to_secondary_mm: Positive
+    secondary_to_filter_wheel_mm: Positive
+    filter_wheel_to_detector_mm: Positive
 
 
 class Mesh(_Frozen):
-    """A square mesh that carries a filter: wires along rows and columns of the detector."""
+    """A square mesh that carries a filter.
+
+    ``windows`` is how many the light of one field point passes in each direction, as the paper counts them.
+    ``share``: where a telescope has several meshes at one place that each see a part of the light, the part.
+    """
 
     name: str
+    place: Literal["entrance", "filter_wheel"]
     pitch_um: Positive
     wire_um: Positive
     windows: Count
-    distance_mm: Positive
+    angle_deg: Number = 0.0
+    share: Annotated[float, Field(gt=0, le=1)] = 1.0
 
     @model_validator(mode="after")
     def _wire_fits(self) -> Mesh:
@@ -45,28 +104,95 @@ class Mesh(_Frozen):
         return self
 
 
+class Rays(_Frozen):
+    """Straight bars from the hub (or the centre) to the rim, at equal angles."""
+
+    count: Count
+    width_mm: Positive
+    first_angle_deg: Number = 0.0
+
+
+class Ring(_Frozen):
+    """A circular bar; the radius is that of its middle."""
+
+    radius_mm: Positive
+    width_mm: Positive
+
+
+class Polygon(_Frozen):
+    """An opaque polygon, corners (x, y) in mm from the centre of the aperture."""
+
+    corners_mm: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=3)]
+
+
+class MaskImage(_Frozen):
+    """A mask as FITS or PNG: 0 is opaque and the largest value open, centred on the aperture.
+
+    ``file`` is the name of a file beside the instrument file.
+    """
+
+    file: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*\.(png|fits|fits\.gz)$")]
+    width_mm: Positive
+
+
+class Mount(_Frozen):
+    """What holds the entrance filter. ``basis`` must say where it comes from."""
+
+    basis: Literal["drawing", "assumed"]
+    rays: tuple[Rays, ...] = ()
+    rings: tuple[Ring, ...] = ()
+    hub_diameter_mm: Annotated[float, Field(ge=0)] = 0.0
+    polygons: tuple[Polygon, ...] = ()
+    mask_image: MaskImage | None = None
+
+
 class Scatter(_Frozen):
-    """Softened power law a / (b + r)^c whose sum over r > 0 on the full reach is `total`."""
+    """Softened power law a / (b + r)^c whose sum over r > 0 on the full reach is ``total``."""
 
     b_px: Positive
     c: Positive
-    total: Annotated[float, Field(gt=0, lt=1)]
+    total: Share
     basis: Literal["published", "fitted", "inferred"]
 
 
 class Instrument(_Frozen):
     """All that a PSF is built from."""
 
-    name: str
-    version: str
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
+    version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")]
     status: Literal["draft", "released"]
     wavelength_angstrom: Positive
+    bandpass: tuple[Line, ...] = ()
     focal_length_mm: Positive
-    aperture_diameter_mm: Positive
     match: dict[str, str] = {}
+    aperture: Aperture
+    mirrors: tuple[Mirror, ...] = ()
+    distances: Distances | None = None
+    meshes: tuple[Mesh, ...] = ()
+    mount: Mount | None = None
     detector: Detector
-    meshes: Annotated[tuple[Mesh, ...], Field(min_length=1)]
-    scatter: Scatter
+    scatter: Scatter | None = None
+
+    @property
+    def lines(self) -> tuple[Line, ...]:
+        """The bandpass, or the one wavelength; weights sum to 1."""
+        lines = self.bandpass or (Line(wavelength_angstrom=self.wavelength_angstrom, weight=1.0),)
+        total = sum(line.weight for line in lines)
+        return tuple(line.model_copy(update={"weight": line.weight / total}) for line in lines)
+
+    def mesh_distance_mm(self, mesh: Mesh) -> float:
+        """Distance over which a mesh diffracts: the focal length at the entrance, else that to the detector.
+
+        Raises DataError "bad-instrument-file" where the file gives no distances.
+        """
+        if mesh.place == "entrance":
+            return self.focal_length_mm
+        if self.distances is None:
+            raise DataError(
+                "bad-instrument-file",
+                f"{self.name}: distances: expected them, since mesh {mesh.name} is at the filter wheel; got none",
+            )
+        return self.distances.filter_wheel_to_detector_mm
 
 
 def load_instrument(name_or_path: str | Path) -> Instrument:
@@ -77,13 +203,26 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     is_file = isinstance(name_or_path, Path) or name_or_path.endswith(".toml")
     path = Path(name_or_path) if is_file else instrument_path(str(name_or_path))
     try:
-        return Instrument.model_validate(tomllib.loads(path.read_text("utf-8")))
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise DataError("bad-instrument-file", f"{path.name}: expected TOML in UTF-8; {reason}") from None
+    return parse_instrument(text, path.name)
+
+
+def parse_instrument(text: str, label: str) -> Instrument:
+    """An instrument from the text of its TOML file; ``label`` names it in errors.
+
+    Raises DataError "bad-instrument-file" (one line that names the key, what was expected and what came).
+    """
+    try:
+        return Instrument.model_validate(tomllib.loads(text))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "file"
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        problem = f"{path.name}: {key}: {first['msg']}; got {first['input']!r:.80}{more}"
+        problem = f"{label}: {key}: {first['msg']}; got {first['input']!r:.80}{more}"
         raise DataError("bad-instrument-file", problem) from None
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except tomllib.TOMLDecodeError as error:
         reason = " ".join(str(error).split())
-        raise DataError("bad-instrument-file", f"{path.name}: expected TOML; {reason}") from None
+        raise DataError("bad-instrument-file", f"{label}: expected TOML; {reason}") from None

@@ -333,6 +333,10 @@ def test_a_psf_comes_back_whole(tmp_path: Path, limits: FitsLimits) -> None:
     with fits.open(tmp_path / "a.fits", checksum=True) as hdus:
         assert all(hdu.verify_checksum() == 1 for hdu in hdus)
         assert hdus["PROFILE"].data["cumulative_pct"][-1] == pytest.approx(10.0, abs=1e-3)
+        assert hdus["PROFILE"].data["encircled"][-1] == pytest.approx(0.9)
+        assert hdus["PROFILE"].data["scatter_encircled"][0] == pytest.approx(1.0)
+        weight = hdus["PROFILE"].data["diffraction_mean_weight"]
+        assert weight[0] == pytest.approx(gaussian(64, 1.0)[32, 32])
         assert hdus[0].header["PSFSUM"] == pytest.approx(0.9)
 
 
@@ -365,3 +369,18 @@ def test_a_real_foreign_psf(real: Find, limits: FitsLimits) -> None:
     assert psf.kernel.shape == (4096, 4096)
     assert psf.total == pytest.approx(1, abs=1e-6)
     assert psf.wavelength_angstrom == 171
+
+
+def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path) -> None:
+    stored = np.arange(32 * 32, dtype=np.int16).reshape(32, 32)
+    stored[3, 4] = -32768
+    hdu = fits.PrimaryHDU(stored)
+    hdu.header["BZERO"], hdu.header["BSCALE"], hdu.header["BLANK"] = 32768, 1, -32768
+    path = tmp_path / "unsigned.fits"
+    with path.open("wb") as file:  # as stored: astropy would scale it on the way out
+        file.write(hdu.header.tostring().encode())
+        data = stored.astype(">i2").tobytes()
+        file.write(data + bytes(-len(data) % 2880))
+    image = read_image(path, FitsLimits(max_pixels=2**20))
+    assert image.mask[3, 4] == MaskBit.NONFINITE and np.isnan(image.pixels[3, 4])
+    assert image.pixels[0, 5] == 32773 and np.count_nonzero(image.mask) == 1

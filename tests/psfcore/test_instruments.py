@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_digest, instrument_names, instrument_path, match_instrument
-from psfcore.instruments.model import load_instrument
+from psfcore.instruments.model import Line, load_instrument
 
 
 def test_every_shipped_instrument_loads_under_its_own_name() -> None:
@@ -50,6 +50,24 @@ def test_an_unknown_instrument_names_the_known_ones() -> None:
         ("windows = 37", 'windows = "many"', "windows"),
         ("total = 0.411", "total = 1.5", "total"),
         ("wavelength_angstrom = 174.0", "", "wavelength_angstrom"),
+        ("diameter_mm = 47.4", "diameter_mm = 47.4\nobscuration_diameter_mm = 50.0", "aperture"),
+        ("diameter_mm = 47.4", "diameter_mm = 47.4\ninner_mm = 5.0", "aperture.inner_mm"),
+        ('place = "entrance"', 'place = "attic"', "meshes.0.place"),
+        ("windows = 37", "windows = 37\nshare = 1.2", "meshes.0.share"),
+        ('basis = "assumed"', 'basis = "guessed"', "mount.basis"),
+        ("count = 8", "count = 0", "mount.rays.0.count"),
+        ("conic = -1.0", 'conic = "round"', "mirrors.0.conic"),
+        ('basis = "assumed"', 'basis = "assumed"\nhub_diameter_mm = -1.0', "mount.hub_diameter_mm"),
+        (
+            'basis = "assumed"',
+            'basis = "assumed"\nmask_image = { file = "../../secret.png", width_mm = 50.0 }',
+            "mount.mask_image.file",
+        ),
+        (
+            'basis = "assumed"',
+            'basis = "assumed"\npolygons = [{ corners_mm = [[0, 1], [1, 0]] }]',
+            "corners_mm",
+        ),
         ('name = "hri_euv"', "name = ", "TOML"),
     ],
 )
@@ -69,3 +87,25 @@ def test_instruments_do_not_change() -> None:
     instrument = load_instrument("hri_euv")
     with pytest.raises(ValidationError, match="frozen"):
         instrument.focal_length_mm = 1.0  # type: ignore[misc]
+
+
+def test_lines_of_the_bandpass_are_normalised_or_the_one_wavelength() -> None:
+    instrument = load_instrument("hri_euv")
+    assert [(line.wavelength_angstrom, line.weight) for line in instrument.lines] == [(174.0, 1.0)]
+    lines = (Line(wavelength_angstrom=171.0, weight=3.0), Line(wavelength_angstrom=177.0, weight=1.0))
+    several = instrument.model_copy(update={"bandpass": lines})
+    assert [line.weight for line in several.lines] == [0.75, 0.25]
+
+
+def test_a_filter_wheel_mesh_needs_distances() -> None:
+    instrument = load_instrument("hri_euv").model_copy(update={"distances": None})
+    entrance, wheel = instrument.meshes
+    assert instrument.mesh_distance_mm(entrance) == 4187.0
+    with pytest.raises(DataError, match="distances: expected"):
+        instrument.mesh_distance_mm(wheel)
+
+
+def test_the_default_mount_is_marked_as_assumed_and_the_file_as_a_draft() -> None:
+    instrument = load_instrument("hri_euv")
+    assert instrument.mount is not None
+    assert (instrument.mount.basis, instrument.status) == ("assumed", "draft")

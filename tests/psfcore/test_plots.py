@@ -53,7 +53,8 @@ def test_a_full_image_is_drawn_quickly(tmp_path: Path) -> None:
 
 
 def test_a_psf_is_drawn_without_pyplot(tmp_path: Path) -> None:
-    psf = make_psf(0.9 * gaussian(64, 2.0), components={"SCATTER": gaussian(64, 5.0)})
+    parts = {"SCATTER": gaussian(64, 5.0), "AIRY": gaussian(64, 1.0), "A_NAME_OF_ITS_OWN": gaussian(64, 3.0)}
+    psf = make_psf(0.9 * gaussian(64, 2.0), components=parts)
     sys.modules.pop("matplotlib.pyplot", None)
     psf_png(psf, tmp_path / "psf.png")
     assert matplotlib.image.imread(tmp_path / "psf.png").std() > 0.05

@@ -7,6 +7,7 @@ import io
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
@@ -95,7 +96,11 @@ def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_pat
     image_id = upload(api, tmp_path / "hri.fits")
     job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": {"image_id": image_id}})
     assert job.status_code == 202
-    assert job.json()["parameters"]["psf_recipe"] == {"instrument": "hri_euv", "size": 2048}
+    recipe = job.json()["parameters"]["psf_recipe"]
+    assert {key: value for key, value in recipe.items() if value is not None} == {
+        "instrument": "hri_euv",
+        "size": 2048,
+    }
 
 
 def test_cancel_before_the_start(
@@ -150,8 +155,48 @@ def test_health(api: TestClient) -> None:
 def test_a_database_that_is_away_is_503(api: TestClient, settings: Settings) -> None:
     for file in settings.data_dir.glob("catalogue.sqlite*"):
         file.unlink()
-    (settings.data_dir / "catalogue.sqlite").write_bytes(b"no database" * 100)
+    (settings.data_dir / "catalogue.sqlite").mkdir()  # cannot be opened as a file
     api.app.state.heliopsf.catalogue.close()  # connections that are open would still see the old file
     answer = api.get("/v1/jobs")
     assert answer.status_code == 503
     assert answer.json()["type"] == "urn:heliopsf:database-away"
+
+
+INSTRUMENT = """
+name = "mine"
+version = "1.0.0"
+status = "draft"
+wavelength_angstrom = 171.0
+focal_length_mm = 1000.0
+[aperture]
+diameter_mm = 20.0
+[mount]
+basis = "drawing"
+mask_image = { file = "mask.png", width_mm = 20.0 }
+[detector]
+pixel_pitch_um = 10.0
+pixels = 512
+readout_pixels = 512
+plate_scale_arcsec = 2.0
+"""
+
+
+def test_a_psf_of_an_instrument_file_and_a_mask_of_the_users(
+    api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
+) -> None:
+    y, x = np.indices((64, 64)) - 31.5
+    open_ring = ((np.hypot(x, y) < 30) & (np.hypot(x, y) > 12)).astype("f4")
+    fits.PrimaryHDU(open_ring).writeto(tmp_path / "mask.fits")
+    parameters = {"instrument_file": INSTRUMENT, "size": 128}
+    missing = api.post("/v1/jobs", json={"kind": "psf-build", "parameters": parameters}).json()
+    parameters["mask_id"] = upload(api, tmp_path / "mask.fits")
+    whole = api.post("/v1/jobs", json={"kind": "psf-build", "parameters": parameters}).json()
+    run_jobs()
+    error = api.get(f"/v1/jobs/{missing['id']}").json()["error"]
+    assert error["code"] == "mask-missing" and "mask.png" in error["message"]
+    psf = api.get(api.get(f"/v1/jobs/{whole['id']}").json()["result"]).json()
+    assert psf["name"] == "mine" and psf["details"]["shape"] == [128, 128]
+    assert psf["details"]["provenance"]["parameters"]["mask_id"] == parameters["mask_id"]
+    with fits.open(io.BytesIO(api.get(psf["file"]).content)) as hdus:
+        text = bytes(np.asarray(hdus["INSTRUMENT"].data["TOML"][0]))
+    assert text.decode() == INSTRUMENT

@@ -22,7 +22,12 @@ from service.client import Heliopsf
 
 POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
 # A lost worker is noticed soon, so that tests need not wait as long as an operator would.
-QUICK = {"HELIOPSF_LEASE_S": "3", "HELIOPSF_HEARTBEAT_S": "0.5", "HELIOPSF_RECONCILE_S": "0.5"}
+QUICK = {
+    "HELIOPSF_RESUBMIT_S": "3",
+    "HELIOPSF_LEASE_S": "3",
+    "HELIOPSF_HEARTBEAT_S": "0.5",
+    "HELIOPSF_RECONCILE_S": "0.5",
+}
 
 
 class Missing(Exception):
@@ -37,6 +42,7 @@ class Stack:
         self.environment = os.environ | QUICK | {"HELIOPSF_DATA_DIR": str(data)} | environment
         self.server: subprocess.Popen[str] | None = None
         self.workers: list[subprocess.Popen[str]] = []
+        self.redis: Redis | None = None
         self.client = Heliopsf()
 
     def start_server(self) -> None:
@@ -82,7 +88,8 @@ class Stack:
         psutil.wait_procs(processes, timeout=10)
 
     def stop(self) -> None:
-        """Stop everything by its process id."""
+        """Stop everything by its process id; nothing may be left running."""
+        started = self._all_processes()
         for process in [*self.workers, *([self.server] if self.server else [])]:
             if process.poll() is None:
                 process.send_signal(signal.SIGTERM)
@@ -93,6 +100,18 @@ class Stack:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
                 raise
+        _, left = psutil.wait_procs(started, timeout=5)
+        for process in left:
+            process.kill()
+        assert not left, f"still running after the stop: {left}"
+
+    def _all_processes(self) -> list[psutil.Process]:
+        running = [p for p in [*self.workers, self.server] if p is not None and p.poll() is None]
+        return [
+            c
+            for p in running
+            for c in (psutil.Process(p.pid), *psutil.Process(p.pid).children(recursive=True))
+        ]
 
 
 @contextmanager
@@ -106,11 +125,12 @@ def embedded(folder: Path) -> Iterator[Stack]:
 def served(folder: Path, workers: int = 1) -> Iterator[Stack]:
     """A service on Redis and PostgreSQL, with workers of its own; ``Missing`` where either is not there."""
     with ExitStack() as resources:
-        redis_url = resources.enter_context(_redis(folder))
+        redis = resources.enter_context(Redis(folder))
         database_url = resources.enter_context(_database())
         stack = Stack(
-            folder / "data", {"HELIOPSF_BROKER_URL": redis_url, "HELIOPSF_DATABASE_URL": database_url}
+            folder / "data", {"HELIOPSF_BROKER_URL": redis.url, "HELIOPSF_DATABASE_URL": database_url}
         )
+        stack.redis = redis
         resources.enter_context(_running(stack))
         for _ in range(workers):
             stack.start_worker()
@@ -127,22 +147,42 @@ def _running(stack: Stack) -> Iterator[Stack]:
         stack.stop()
 
 
-@contextmanager
-def _redis(folder: Path) -> Iterator[str]:
-    binary = shutil.which("redis-server")
-    if binary is None:
-        raise Missing("no redis-server on this machine")
-    port = free_port()
-    server = subprocess.Popen(
-        [binary, "--bind", "127.0.0.1", "--port", str(port), "--save", "", "--dir", str(folder)],
-        stdout=subprocess.DEVNULL,
-    )
-    try:
-        wait_for(lambda: _listens(port), "Redis listens")
-        yield f"redis://127.0.0.1:{port}/0"
-    finally:
-        server.terminate()
-        server.wait(10)
+class Redis:
+    """A Redis server of the test's own, on a free port, that keeps nothing."""
+
+    def __init__(self, folder: Path) -> None:
+        binary = shutil.which("redis-server")
+        if binary is None:
+            raise Missing("no redis-server on this machine")
+        self._port = free_port()
+        self._command = [
+            binary,
+            "--bind",
+            "127.0.0.1",
+            "--port",
+            str(self._port),
+            "--save",
+            "",
+            "--dir",
+            str(folder),
+        ]
+        self.url = f"redis://127.0.0.1:{self._port}/0"
+
+    def __enter__(self) -> Redis:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    def start(self) -> None:
+        self._server = subprocess.Popen(self._command, stdout=subprocess.DEVNULL)
+        wait_for(lambda: _listens(self._port), "Redis listens")
+
+    def kill(self) -> None:
+        """SIGKILL, as when the power goes; what was queued is gone."""
+        self._server.kill()
+        self._server.wait()
 
 
 @contextmanager

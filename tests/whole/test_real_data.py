@@ -30,7 +30,7 @@ def test_the_real_hri_image(stack: Stack, shared: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.fits"
     product = stack.client.deconvolve(shared / HRI, output)
     change = product["details"]
-    assert change["flux_ratio"] == pytest.approx(1, abs=0.01)
+    assert abs(change["flux_change_pct"]) < 1
     assert change["bright_change_pct"] > 10
     assert change["dark_change_pct"] < -5
     sunpy_map = pytest.importorskip("sunpy.map").Map(output)
@@ -49,7 +49,7 @@ def test_images_of_other_telescopes_need_a_psf_of_theirs(
     assert refused.value.status == 409
     psf_id = stack.client.upload_psf(psf_file)["id"]
     product = stack.client.deconvolve(shared / name, tmp_path / "out.fits", psf_id=psf_id, steps=2)
-    assert product["details"]["flux_ratio"] == pytest.approx(1, abs=0.01)
+    assert abs(product["details"]["flux_change_pct"]) < 1
     assert len(fits.getheader(tmp_path / "out.fits")) > 50
 
 

@@ -33,7 +33,7 @@ def stack(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Stack]:
 
 def big_image(path: Path) -> Path:
     """An image whose deconvolution takes some seconds, so that something can happen meanwhile."""
-    write_image(path, shape=(768, 768))
+    write_image(path, shape=(1024, 1024))
     return path
 
 
@@ -106,6 +106,38 @@ def test_what_was_queued_while_everything_was_down_is_done(
     for job in jobs:
         assert stack.client.wait(stack.client.job(job["id"]), timeout_s=120)["phase"] == "COMPLETED"
     assert len(list(stack.client.products())) == 3
+
+
+def test_a_broker_killed_at_work_costs_nothing(tmp_path: Path, psf_file: Path) -> None:
+    """The running job ends, the worker lives on, and what was queued meanwhile is done once Redis is back."""
+    with ExitStack() as resources:
+        try:
+            stack = resources.enter_context(stacks.served(tmp_path))
+        except Missing as missing:
+            pytest.skip(str(missing))
+        assert stack.redis is not None
+        image_id = stack.client.upload_image(big_image(tmp_path / "image.fits"))["id"]
+        psf_id = stack.client.upload_psf(psf_file)["id"]
+        many, few = ({"name": "richardson-lucy", "steps": n} for n in (200, 3))
+        running = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=many)
+        wait_for(lambda: stack.client.job(running["id"])["progress"]["step"] > 2, "the job is at work")
+        stack.redis.kill()
+        meanwhile = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=few)
+        assert stack.client.wait(running, timeout_s=90)["attempt"] == 1
+        stack.redis.start()
+        assert stack.client.wait(meanwhile, timeout_s=120)["attempt"] == 1
+        assert stack.workers[0].poll() is None
+
+
+def test_a_server_that_dies_takes_its_worker_along(tmp_path: Path) -> None:
+    with stacks.embedded(tmp_path) as stack:
+        wait_for(lambda: len(stack.worker_processes()) > 1, "the worker is up")
+        workers = stack.worker_processes()
+        assert stack.server is not None
+        stack.server.kill()
+        stack.server.wait()
+        _, left = psutil.wait_procs(workers, timeout=30)
+        assert left == []
 
 
 def test_the_command_line_over_http_and_local_agree(tmp_path: Path, psf_file: Path) -> None:

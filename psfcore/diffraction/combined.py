@@ -1,0 +1,286 @@
+"""The diffraction of a whole telescope: entrance pupil and filter-wheel meshes, part by part.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation", the simplified-combined
+solution: Fraunhofer for the entrance pupil (aperture, mount and entrance mesh in one mask), the analytic
+series for the filter-wheel mesh, and their patterns convolved. Lines of the bandpass add by their weight.
+
+Which way an entrance part goes is decided by one rule, and written into the provenance:
+
+- the mask is transformed where a pixel needs at most 32 samples (fraunhofer, Eq. (3)); beyond that the
+  aperture is an analytic Airy pattern, and a mount is left out;
+- entrance meshes stand in that mask where all of them cover the whole pupil and lie along the pixels;
+  else each has its series, turned by its angle, and their sum by share is convolved with the aperture's.
+
+| symbol | name |
+|---|---|
+| S | samples, per pixel and axis |
+| P | patterns, shares of a point's light per pixel [y, x], centre at [n // 2, n // 2] |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.diffraction.airy import airy_kernel
+from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
+from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, rotated_mesh_kernel
+from psfcore.diffraction.pupil import Pupil, entrance_pupil
+from psfcore.fourier import linear_convolve
+from psfcore.instruments.model import Instrument, Line, Mesh
+
+MOST_SAMPLES = 32
+PERIOD_PX = 4096  # of the transform: light wraps round it, not round the 2048 px that are kept
+NARROW_WINDOWS = 400
+STEPS_A_PUPIL = 20
+AIRY, ENTRANCE_MESH, MOUNT, ENTRANCE = "AIRY", "ENTRANCE_MESH", "MOUNT", "ENTRANCE"
+FILTER_WHEEL, DIFFRACTION = "FILTER_WHEEL", "DIFFRACTION"
+
+Kernel = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Route:
+    """Which parts of the entrance are in the transformed mask, and why."""
+
+    samples: int
+    mask: bool
+    meshes_in_mask: bool
+    mount: bool
+
+    def __str__(self) -> str:
+        if not self.mask:
+            too_many = f"{self.samples} samples a pixel are more than {MOST_SAMPLES}"
+            return f"{too_many}: analytic Airy pattern, entrance meshes as series, no mount"
+        meshes = "in it" if self.meshes_in_mask else "as series"
+        return f"Fraunhofer transform of the mask, {self.samples} samples a pixel, entrance meshes {meshes}"
+
+
+@dataclass
+class Patterns:
+    """Patterns by part, each the share of all light that falls on the grid, and notes on how they came."""
+
+    kernels: dict[str, Kernel] = field(default_factory=dict)
+    notes: dict[str, Any] = field(default_factory=dict)
+
+
+def route_of(instrument: Instrument) -> Route:
+    """The rule above, for the shortest wavelength of the bandpass."""
+    samples = max(
+        samples_per_pixel(
+            instrument.aperture.diameter_mm,
+            wavelength_angstrom=line.wavelength_angstrom,
+            focal_length_mm=instrument.focal_length_mm,
+            pixel_pitch_um=instrument.detector.pixel_pitch_um,
+        )
+        for line in instrument.lines
+    )
+    mask = samples <= MOST_SAMPLES
+    plain = all(mesh.share == 1 and mesh.angle_deg % 90 == 0 for mesh in _meshes(instrument, "entrance"))
+    return Route(
+        samples=samples,
+        mask=mask,
+        meshes_in_mask=mask and plain,
+        mount=mask and instrument.mount is not None,
+    )
+
+
+def available_parts(instrument: Instrument) -> tuple[str, ...]:
+    """Names of the parts that this instrument has, in the order in which they are made."""
+    route = route_of(instrument)
+    has = {
+        ENTRANCE_MESH: bool(_meshes(instrument, "entrance")),
+        MOUNT: route.mount,
+        FILTER_WHEEL: bool(_meshes(instrument, "filter_wheel")),
+    }
+    names = (AIRY, ENTRANCE_MESH, MOUNT, ENTRANCE, FILTER_WHEEL, DIFFRACTION)
+    return tuple(name for name in names if has.get(name, True))
+
+
+def needed_parts(instrument: Instrument, wanted: Iterable[str]) -> set[str]:
+    """The parts that have to be computed for those that are wanted."""
+    route, available = route_of(instrument), set(available_parts(instrument))
+    needed = set(wanted)
+    if DIFFRACTION in needed:
+        needed |= {ENTRANCE, FILTER_WHEEL} & available
+    if ENTRANCE in needed and not (route.meshes_in_mask and {ENTRANCE_MESH, MOUNT} <= available):
+        needed |= {ENTRANCE_MESH, MOUNT} & available or {AIRY}
+    if ENTRANCE_MESH in needed and not route.meshes_in_mask:
+        needed.add(AIRY)
+    return needed & available
+
+
+def diffraction_patterns(
+    instrument: Instrument,
+    *,
+    size: int,
+    wanted: Iterable[str],
+    mount_image: NDArray[np.floating] | None = None,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> Patterns:
+    """The wanted parts on (size, size), lines of the bandpass added by weight, not normalised."""
+    needed = needed_parts(instrument, wanted)
+    made = Patterns(notes={"entrance_route": str(route_of(instrument))})
+    lines = instrument.lines
+    steps = len(needed) * STEPS_A_PUPIL
+    for index, line in enumerate(lines):
+        work = _OneLine(instrument, line, size, mount_image, threads, made.notes)
+        for place, name in enumerate(part for part in available_parts(instrument) if part in needed):
+            before = (index * len(needed) + place) * STEPS_A_PUPIL
+            work.make(name, _scaled(progress, before, steps * len(lines)))
+        for name, kernel in work.kernels.items():
+            if len(lines) > 1:
+                kernel = line.weight * kernel
+            made.kernels[name] = made.kernels[name] + kernel if name in made.kernels else kernel
+    return made
+
+
+def _scaled(progress: Progress | None, before: int, steps: int) -> Progress:
+    """A part's own progress as steps of the whole."""
+
+    def report(done: int, of: int) -> None:
+        if progress is not None:
+            progress(before + STEPS_A_PUPIL * done // of, steps)
+
+    return report
+
+
+class _OneLine:
+    """All parts at one wavelength; each is made from the aperture or from parts made before it."""
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        line: Line,
+        size: int,
+        mount_image: NDArray[np.floating] | None,
+        threads: int,
+        notes: dict[str, Any],
+    ) -> None:
+        self.instrument = instrument
+        self.wavelength_angstrom = line.wavelength_angstrom
+        self.size = size
+        self.mount_image = mount_image
+        self.threads = threads
+        self.notes = notes
+        self.route = route_of(instrument)
+        self.kernels: dict[str, Kernel] = {}
+
+    def make(self, name: str, progress: Progress) -> None:
+        progress(0, 1)
+        makers: dict[str, Callable[[Progress], Kernel]] = {
+            AIRY: self._airy,
+            ENTRANCE_MESH: self._entrance_mesh,
+            MOUNT: self._mount,
+            ENTRANCE: self._entrance,
+            FILTER_WHEEL: lambda _: self._series("filter_wheel"),
+            DIFFRACTION: self._diffraction,
+        }
+        self.kernels[name] = makers[name](progress)
+        progress(1, 1)
+
+    def _airy(self, _: Progress) -> Kernel:
+        aperture = self.instrument.aperture
+        return airy_kernel(
+            wavelength_angstrom=self.wavelength_angstrom,
+            focal_length_mm=self.instrument.focal_length_mm,
+            diameter_mm=aperture.diameter_mm,
+            obscuration_diameter_mm=aperture.obscuration_diameter_mm,
+            pixel_pitch_um=self.instrument.detector.pixel_pitch_um,
+            size=self.size,
+        )
+
+    def _entrance_mesh(self, progress: Progress) -> Kernel:
+        if not self.route.meshes_in_mask:
+            return self._convolved(self.kernels[AIRY], self._series("entrance"))
+        meshes = _meshes(self.instrument, "entrance")
+        return self._far_field(
+            ENTRANCE_MESH, entrance_pupil(self.instrument.aperture, meshes=meshes), progress
+        )
+
+    def _mount(self, progress: Progress) -> Kernel:
+        return self._far_field(MOUNT, self._mounted(()), progress)
+
+    def _entrance(self, progress: Progress) -> Kernel:
+        """All of the pupil together; where only one part stands in it, that part's own pattern."""
+        has_mesh, has_mount = bool(_meshes(self.instrument, "entrance")), self.route.mount
+        if has_mesh and has_mount and self.route.meshes_in_mask:
+            pupil = self._mounted(_meshes(self.instrument, "entrance"))
+            return self._far_field(ENTRANCE, pupil, progress)
+        if has_mesh and has_mount:
+            return self._convolved(self.kernels[MOUNT], self._series("entrance"))
+        return self.kernels[ENTRANCE_MESH if has_mesh else MOUNT if has_mount else AIRY]
+
+    def _diffraction(self, _: Progress) -> Kernel:
+        if FILTER_WHEEL not in self.kernels:
+            return self.kernels[ENTRANCE]
+        return self._convolved(self.kernels[ENTRANCE], self.kernels[FILTER_WHEEL])
+
+    def _mounted(self, meshes: tuple[Mesh, ...]) -> Pupil:
+        mount = self.instrument.mount
+        return entrance_pupil(
+            self.instrument.aperture, mount=mount, mount_image=self.mount_image, meshes=meshes
+        )
+
+    def _far_field(self, name: str, pupil: Pupil, progress: Progress) -> Kernel:
+        found = far_field(
+            pupil,
+            wavelength_angstrom=self.wavelength_angstrom,
+            focal_length_mm=self.instrument.focal_length_mm,
+            pixel_pitch_um=self.instrument.detector.pixel_pitch_um,
+            size=self.size,
+            period=max(self.size, PERIOD_PX),
+            threads=self.threads,
+            progress=progress,
+        )
+        self.notes[name.lower()] = {
+            "open_area_mm2": found.open_area_mm2,
+            "symmetry": found.symmetry,
+            "light_beyond_grid": 1 - float(found.pattern.sum()),
+        }
+        return found.pattern
+
+    def _series(self, place: str) -> Kernel:
+        """The meshes of one place: those that all light passes convolved, the others added by their share."""
+        whole = [mesh for mesh in _meshes(self.instrument, place) if mesh.share == 1]
+        shared = [mesh for mesh in _meshes(self.instrument, place) if mesh.share < 1]
+        kernels = [self._mesh(mesh) for mesh in whole]
+        if shared:
+            mixed = np.zeros((self.size, self.size))
+            for mesh in shared:
+                mixed += mesh.share * self._mesh(mesh)
+            mixed[self.size // 2, self.size // 2] += max(0.0, 1 - sum(mesh.share for mesh in shared))
+            kernels.append(mixed)
+        combined = kernels[0]
+        for kernel in kernels[1:]:
+            combined = self._convolved(combined, kernel)
+        return combined
+
+    def _mesh(self, mesh: Mesh) -> Kernel:
+        optics: dict[str, Any] = {
+            "wavelength_angstrom": self.wavelength_angstrom,
+            "distance_mm": self.instrument.mesh_distance_mm(mesh),
+            "pitch_um": mesh.pitch_um,
+            "wire_um": mesh.wire_um,
+            # At the entrance the aperture's own diffraction is in its pattern: the series' orders are narrow.
+            "windows": max(mesh.windows, NARROW_WINDOWS) if mesh.place == "entrance" else mesh.windows,
+            "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
+            "size": self.size,
+        }
+        if mesh.angle_deg % 90 == 0:
+            line = mesh_line(**optics)
+            return mesh_kernel(line, line)
+        return rotated_mesh_kernel(angle_deg=mesh.angle_deg, **optics)
+
+    def _convolved(self, a: Kernel, b: Kernel) -> Kernel:
+        return linear_convolve(a, b, (self.size, self.size), threads=self.threads)
+
+
+def _meshes(instrument: Instrument, place: str) -> tuple[Mesh, ...]:
+    return tuple(mesh for mesh in instrument.meshes if mesh.place == place)

@@ -1,0 +1,173 @@
+"""What the pitch and the wire of an entrance mesh do to a point-spread function.
+
+Hofmeister et al., The point-spread function of HRI_EUV, sections "Analytical solution for mesh diffraction"
+and "Mesh geometry": a larger pitch brings the orders closer together, so that light blurs rather than veils;
+a smaller one spreads them, which veils but lets flares' orders be told apart. With f = 1 - wire / pitch:
+
+    share of the light in the order (k, 0) = f^2 sinc^2(pi k f)                                      Eq. (1)
+    share outside the order (0, 0) = 1 - f^2                                                         Eq. (2)
+
+What lies beyond a radius is counted on the pattern of mesh_series (a square pupil as wide as the aperture,
+light normalised to the full reach), without mount, filter wheel or scatter.
+
+| symbol | name | unit |
+|---|---|---|
+| d | pitch_um | um |
+| - | wire_um | um |
+| N | windows: aperture over pitch | - |
+| lambda f / d | spacing_px | px |
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, order_spacing_px
+from psfcore.errors import DataError
+from psfcore.instruments.model import Instrument
+from psfcore.psf import REACH_GRID_PX, cumulative_curve
+from psfcore.scatter.power_law import scatter_kernel
+
+NEAR_PX = 10.0
+FAR_PX = 100.0
+FLARE_PX = 5
+MOST_MESHES = 400
+_SEEN_PX = (50.0, 150.0)
+
+
+@dataclass(frozen=True)
+class MeshDesign:
+    """One mesh: its geometry and what follows; percents are of all light that passes.
+
+    peak_visibility: (high - low) / (high + low) along the axis at the order nearest to 100 px, for a flare
+    of `flare_px` px a side: 1 where orders stand apart, 0 where they run together.
+    peak_over_scatter: of the orders on the axis from 50 to 150 px, the most that one adds to the diffuse
+    scatter of such a flare that it lies on, as a multiple of it; None where the instrument has no scatter.
+    """
+
+    pitch_um: float
+    wire_um: float
+    windows: int
+    spacing_px: float
+    transmitted_pct: float
+    diffracted_pct: float
+    beyond_10_px_pct: float
+    beyond_100_px_pct: float
+    peak_visibility: float
+    peak_over_scatter: float | None
+
+
+@dataclass(frozen=True)
+class DesignStudy:
+    """All meshes looked at, in order of wire and pitch, and the one that flies (None where there is none)."""
+
+    instrument: str
+    flare_px: int
+    rows: tuple[MeshDesign, ...]
+    flown: MeshDesign | None
+
+    def as_json(self) -> str:
+        """The study as JSON, keys as the fields are named."""
+        return json.dumps(asdict(self), indent=1)
+
+
+def design_study(
+    instrument: Instrument,
+    pitches_um: Iterable[float],
+    wires_um: Iterable[float],
+    *,
+    flare_px: int = FLARE_PX,
+) -> DesignStudy:
+    """Every pitch with every wire at the entrance of `instrument`, and its own first entrance mesh.
+
+    Raises DataError "bad-design": no mesh, over 400 of them, or a wire not less than its pitch.
+    """
+    pitches, wires = sorted(set(pitches_um)), sorted(set(wires_um))
+    _check(pitches, wires, flare_px)
+    halo = None
+    if instrument.scatter is not None:
+        law = instrument.scatter
+        kernel = scatter_kernel(law.b_px, law.c, law.total, REACH_GRID_PX)
+        halo = kernel[REACH_GRID_PX // 2, REACH_GRID_PX // 2 :]
+    rows = [_mesh(instrument, pitch, wire, flare_px, halo) for wire in wires for pitch in pitches]
+    own = next((mesh for mesh in instrument.meshes if mesh.place == "entrance"), None)
+    flown = None if own is None else _mesh(instrument, own.pitch_um, own.wire_um, flare_px, halo)
+    return DesignStudy(instrument.name, flare_px, tuple(rows), flown)
+
+
+def _check(pitches: Sequence[float], wires: Sequence[float], flare_px: int) -> None:
+    number = len(pitches) * len(wires)
+    if not 1 <= number <= MOST_MESHES:
+        raise DataError("bad-design", f"expected 1 to {MOST_MESHES} meshes; got {number}")
+    if not (wires[0] > 0 and np.isfinite(pitches).all() and wires[-1] < pitches[0]):
+        wanted = "finite pitches and wires, 0 < wire < pitch, um"
+        raise DataError("bad-design", f"expected {wanted}; got wires {wires} and pitches {pitches}")
+    if flare_px < 1:
+        raise DataError("bad-design", f"expected a flare of 1 px or more; got {flare_px}")
+
+
+def _mesh(
+    instrument: Instrument,
+    pitch_um: float,
+    wire_um: float,
+    flare_px: int,
+    halo: NDArray[np.float64] | None,
+) -> MeshDesign:
+    windows = max(1, round(instrument.aperture.diameter_mm * 1e3 / pitch_um))
+    pixel_um = instrument.detector.pixel_pitch_um
+    spacing = order_spacing_px(
+        wavelength_angstrom=instrument.wavelength_angstrom,
+        distance_mm=instrument.focal_length_mm,
+        pitch_um=pitch_um,
+        pixel_pitch_um=pixel_um,
+    )
+    line = mesh_line(
+        wavelength_angstrom=instrument.wavelength_angstrom,
+        distance_mm=instrument.focal_length_mm,
+        pitch_um=pitch_um,
+        wire_um=wire_um,
+        windows=windows,
+        pixel_pitch_um=pixel_um,
+        size=REACH_GRID_PX,
+    )
+    beyond = cumulative_curve(mesh_kernel(line, line), [NEAR_PX, FAR_PX])
+    open_share = 1 - wire_um / pitch_um
+    return MeshDesign(
+        pitch_um=float(pitch_um),
+        wire_um=float(wire_um),
+        windows=windows,
+        spacing_px=spacing,
+        transmitted_pct=100 * open_share**2,
+        diffracted_pct=100 * (1 - open_share**2),  # Eq. (2)
+        beyond_10_px_pct=float(beyond[0]),
+        beyond_100_px_pct=float(beyond[1]),
+        peak_visibility=_visibility(spacing, flare_px),
+        peak_over_scatter=None if halo is None else _over_scatter(open_share, spacing, flare_px, halo),
+    )
+
+
+def _visibility(spacing_px: float, flare_px: int) -> float:
+    """Contrast along the axis of equal orders of a flare seen by pixels; see MeshDesign.
+
+    Each order is a flare's box seen by a pixel, a trapezium; near one order its neighbours are as bright.
+    """
+    x = np.linspace(0.0, spacing_px, 401)
+    neighbours = int(np.ceil((flare_px + 1) / spacing_px)) + 1
+    orders = spacing_px * np.arange(-neighbours, neighbours + 2)
+    apart = np.abs(x[:, None] - orders)
+    seen = np.clip((flare_px + 1) / 2 - apart, 0.0, min(1.0, float(flare_px))).sum(axis=1)
+    return float((seen.max() - seen.min()) / (seen.max() + seen.min()))
+
+
+def _over_scatter(open_share: float, spacing_px: float, flare_px: int, halo: NDArray[np.float64]) -> float:
+    """The order that stands highest over the scatter from 50 to 150 px; 0 where there is none."""
+    k = np.arange(np.ceil(_SEEN_PX[0] / spacing_px), np.floor(_SEEN_PX[1] / spacing_px) + 1)
+    share = open_share**2 * np.sinc(k * open_share) ** 2  # Eq. (1)
+    under = halo[np.rint(k * spacing_px).astype(int)]
+    # The order's light lies on the flare's pixels; scatter of all of the flare is nearly even under it.
+    return float((share / flare_px**2 / under).max(initial=0.0))

@@ -1,0 +1,318 @@
+"""Far-field diffraction by the entrance pupil, summed over detector pixels.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Fraunhofer propagation", without the phase
+factors that |E|^2 drops, and with the wave's focal length f for the distance z:
+
+    E(q) = sum over cells i of c_i exp(-2 pi i q . i / n),   dx = lambda f / (n p)                  Eq. (1)
+    P_j = 1/S^2 sum over s, t = 0 .. S-1 of |E(j + (o_s, o_t))|^2,   o_s = (s + 1/2) / S - 1/2      Eq. (2)
+    S >= 2 D p / (lambda f), and at least 14                                                       Eq. (3)
+
+The paper transforms the padded mask at once. Here each pair (s, t) of places within the pixel is one n x n
+transform: exp(-2 pi i j . i / n) has the period n in i, so the cells, times exp(-2 pi i o . i / n), are added
+modulo n first ("folded"), along x for all rows, then along y. Of each transform only the pixels asked for are
+kept. With Eq. (3) the sum over all n x n pixels is that of the mask's squares exactly (Parseval).
+
+Departure: a cell's open share is a mean over the cell, which weakens E far out by sinc(x / n) sinc(y / n);
+the pattern is divided by the square of that. What falls beyond the n x n pixels wraps round to the other
+side, with an amplitude of (x / (n - x))^2 of that which belongs there: 11 % at n / 4, 1 % at n / 11. With
+n = 4096, where HRI_EUV's pupil puts 0.13 % of its light beyond the inner 2048 px, this is 1e-5 of all light.
+
+Summing Eq. (2) instead of integrating keeps the energy but not each weight: for HRI_EUV's open disc the
+central pixel holds 3e-4 too little.
+
+A real mask has P(-q) = P(q); with a mirror axis x or y it has both; one that equals its transpose too needs
+an eighth of the transforms. Symmetry is found on the mask itself: for random vectors r, M r must agree with
+r M and with M's mirror images (Freivalds).
+
+| symbol | name | unit |
+|---|---|---|
+| lambda | wavelength_angstrom | Angstrom |
+| f | focal_length_mm | mm |
+| p | pixel_pitch_um | um |
+| D | pupil.width_mm | mm |
+| S | samples a pixel and axis, even | - |
+| n | period, pixels of the transform, of which the inner `size` are kept | px |
+| c | mask.rows, open share of the cells | - |
+| dx | mask.cell_mm | mm |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from psfcore.diffraction.pupil import MaskGrid, Pupil
+from psfcore.fourier import transform_axis
+
+STRIP_ROWS = 16
+SURVEY_CELLS = 4096  # across the pupil
+FEWEST_SAMPLES = 14
+SPECTRA_BYTES = 700 * 2**20  # for the transforms along x that are kept at a time
+_SYMMETRY_TOLERANCE_CELLS = 1e-2
+_SYMMETRY_SEED = 174
+_MM_PER_ANGSTROM = 1e-7
+_MM_PER_UM = 1e-3
+
+NO_SYMMETRY, MIRROR, MIRROR_AND_TRANSPOSE = "none", "mirror", "mirror and transpose"
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class FarField:
+    """Share of the pupil's light in each pixel [y, x], centre at [n // 2, n // 2], and how it was found.
+
+    open_area_mm2: of the pupil. samples: S of Eq. (3). symmetry: "none", "mirror" or "mirror and transpose".
+    The pattern sums to less than 1: the rest falls beyond the grid.
+    """
+
+    pattern: NDArray[np.float64]
+    open_area_mm2: float
+    samples: int
+    symmetry: str
+
+
+def samples_per_pixel(
+    width_mm: float, *, wavelength_angstrom: float, focal_length_mm: float, pixel_pitch_um: float
+) -> int:
+    """Smallest even S of Eq. (3)."""
+    resolved_mm = wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / (pixel_pitch_um * _MM_PER_UM)
+    return max(FEWEST_SAMPLES, 2 * math.ceil(width_mm / resolved_mm - 1e-9))
+
+
+def far_field(
+    pupil: Pupil,
+    *,
+    wavelength_angstrom: float,
+    focal_length_mm: float,
+    pixel_pitch_um: float,
+    size: int,
+    period: int | None = None,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> FarField:
+    """Eq. (2) for a pupil, on (size, size); `progress` is told after each transform.
+
+    period: n, not less than size and even like it; the same as size where it is not given.
+    """
+    n = period or size
+    optics = {
+        "wavelength_angstrom": wavelength_angstrom,
+        "focal_length_mm": focal_length_mm,
+        "pixel_pitch_um": pixel_pitch_um,
+    }
+    samples = samples_per_pixel(pupil.width_mm, **optics)
+    cell_mm = wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / (n * pixel_pitch_um * _MM_PER_UM)
+    mask = MaskGrid(pupil, cell_mm)
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        seen = _survey(MaskGrid(pupil, pupil.width_mm / SURVEY_CELLS), pool)
+        places = _Places(mask, seen, samples, n, size, pool, threads)
+        pattern = places.summed(progress or _silent)
+    pattern /= float(n) ** 2 * samples**2 * seen.open_area_mm2 / cell_mm**2
+    sinc = np.sinc((np.arange(size) - size // 2) / n)
+    pattern /= sinc[:, None] ** 2
+    pattern /= sinc[None, :] ** 2
+    return FarField(pattern, seen.open_area_mm2, samples, seen.symmetry)
+
+
+def _silent(done: int, of: int) -> None:
+    """No one listens."""
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """What one pass over the mask tells: its area, its symmetry, and whether turning y changes nothing."""
+
+    open_area_mm2: float
+    symmetry: str
+    upside_down: bool
+
+
+def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
+    """Open area, and the symmetry that random vectors do not tell from the mask's.
+
+    Its cells need not be those of the transform: shares of area miss nothing.
+    """
+    r = np.random.default_rng(_SYMMETRY_SEED).random(mask.cells)
+    right = np.stack([r, r[::-1]], axis=1)
+
+    def look(first: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        strip = mask.rows(first, min(first + STRIP_ROWS, mask.cells)).astype(np.float64)
+        return strip @ right, r[first : first + len(strip)] @ strip, float(strip.sum())
+
+    after, before, open_cells = [], np.zeros(mask.cells), 0.0
+    for strip_after, strip_before, strip_sum in pool.map(look, _strips(mask.cells)):
+        after.append(strip_after)
+        before += strip_before
+        open_cells += strip_sum
+    by_row, by_mirrored_row = np.concatenate(after).T  # M r, M r[::-1]
+    area_mm2 = open_cells * mask.cell_mm**2
+    mirror_x = _agree(by_row, by_mirrored_row)
+    # (M turned over in y) r = (M r)[::-1], and r^T (M turned over in y) = r[::-1]^T M
+    mirror_y = _agree(by_row, by_row[::-1])
+    if not (mirror_x or mirror_y):
+        return _Survey(area_mm2, NO_SYMMETRY, upside_down=False)
+    symmetry = MIRROR_AND_TRANSPOSE if _agree(by_row, before) else MIRROR
+    return _Survey(area_mm2, symmetry, upside_down=mirror_y)
+
+
+def _agree(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    return float(np.abs(a - b).max()) < _SYMMETRY_TOLERANCE_CELLS
+
+
+def _strips(cells: int) -> range:
+    return range(0, cells, STRIP_ROWS)
+
+
+class _Places:
+    """The transforms of Eq. (2), one for each place in the pixel that the mask's symmetry leaves to compute."""
+
+    def __init__(
+        self,
+        mask: MaskGrid,
+        seen: _Survey,
+        samples: int,
+        period: int,
+        size: int,
+        pool: ThreadPoolExecutor,
+        threads: int,
+    ) -> None:
+        self.mask, self.symmetry, self.samples, self.period = mask, seen.symmetry, samples, period
+        self.kept = slice(period // 2 - size // 2, period // 2 - size // 2 + size)
+        self.pool, self.threads = pool, threads
+        # Rows that are the same upside down are computed once.
+        rows = mask.cells // 2 if seen.upside_down else mask.cells
+        # A few s share one pass over the mask, as many as fit the memory set aside.
+        together = max(1, min(samples // 2, SPECTRA_BYTES // (8 * rows * size)))
+        self.spectra = np.empty((together, rows, size), dtype=np.complex64)
+        self.field = np.empty((period, size), dtype=np.complex64)
+        self.total = np.zeros((size, size))
+
+    def summed(self, progress: Progress) -> NDArray[np.float64]:
+        """Sum over all s, t of |E|^2."""
+        half, together = self.samples // 2, len(self.spectra)
+        places = [(s, t) for s in range(half) for t in self._along_y(s)]
+        for done, (s, t) in enumerate(places):
+            if t == 0 and s % together == 0:
+                self._transform_along_x(range(s, min(s + together, half)))
+            self._transform_along_y(self.spectra[s % together], t)
+            # With the transpose added in the end, s = t would count twice.
+            self._add(0.5 if s == t and self.symmetry == MIRROR_AND_TRANSPOSE else 1.0)
+            progress(done + 1, len(places))
+        return _completed(self.total, self.symmetry)
+
+    def _along_y(self, s: int) -> range:
+        """The t that have to be computed for one s: all, a half, or those up to s."""
+        half = self.samples // 2
+        return range({NO_SYMMETRY: self.samples, MIRROR: half, MIRROR_AND_TRANSPOSE: s + 1}[self.symmetry])
+
+    def _transform_along_x(self, columns: range) -> None:
+        """spectra[y, j] of all rows, for a few s: the same for all t."""
+        phases = [
+            _phases(_turns(s, self.samples, self.period), self.mask.cells, self.period) for s in columns
+        ]
+
+        def transform(block: slice) -> None:
+            strip = np.empty((STRIP_ROWS, self.mask.cells), dtype=np.float32)
+            folded = np.empty((STRIP_ROWS, self.period), dtype=np.complex64)
+            for first in range(block.start, block.stop, STRIP_ROWS):
+                stop = min(first + STRIP_ROWS, block.stop)
+                rows, part = self.mask.rows(first, stop, out=strip), folded[: stop - first]
+                for spectrum, (within, of_period) in zip(self.spectra, phases, strict=False):
+                    _fold_strip(rows, within, of_period, part)
+                    spectrum[first:stop] = transform_axis(part, axis=1)[:, self.kept]
+
+        list(self.pool.map(transform, _blocks(self.spectra.shape[1], self.threads)))
+
+    def _transform_along_y(self, spectrum: NDArray[np.complex64], t: int) -> None:
+        """field[j_y, j_x] for one t, all j_y of the period."""
+        within, of_period = _phases(_turns(t, self.samples, self.period), self.mask.cells, self.period)
+
+        def fold(block: slice) -> None:
+            _fold_block(spectrum, self.mask.cells, within, of_period, self.field, block.start, block.stop)
+
+        list(self.pool.map(fold, _blocks(self.period, self.threads)))
+        self.field = transform_axis(self.field, axis=0, threads=self.threads)
+
+    def _add(self, weight: float) -> None:
+        field = self.field[self.kept]
+        blocks = _blocks(len(self.total), self.threads)
+        list(self.pool.map(lambda block: _add_intensity(field[block], self.total[block], weight), blocks))
+
+
+def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]:
+    """Add the places that were left out: they are mirror images of those that were computed."""
+    n = len(total)
+    mirror = (2 * (n // 2) - np.arange(n)) % n
+    if symmetry == MIRROR_AND_TRANSPOSE:
+        total = total + total.T
+    if symmetry == NO_SYMMETRY:
+        return np.asarray(total + total[np.ix_(mirror, mirror)])
+    total = total + total[mirror]
+    return np.asarray(total + total[:, mirror])
+
+
+def _turns(place: int, samples: int, size: int) -> float:
+    """o_s - n // 2: the origin of j moves to [n // 2] without a shift of the result."""
+    return (place + 0.5) / samples - 0.5 - size // 2
+
+
+def _phases(turns: float, cells: int, size: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+    """exp(-2 pi i turns (m + k n) / n) as a factor for each m and one for each k."""
+    within = np.exp(-2j * np.pi * turns * np.arange(size) / size)
+    of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(cells / size)))
+    return within.astype(np.complex64), of_period.astype(np.complex64)
+
+
+def _blocks(size: int, threads: int) -> list[slice]:
+    step = math.ceil(size / (4 * threads))
+    return [slice(first, min(first + step, size)) for first in range(0, size, step)]
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _fold_strip(strip, within, of_period, folded):  # type: ignore[no-untyped-def]
+    """folded[y, m] = sum over k of c[y, m + k n] exp(-2 pi i turns (m + k n) / n)."""
+    rows, cells = strip.shape
+    size = len(within)
+    real, imaginary = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
+    for y in range(rows):
+        real[:] = 0
+        imaginary[:] = 0
+        for k in range(len(of_period)):
+            a, b = of_period[k].real, of_period[k].imag
+            part = strip[y, k * size : min((k + 1) * size, cells)]
+            for m in range(len(part)):
+                real[m] += a * part[m]
+                imaginary[m] += b * part[m]
+        for m in range(size):
+            folded[y, m] = within[m] * complex(real[m], imaginary[m])
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _fold_block(spectra, cells, within, of_period, field, start, stop):  # type: ignore[no-untyped-def]
+    """field[m] = sum over k of spectra[m + k n] exp(-2 pi i turns (m + k n) / n); rows left out are mirrored."""
+    rows, columns = spectra.shape
+    period = len(field)
+    for m in range(start, stop):
+        field[m, :] = 0
+        for k in range(len(of_period)):
+            row = m + k * period
+            if row < cells:
+                factor = within[m] * of_period[k]
+                source = spectra[row if row < rows else cells - 1 - row]
+                for x in range(columns):
+                    field[m, x] += factor * source[x]
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _add_intensity(field, total, weight):  # type: ignore[no-untyped-def]
+    rows, columns = field.shape
+    for y in range(rows):
+        for x in range(columns):
+            total[y, x] += weight * (field[y, x].real ** 2 + field[y, x].imag ** 2)

@@ -1,0 +1,373 @@
+"""How well the simplified-combined method stands in for Fresnel propagation, in one dimension.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation" and the discussion of where
+diffracting components may stand. Two images of a point, both binned to pixels, are compared by the light
+that lands farther than a distance from the centre:
+
+- Fresnel: entrance aperture and mesh -> primary -> secondary -> filter-wheel mesh -> detector;
+- simplified-combined: Fraunhofer image of the entrance aperture and mesh, convolved with the analytic series
+  of the filter-wheel mesh.
+
+Choices the text leaves open, each told in the result:
+
+- The mirror separation is the one of best focus. Both methods use the focal length it gives.
+- Where the filter-wheel wires lie across the beam is unknown. Results are means over equally spaced phases of
+  the mesh, with the spread of the single phases beside them.
+- The series has as many windows as the instrument gives (all that the field lights) or the caller asks for;
+  the wave meets the few wires that the beam of one field point covers. It is not that number that the series
+  wants: the image of the entrance holds the diffraction at the beam's edges already, and a series of few
+  windows adds it again. The more windows, the closer the methods come.
+- Other distances move the wheel between secondary and detector; the total stays.
+- Each line is normalised to the light within REACH_PX of the axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.diffraction.best_focus import BestFocus, best_focus
+from psfcore.diffraction.fresnel import (
+    SAMPLING_MARGIN,
+    FresnelStep,
+    Grid,
+    Line,
+    Wave,
+    binned_light,
+    fraunhofer_field,
+    light_beyond,
+    open_share,
+    propagate,
+)
+from psfcore.diffraction.light_path import (
+    MM_PER_UM,
+    REACH_PX,
+    SAMPLES_PER_PIXEL,
+    LightPath,
+    light_path,
+    mesh_windows_mm,
+)
+from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
+from psfcore.errors import DataError
+from psfcore.fourier import linear_convolve
+from psfcore.instruments.model import Instrument
+
+DISTANCES_MM = (50.0, 100.0, 200.0, 273.0, 400.0, 500.0, 550.0)
+ZOOM_PX = 64
+_SIZE_PX = 2 * REACH_PX + 1
+_UM_PER_MM = 1e3
+_ANGSTROM_PER_MM = 1e7
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a plane was sampled: width X, step dx, and count N = X / dx; least_samples is X1 X2 / (lambda z)."""
+
+    plane: str
+    width_mm: float
+    step_um: float
+    samples: int
+    least_samples: int | None
+    light: float  # share of what passed the entrance, behind this plane's mask; mean over phases
+
+
+@dataclass(frozen=True)
+class DistanceResult:
+    """Both methods with the filter wheel at one distance from the detector.
+
+    Lines, shape (2 REACH_PX + 1,), sum 1, centre at [REACH_PX]. Curves run over FresnelStudy.radii_px:
+    light beyond a radius in percent, differences (Fresnel less combined) in percentage points, of the mean
+    over phases and, with a phase's name, the lowest and the highest of the single phases.
+    """
+
+    distance_mm: float
+    beam_mm: float
+    beam_pitches: float
+    wheel_order_spacing_px: float
+    sampling: tuple[Sampling, ...]
+    fresnel_line: Line
+    combined_line: Line
+    fresnel_beyond_pct: Line
+    combined_beyond_pct: Line
+    difference_points: Line
+    phase_lowest_points: Line
+    phase_highest_points: Line
+    phase_largest_points: Line  # for each phase, its largest absolute difference; shape (phases,)
+
+    @property
+    def largest_points(self) -> float:
+        """Largest absolute difference of the mean over phases."""
+        return float(np.abs(self.difference_points).max())
+
+    @property
+    def largest_single_points(self) -> float:
+        """Largest absolute difference of any single phase."""
+        return float(self.phase_largest_points.max())
+
+
+@dataclass(frozen=True)
+class FresnelStudy:
+    """What was compared, how, and what came out."""
+
+    instrument: str
+    version: str
+    wavelength_angstrom: float
+    printed_distance_mm: float
+    focus: BestFocus
+    phases: int
+    windows: int
+    reach_px: int
+    samples_per_pixel: int
+    sampling_margin: float
+    radii_px: Line
+    distances: tuple[DistanceResult, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain numbers: curves at every radius up to ZOOM_PX and at growing steps beyond; lines up to ZOOM_PX.
+
+        The largest differences are those over all radii.
+        """
+        kept = _thinned(self.radii_px)
+        return {
+            "instrument": self.instrument,
+            "version": self.version,
+            "wavelength_angstrom": self.wavelength_angstrom,
+            "printed_distance_mm": self.printed_distance_mm,
+            "focus": asdict(self.focus),
+            "phases": self.phases,
+            "windows": self.windows,
+            "reach_px": self.reach_px,
+            "samples_per_pixel": self.samples_per_pixel,
+            "sampling_margin": self.sampling_margin,
+            "radii_px": self.radii_px[kept].tolist(),
+            "offsets_px": list(range(-ZOOM_PX, ZOOM_PX + 1)),
+            "distances": [_distance_json(result, kept) for result in self.distances],
+        }
+
+
+def fresnel_study(
+    instrument: Instrument,
+    *,
+    distances_mm: Sequence[float] = DISTANCES_MM,
+    phases: int = 16,
+    windows: int | None = None,
+    progress: Progress | None = None,
+) -> FresnelStudy:
+    """Compare the methods with the filter wheel at each distance (mm) from the detector.
+
+    phases: how many places of the wheel's mesh, at equal parts of its pitch. windows: of the analytic series;
+    by default the instrument's. progress: called with (done, of).
+    Raises DataError "bad-instrument-file", "no-focus", "bad-distance", "bad-phases", "bad-windows" or
+    "too-many-samples".
+    """
+    path = light_path(instrument)
+    windows = path.wheel_mesh.windows if windows is None else windows
+    _check(path, distances_mm, phases, windows)
+    report = progress or _silent
+    steps = 1 + len(distances_mm) * phases
+    report(0, steps)
+    focus = best_focus(path, nominal_focal_length_mm=instrument.focal_length_mm)
+    entrance_line = _entrance_line(path, focus.focal_length_mm)
+    at_primary = path.field_at_primary(path.entrance_mm, *path.entrance_grids())
+    report(1, steps)
+    results = []
+    for index, distance_mm in enumerate(distances_mm):
+        done = 1 + index * phases
+        wheel = _AtWheel(path, at_primary, focus.separation_mm, distance_mm)
+        lines = []
+        for phase in range(phases):
+            lines.append(wheel.line(phase / phases))
+            report(done + phase + 1, steps)
+        combined = _combined_line(path, entrance_line, distance_mm, windows)
+        results.append(_compared(wheel, np.array(lines), combined))
+    return FresnelStudy(
+        instrument=instrument.name,
+        version=instrument.version,
+        wavelength_angstrom=instrument.wavelength_angstrom,
+        printed_distance_mm=path.printed_distance_mm,
+        focus=focus,
+        phases=phases,
+        windows=windows,
+        reach_px=REACH_PX,
+        samples_per_pixel=SAMPLES_PER_PIXEL,
+        sampling_margin=SAMPLING_MARGIN,
+        radii_px=np.arange(REACH_PX, dtype=np.float64),
+        distances=tuple(results),
+    )
+
+
+def _grids(path: LightPath, distance_mm: float) -> tuple[Grid, Grid]:
+    """Grids of secondary and filter wheel for a wheel at this distance from the detector."""
+    wheel = path.wheel_grid(distance_mm)
+    behind_mm = path.secondary_to_detector_mm - distance_mm
+    return path.secondary_grid(next_width_mm=wheel.width_mm, distance_mm=behind_mm), wheel
+
+
+class _AtWheel:
+    """The focused wave in front of a filter wheel, and its way on through the wheel's mesh."""
+
+    def __init__(self, path: LightPath, at_primary: Wave, separation_mm: float, distance_mm: float) -> None:
+        self.path, self.distance_mm = path, distance_mm
+        self.behind_secondary_mm = path.secondary_to_detector_mm - distance_mm
+        self.beam_mm = path.beam_mm(separation_mm, self.behind_secondary_mm)
+        self._secondary, self._grid = _grids(path, distance_mm)
+        self._detector = path.detector_grid
+        self._lights: list[float] = []
+        self._upstream: list[tuple[Grid, float]] = []
+        self._field = self._arriving(at_primary, separation_mm)
+        self._step = FresnelStep(
+            self._grid, self._detector, wavelength_mm=path.wavelength_mm, distance_mm=distance_mm
+        )
+
+    def line(self, phase: float) -> Line:
+        """Light in each pixel, for the mesh moved by `phase` of its pitch."""
+        openings_mm = mesh_windows_mm(self.path.wheel_mesh, phase, self._grid.width_mm)
+        field = self._field * open_share(self._grid, openings_mm)
+        self._lights.append(self._grid.light(field))
+        return binned_light(self._step.apply(field), self._detector, SAMPLES_PER_PIXEL)
+
+    def sampling(self, detector_light: float) -> tuple[Sampling, ...]:
+        """All planes from the aperture to the detector, with what light is behind them."""
+        wheel_light = float(np.mean(self._lights))
+        planes = [*self._upstream, (self._grid, wheel_light), (self._detector, detector_light)]
+        lengths_mm = [
+            self.path.aperture_to_primary_mm,
+            self.path.printed_separation_mm,
+            self.behind_secondary_mm,
+            self.distance_mm,
+        ]
+        least: list[int | None] = [
+            round(this.width_mm * after.width_mm / (self.path.wavelength_mm * length_mm))
+            for (this, _), (after, _), length_mm in zip(planes, planes[1:], lengths_mm, strict=False)
+        ]
+        return tuple(
+            Sampling(grid.plane, grid.width_mm, grid.step_mm * _UM_PER_MM, grid.samples, count, light)
+            for (grid, light), count in zip(planes, [*least, None], strict=True)
+        )
+
+    def _arriving(self, at_primary: Wave, separation_mm: float) -> Wave:
+        path, secondary = self.path, self._secondary
+        aperture, primary = path.entrance_grids()
+        at_secondary = path.field_at_secondary(at_primary, primary, secondary, separation_mm)
+        self._upstream = [
+            (aperture, 1.0),
+            (primary, primary.light(at_primary)),
+            (secondary, secondary.light(at_secondary)),
+        ]
+        return propagate(
+            at_secondary,
+            secondary,
+            self._grid,
+            wavelength_mm=path.wavelength_mm,
+            distance_mm=self.behind_secondary_mm,
+        )
+
+
+def _entrance_line(path: LightPath, focal_length_mm: float) -> Line:
+    """Fraunhofer image of entrance aperture and mesh in pixels, sum 1."""
+    grid = path.detector_grid
+    field = fraunhofer_field(
+        path.entrance_mm, grid, wavelength_mm=path.wavelength_mm, focal_length_mm=focal_length_mm
+    )
+    line = binned_light(field, grid, SAMPLES_PER_PIXEL)
+    return np.asarray(line / line.sum())
+
+
+def _combined_line(path: LightPath, entrance_line: Line, distance_mm: float, windows: int) -> Line:
+    """The entrance's image convolved with the wheel mesh's series, sum 1."""
+    series = mesh_line(
+        wavelength_angstrom=path.wavelength_mm * _ANGSTROM_PER_MM,
+        distance_mm=distance_mm,
+        pitch_um=path.wheel_mesh.pitch_um,
+        wire_um=path.wheel_mesh.wire_um,
+        windows=windows,
+        pixel_pitch_um=path.pixel_mm * _UM_PER_MM,
+        size=_SIZE_PX,
+    )
+    line = linear_convolve(entrance_line[None, :], series[None, :], (1, _SIZE_PX))[0]
+    return np.asarray(line / line.sum())
+
+
+def _compared(wheel: _AtWheel, lines: Line, combined: Line) -> DistanceResult:
+    """Curves and differences from the lines of all phases, shape (phases, 2 REACH_PX + 1)."""
+    path = wheel.path
+    radii_px = np.arange(REACH_PX)
+    combined_beyond = 100 * light_beyond(combined, radii_px)
+    # A phase's line counts by its own light, so that a mean of curves is the curve of a mean.
+    shares = lines / lines.sum(axis=1, keepdims=True)
+    single = np.array([100 * light_beyond(line, radii_px) for line in shares]) - combined_beyond
+    mean_line = shares.mean(axis=0)
+    fresnel_beyond = 100 * light_beyond(mean_line, radii_px)
+    pitch_mm = path.wheel_mesh.pitch_um * MM_PER_UM
+    return DistanceResult(
+        distance_mm=wheel.distance_mm,
+        beam_mm=wheel.beam_mm,
+        beam_pitches=wheel.beam_mm / pitch_mm,
+        wheel_order_spacing_px=order_spacing_px(
+            wavelength_angstrom=path.wavelength_mm * _ANGSTROM_PER_MM,
+            distance_mm=wheel.distance_mm,
+            pitch_um=path.wheel_mesh.pitch_um,
+            pixel_pitch_um=path.pixel_mm * _UM_PER_MM,
+        ),
+        sampling=wheel.sampling(float(lines.sum(axis=1).mean())),
+        fresnel_line=mean_line,
+        combined_line=combined,
+        fresnel_beyond_pct=fresnel_beyond,
+        combined_beyond_pct=combined_beyond,
+        difference_points=fresnel_beyond - combined_beyond,
+        phase_lowest_points=single.min(axis=0),
+        phase_highest_points=single.max(axis=0),
+        phase_largest_points=np.abs(single).max(axis=1),
+    )
+
+
+def _check(path: LightPath, distances_mm: Sequence[float], phases: int, windows: int) -> None:
+    longest = path.secondary_to_detector_mm
+    wrong = [d for d in distances_mm if not 0 < d < longest]
+    if wrong or not distances_mm:
+        got = f"{wrong[0]:g}" if wrong else "none"
+        raise DataError("bad-distance", f"expected distances over 0 and under {longest:g} mm; got {got}")
+    for distance_mm in distances_mm:
+        _grids(path, distance_mm)
+    for code, value, most in (("bad-phases", phases, 1000), ("bad-windows", windows, 100_000)):
+        if not 1 <= value <= most:
+            raise DataError(code, f"expected 1 to {most}; got {value}")
+
+
+def _thinned(radii_px: Line) -> NDArray[np.int64]:
+    """Indices of the radii that a report keeps."""
+    far = np.geomspace(ZOOM_PX, radii_px.size - 1, 96).round().astype(np.int64)
+    return np.unique(np.concatenate([np.arange(ZOOM_PX), far]))
+
+
+def _distance_json(result: DistanceResult, kept: NDArray[np.int64]) -> dict[str, Any]:
+    near = slice(REACH_PX - ZOOM_PX, REACH_PX + ZOOM_PX + 1)
+    curves = (
+        "fresnel_beyond_pct",
+        "combined_beyond_pct",
+        "difference_points",
+        "phase_lowest_points",
+        "phase_highest_points",
+    )
+    return {
+        "distance_mm": result.distance_mm,
+        "beam_mm": result.beam_mm,
+        "beam_pitches": result.beam_pitches,
+        "wheel_order_spacing_px": result.wheel_order_spacing_px,
+        "sampling": [asdict(plane) for plane in result.sampling],
+        "largest_points": result.largest_points,
+        "largest_single_points": result.largest_single_points,
+        "phase_largest_points": result.phase_largest_points.tolist(),
+        "fresnel_line": result.fresnel_line[near].tolist(),
+        "combined_line": result.combined_line[near].tolist(),
+        **{name: getattr(result, name)[kept].tolist() for name in curves},
+    }
+
+
+def _silent(done: int, of: int) -> None:
+    """No one listens."""

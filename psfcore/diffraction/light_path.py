@@ -1,0 +1,210 @@
+"""A two-mirror telescope along its axis: what a wave meets, and where rays go.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Fresnel propagation": the wave goes from
+the entrance aperture over primary and secondary to the filter wheel and the detector. Rays parallel to the
+axis at height 1, with thin mirrors, f = R / 2 for a concave and -R / 2 for a convex one:
+
+    y2 = 1 - s / f1,   u2 = -1 / f1 - y2 / f2,   y(z) = y2 + z u2,   focal length = -1 / u2        Eq. (1)
+
+| symbol | name | unit |
+|---|---|---|
+| s | separation_mm, of the mirrors | mm |
+| f1, f2 | focal_mm of primary and secondary | mm |
+| z | distance behind the secondary | mm |
+| y, u | height, slope, for a ray that came in at height 1 | -, 1/mm |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from psfcore.diffraction.fresnel import (
+    Grid,
+    Line,
+    Wave,
+    aperture_openings_mm,
+    common_openings_mm,
+    grid_for,
+    mesh_openings_mm,
+    mirror_transmission,
+    open_share,
+    propagate,
+)
+from psfcore.errors import DataError
+from psfcore.instruments.model import Aperture, Instrument, Mesh, Mirror
+
+REACH_PX = 1023
+SAMPLES_PER_PIXEL = 16
+MM_PER_UM = 1e-3
+_MM_PER_ANGSTROM = 1e-7
+
+
+@dataclass(frozen=True)
+class LightPath:
+    """The numbers of a telescope that a wave meets on its way. Lengths in mm."""
+
+    wavelength_mm: float
+    aperture: Aperture
+    entrance_mesh: Mesh
+    primary: Mirror
+    secondary: Mirror
+    wheel_mesh: Mesh
+    aperture_to_primary_mm: float
+    printed_separation_mm: float
+    secondary_to_detector_mm: float
+    printed_distance_mm: float  # from filter wheel to detector
+    pixel_mm: float
+
+    @property
+    def detector_grid(self) -> Grid:
+        """SAMPLES_PER_PIXEL for each pixel within REACH_PX of the axis."""
+        samples = (2 * REACH_PX + 1) * SAMPLES_PER_PIXEL
+        return Grid("detector", samples, self.pixel_mm / SAMPLES_PER_PIXEL)
+
+    @property
+    def aperture_mm(self) -> Line:
+        """The open entrance, without its mesh, rows of (begin, end)."""
+        return aperture_openings_mm(self.aperture)
+
+    @property
+    def entrance_mm(self) -> Line:
+        """The entrance through its mesh, rows of (begin, end)."""
+        # An odd number of windows has one on the axis, an even number a wire.
+        phase = 0.0 if self.entrance_mesh.windows % 2 else 0.5
+        windows_mm = mesh_windows_mm(self.entrance_mesh, phase, self.aperture.diameter_mm)
+        return common_openings_mm(self.aperture_mm, windows_mm)
+
+    def slope_per_mm(self, separation_mm: float) -> float:
+        """Slope behind the secondary of a ray that came in at height 1, Eq. (1)."""
+        f1, f2 = focal_mm(self.primary), focal_mm(self.secondary)
+        return -1 / f1 - (1 - separation_mm / f1) / f2
+
+    def focal_length_mm(self, separation_mm: float) -> float:
+        """Focal length of both mirrors together, Eq. (1)."""
+        return -1 / self.slope_per_mm(separation_mm)
+
+    def beam_mm(self, separation_mm: float, behind_secondary_mm: float) -> float:
+        """Width of one field point's beam at a distance behind the secondary, Eq. (1)."""
+        height = 1 - separation_mm / focal_mm(self.primary)
+        height += behind_secondary_mm * self.slope_per_mm(separation_mm)
+        return abs(height) * self.aperture.diameter_mm
+
+    def entrance_grids(self) -> tuple[Grid, Grid]:
+        """Grids of the aperture, for all of the primary, and of the primary, for all of the secondary."""
+        return self._grid(
+            "aperture", self.aperture.diameter_mm, self.primary.diameter_mm, self.aperture_to_primary_mm
+        ), self._grid(
+            "primary", self.primary.diameter_mm, self.secondary.diameter_mm, self.printed_separation_mm
+        )
+
+    def secondary_grid(self, *, next_width_mm: float, distance_mm: float) -> Grid:
+        """Grid of the secondary for light that goes on to a plane of `next_width_mm`."""
+        return self._grid("secondary", self.secondary.diameter_mm, next_width_mm, distance_mm)
+
+    def wheel_grid(self, distance_mm: float) -> Grid:
+        """Grid of a filter wheel at a distance from the detector.
+
+        As wide as what straight lines from all of the secondary to all of the detector cross there.
+        """
+        part = distance_mm / self.secondary_to_detector_mm
+        detector_mm = self.detector_grid.width_mm
+        width_mm = part * self.secondary.diameter_mm + (1 - part) * detector_mm
+        return self._grid("filter wheel", width_mm, detector_mm, distance_mm)
+
+    def _grid(self, plane: str, width_mm: float, next_width_mm: float, distance_mm: float) -> Grid:
+        return grid_for(
+            plane,
+            width_mm=width_mm,
+            next_width_mm=next_width_mm,
+            wavelength_mm=self.wavelength_mm,
+            distance_mm=distance_mm,
+        )
+
+    def field_at_primary(self, openings_mm: Line, aperture: Grid, primary: Grid) -> Wave:
+        """A plane wave on the axis through the openings, to behind the primary; light 1 enters."""
+        field = open_share(aperture, openings_mm).astype(np.complex128)
+        field /= np.sqrt(aperture.light(field))
+        field = propagate(
+            field,
+            aperture,
+            primary,
+            wavelength_mm=self.wavelength_mm,
+            distance_mm=self.aperture_to_primary_mm,
+        )
+        return np.asarray(field * mirror_transmission(self.primary, primary, self.wavelength_mm))
+
+    def field_at_secondary(
+        self, at_primary: Wave, primary: Grid, secondary: Grid, separation_mm: float
+    ) -> Wave:
+        """From behind the primary to behind the secondary."""
+        field = propagate(
+            at_primary,
+            primary,
+            secondary,
+            wavelength_mm=self.wavelength_mm,
+            distance_mm=separation_mm,
+        )
+        return np.asarray(field * mirror_transmission(self.secondary, secondary, self.wavelength_mm))
+
+
+def focal_mm(mirror: Mirror) -> float:
+    """Focal length of a thin mirror: half its radius, negative where it is convex."""
+    return mirror.radius_mm / 2 if mirror.figure == "concave" else -mirror.radius_mm / 2
+
+
+def mesh_windows_mm(mesh: Mesh, phase: float, width_mm: float) -> Line:
+    """Windows of an instrument's mesh over at least `width_mm`, rows of (begin, end)."""
+    return mesh_openings_mm(
+        pitch_mm=mesh.pitch_um * MM_PER_UM,
+        wire_mm=mesh.wire_um * MM_PER_UM,
+        phase=phase,
+        width_mm=width_mm,
+    )
+
+
+def light_path(instrument: Instrument) -> LightPath:
+    """What propagation needs of an instrument.
+
+    Raises DataError "bad-instrument-file", naming the key, where the instrument lacks some of it.
+    """
+    if len(instrument.mirrors) != 2:
+        raise _lacking(
+            instrument, "mirrors", "a primary and a secondary", f"{len(instrument.mirrors)} mirrors"
+        )
+    if instrument.distances is None:
+        raise _lacking(instrument, "distances", "the distances along the light's way", "none")
+    entrance, wheel = (_one_mesh(instrument, place) for place in ("entrance", "filter_wheel"))
+    if (entrance.angle_deg - wheel.angle_deg) % 90:
+        angles = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
+        raise _lacking(
+            instrument, "meshes.angle_deg", "meshes along the same axes, for one dimension", angles
+        )
+    distances = instrument.distances
+    return LightPath(
+        wavelength_mm=instrument.wavelength_angstrom * _MM_PER_ANGSTROM,
+        aperture=instrument.aperture,
+        entrance_mesh=entrance,
+        primary=instrument.mirrors[0],
+        secondary=instrument.mirrors[1],
+        wheel_mesh=wheel,
+        aperture_to_primary_mm=distances.aperture_to_primary_mm,
+        printed_separation_mm=distances.primary_to_secondary_mm,
+        secondary_to_detector_mm=(
+            distances.secondary_to_filter_wheel_mm + distances.filter_wheel_to_detector_mm
+        ),
+        printed_distance_mm=distances.filter_wheel_to_detector_mm,
+        pixel_mm=instrument.detector.pixel_pitch_um * MM_PER_UM,
+    )
+
+
+def _one_mesh(instrument: Instrument, place: str) -> Mesh:
+    found = [mesh for mesh in instrument.meshes if mesh.place == place]
+    if len(found) != 1:
+        raise _lacking(instrument, "meshes", f"one mesh at place {place!r}", str(len(found)))
+    return found[0]
+
+
+def _lacking(instrument: Instrument, key: str, expected: str, got: str) -> DataError:
+    return DataError("bad-instrument-file", f"{instrument.name}: {key}: expected {expected}; got {got}")

@@ -1,0 +1,377 @@
+"""The entrance pupil as a transmission mask, made a strip of rows at a time.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation": amplitude masks of the
+aperture, its mount and its mesh. A cell of the mask holds the open share of its area: exactly, because
+every outline is a polygon (a circle one of 4096 corners and of the circle's area) and the area under a
+polygon's edge in a cell is a trapezoid:
+
+    open area of cell i = sum over edges of dy (i + 1 - x), x the mean of the edge's part in the cell   Eq. (1)
+    circle of radius R: corners at R sqrt((2 pi / m) / sin(2 pi / m))                                   Eq. (2)
+
+Where outlines of different parts cross in one cell, their open shares are multiplied.
+
+| symbol | name | unit |
+|---|---|---|
+| d | pitch_um of a mesh; wires lie at (k + 1/2) d, or at k d where its windows are even | um |
+| wire_um | wire width | um |
+| dx | cell_mm, edge of a cell of the mask | mm |
+| N | cells along an edge of the mask, the optical axis in its middle | - |
+| m | corners of a circle | - |
+
+Angles run from +x of the detector towards +y, and mask[y, x] has the axes of image[y, x].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount
+
+CIRCLE_CORNERS = 4096
+_UM_PER_MM = 1e3
+# A bar of no visible width or a ring beyond the rim would be a slip of the pen in an instrument file.
+_RIM_TOLERANCE_MM = 1e-6
+
+Corners = NDArray[np.float64]
+Outline = tuple[Corners, ...]
+
+
+@dataclass(frozen=True)
+class MaskPicture:
+    """A mask given as pixels: open share 0..1 [y, x] of a square of `width_mm`, row 0 at the lowest y."""
+
+    open_share: NDArray[np.float64]
+    width_mm: float
+
+
+@dataclass(frozen=True)
+class Pupil:
+    """What is open: the opening, less all opaque outlines, the wires of the meshes, and a picture's dark parts.
+
+    Outlines are closed polygons, corners (x, y) in mm; several of one outline cut each other out.
+    """
+
+    opening: Outline
+    opaque: tuple[Outline, ...] = ()
+    meshes: tuple[Mesh, ...] = ()
+    picture: MaskPicture | None = None
+
+    @property
+    def width_mm(self) -> float:
+        """Edge of the smallest square round the optical axis that holds the opening."""
+        return 2 * float(max(np.abs(corners).max() for corners in self.opening))
+
+
+def entrance_pupil(
+    aperture: Aperture,
+    *,
+    mount: Mount | None = None,
+    mount_image: NDArray[np.floating] | None = None,
+    meshes: Iterable[Mesh] = (),
+) -> Pupil:
+    """The pupil of an aperture, with its mount and its meshes where they are given.
+
+    mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y, 0 opaque.
+    Raises DataError "bad-mount" (names the key) for a bar outside the aperture or an unfit mask image.
+    """
+    radius_mm = aperture.diameter_mm / 2
+    opening: Outline = (circle(radius_mm),)
+    if aperture.obscuration_diameter_mm > 0:
+        opening += (circle(aperture.obscuration_diameter_mm / 2)[::-1],)
+    opaque = [] if mount is None else _mount_outlines(mount, radius_mm)
+    picture = None
+    if mount is not None and mount.mask_image is not None:
+        picture = _mask_picture(mount.mask_image, mount_image, aperture)
+    return Pupil(opening, tuple(opaque), tuple(meshes), picture)
+
+
+def circle(radius_mm: float) -> Corners:
+    """Corners (4096, 2) in mm of a polygon with the area of a circle, counter-clockwise."""
+    step = 2 * math.pi / CIRCLE_CORNERS
+    # Corners straddle both axes and the diagonals, so that the polygon has the circle's mirror symmetries.
+    angle = (np.arange(CIRCLE_CORNERS) + 0.5) * step
+    reach_mm = radius_mm * math.sqrt(step / math.sin(step))  # Eq. (2)
+    return reach_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def bar(start_mm: float, end_mm: float, width_mm: float, angle_deg: float, across_mm: float = 0.0) -> Corners:
+    """Corners (4, 2) in mm of a bar along `angle_deg`, from start to end, its middle `across_mm` to the left."""
+    left, right = across_mm + width_mm / 2, across_mm - width_mm / 2
+    corners = np.array([(start_mm, right), (end_mm, right), (end_mm, left), (start_mm, left)])
+    return corners @ _rotation(angle_deg).T
+
+
+def _rotation(angle_deg: float) -> NDArray[np.float64]:
+    cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+def _mount_outlines(mount: Mount, rim_mm: float) -> list[Outline]:
+    outlines: list[Outline] = []
+    hub_mm = mount.hub_diameter_mm / 2
+    if hub_mm >= rim_mm:
+        wanted = f"mount.hub_diameter_mm: expected less than the aperture's {2 * rim_mm:g} mm"
+        raise DataError("bad-mount", f"{wanted}; got {mount.hub_diameter_mm:g}")
+    if hub_mm > 0:
+        outlines.append((circle(hub_mm),))
+    for index, rays in enumerate(mount.rays):
+        if rays.width_mm >= 2 * rim_mm:
+            wanted = f"mount.rays.{index}.width_mm: expected less than the aperture's {2 * rim_mm:g} mm"
+            raise DataError("bad-mount", f"{wanted}; got {rays.width_mm:g}")
+        for ray in range(rays.count):
+            angle_deg = rays.first_angle_deg + 360 * ray / rays.count
+            outlines.append((bar(0.0, 2 * rim_mm, rays.width_mm, angle_deg),))
+    for index, ring in enumerate(mount.rings):
+        inner_mm, outer_mm = ring.radius_mm - ring.width_mm / 2, ring.radius_mm + ring.width_mm / 2
+        if inner_mm < 0 or outer_mm > rim_mm + _RIM_TOLERANCE_MM:
+            wanted = f"mount.rings.{index}: expected a ring within the aperture's radius {rim_mm:g} mm"
+            raise DataError("bad-mount", f"{wanted}; got {inner_mm:g} to {outer_mm:g} mm")
+        hole = (circle(inner_mm)[::-1],) if inner_mm > 0 else ()
+        outlines.append((circle(outer_mm), *hole))
+    return outlines + [(np.array(polygon.corners_mm, dtype=np.float64),) for polygon in mount.polygons]
+
+
+def _mask_picture(
+    described: MaskImage, pixels: NDArray[np.floating] | None, aperture: Aperture
+) -> MaskPicture:
+    key = "mount.mask_image"
+    if pixels is None:
+        raise DataError("bad-mount", f"{key}: expected the pixels of {described.file}; got none")
+    if pixels.ndim != 2 or pixels.shape[0] != pixels.shape[1] or pixels.size == 0:
+        raise DataError("bad-mount", f"{key}: expected a square image on two axes; got shape {pixels.shape}")
+    if not np.isfinite(pixels).all() or pixels.min() < 0 or pixels.max() <= 0:
+        wanted = "expected finite values, 0 where opaque and the largest where open"
+        raise DataError("bad-mount", f"{key}: {wanted}; got {pixels.min():g} to {pixels.max():g}")
+    if described.width_mm < aperture.diameter_mm:
+        wanted = f"{key}.width_mm: expected at least the aperture's {aperture.diameter_mm:g} mm"
+        raise DataError("bad-mount", f"{wanted}; got {described.width_mm:g}")
+    return MaskPicture(np.asarray(pixels, dtype=np.float64) / float(pixels.max()), described.width_mm)
+
+
+class MaskGrid:
+    """The mask of `pupil` in cells of `cell_mm`, N x N round the optical axis, computed where it is asked for."""
+
+    def __init__(self, pupil: Pupil, cell_mm: float) -> None:
+        self.cell_mm = cell_mm
+        self.cells = 2 * math.ceil(pupil.width_mm / cell_mm / 2) + 2
+        straight = [mesh for mesh in pupil.meshes if mesh.angle_deg % 90 == 0]
+        lines = [self._mesh_line(mesh) for mesh in straight]
+        self._line = (np.prod(lines, axis=0) if lines else np.ones(self.cells)).astype(np.float32)
+        tilted = [mesh for mesh in pupil.meshes if mesh.angle_deg % 90 != 0]
+        wires = [wire for mesh in tilted for wire in _wires(mesh, pupil.width_mm)]
+        outlines = (pupil.opening, *pupil.opaque, *wires)
+        self._edges, self._outline_of_edge = self._in_cells(outlines)
+        self._first_entry, self._entries = _edges_by_row(self._edges, self.cells)
+        self._picture = pupil.picture
+
+    def rows(self, first: int, stop: int, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """Open shares of the rows `first` to `stop` - 1; shape (stop - first, cells), in `out` if it is given."""
+        strip = np.empty((stop - first, self.cells), dtype=np.float32) if out is None else out[: stop - first]
+        _cover(
+            strip,
+            first,
+            self._line,
+            self._edges,
+            self._outline_of_edge,
+            self._first_entry,
+            self._entries,
+        )
+        if self._picture is not None:
+            cells_per_pixel = self._picture.width_mm / self._picture.open_share.shape[0] / self.cell_mm
+            _shade(strip, first, self._picture.open_share, cells_per_pixel)
+        return strip
+
+    def _in_cells(self, outlines: tuple[Outline, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """All edges (x0, y0, x1, y1) in cells from the mask's lower left, and the outline each belongs to."""
+        edges, owners = [], []
+        for owner, outline in enumerate(outlines):
+            for corners in outline:
+                start = corners / self.cell_mm + self.cells / 2
+                edges.append(np.hstack([start, np.roll(start, -1, axis=0)]))
+                owners.append(np.full(len(start), owner))
+        return np.concatenate(edges), np.concatenate(owners).astype(np.int64)
+
+    def _mesh_line(self, mesh: Mesh) -> NDArray[np.float64]:
+        """Open share of each cell along an axis that crosses the wires of a mesh; shape (cells,)."""
+        edges_um = (np.arange(self.cells + 1, dtype=np.float64) - self.cells / 2) * self.cell_mm * _UM_PER_MM
+        return np.diff(_open_length_um(edges_um, mesh)) / (self.cell_mm * _UM_PER_MM)
+
+
+def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float64]:
+    """Integral of the open share along a mesh, up to a constant: windows are w wide, pitch d apart."""
+    window_um = mesh.pitch_um - mesh.wire_um
+    from_window_um = x_um + window_um / 2 - (0 if mesh.windows % 2 else mesh.pitch_um / 2)
+    whole, part_um = np.divmod(from_window_um, mesh.pitch_um)
+    return np.asarray(whole * window_um + np.minimum(part_um, window_um))
+
+
+def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
+    """The wires of a tilted mesh, as bars that reach past the pupil; one of an axis is one outline."""
+    reach_mm = width_mm  # > width / sqrt(2), half the diagonal
+    pitch_mm, wire_mm = mesh.pitch_um / _UM_PER_MM, mesh.wire_um / _UM_PER_MM
+    count = math.ceil(reach_mm / pitch_mm)
+    across_mm = (np.arange(-count, count + 1) + (0.5 if mesh.windows % 2 else 0.0)) * pitch_mm
+    return [
+        tuple(bar(-reach_mm, reach_mm, wire_mm, mesh.angle_deg + turn, float(a)) for a in across_mm)
+        for turn in (0.0, 90.0)
+    ]
+
+
+@njit(nogil=True, cache=True)
+def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
+    """For each row of cells the edges that pass it: entries[first[row] : first[row + 1]], in their order."""
+    first = np.zeros(rows + 1, dtype=np.int64)
+    low = np.empty(len(edges), dtype=np.int64)
+    high = np.empty(len(edges), dtype=np.int64)
+    for e in range(len(edges)):
+        low[e] = max(math.floor(min(edges[e, 1], edges[e, 3])), 0)
+        high[e] = min(math.ceil(max(edges[e, 1], edges[e, 3])), rows)
+        for row in range(low[e], high[e]):
+            first[row + 1] += 1
+    first = np.cumsum(first)
+    entries = np.empty(first[rows], dtype=np.int64)
+    filled = first[:rows].copy()
+    for e in range(len(edges)):
+        for row in range(low[e], high[e]):
+            entries[filled[row]] = e
+            filled[row] += 1
+    return first, entries
+
+
+@njit(nogil=True, cache=True)
+def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
+    """Write open shares into `strip`: mesh, times the opening (outline 0), times what others leave open."""
+    rows, cells = strip.shape
+    area = np.zeros(cells + 2)
+    most = 1
+    for k in range(first_row, first_row + rows):
+        most = max(most, first_entry[k + 1] - first_entry[k])
+    begins, ends = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
+    for k in range(rows):
+        row = first_row + k
+        strip[k, :] = 0.0
+        entry, stop = first_entry[row], first_entry[row + 1]
+        while entry < stop:
+            outline = outline_of_edge[entries[entry]]
+            touched = 0
+            while entry < stop and outline_of_edge[entries[entry]] == outline:
+                begin, end = _add_edge(area, edges[entries[entry]], row, cells)
+                entry += 1
+                if begin <= end:
+                    _insert(begins, ends, touched, begin, end)
+                    touched += 1
+            inside, done = 0.0, cells
+            for j in range(touched):
+                # Between the cells that edges touch the cover is constant.
+                _apply(strip[k], line, line[row], done, begins[j], inside, outline)
+                for i in range(max(begins[j], done if j else 0), min(ends[j] + 2, cells)):
+                    inside += area[i]
+                    area[i] = 0.0
+                    _apply(strip[k], line, line[row], i, i + 1, inside, outline)
+                done = max(ends[j] + 2, done if j else 0)
+            _apply(strip[k], line, line[row], done, cells, inside, outline)  # an edge may lie beyond the mask
+            area[cells:] = 0.0
+
+
+@njit(nogil=True, cache=True)
+def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
+    """Put a range of cells into a list sorted by where they begin."""
+    j = count
+    while j > 0 and begins[j - 1] > begin:
+        begins[j], ends[j] = begins[j - 1], ends[j - 1]
+        j -= 1
+    begins[j], ends[j] = begin, end
+
+
+@njit(nogil=True, cache=True)
+def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]
+    """Open (outline 0) or close the cells from start to stop by the share that lies inside an outline."""
+    covered = np.float32(min(abs(inside), 1.0))
+    if outline == 0:
+        covered *= line_y
+        for i in range(start, stop):
+            row[i] = covered * line[i]
+    elif covered > 0:
+        for i in range(start, stop):
+            row[i] *= np.float32(1.0) - covered
+
+
+@njit(nogil=True, cache=True)
+def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
+    """Add an edge's part in a row, Eq. (1), to `area`, whose running sum is the covered share of each cell.
+
+    Returns the first and last cell touched, the last before the first where there is none.
+    """
+    x0, y0, x1, y1 = edge[0], edge[1], edge[2], edge[3]
+    ya, yb = min(max(y0, row), row + 1), min(max(y1, row), row + 1)
+    dy = yb - ya
+    if dy == 0.0:
+        return cells, 0
+    slope = (x1 - x0) / (y1 - y0)
+    xa, xb = x0 + (ya - y0) * slope, x0 + (yb - y0) * slope
+    if xa > xb:
+        xa, xb = xb, xa
+    if xb <= 0:
+        area[0] += dy
+        return 0, 0
+    if xa >= cells:
+        return cells, 0
+    if xb - xa < 1e-12:
+        i = min(int(xa), cells - 1)
+        area[i] += dy * (i + 1 - xa)
+        area[i + 1] += dy * (xa - i)
+        return i, i
+    per_x = dy / (xb - xa)
+    if xa < 0:
+        area[0] += per_x * -xa
+        xa = 0.0
+    begin, end = int(xa), min(int(xb), cells - 1)
+    for i in range(begin, end + 1):
+        left, right = max(xa, i), min(xb, i + 1)
+        part, mean = per_x * (right - left), 0.5 * (left + right)
+        area[i] += part * (i + 1 - mean)  # Eq. (1)
+        area[i + 1] += part * (mean - i)
+    return begin, end
+
+
+@njit(nogil=True, cache=True)
+def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-untyped-def]
+    """Multiply `strip` by a picture's mean over each cell; outside the picture nothing is open."""
+    rows, cells = strip.shape
+    pixels = len(open_share)
+    corner = 0.5 * (cells - pixels * cells_per_pixel)  # lower left of the picture, in cells
+    running = np.zeros(pixels + 1)
+    for k in range(rows):
+        low = (first_row + k - corner) / cells_per_pixel
+        high = low + 1 / cells_per_pixel
+        running[:] = 0.0
+        for j in range(max(int(low), 0), min(math.ceil(high), pixels)):
+            weight = (min(high, j + 1) - max(low, j)) * cells_per_pixel
+            for i in range(pixels):
+                running[i + 1] += weight * open_share[j, i]
+        for i in range(pixels):
+            running[i + 1] += running[i]
+        before = _running_at(running, -corner / cells_per_pixel)
+        for i in range(cells):
+            upto = _running_at(running, (i + 1 - corner) / cells_per_pixel)
+            strip[k, i] *= (upto - before) * cells_per_pixel
+            before = upto
+
+
+@njit(nogil=True, cache=True)
+def _running_at(running, x):  # type: ignore[no-untyped-def]
+    """Running sum at a place between pixels."""
+    last = len(running) - 1
+    if x <= 0:
+        return running[0]
+    if x >= last:
+        return running[last]
+    i = int(x)
+    return running[i] + (x - i) * (running[i + 1] - running[i])

@@ -1,0 +1,111 @@
+"""Pictures of diffraction studies for people.
+
+Drawn on figures of their own with the Agg canvas, so that threads and processes do not meet in pyplot.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from psfcore.diffraction.fresnel_study import DistanceResult, FresnelStudy
+
+SHOWN_PX = 30
+_FRESNEL, _COMBINED, _DIFFERENCE, _INK = "#1f6fb4", "#e0761a", "#2b8a4e", "#222222"
+
+
+def fresnel_png(study: FresnelStudy, path: str | Path, *, distance_mm: float | None = None) -> None:
+    """Three panels: the PSF's centre, light beyond a distance with the difference, and all distances.
+
+    distance_mm: which of the study's to show in the first two, the nearest one; by default the printed one.
+    """
+    wanted_mm = study.printed_distance_mm if distance_mm is None else distance_mm
+    shown = min(study.distances, key=lambda result: abs(result.distance_mm - wanted_mm))
+    figure = Figure(
+        figsize=(15.6, 5.4), dpi=100, facecolor="white", layout=ConstrainedLayoutEngine(w_pad=0.1)
+    )
+    heading = (
+        f"{study.instrument}: Fresnel and simplified-combined in one dimension, "
+        f"filter wheel {shown.distance_mm:g} mm from the detector"
+    )
+    focus = study.focus
+    below = (
+        f"best focus: mirror separation {focus.separation_mm:.2f} mm ({focus.shift_mm:+.2f} mm from the printed), "
+        f"focal length {focus.focal_length_mm:.0f} mm; mean of {study.phases} mesh phases; "
+        f"series of {study.windows} windows"
+    )
+    figure.suptitle(f"{heading}\n{below}", fontsize=11.5, color=_INK, x=0.01, ha="left")
+    centre_axes, curve_axes, distance_axes = figure.subplots(1, 3)
+    _draw_centre(centre_axes, shown, study.reach_px)
+    _draw_curves(curve_axes, shown, study)
+    _draw_distances(distance_axes, study)
+    for axes in (centre_axes, curve_axes, distance_axes):
+        axes.grid(which="major", color="#dddddd", linewidth=0.7)
+        axes.spines["top"].set_visible(False)
+    FigureCanvasAgg(figure).print_png(str(path))
+
+
+def _draw_centre(axes: Any, shown: DistanceResult, centre: int) -> None:
+    offsets = np.arange(-SHOWN_PX, SHOWN_PX + 1)
+    near = slice(centre - SHOWN_PX, centre + SHOWN_PX + 1)
+    # Where the two agree, the wider line shows on both sides of the thinner one.
+    for line, colour, width, label in (
+        (shown.combined_line, _COMBINED, 3.2, "Simplified-combined"),
+        (shown.fresnel_line, _FRESNEL, 1.2, "Fresnel"),
+    ):
+        axes.semilogy(offsets, line[near], color=colour, label=label, drawstyle="steps-mid", linewidth=width)
+    axes.set(xlabel="Offset (px)", ylabel="Weight (fraction per pixel)", title="Centre of the PSF")
+    axes.legend(frameon=False, loc="upper right")
+
+
+def _draw_curves(axes: Any, shown: DistanceResult, study: FresnelStudy) -> None:
+    # The central pixel, at radius 0, is drawn at half a pixel: a logarithmic axis has no zero.
+    radii_px = np.maximum(study.radii_px, 0.5)
+    axes.semilogx(
+        radii_px, shown.combined_beyond_pct, color=_COMBINED, linewidth=3.2, label="Simplified-combined"
+    )
+    axes.semilogx(radii_px, shown.fresnel_beyond_pct, color=_FRESNEL, linewidth=1.2, label="Fresnel")
+    axes.semilogx(radii_px, shown.difference_points, color=_DIFFERENCE, label="Difference (points)")
+    axes.fill_between(
+        radii_px,
+        shown.phase_lowest_points,
+        shown.phase_highest_points,
+        color=_DIFFERENCE,
+        alpha=0.2,
+        linewidth=0,
+        label="Difference, single phases",
+    )
+    axes.axhline(0, color=_INK, linewidth=0.7)
+    title = f"Light beyond a distance: at most {shown.largest_points:.2f} points apart"
+    axes.set(xlabel="Distance (px)", ylabel="Light beyond (%)", title=title)
+    axes.legend(frameon=False, loc="upper right")
+
+
+def _draw_distances(axes: Any, study: FresnelStudy) -> None:
+    distances_mm = [result.distance_mm for result in study.distances]
+    singles = np.array([result.phase_largest_points for result in study.distances])
+    axes.vlines(
+        distances_mm,
+        singles.min(axis=1),
+        singles.max(axis=1),
+        color=_DIFFERENCE,
+        alpha=0.4,
+        linewidth=5,
+        label="Single phases, lowest to highest",
+    )
+    means = [result.largest_points for result in study.distances]
+    axes.plot(distances_mm, means, "o-", color=_DIFFERENCE, label="Mean over phases")
+    axes.axhline(1.0, color=_INK, linewidth=0.8, linestyle=":", label="1 point")
+    axes.axvline(study.printed_distance_mm, color="#888888", linewidth=0.8)
+    axes.set(
+        xlabel="Filter wheel to detector (mm)",
+        ylabel="Largest difference (percentage points)",
+        title="Largest difference by distance",
+    )
+    axes.set_ylim(bottom=0)
+    axes.legend(frameon=False, loc="upper right")

@@ -1,0 +1,215 @@
+"""The far field against direct sums, formulas, and energy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.special import j0, j1
+
+from psfcore.diffraction.airy import airy_kernel, first_dark_ring_v, light_beyond
+from psfcore.diffraction.fraunhofer import FarField, far_field, samples_per_pixel
+from psfcore.diffraction.mesh_series import mesh_line
+from psfcore.diffraction.pupil import MaskGrid, MaskPicture, Pupil, bar, circle, entrance_pupil
+from psfcore.instruments.model import Aperture, Mesh, Mount, Polygon, Rays, load_instrument
+from psfcore.psf import cumulative_curve, squared_radii
+
+HRI = load_instrument("hri_euv")
+OPTICS = {"wavelength_angstrom": 174.0, "focal_length_mm": 4187.0, "pixel_pitch_um": 10.0}
+LAMBDA_F_OVER_P_MM = 174e-7 * 4187.0 / 10e-3
+
+
+def far(pupil: Pupil, size: int, **changes: object) -> FarField:
+    return far_field(pupil, **(OPTICS | {"size": size, "threads": 2} | changes))  # type: ignore[arg-type]
+
+
+def directly(pupil: Pupil, size: int, samples: int, area_mm2: float) -> NDArray[np.float64]:
+    """Reference: the definition, Eq. (1) and (2), as matrix products; not divided by the cells' sinc."""
+    grid = MaskGrid(pupil, LAMBDA_F_OVER_P_MM / size)
+    c = grid.rows(0, grid.cells).astype(np.float64)
+    q = (np.arange(size * samples) + 0.5) / samples - 0.5 - size // 2
+    wave = np.exp(-2j * np.pi * np.outer(q, np.arange(grid.cells) - (grid.cells - 1) / 2) / size)
+    intensity = np.abs(wave @ c @ wave.T) ** 2
+    pixels = intensity.reshape(size, samples, size, samples).sum(axis=(1, 3))
+    return np.asarray(pixels / (size**2 * samples**2) / (area_mm2 / grid.cell_mm**2))
+
+
+def unwindowed(pattern: NDArray[np.float64]) -> NDArray[np.float64]:
+    n = len(pattern)
+    sinc = np.sinc((np.arange(n) - n // 2) / n) ** 2
+    return pattern * sinc[:, None] * sinc[None, :]
+
+
+def small(opaque: tuple[NDArray[np.float64], ...] = (), **changes: object) -> Pupil:
+    return Pupil((circle(6.0),), tuple((corners,) for corners in opaque), **changes)  # type: ignore[arg-type]
+
+
+POLYGON = np.array([(1.0, 0.5), (5.0, 1.0), (2.0, 2.5)])
+PICTURE = np.ones((5, 5))
+PICTURE[3, 0] = 0
+
+
+@pytest.mark.parametrize(
+    ("pupil", "symmetry"),
+    [
+        (small(), "mirror and transpose"),
+        (small((bar(-7, 7, 1.0, 0.0),)), "mirror"),  # both axes
+        (small((bar(0, 7, 1.0, 0.0),)), "mirror"),  # y alone
+        (small((bar(0, 7, 1.0, 90.0),)), "mirror"),  # x alone
+        (small((bar(0, 7, 1.0, 30.0),)), "none"),
+        (small((bar(0, 7, 1.0, 45.0),)), "none"),  # a diagonal alone
+        (small((POLYGON,)), "none"),
+        (small((POLYGON - 4.0, POLYGON)), "none"),
+        (small(picture=MaskPicture(PICTURE, 14.0)), "none"),
+    ],
+)
+def test_a_small_pupil_equals_the_direct_sum(pupil: Pupil, symmetry: str) -> None:
+    found = far(pupil, 32)
+    assert found.symmetry == symmetry
+    wanted = directly(pupil, 32, found.samples, found.open_area_mm2)
+    np.testing.assert_allclose(unwindowed(found.pattern), wanted, rtol=2e-5, atol=1e-9)
+
+
+def test_a_bar_sends_its_light_across_itself() -> None:
+    """Along 30 degrees from +x towards +y; its light goes to 120 degrees."""
+    pattern = far(small((bar(-7, 7, 0.5, 30.0),)), 128).pattern
+    y, x = np.indices(pattern.shape) - 64
+    towards = {
+        angle: pattern[
+            (np.hypot(x, y) > 20) & (abs(np.angle(np.exp(1j * (np.arctan2(y, x) - np.radians(angle))))) < 0.1)
+        ].sum()
+        for angle in (30, 60, 120, 150)
+    }
+    assert towards[120] > 5 * max(towards[30], towards[60], towards[150])
+
+
+def test_threads_change_nothing() -> None:
+    one, three = (far(small((POLYGON,)), 32, threads=threads).pattern for threads in (1, 3))
+    np.testing.assert_array_equal(one, three)
+
+
+@pytest.mark.parametrize("pupil", [small(), small((POLYGON,))], ids=["disc", "polygon"])
+def test_energy_is_kept(pupil: Pupil) -> None:
+    """Over a whole period the pattern holds the mask's squares (Parseval), to the rounding of float32."""
+    found = far(pupil, 256)
+    grid = MaskGrid(pupil, LAMBDA_F_OVER_P_MM / 256)
+    c = grid.rows(0, grid.cells).astype(np.float64)
+    assert unwindowed(found.pattern).sum() == pytest.approx((c**2).sum() / c.sum(), rel=2e-7)
+    assert found.open_area_mm2 == pytest.approx(c.sum() * grid.cell_mm**2, rel=1e-5)
+
+
+def test_samples_follow_the_pupils_width() -> None:
+    assert samples_per_pixel(47.4, **OPTICS) == samples_per_pixel(3.0, **OPTICS) == 14
+    assert samples_per_pixel(10 * LAMBDA_F_OVER_P_MM, **OPTICS) == 20
+    assert samples_per_pixel(10.01 * LAMBDA_F_OVER_P_MM, **OPTICS) == 22
+
+
+def test_a_longer_period_takes_wrapped_light_out() -> None:
+    exact = airy_kernel(**OPTICS, diameter_mm=12.0, size=64)
+    wrapped, longer = (far(small(), 64, period=period).pattern for period in (64, 256))
+    outside = squared_radii(exact.shape) > 5**2  # further in, summing samples is what differs
+    errors = [np.abs(found - exact)[outside].sum() for found in (wrapped, longer)]
+    assert longer.shape == (64, 64)
+    assert errors[1] < 0.1 * errors[0]
+    assert 1 - longer.sum() == pytest.approx(1 - exact.sum(), rel=0.05)
+
+
+def test_the_open_disc_is_the_airy_pattern() -> None:
+    """Summed samples against the integral: 4e-4 of the light at most in a pixel."""
+    pupil = entrance_pupil(HRI.aperture)
+    found = far(pupil, 128, period=512).pattern
+    exact = airy_kernel(**OPTICS, diameter_mm=47.4, size=128)
+    assert np.abs(found - exact).max() < 4e-4
+    near = squared_radii(exact.shape) < 30**2
+    np.testing.assert_allclose(found[near], exact[near], rtol=0.06)
+    assert found.sum() == pytest.approx(exact.sum(), abs=2e-5)
+
+
+def test_an_airy_pattern_meets_its_formula() -> None:
+    """Dark at 1.22 lambda f / D, 83.8 % within; pixels against a fine sum of (2 J1(v) / v)^2."""
+    assert first_dark_ring_v() / np.pi == pytest.approx(1.2197, abs=1e-4)
+    assert 1 - light_beyond(np.array([first_dark_ring_v()]))[0] == pytest.approx(0.8378, abs=1e-4)
+    fine, size = 100, 16
+    q = (np.arange(size * fine) + 0.5) / fine - 0.5 - size // 2
+    v_per_px = np.pi * 5.0 / LAMBDA_F_OVER_P_MM
+    v = v_per_px * np.hypot(q[:, None], q[None, :])
+    intensity = v_per_px**2 / (4 * np.pi) * (2 * j1(v) / v) ** 2
+    wanted = intensity.reshape(size, fine, size, fine).mean(axis=(1, 3))
+    found = airy_kernel(**OPTICS, diameter_mm=5.0, size=size)
+    np.testing.assert_allclose(found, wanted, rtol=3e-4)
+
+
+def test_a_ring_aperture_loses_the_light_of_its_hole_and_spreads_it() -> None:
+    v = np.arange(0, 60, 0.02)
+    np.testing.assert_allclose(light_beyond(v, 1e-9), j0(v) ** 2 + j1(v) ** 2, atol=1e-7)
+    ring = Aperture(diameter_mm=12.0, obscuration_diameter_mm=5.0)
+    found = far(entrance_pupil(ring), 64, period=256).pattern
+    exact = airy_kernel(**OPTICS, diameter_mm=12.0, obscuration_diameter_mm=5.0, size=64)
+    assert np.abs(found - exact).max() < 1e-3
+    assert (
+        cumulative_curve(exact, [0.5])[0]
+        > cumulative_curve(airy_kernel(**OPTICS, diameter_mm=12.0, size=64), [0.5])[0]
+    )
+
+
+def test_a_square_mesh_is_the_analytic_series() -> None:
+    """N windows in a square pupil: the published formula, along an axis and off it."""
+    windows, pitch_mm = 11, 1.27
+    side_mm = windows * pitch_mm
+    mesh = Mesh(name="m", place="entrance", pitch_um=1270.0, wire_um=40.0, windows=windows)
+    pupil = Pupil((bar(-side_mm / 2, side_mm / 2, side_mm, 0.0),), meshes=(mesh,))
+    found = far(pupil, 128, period=1024).pattern
+    line = mesh_line(
+        wavelength_angstrom=174.0,
+        distance_mm=4187.0,
+        pitch_um=1270.0,
+        wire_um=40.0,
+        windows=windows,
+        pixel_pitch_um=10.0,
+        size=4096,
+    )[2048 - 64 : 2048 + 64]
+    exact = np.outer(line, line)
+    assert np.abs(found - exact).max() < 1e-3
+    blocks = [part.reshape(16, 8, 16, 8).sum(axis=(1, 3)) for part in (found, exact)]
+    assert np.abs(blocks[0] - blocks[1]).max() < 5e-4
+    assert found.sum() == pytest.approx(exact.sum(), abs=1e-3)
+
+
+def test_orders_of_the_entrance_mesh_are_5_7365_px_apart() -> None:
+    """On pixels of 1 um: tops of parabolas through the logarithm. Wings of the centre move the first two."""
+    meshes = [mesh for mesh in HRI.meshes if mesh.place == "entrance"]
+    fine, size = 10, 1024
+    pattern = far(entrance_pupil(HRI.aperture, meshes=meshes), size, pixel_pitch_um=10 / fine).pattern
+    row = np.log(pattern[size // 2])
+    spacings = []
+    for order in range(3, 9):
+        near = size // 2 + round(order * 5.7365 * fine)
+        top = near - 2 + int(row[near - 2 : near + 3].argmax())
+        low, middle, high = row[top - 1 : top + 2]
+        place = top - size // 2 + 0.5 * (low - high) / (low - 2 * middle + high)
+        spacings.append(place / fine / order)
+    assert np.mean(spacings) == pytest.approx(5.7365, abs=0.001)
+
+
+def test_progress_is_told_and_ends_the_work() -> None:
+    told: list[tuple[int, int]] = []
+
+    def stop(done: int, of: int) -> None:
+        told.append((done, of))
+        if done == 3:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        far(small((POLYGON,)), 32, progress=stop)
+    assert [done for done, _ in told] == [1, 2, 3]
+    assert len({of for _, of in told}) == 1
+
+
+def test_mount_and_polygons_come_from_the_instrument_file() -> None:
+    mount = Mount(
+        basis="assumed",
+        rays=(Rays(count=1, width_mm=1.0, first_angle_deg=30.0),),
+        polygons=(Polygon(corners_mm=tuple(map(tuple, POLYGON))),),
+    )
+    described = far(entrance_pupil(Aperture(diameter_mm=12.0), mount=mount), 32).pattern
+    np.testing.assert_allclose(described, far(small((bar(0, 7, 1.0, 30.0), POLYGON)), 32).pattern, rtol=1e-4)

@@ -1,0 +1,165 @@
+"""Masks have the area and the place of what is described."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psfcore.diffraction.pupil import MaskGrid, MaskPicture, Pupil, bar, circle, entrance_pupil
+from psfcore.errors import DataError
+from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount, Polygon, Rays, Ring
+
+CELL_MM = 0.05
+APERTURE = Aperture(diameter_mm=10.0)
+DISC_MM2 = math.pi * 25
+
+
+def mesh(**changes: object) -> Mesh:
+    known = {"name": "m", "place": "entrance", "pitch_um": 1000.0, "wire_um": 70.0, "windows": 9}
+    return Mesh(**(known | changes))  # type: ignore[arg-type]
+
+
+def mask(pupil: Pupil, cell_mm: float = CELL_MM) -> NDArray[np.float64]:
+    grid = MaskGrid(pupil, cell_mm)
+    whole = grid.rows(0, grid.cells).astype(np.float64)
+    assert whole.min() >= 0
+    assert whole.max() <= 1
+    return whole
+
+
+def area_mm2(pupil: Pupil, cell_mm: float = CELL_MM) -> float:
+    return float(mask(pupil, cell_mm).sum()) * cell_mm**2
+
+
+def by_points(pupil_inside: object, cells: int, cell_mm: float, points: int = 30) -> NDArray[np.float64]:
+    """Reference: share of points x points places in each cell at which a function of (x, y) is true."""
+    fine = (np.arange(cells * points) + 0.5) / points - cells / 2
+    x, y = np.meshgrid(fine * cell_mm, fine * cell_mm)
+    inside = np.asarray(pupil_inside(x, y), dtype=np.float64)  # type: ignore[operator]
+    return inside.reshape(cells, points, cells, points).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("cell_mm", [0.05, 0.0371, 0.3])
+def test_a_disc_and_a_ring_have_their_area(cell_mm: float) -> None:
+    assert area_mm2(entrance_pupil(APERTURE), cell_mm) == pytest.approx(DISC_MM2, rel=1e-6)
+    ring = Aperture(diameter_mm=10.0, obscuration_diameter_mm=4.0)
+    assert area_mm2(entrance_pupil(ring), cell_mm) == pytest.approx(DISC_MM2 * (1 - 0.16), rel=1e-6)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 17.0, 45.0, 90.0, 133.0])
+def test_a_bar_takes_its_area(angle_deg: float) -> None:
+    square = Pupil((bar(-5, 5, 10, 0.0),), ((bar(-3, 2, 0.8, angle_deg),),))
+    assert area_mm2(square) == pytest.approx(100 - 4.0, rel=1e-6)
+
+
+def test_rings_and_hub_take_their_area() -> None:
+    mount = Mount(basis="assumed", rings=(Ring(radius_mm=3.0, width_mm=0.4),), hub_diameter_mm=2.0)
+    wanted = DISC_MM2 - 2 * math.pi * 3.0 * 0.4 - math.pi
+    assert area_mm2(entrance_pupil(APERTURE, mount=mount)) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_the_open_area_with_wires_is_right_to_1e_5() -> None:
+    """Full windows of a square opening, cells that fit neither pitch nor wire."""
+    square = Pupil((bar(-4.5, 4.5, 9.0, 0.0),), meshes=(mesh(),))
+    assert area_mm2(square, 0.0337) == pytest.approx(81 * 0.93**2, rel=1e-5)
+
+
+def test_wires_lie_between_windows_and_on_the_axis_for_an_even_number() -> None:
+    odd, even = (mask(Pupil((bar(-4, 4, 8.0, 0.0),), meshes=(mesh(windows=n),))) for n in (9, 8))
+    centre = len(odd) // 2
+    assert odd[centre - 9 : centre + 9, centre - 9 : centre + 9].min() == 1
+    assert even[centre, centre + 5] == pytest.approx(0.3, abs=1e-6)  # 35 of 50 um are wire
+    np.testing.assert_allclose(odd, odd[::-1], atol=1e-6)
+    np.testing.assert_allclose(odd, odd.T, atol=1e-6)
+
+
+def test_a_tilted_mesh_is_the_straight_one_turned() -> None:
+    disc = (circle(4.0),)
+    straight, quarter = (mask(Pupil(disc, meshes=(mesh(angle_deg=a),))) for a in (0.0, 90.0))
+    np.testing.assert_allclose(straight, quarter)
+    # 0.001 degrees moves a wire's end by 0.07 um, 0.0014 of a cell; crossings differ where products meet.
+    tilted = mask(Pupil(disc, meshes=(mesh(angle_deg=0.001),)))
+    np.testing.assert_allclose(tilted, straight, atol=0.005)
+    turned = mask(Pupil(disc, meshes=(mesh(angle_deg=30.0),)))
+    assert turned.sum() == pytest.approx(straight.sum(), rel=2e-3)
+    assert abs(turned - straight).max() > 0.9
+
+
+def test_a_mask_equals_counting_points_in_each_cell() -> None:
+    """Off-centre, without symmetry, in all its parts."""
+    corners = ((0.3, -2.0), (2.9, -1.1), (1.2, 0.7))
+    mount = Mount(
+        basis="drawing",
+        rays=(Rays(count=1, width_mm=0.5, first_angle_deg=110.0),),
+        polygons=(Polygon(corners_mm=corners),),
+    )
+
+    def inside(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+        angle = math.radians(110.0)
+        along = x * math.cos(angle) + y * math.sin(angle)
+        across = -x * math.sin(angle) + y * math.cos(angle)
+        on_bar = (along > 0) & (abs(across) < 0.25)
+        sides = [
+            (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > 0
+            for (x0, y0), (x1, y1) in zip(corners, corners[1:] + corners[:1], strict=True)
+        ]
+        return (np.hypot(x, y) < 5) & ~on_bar & ~np.logical_and.reduce(sides)
+
+    found = mask(entrance_pupil(APERTURE, mount=mount), 0.1)
+    wanted = by_points(inside, len(found), 0.1)
+    # 900 points tell a cell's share to 0.03; where two edges meet in a cell shares are multiplied.
+    assert np.abs(found - wanted).mean() < 2e-4
+    assert np.quantile(np.abs(found - wanted), 0.999) < 0.05
+    assert found.sum() == pytest.approx(wanted.sum(), rel=2e-5)
+
+
+def test_strips_are_parts_of_the_whole() -> None:
+    grid = MaskGrid(entrance_pupil(APERTURE, meshes=[mesh(angle_deg=20.0)]), CELL_MM)
+    whole = grid.rows(0, grid.cells)
+    np.testing.assert_array_equal(np.concatenate([grid.rows(0, 77), grid.rows(77, grid.cells)]), whole)
+    out = np.full((80, grid.cells), np.nan, dtype=np.float32)
+    np.testing.assert_array_equal(grid.rows(40, 90, out=out), whole[40:90])
+
+
+@pytest.mark.parametrize("pixels", [37, 200, 1000])
+def test_a_mask_image_keeps_its_area_and_place(pixels: int) -> None:
+    """A quarter in the upper left (y high, x low) is dark; pixels wider and narrower than cells."""
+    share = np.ones((pixels, pixels))
+    share[pixels // 2 :, : pixels // 2] = 0
+    square = Pupil((bar(-5, 5, 10.0, 0.0),), picture=MaskPicture(share, 10.0))
+    found = mask(square)
+    centre = len(found) // 2
+    assert found[centre + 40, centre - 40] == 0
+    assert found[centre - 40, centre - 40] == found[centre + 40, centre + 40] == pytest.approx(1)
+    assert found.sum() * CELL_MM**2 == pytest.approx(100 * share.mean(), rel=1e-5)
+
+
+def image_mount(width_mm: float = 10.0) -> Mount:
+    return Mount(basis="drawing", mask_image=MaskImage(file="mask.png", width_mm=width_mm))
+
+
+@pytest.mark.parametrize(
+    ("mount", "image", "key"),
+    [
+        (image_mount(), None, "mask_image"),
+        (image_mount(), np.ones((4, 5)), "mask_image"),
+        (image_mount(), np.ones(16), "mask_image"),
+        (image_mount(), np.ones((3, 3, 3)), "mask_image"),
+        (image_mount(), np.zeros((4, 4)), "mask_image"),
+        (image_mount(), np.full((4, 4), np.nan), "mask_image"),
+        (image_mount(9.0), np.ones((4, 4)), "mask_image.width_mm"),
+        (Mount(basis="assumed", rings=(Ring(radius_mm=4.9, width_mm=0.4),)), None, "rings.0"),
+        (Mount(basis="assumed", rings=(Ring(radius_mm=0.1, width_mm=0.4),)), None, "rings.0"),
+        (Mount(basis="assumed", hub_diameter_mm=11.0), None, "hub_diameter_mm"),
+        (Mount(basis="assumed", rays=(Rays(count=2, width_mm=10.0),)), None, "rays.0.width_mm"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_its_key(
+    mount: Mount, image: NDArray[np.float64] | None, key: str
+) -> None:
+    with pytest.raises(DataError, match=rf"mount\.{key}: expected") as caught:
+        entrance_pupil(APERTURE, mount=mount, mount_image=image)
+    assert caught.value.code == "bad-mount"
