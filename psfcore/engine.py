@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fft_kernels import LANES, Plan, forward, good_length, inverse, make_plan
-from psfcore.fourier import needed_kernel, real_transform
+from psfcore.fourier import needed_kernel
 
 BLOCK_ROWS = 2 * LANES
 SYMMETRIC_TO = 1e-7  # of the sum: below float32's own rounding of the transfer function
@@ -52,32 +52,45 @@ class Engine:
     """Convolution with one PSF, cut to one field, and its adjoint, in float32.
 
     psf_kernel: weights [y, x], centre at [n // 2, n // 2]; any shape, even or odd. field_shape: (ny, nx).
-    threads: how many work at once; the result is the same for any number.
+    span: (ny, nx), pixels less than this apart are joined as the PSF says; none: all, the field's shape. Where the
+    field holds a margin, what is farther apart lies in opposite margins: there light may wrap, which keeps
+    the transforms short. threads: how many work at once; the result is the same for any number.
     Raises DataError "field-shape" when an array has another shape.
     """
 
     def __init__(
-        self, psf_kernel: NDArray[np.floating], field_shape: tuple[int, int], *, threads: int = 1
+        self,
+        psf_kernel: NDArray[np.floating],
+        field_shape: tuple[int, int],
+        *,
+        span: tuple[int, int] | None = None,
+        threads: int = 1,
     ) -> None:
         self.field_shape = field_shape
         self.threads = threads
-        kernel, first = needed_kernel(psf_kernel, field_shape)
+        span = span or field_shape
+        kernel, first = needed_kernel(psf_kernel, span)
         ly, lx = (
-            good_length(size + max(-low, low + count - 1, 0))
-            for size, low, count in zip(field_shape, first, kernel.shape, strict=True)
+            good_length(max(size, joined + max(-low, low + count - 1, 0)))
+            for size, joined, low, count in zip(field_shape, span, first, kernel.shape, strict=True)
         )
         self.row_plan, self.column_plan = make_plan(lx), make_plan(ly)
         ny, nx = field_shape
         self.row_blocks = -(-ny // BLOCK_ROWS)
         self.column_blocks = -(-(lx // 2 + 1) // LANES)
         self.lanes_shape = (self.row_blocks, nx, 2, LANES)
-        self.transfer, self.symmetric = self._transfer_function(kernel, first)
         self._spectrum = np.zeros((self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES), np.float32)
         self._pool = ThreadPoolExecutor(threads)
         self._scratch: queue.SimpleQueue[Scratch] = queue.SimpleQueue()
         for _ in range(threads):
             buffer = np.zeros(max(lx, ly) * 2 * LANES, np.float32)
             self._scratch.put(Scratch(buffer, np.zeros((LANES, 4, LANES), np.float32)))
+        self.transfer = self._transfer_function(kernel, first)
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the PSF is symmetric about its centre: its transfer function is real."""
+        return self.transfer.shape[2] == 1
 
     # Whole operators -------------------------------------------------------------------------------
 
@@ -134,12 +147,15 @@ class Engine:
 
     def columns(self, *, adjoint: bool) -> None:
         """Convolve the spectrum's columns: there, times the transfer function (conjugate: adjoint), and back."""
-        plan = self.column_plan
-        kernel = _columns_real if self.symmetric else _columns_complex
-        sign = np.float32(-1.0 if adjoint else 1.0)
+        self.multiply_columns(self.transfer, conjugate=adjoint)
+
+    def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
+        """The spectrum's columns there, times a filter laid out as the transfer function, and back."""
+        kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
+        sign = np.float32(-1.0 if conjugate else 1.0)
 
         def work(start: int, stop: int, scratch: Scratch) -> None:
-            kernel(self._spectrum, self.transfer, sign, scratch.buffer, start, stop, *_numbers(plan))
+            kernel(self._spectrum, transfer, sign, scratch.buffer, start, stop, *_numbers(self.column_plan))
 
         self.run(work, self.column_blocks)
 
@@ -175,21 +191,41 @@ class Engine:
 
         return list(self._pool.map(one, range(chunks)))
 
-    def _transfer_function(self, kernel: NDArray[np.floating], first: tuple[int, int]) -> tuple[Single, bool]:
-        """The PSF's transform over the transforms' lengths, in the order of the column kernels."""
+    @property
+    def transfer_scale(self) -> int:
+        """What the transfer function is divided by, so that a transform there and back needs no scaling."""
+        return self.row_plan.length * self.column_plan.length
+
+    def _transfer_function(self, kernel: NDArray[np.floating], first: tuple[int, int]) -> Single:
+        """The PSF's transform over the transforms' lengths: [block of columns][row][re, im][lane].
+
+        Without the imaginary part where the PSF is symmetric.
+        """
         ly, lx = self.column_plan.length, self.row_plan.length
-        corner = np.zeros((ly, lx), np.float32)
-        corner[: kernel.shape[0], : kernel.shape[1]] = kernel
-        transfer = real_transform(np.roll(corner, first, axis=(0, 1)), threads=self.threads)
-        transfer = transfer[self.column_plan.frequency] / np.float32(ly * lx)
-        symmetric = float(np.abs(transfer.imag).max()) * ly * lx < SYMMETRIC_TO * float(kernel.sum())
-        planes = [transfer.real] if symmetric else [transfer.real, transfer.imag]
-        lanes = np.zeros((self.column_blocks, ly, len(planes), LANES), np.float32)
-        for block in range(self.column_blocks):
-            for part, plane in enumerate(planes):
-                columns = plane[:, block * LANES : (block + 1) * LANES]
-                lanes[block, :, part, : columns.shape[1]] = columns
-        return lanes, symmetric
+        corner = np.zeros((-(-ly // BLOCK_ROWS) * BLOCK_ROWS, lx), np.float32)
+        corner[: kernel.shape[0], : kernel.shape[1]] = kernel / self.transfer_scale
+        corner[:ly] = np.roll(corner[:ly], first, axis=(0, 1))
+        blocks = corner.shape[0] // BLOCK_ROWS
+        transfer = np.zeros((self.column_blocks, corner.shape[0], 2, LANES), np.float32)
+        rows = corner.reshape(blocks, 2, LANES, lx)
+
+        def along_rows(start: int, stop: int, scratch: Scratch) -> None:
+            lanes = np.ascontiguousarray(rows[start:stop].transpose(0, 3, 1, 2))
+            _rows_forward(
+                lanes, transfer[:, start * BLOCK_ROWS : stop * BLOCK_ROWS], scratch.buffer, scratch.corner,
+                0, stop - start, *self.row_numbers,
+            )  # fmt: skip
+
+        def along_columns(start: int, stop: int, _scratch: Scratch) -> None:
+            for block in range(start, stop):
+                forward(transfer[block, :ly].reshape(-1), *_numbers(self.column_plan))
+
+        self.run(along_rows, blocks)
+        self.run(along_columns, self.column_blocks)
+        transfer = transfer[:, :ly]
+        odd_part = float(np.abs(transfer[:, :, 1]).max()) * self.transfer_scale
+        symmetric = odd_part < SYMMETRIC_TO * float(kernel.sum())
+        return np.ascontiguousarray(transfer[:, :, :1] if symmetric else transfer)
 
 
 def _numbers(plan: Plan) -> tuple[Any, ...]:

@@ -10,6 +10,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from enum import IntFlag
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,8 @@ Cards = Mapping[str, tuple[CardValue, str]]
 
 _CHECKSUM_COMMENT = "computed when the file was written"
 _SATURATION_KEYS = ("SATURATE", "DATASAT")
+_TABLE_FORMAT = {np.dtype(np.uint8): "B", np.dtype(np.uint16): "I", np.dtype(np.float32): "E"}
+_BITS_STORED = {1: np.uint8, 2: np.uint16}
 _FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 15, 16))
 # Cards that describe how the input's pixels were stored, or figures of pixels that are no longer these.
 _STORAGE_CARD = re.compile(
@@ -158,11 +161,16 @@ def write_image(
     cards: Cards,
     history: Sequence[str] = (),
     mask: NDArray[np.uint8] | None = None,
+    planes: Mapping[str, NDArray[Any]] | None = None,
+    plane_bits: Mapping[str, type[IntFlag]] | None = None,
 ) -> None:
-    """Write a product: float32 pixels under the input's header and WCS, `cards`, `history`, and the mask.
+    """Write a product: float32 pixels under the input's header and WCS, `cards`, `history`, mask and planes.
 
     mask: plane [y, x] to store instead of image.mask. Storage cards of the input are dropped and DATAMIN,
     DATAMAX and DATAMEAN are computed anew (median, rms and percentiles are dropped).
+    planes: further planes [y, x] by name (ERROR, PSF_ERROR, QUALITY): bits are kept as uint8 or uint16,
+    numbers as float32 in the image's unit. plane_bits: what the bits of a plane mean.
+    Raises DataError "bad-plane" for another shape, type or a name that is taken.
     """
     header = _kept_header(image.header)
     pixels = image.pixels.astype(np.float32)
@@ -176,7 +184,22 @@ def write_image(
     for line in history:
         header.add_history(_ascii(line))
     plane = image.mask if mask is None else np.ascontiguousarray(mask, dtype=np.uint8)
-    _write(path, [fits.PrimaryHDU(pixels, header), _mask_hdu(plane)])
+    hdus = [fits.PrimaryHDU(pixels, header), _plane_hdu("MASK", plane, bits=MaskBit, bit_key="MBIT")]
+    for name, extra in (planes or {}).items():
+        _check_plane(name, extra, pixels.shape, taken=[hdu.name for hdu in hdus])
+        hdus.append(_plane_hdu(name, extra, unit=image.unit, bits=(plane_bits or {}).get(name)))
+    _write(path, hdus)
+
+
+def read_planes(path: str | Path) -> dict[str, NDArray[Any]]:
+    """The planes [y, x] of a product by name, the mask not among them; floats are float32."""
+    planes: dict[str, NDArray[Any]] = {}
+    with fits.open(path, memmap=False) as hdus:
+        for hdu in hdus[1:]:
+            if isinstance(hdu, fits.BinTableHDU) and hdu.header.get("PLANE") is True:
+                data = np.asarray(hdu.data[hdu.name][0])
+                planes[hdu.name] = data.astype(data.dtype.newbyteorder("="))
+    return planes
 
 
 def read_mask(path: str | Path) -> NDArray[np.uint8] | None:
@@ -187,15 +210,43 @@ def read_mask(path: str | Path) -> NDArray[np.uint8] | None:
         return np.array(hdus["MASK"].data["MASK"][0], dtype=np.uint8)
 
 
-def _mask_hdu(mask: NDArray[np.uint8]) -> fits.BinTableHDU:
+def _plane_hdu(
+    name: str,
+    plane: NDArray[Any],
+    *,
+    unit: str | None = None,
+    bits: type[IntFlag] | None = None,
+    bit_key: str = "QBIT",
+) -> fits.BinTableHDU:
     # sunpy.map.Map makes a map of every HDU whose data has two axes or more, so an image extension would
     # turn the product into a list of maps. A table of one row has one axis to it, and TDIM keeps the shape.
-    ny, nx = mask.shape
-    column = fits.Column(name="MASK", format=f"{mask.size}B", dim=f"({nx},{ny})", array=mask[None])
-    hdu = fits.BinTableHDU.from_columns([column], name="MASK")
-    for bit in MaskBit:
-        hdu.header[f"MBIT{bit.bit_length() - 1}"] = (bit.name or "", f"meaning of value {int(bit)}")
+    ny, nx = plane.shape
+    is_bits = plane.dtype.kind in "ub"
+    stored = plane.astype(_BITS_STORED.get(plane.dtype.itemsize, np.uint16) if is_bits else np.float32)
+    column = fits.Column(
+        name=name,
+        format=f"{plane.size}{_TABLE_FORMAT[stored.dtype]}",
+        dim=f"({nx},{ny})",
+        unit=None if is_bits or unit is None else _ascii(unit),
+        bzero=2**15 if stored.dtype == np.uint16 else None,
+        array=stored[None],
+    )
+    hdu = fits.BinTableHDU.from_columns([column], name=name)
+    if name != "MASK":
+        hdu.header["PLANE"] = (True, "one value a pixel of the image")
+    for bit in bits or ():
+        hdu.header[f"{bit_key}{bit.bit_length() - 1}"] = (bit.name or "", f"meaning of value {int(bit)}")
     return hdu
+
+
+def _check_plane(name: str, plane: NDArray[Any], shape: tuple[int, ...], *, taken: Sequence[str]) -> None:
+    if not re.fullmatch(r"[A-Z][A-Z0-9_]{0,31}", name) or name in taken:
+        message = f"expected a name in capitals that is not one of {', '.join(taken)}; got {name!r:.40}"
+        raise DataError("bad-plane", message)
+    if plane.shape != shape:
+        raise DataError("bad-plane", f"expected {name} to have {shape} pixels; got {plane.shape}")
+    if plane.dtype.kind not in "ubf" or (plane.dtype.kind == "u" and plane.dtype.itemsize > 2):
+        raise DataError("bad-plane", f"expected {name} as floats, uint8 or uint16; got {plane.dtype}")
 
 
 def _kept_header(source: fits.Header) -> fits.Header:

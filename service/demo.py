@@ -13,10 +13,6 @@ from service.client import Heliopsf, Progress, percent
 def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
     """Serve on a free port, upload, deconvolve, download, stop; returns what to tell the user."""
     output.mkdir(parents=True, exist_ok=True)
-    if image is None:
-        image = output / "simulated.fits"
-        _simulate(image)
-    product_file, picture = output / f"{image.stem}-deconvolved.fits", output / f"{image.stem}-preview.png"
     with (output / "server.log").open("w") as log:
         server = subprocess.Popen(
             [sys.executable, "-m", "service.cli", "serve", "--port", "0", "--data", str(output / "data")],
@@ -28,6 +24,10 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
         )
         try:
             with Heliopsf(_address(server, output)) as service:
+                if image is None:
+                    image = _simulated(service, output, progress)
+                product_file = output / f"{image.stem}-deconvolved.fits"
+                picture = output / f"{image.stem}-preview.png"
                 product = service.deconvolve(image, product_file, preview=picture, progress=progress)
         finally:
             server.terminate()
@@ -55,10 +55,14 @@ def _address(server: subprocess.Popen[str], output: Path) -> str:
     return address
 
 
-def _simulate(path: Path) -> None:
+def _simulated(service: Heliopsf, output: Path, progress: Progress) -> Path:
+    """An image seen through the very PSF that the service then takes away again."""
     # Imported here, so that a demo of an image of your own does not load it.
-    from psfcore.build import build_psf
-    from psfcore.instruments.model import load_instrument
+    from psfcore.fits_io import read_psf
+    from psfcore.header import FitsLimits
     from psfcore.simulate.observe import demo_image
 
-    demo_image(path, build_psf(load_instrument("hri_euv")))
+    psf_file, image = output / "psf.fits", output / "simulated.fits"
+    service.build_psf("hri_euv", psf_file, preview=output / "psf.png", progress=progress)
+    demo_image(image, read_psf(psf_file, FitsLimits(max_pixels=2048 * 2048)))
+    return image

@@ -12,6 +12,23 @@ from astropy.io import fits
 REPOSITORY = Path(__file__).parents[1]
 
 
+# An instrument so small that its PSF is built in a second.
+SMALL_INSTRUMENT = """
+name = "small"
+version = "1.0.0"
+status = "draft"
+wavelength_angstrom = 171.0
+focal_length_mm = 1000.0
+[aperture]
+diameter_mm = 4.0
+[detector]
+pixel_pitch_um = 10.0
+pixels = 512
+readout_pixels = 512
+plate_scale_arcsec = 2.0
+"""
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of real and practice data; the test is skipped where it is missing."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib.image
@@ -40,7 +41,7 @@ def test_the_flown_mesh_has_the_published_spacing_and_its_geometric_share(study:
 def test_a_larger_pitch_diffracts_less_and_less_far_but_its_orders_run_together(study: DesignStudy) -> None:
     for wire_um in (20.0, 40.0):
         rows = by_pitch(study, wire_um)
-        for fine, coarse in zip(rows, rows[1:], strict=False):
+        for fine, coarse in pairwise(rows):
             assert fine.spacing_px > coarse.spacing_px
             assert fine.diffracted_pct > coarse.diffracted_pct
             assert fine.beyond_10_px_pct > coarse.beyond_10_px_pct
@@ -84,6 +85,6 @@ def test_it_is_quick_and_drawn_and_json(study: DesignStudy, tmp_path: Path) -> N
     [([], [40.0], 5), ([100.0], [100.0], 5), ([100.0], [-1.0], 5), ([float("inf")], [40.0], 5), ([100.0], [4.0], 0)],
 )  # fmt: skip
 def test_meshes_that_cannot_be_are_refused(pitches: list[float], wires: list[float], flare_px: int) -> None:
-    with pytest.raises(DataError, match="expected .*; got") as caught:
+    with pytest.raises(DataError, match=r"expected .*; got") as caught:
         design_study(load_instrument("hri_euv"), pitches, wires, flare_px=flare_px)
     assert caught.value.code == "bad-design"

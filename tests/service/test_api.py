@@ -11,7 +11,7 @@ import numpy as np
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
-from tests.conftest import write_image
+from tests.conftest import SMALL_INSTRUMENT, write_image
 from tests.service.conftest import upload
 from workers.settings import Settings
 
@@ -80,12 +80,12 @@ def test_downloads_answer_to_etags(api: TestClient, psf_file: Path) -> None:
 
 
 def test_a_psf_is_built_and_listed(api: TestClient, run_jobs: Callable[[], None]) -> None:
-    body = {"kind": "psf-build", "parameters": {"instrument": "hri_euv", "size": 128}}
+    body = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
     job = api.post("/v1/jobs", json=body).json()
     run_jobs()
     psf = api.get(api.get(f"/v1/jobs/{job['id']}").json()["result"]).json()
     assert psf["status"] == "draft" and psf["details"]["shape"] == [128, 128]
-    listed = api.get("/v1/psfs", params={"instrument": "hri_euv"}).json()["items"]
+    listed = api.get("/v1/psfs", params={"instrument": "small"}).json()["items"]
     assert [item["id"] for item in listed] == [psf["id"]]
     assert api.get("/v1/psfs", params={"instrument": "aia"}).json()["items"] == []
     assert api.get(psf["preview"]).content.startswith(b"\x89PNG")
@@ -162,23 +162,14 @@ def test_a_database_that_is_away_is_503(api: TestClient, settings: Settings) -> 
     assert answer.json()["type"] == "urn:heliopsf:database-away"
 
 
-INSTRUMENT = """
-name = "mine"
-version = "1.0.0"
-status = "draft"
-wavelength_angstrom = 171.0
-focal_length_mm = 1000.0
-[aperture]
-diameter_mm = 20.0
+MASKED_INSTRUMENT = (
+    SMALL_INSTRUMENT
+    + """
 [mount]
 basis = "drawing"
-mask_image = { file = "mask.png", width_mm = 20.0 }
-[detector]
-pixel_pitch_um = 10.0
-pixels = 512
-readout_pixels = 512
-plate_scale_arcsec = 2.0
+mask_image = { file = "mask.png", width_mm = 4.0 }
 """
+)
 
 
 def test_a_psf_of_an_instrument_file_and_a_mask_of_the_users(
@@ -187,7 +178,7 @@ def test_a_psf_of_an_instrument_file_and_a_mask_of_the_users(
     y, x = np.indices((64, 64)) - 31.5
     open_ring = ((np.hypot(x, y) < 30) & (np.hypot(x, y) > 12)).astype("f4")
     fits.PrimaryHDU(open_ring).writeto(tmp_path / "mask.fits")
-    parameters = {"instrument_file": INSTRUMENT, "size": 128}
+    parameters = {"instrument_file": MASKED_INSTRUMENT, "size": 128}
     missing = api.post("/v1/jobs", json={"kind": "psf-build", "parameters": parameters}).json()
     parameters["mask_id"] = upload(api, tmp_path / "mask.fits")
     whole = api.post("/v1/jobs", json={"kind": "psf-build", "parameters": parameters}).json()
@@ -195,8 +186,8 @@ def test_a_psf_of_an_instrument_file_and_a_mask_of_the_users(
     error = api.get(f"/v1/jobs/{missing['id']}").json()["error"]
     assert error["code"] == "mask-missing" and "mask.png" in error["message"]
     psf = api.get(api.get(f"/v1/jobs/{whole['id']}").json()["result"]).json()
-    assert psf["name"] == "mine" and psf["details"]["shape"] == [128, 128]
+    assert psf["name"] == "small" and psf["details"]["shape"] == [128, 128]
     assert psf["details"]["provenance"]["parameters"]["mask_id"] == parameters["mask_id"]
     with fits.open(io.BytesIO(api.get(psf["file"]).content)) as hdus:
         text = bytes(np.asarray(hdus["INSTRUMENT"].data["TOML"][0]))
-    assert text.decode() == INSTRUMENT
+    assert text.decode() == MASKED_INSTRUMENT

@@ -10,7 +10,7 @@ from astropy.io import fits
 
 from service.client import ServiceError
 from service.local import LocalService
-from tests.conftest import write_image, write_psf
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from workers import runner, tasks
 from workers.catalogue import Catalogue, ProductRow
 from workers.contract import Phase
@@ -89,8 +89,10 @@ def test_a_psf_that_sums_to_three_is_the_users_error(
 
 
 def test_a_built_psf_carries_where_it_came_from(local: LocalService, tmp_path: Path) -> None:
-    psf = local.build_psf("hri_euv", tmp_path / "psf.fits", size=256, preview=tmp_path / "psf.png")
-    assert psf["status"] == "draft" and psf["instrument"] == "hri_euv"
+    file = tmp_path / "small.toml"
+    file.write_text(SMALL_INSTRUMENT)
+    psf = local.build_psf(file, tmp_path / "psf.fits", size=256, preview=tmp_path / "psf.png")
+    assert psf["status"] == "draft" and psf["instrument"] == "small"
     provenance = psf["details"]["provenance"]
     assert len(provenance["instrument_file_sha256"]) == 64
     assert provenance["software_version"] and provenance["algorithm_version"]

@@ -1,0 +1,178 @@
+"""What a deconvolution may have put into an image that the Sun did not.
+
+Four signs are looked for, each where the image before says that it cannot be real:
+
+    hole        x <= 0, or x < 0.02 y, where y > 5 sigma                                       Eq. (1)
+    overshoot   x > (y + 5 sigma) / h0:  light >= 0 seen through the PSF gives y >= h0 x       Eq. (2)
+    new extreme |x - med x| > 8 sigma_x at an extreme of 3 x 3 px, with |y - med y| < sigma
+                or of the other sign: a point where the image before is smooth                 Eq. (3)
+    ringing     rise after the first dip of the mean profile round bright sources, in percent
+                of the peak, beyond that of the image before                                   Eq. (4)
+
+med is the median of 5 x 5 px. The score is the sum of the four, each over the value from which a person should
+look: below 1 nothing was found. It ranks a catalogue; it is no probability.
+
+sigma comes from the camera's noise where it is known. Else, and for the image after always, from the pixels
+(Immerkaer 1996): the second difference in both directions of white noise has 6 sigma; its median absolute value
+within classes of brightness. Structure enters as if it were noise, so that this is an upper limit.
+
+| symbol | name | unit |
+|---|---|---|
+| y, x | before, after | image unit |
+| h0 | peak_weight: the PSF's central weight | - |
+| sigma, sigma_x | noise before, noise after | image unit |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve, maximum_filter, median_filter, minimum_filter
+
+HOLE_SHARE = 0.02
+SEEN_SIGMA = 5.0
+EXTREME_SIGMA = 8.0
+# Values from which a person should look: per million pixels, and percent of a source's peak.
+ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 5.0}
+RING_RADIUS_PX = 8
+_SOURCES = 100
+_FEWEST_SOURCES = 3
+_BRIGHTNESS_CLASSES = 16
+_SECOND_DIFFERENCE = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+
+Plane = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Artefacts:
+    """suspected: pixels [y, x] with a sign of Eq. (1) to (3). signs: figures by the names of ALARMS.
+
+    ringing_pct is None where fewer than three sources stand out. score: 0 is clean, above 1 is to be looked at.
+    """
+
+    suspected: Flags
+    signs: dict[str, float | None]
+    sources: int
+    score: float
+
+    def as_json(self) -> dict[str, Any]:
+        """All but the plane."""
+        return {"score": self.score, "sources": self.sources, "signs": self.signs, "alarms": ALARMS}
+
+
+def find_artefacts(
+    before: Plane, after: Plane, counted: Flags, peak_weight: float, *, sigma: Plane | None = None
+) -> Artefacts:
+    """Signs of artefacts in `after` [y, x]; pixels that are not counted are passed over.
+
+    sigma: noise of `before` [y, x], in its unit; estimated from the pixels where it is not given.
+    """
+    filled_before, filled_after = _filled(before, counted), _filled(after, counted)
+    noise_before = noise_from_pixels(filled_before, filled_before) if sigma is None else sigma
+    noise_after = noise_from_pixels(filled_after, filled_before)
+    seen = filled_before > SEEN_SIGMA * noise_before
+    holes = counted & seen & (filled_after < HOLE_SHARE * filled_before)  # Eq. (1)
+    limit = (filled_before + SEEN_SIGMA * noise_before) / peak_weight
+    overshoots = counted & (filled_after > limit)  # Eq. (2)
+    extremes = counted & _new_extremes(filled_before, filled_after, noise_before, noise_after)
+    ringing, sources = ringing_pct(filled_before, filled_after, counted)
+    area = max(1, int(np.count_nonzero(counted)))
+    signs: dict[str, float | None] = {
+        "holes_ppm": 1e6 * np.count_nonzero(holes) / area,
+        "overshoots_ppm": 1e6 * np.count_nonzero(overshoots) / area,
+        "new_extremes_ppm": 1e6 * np.count_nonzero(extremes) / area,
+        "ringing_pct": ringing,
+    }
+    score = sum((signs[name] or 0.0) / alarm for name, alarm in ALARMS.items())
+    return Artefacts(
+        suspected=holes | overshoots | extremes, signs=signs, sources=sources, score=float(score)
+    )
+
+
+def noise_from_pixels(pixels: Plane, brightness: Plane) -> Plane:
+    """Upper limit of the noise of `pixels` [y, x] as it goes with `brightness`; finite pixels only."""
+    second = np.abs(convolve(pixels, _SECOND_DIFFERENCE, mode="reflect")) / 6
+    bounds = np.percentile(brightness, np.linspace(0, 100, _BRIGHTNESS_CLASSES + 1))
+    place = np.clip(np.searchsorted(bounds[1:-1], brightness), 0, _BRIGHTNESS_CLASSES - 1)
+    centres, levels = [], []
+    for index in range(_BRIGHTNESS_CLASSES):
+        member = place == index
+        if member.any():
+            centres.append(float(np.median(brightness[member])))
+            levels.append(1.4826 * float(np.median(second[member])))
+    smallest = 1e-6 * float(np.abs(pixels).max()) + np.finfo(float).tiny
+    return np.asarray(np.maximum(np.interp(brightness, centres, levels), smallest))
+
+
+def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
+    """Eq. (4), and the number of sources it was averaged over; None for fewer than three."""
+    sources = _bright_sources(before, counted)
+    if len(sources) < _FEWEST_SOURCES:
+        return None, len(sources)
+    rise_after, rise_before = (_rise(_mean_profile(plane, sources)) for plane in (after, before))
+    return 100 * max(0.0, rise_after - rise_before), len(sources)
+
+
+def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after: Plane) -> Flags:
+    """Eq. (3)."""
+    away_after = after - median_filter(after, 5)
+    away_before = before - median_filter(before, 5)
+    peak = (after == maximum_filter(after, 3)) & (away_after > EXTREME_SIGMA * noise_after)
+    pit = (after == minimum_filter(after, 3)) & (away_after < -EXTREME_SIGMA * noise_after)
+    # A peak has to show before, as far as noise lets it; so has a pit.
+    return np.asarray((peak & (away_before < noise_before)) | (pit & (away_before > -noise_before)))
+
+
+def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
+    """[y, x] of the brightest compact peaks, each alone within the ring's radius; shape (n, 2)."""
+    size = 2 * RING_RADIUS_PX + 1
+    surroundings = median_filter(before, footprint=_ring_footprint())
+    whole = minimum_filter(counted.astype(np.uint8), size, mode="constant", cval=0) > 0
+    peak = whole & (before == maximum_filter(before, size)) & (before > 2 * np.maximum(surroundings, 0))
+    found = np.argwhere(peak)
+    order = np.argsort(-before[peak], kind="stable")
+    return found[order[:_SOURCES]]
+
+
+def _ring_footprint() -> Flags:
+    """Sixteen points on a circle: a median over the whole ring would cost much and say the same."""
+    angle = np.arange(16) * np.pi / 8
+    footprint = np.zeros((2 * RING_RADIUS_PX + 1, 2 * RING_RADIUS_PX + 1), dtype=bool)
+    row = np.rint(RING_RADIUS_PX * (1 + np.sin(angle))).astype(int)
+    footprint[row, np.rint(RING_RADIUS_PX * (1 + np.cos(angle))).astype(int)] = True
+    return footprint
+
+
+def _mean_profile(plane: Plane, sources: NDArray[np.int64]) -> Plane:
+    """Median over sources of the ring means by radius, over the peak, less the outermost ring."""
+    offset = np.arange(-RING_RADIUS_PX, RING_RADIUS_PX + 1)
+    ring = np.rint(np.hypot(*np.meshgrid(offset, offset))).astype(int).ravel()
+    inside = ring <= RING_RADIUS_PX
+    count = np.bincount(ring[inside])
+    profiles = []
+    for y, x in sources:
+        stamp = plane[y + offset[0] : y + offset[-1] + 1, x + offset[0] : x + offset[-1] + 1].ravel()
+        means = np.bincount(ring[inside], weights=stamp[inside]) / count
+        height = means[0] - means[-1]
+        if height > 0:
+            profiles.append((means - means[-1]) / height)
+    return np.median(profiles, axis=0) if profiles else np.zeros(RING_RADIUS_PX + 1)
+
+
+def _rise(profile: Plane) -> float:
+    """How far a profile climbs again behind its first dip, in units of the peak."""
+    falls = np.flatnonzero(np.diff(profile) > 0)
+    if falls.size == 0:
+        return 0.0
+    dip = int(falls[0])
+    return float(profile[dip + 1 :].max() - profile[dip])
+
+
+def _filled(plane: Plane, counted: Flags) -> Plane:
+    """Pixels that are not counted as the median of those that are."""
+    good = counted & np.isfinite(plane)
+    return np.where(good, plane, float(np.median(plane[good])) if good.any() else 0.0)

@@ -1,0 +1,115 @@
+"""An image made ready for a method, and a method's estimate made a result: what stands around every method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.edges import Domain, Edges, edge_band_px, lay_out, margin_for
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.stopping import Ended, Iteration, Judgement, Stop, check_steps, judgement, run
+from psfcore.engine import Engine
+from psfcore.image import Image, MaskBit
+from psfcore.psf import Psf, check_compatible
+
+# A starting value is taken from trusted neighbours where the PSF gathers at least this share of its light there.
+_ENOUGH_NEIGHBOURS = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """An image and a PSF, checked, laid out on the plane on which the scene is sought, with its engine."""
+
+    image: Image
+    psf: Psf
+    conditions: Conditions
+    domain: Domain
+    engine: Engine
+    judgement: Judgement
+
+    def solve(self, iteration: Iteration, *, steps: int, stop: Stop) -> Ended:
+        """Let a method step until it is to end."""
+        return run(
+            iteration,
+            self.judgement,
+            steps=steps,
+            stop=stop,
+            noise_known=self.conditions.noise is not None,
+            progress=self.conditions.progress,
+        )
+
+
+def pose(
+    image: Image, psf: Psf, conditions: Conditions, *, edges: Edges, margin_share: float, steps: int, stop: Stop
+) -> Problem:
+    """Check a request and lay it out.
+
+    edges: the method's own choice, where the conditions make none. margin_share: how much of its light a pixel
+    at the edge may have from beyond the margin. Raises DataError: "bad-steps", "bad-stop", "bad-edges",
+    "all-masked", "no-signal", "plate-scale-mismatch", "no-exposure".
+    """
+    check_steps(steps, stop)
+    check_compatible(image, psf)
+    margin_px = conditions.margin_px
+    if margin_px is None:
+        margin_px = margin_for(psf, (image.pixels.shape[0], image.pixels.shape[1]), share=margin_share)
+    domain = lay_out(image, edges=conditions.edges or edges, margin_px=margin_px)
+    engine = conditions.engine_for(psf, domain.shape, domain.span, conditions.threads)
+    return Problem(
+        image, psf, conditions, domain, engine, judgement(image, psf, domain, engine, conditions)
+    )
+
+
+def first_estimate(problem: Problem) -> NDArray[np.float32]:
+    """The observation; at pixels that are not finite the PSF-weighted mean of trusted ones. Shape of the domain."""
+    domain, engine = problem.domain, problem.engine
+    estimate = domain.pixels.copy()
+    missing = ~domain.finite
+    if missing.any():
+        observed = np.where(domain.trusted, domain.pixels, np.float32(0))
+        near = engine.apply(domain.trusted.astype(np.float32))[missing]
+        seen = engine.apply(observed)[missing]
+        everywhere = np.float32(domain.pixels[domain.trusted].mean())
+        estimate[missing] = np.where(
+            near > _ENOUGH_NEIGHBOURS, seen / np.maximum(near, _ENOUGH_NEIGHBOURS), everywhere
+        )
+    return estimate
+
+
+def solution(
+    problem: Problem,
+    estimate: NDArray[np.float32],
+    ended: Ended,
+    *,
+    method: str,
+    last_change: float,
+    negatives_count: bool,
+    noise_amplification: float | None = None,
+) -> Deconvolved:
+    """An estimate on the domain as the result for the image.
+
+    negatives_count: whether the method takes pixels below 0 as they are, or as 0.
+    """
+    image, domain = problem.image, problem.domain
+    pixels = domain.cut(estimate)
+    observed = image.pixels[image.valid]
+    flux_out = float(pixels[image.valid].sum())
+    pixels[(image.mask & MaskBit.NONFINITE) != 0] = np.nan
+    return Deconvolved(
+        pixels=pixels,
+        method=method,
+        steps_done=ended.steps_done,
+        stopped_because=ended.because,
+        flux_in=float((observed if negatives_count else np.maximum(observed, 0)).sum()),
+        flux_out=flux_out,
+        negative_pixels=int(np.count_nonzero(observed < 0)),
+        last_change=last_change,
+        edges=domain.edges,
+        margin_px=domain.margin_px,
+        edge_band_px=edge_band_px(problem.psf),
+        noise_amplification=noise_amplification,
+        chi2_per_pixel=ended.chi2,
+    )
