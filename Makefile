@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test test-full bench lint openapi clean
+.PHONY: demo test test-full bench bench-peers lint openapi clean
 .DELETE_ON_ERROR:
 
 $(RUN): pyproject.toml constraints.txt
@@ -30,6 +30,12 @@ test-full: $(DEV)
 bench: $(DEV)
 	$(BIN)/python -m tests.bench
 
+# What others use, in an environment of its own, timed in turn with ours on the same data.
+bench-peers: $(DEV)
+	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9'
+	$(BIN)/python -m tests.bench_peers .venv-peers/bin/python
+
 lint: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -39,4 +45,4 @@ openapi: $(DEV)
 	$(BIN)/python -m service.openapi openapi/openapi.json
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-peers .mypy_cache .ruff_cache .hypothesis

@@ -367,16 +367,17 @@ def _instrument_hdu(text: bytes) -> fits.BinTableHDU:
     return fits.BinTableHDU.from_columns([column], name="INSTRUMENT")
 
 
-def read_psf(path: str | Path, limits: FitsLimits) -> Psf:
+def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf:
     """A PSF from the first 2-D image of a file; metadata from its cards, or the file's stem as its name.
 
-    Weights are taken as they are, centre at [n // 2, n // 2]. Raises HeaderError, DataError
+    Weights are taken as they are, centre at [n // 2, n // 2]. parts: also read the components and the
+    instrument's text of a file that write_psf wrote; a convolution needs neither. Raises HeaderError, DataError
     "unreadable-pixels", and what Psf checks ("psf-not-centred", "psf-sum", ...).
     """
     summary = read_summary(path, limits)
     kernel, header = _read_pixels(path, summary)
     own = "PSFNAME" in header
-    components, provenance = _read_extras(path, limits) if own else ({}, {})
+    components, provenance = _read_extras(path, limits) if own and parts else ({}, {})
     return Psf(
         kernel=kernel,
         name=optional_text(header, "PSFNAME") or Path(path).name.split(".")[0],

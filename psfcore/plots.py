@@ -20,7 +20,7 @@ from psfcore.psf import Psf, crop_centred, cumulative_curve, radial_profile
 PANEL_PX = 640
 CHANGE_LIMIT_PCT = 100.0
 _NO_DATA = "#3a4a5a"
-_GOLD = LinearSegmentedColormap.from_list(
+GOLD = LinearSegmentedColormap.from_list(
     "euv_gold",
     [
         (0.0, "#000000"),
@@ -31,7 +31,7 @@ _GOLD = LinearSegmentedColormap.from_list(
         (1.0, "#fffbe8"),
     ],
 ).with_extremes(bad=_NO_DATA)
-_CHANGE = LinearSegmentedColormap.from_list(
+CHANGE = LinearSegmentedColormap.from_list(
     "change", ["#123a7a", "#3f7fc1", "#b9d5ea", "#f7f7f4", "#f6c9a4", "#d5642f", "#7d1a12"]
 ).with_extremes(bad=_NO_DATA)
 # Colour, width and dashes of a component's curve; reference and parts stand behind the sums.
@@ -46,7 +46,7 @@ _CURVES: dict[str, tuple[str, float, Any]] = {
     "AIRY": ("#8a8a8a", 1.6, (0, (4, 2))),
 }
 _OTHER_CURVE = ("#2b8a6e", 1.3, "-")
-_INK = "#222222"
+INK = "#222222"
 
 Plane = NDArray[np.floating]
 
@@ -54,29 +54,29 @@ Plane = NDArray[np.floating]
 def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str = "DN/s") -> None:
     """Three panels [y, x], first row at the bottom: before, after (same stretch), change in percent."""
     step = max(1, -(-max(before.shape) // PANEL_PX))
-    small_before, small_after = _binned(before, step), _binned(after, step)
-    stretch = _stretch(small_before, small_after)
-    change = _change_pct(small_before, small_after)
+    small_before, small_after = binned(before, step), binned(after, step)
+    stretch = square_root_stretch(small_before, small_after)
+    change = change_pct(small_before, small_after)
     figure = Figure(figsize=(15.6, 5.55), dpi=100, facecolor="white")
-    figure.text(0.045, 0.955, title, fontsize=13, color=_INK, va="center", weight="bold")
+    figure.text(0.045, 0.955, title, fontsize=13, color=INK, va="center", weight="bold")
     extent = (-0.5, before.shape[1] - 0.5, -0.5, before.shape[0] - 0.5)
     panels: list[tuple[str, Plane, Colormap, Normalize, str]] = [
-        ("Before", small_before, _GOLD, stretch, unit),
-        ("After", small_after, _GOLD, stretch, unit),
-        ("Change", change, _CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT), "% of before"),
+        ("Before", small_before, GOLD, stretch, unit),
+        ("After", small_after, GOLD, stretch, unit),
+        ("Change", change, CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT), "% of before"),
     ]
     for index, (name, data, colours, norm, label) in enumerate(panels):
         axes = figure.add_axes((0.045 + 0.318 * index, 0.085, 0.266, 0.79))
         drawn = axes.imshow(
             data, origin="lower", cmap=colours, norm=norm, extent=extent, interpolation="nearest"
         )
-        axes.set_title(f"{name} ({label})", fontsize=11, color=_INK, loc="left")
+        axes.set_title(f"{name} ({label})", fontsize=11, color=INK, loc="left")
         axes.set_xlabel("x (px)")
         if index == 0:
             axes.set_ylabel("y (px)")
         else:
             axes.set_yticks([])
-        _colourbar(figure, axes, drawn, beyond="both" if name == "Change" else "max")
+        colourbar(figure, axes, drawn, beyond="both" if name == "Change" else "max")
     FigureCanvasAgg(figure).print_png(str(path), pil_kwargs={"compress_level": 3})
 
 
@@ -92,7 +92,7 @@ def psf_png(psf: Psf, path: str | Path) -> None:
         layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08),
     )
     heading = f"PSF {psf.name} {psf.version} ({psf.status}), sum {psf.total:.4f} on {psf.kernel.shape[1]} px"
-    figure.suptitle(heading, fontsize=14, color=_INK, weight="bold", x=0.01, ha="left")
+    figure.suptitle(heading, fontsize=14, color=INK, weight="bold", x=0.01, ha="left")
     image_axes, profile_axes, curve_axes = figure.subplots(1, 3, width_ratios=(1.12, 1, 1))
     _draw_centre(figure, image_axes, psf)
     kernels = {"TOTAL": psf.kernel, **psf.components}
@@ -155,7 +155,7 @@ def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:
     figure.colorbar(drawn, ax=axes, label="Weight (fraction per pixel)", shrink=0.85)
 
 
-def _binned(plane: Plane, step: int) -> NDArray[np.float64]:
+def binned(plane: Plane, step: int) -> NDArray[np.float64]:
     """Means of step x step pixels; NaN only where all of them are. An incomplete last row is dropped."""
     ny, nx = plane.shape[0] // step, plane.shape[1] // step
     data = np.asarray(plane[: ny * step, : nx * step], dtype=np.float32)
@@ -175,7 +175,7 @@ def _block_sum(data: NDArray[np.float32], step: int) -> NDArray[np.float64]:
     return total
 
 
-def _stretch(before: Plane, after: Plane) -> FuncNorm:
+def square_root_stretch(before: Plane, after: Plane) -> FuncNorm:
     """One square-root-like stretch for both: 0 to the 99.7th percentile of the brighter of the two."""
     finite = [plane[np.isfinite(plane)] for plane in (before, after)]
     top = max((float(np.percentile(values, 99.7)) for values in finite if values.size), default=1.0)
@@ -191,14 +191,14 @@ def _square(value: Any) -> Any:
     return np.square(value)
 
 
-def _change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
+def change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
     """100 (after / before - 1), NaN where before is not above zero."""
     ratio = np.full(before.shape, np.nan)
     np.divide(after, before, out=ratio, where=before > 0)
     return np.asarray(100 * (ratio - 1))
 
 
-def _colourbar(figure: Figure, axes: Any, drawn: Any, *, beyond: str) -> None:
+def colourbar(figure: Figure, axes: Any, drawn: Any, *, beyond: str) -> None:
     box = axes.get_position()
     width = 0.0085
     bar_axes = figure.add_axes((box.x1 + 0.006, box.y0, width, box.height))

@@ -207,7 +207,7 @@ def psf_row(
 @lru_cache(maxsize=2)
 def _read_psf_cached(path: Path, limits: FitsLimits) -> Psf:
     """A PSF that this process read before is not read again; its file never changes."""
-    return read_psf(path, limits)
+    return read_psf(path, limits, parts=False)
 
 
 # Products -------------------------------------------------------------------------------------------

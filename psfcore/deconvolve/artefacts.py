@@ -36,7 +36,7 @@ HOLE_SHARE = 0.02
 SEEN_SIGMA = 5.0
 EXTREME_SIGMA = 8.0
 # Values from which a person should look: per million pixels, and percent of a source's peak.
-ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 5.0}
+ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 2.0}
 RING_RADIUS_PX = 8
 _SOURCES = 100
 _FEWEST_SOURCES = 3
@@ -71,9 +71,11 @@ def find_artefacts(
 
     sigma: noise of `before` [y, x], in its unit; estimated from the pixels where it is not given.
     """
-    filled_before, filled_after = _filled(before, counted), _filled(after, counted)
-    noise_before = noise_from_pixels(filled_before, filled_before) if sigma is None else sigma
-    noise_after = noise_from_pixels(filled_after, filled_before)
+    filled_before, filled_after = _filled(before), _filled(after)
+    found_before, noise_after = (
+        noise_from_pixels(plane, filled_before, counted) for plane in (filled_before, filled_after)
+    )
+    noise_before = found_before if sigma is None else sigma
     seen = filled_before > SEEN_SIGMA * noise_before
     holes = counted & seen & (filled_after < HOLE_SHARE * filled_before)  # Eq. (1)
     limit = (filled_before + SEEN_SIGMA * noise_before) / peak_weight
@@ -82,9 +84,9 @@ def find_artefacts(
     ringing, sources = ringing_pct(filled_before, filled_after, counted)
     area = max(1, int(np.count_nonzero(counted)))
     signs: dict[str, float | None] = {
-        "holes_ppm": 1e6 * np.count_nonzero(holes) / area,
-        "overshoots_ppm": 1e6 * np.count_nonzero(overshoots) / area,
-        "new_extremes_ppm": 1e6 * np.count_nonzero(extremes) / area,
+        "holes_ppm": 1e6 * int(np.count_nonzero(holes)) / area,
+        "overshoots_ppm": 1e6 * int(np.count_nonzero(overshoots)) / area,
+        "new_extremes_ppm": 1e6 * int(np.count_nonzero(extremes)) / area,
         "ringing_pct": ringing,
     }
     score = sum((signs[name] or 0.0) / alarm for name, alarm in ALARMS.items())
@@ -93,19 +95,19 @@ def find_artefacts(
     )
 
 
-def noise_from_pixels(pixels: Plane, brightness: Plane) -> Plane:
-    """Upper limit of the noise of `pixels` [y, x] as it goes with `brightness`; finite pixels only."""
-    second = np.abs(convolve(pixels, _SECOND_DIFFERENCE, mode="reflect")) / 6
-    bounds = np.percentile(brightness, np.linspace(0, 100, _BRIGHTNESS_CLASSES + 1))
-    place = np.clip(np.searchsorted(bounds[1:-1], brightness), 0, _BRIGHTNESS_CLASSES - 1)
-    centres, levels = [], []
-    for index in range(_BRIGHTNESS_CLASSES):
-        member = place == index
-        if member.any():
-            centres.append(float(np.median(brightness[member])))
-            levels.append(1.4826 * float(np.median(second[member])))
+def noise_from_pixels(pixels: Plane, brightness: Plane, counted: Flags) -> Plane:
+    """Upper limit of the noise of `pixels` [y, x] as it goes with `brightness`; both finite everywhere."""
+    second = np.abs(convolve(pixels, _SECOND_DIFFERENCE, mode="reflect"))[counted] / 6
     smallest = 1e-6 * float(np.abs(pixels).max()) + np.finfo(float).tiny
-    return np.asarray(np.maximum(np.interp(brightness, centres, levels), smallest))
+    if second.size < _BRIGHTNESS_CLASSES:
+        return np.full(pixels.shape, smallest)
+    order = np.argsort(brightness[counted], kind="stable")
+    classes = np.array_split(order, _BRIGHTNESS_CLASSES)
+    centres = np.array([np.median(brightness[counted][members]) for members in classes])
+    levels = np.array([1.4826 * np.median(second[members]) for members in classes])
+    # Within the brightest class, whose pixels differ by much, as photon noise grows.
+    beyond = np.sqrt(np.maximum(brightness, centres[-1]) / centres[-1]) if centres[-1] > 0 else 1.0
+    return np.asarray(np.maximum(np.interp(brightness, centres, levels) * beyond, smallest))
 
 
 def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
@@ -130,21 +132,20 @@ def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after:
 def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
     """[y, x] of the brightest compact peaks, each alone within the ring's radius; shape (n, 2)."""
     size = 2 * RING_RADIUS_PX + 1
-    surroundings = median_filter(before, footprint=_ring_footprint())
     whole = minimum_filter(counted.astype(np.uint8), size, mode="constant", cval=0) > 0
-    peak = whole & (before == maximum_filter(before, size)) & (before > 2 * np.maximum(surroundings, 0))
-    found = np.argwhere(peak)
-    order = np.argsort(-before[peak], kind="stable")
+    found = np.argwhere(whole & (before == maximum_filter(before, size)))
+    height = before[tuple(found.T)]
+    found = found[height > 2 * np.maximum(_median_on_circle(before, found), 0)]
+    order = np.argsort(-before[tuple(found.T)], kind="stable")
     return found[order[:_SOURCES]]
 
 
-def _ring_footprint() -> Flags:
-    """Sixteen points on a circle: a median over the whole ring would cost much and say the same."""
+def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:
+    """Median of sixteen pixels on a circle round each place [y, x]."""
     angle = np.arange(16) * np.pi / 8
-    footprint = np.zeros((2 * RING_RADIUS_PX + 1, 2 * RING_RADIUS_PX + 1), dtype=bool)
-    row = np.rint(RING_RADIUS_PX * (1 + np.sin(angle))).astype(int)
-    footprint[row, np.rint(RING_RADIUS_PX * (1 + np.cos(angle))).astype(int)] = True
-    return footprint
+    rows = places[:, :1] + np.rint(RING_RADIUS_PX * np.sin(angle)).astype(int)
+    columns = places[:, 1:] + np.rint(RING_RADIUS_PX * np.cos(angle)).astype(int)
+    return np.asarray(np.median(plane[rows, columns], axis=1))
 
 
 def _mean_profile(plane: Plane, sources: NDArray[np.int64]) -> Plane:
@@ -172,7 +173,7 @@ def _rise(profile: Plane) -> float:
     return float(profile[dip + 1 :].max() - profile[dip])
 
 
-def _filled(plane: Plane, counted: Flags) -> Plane:
-    """Pixels that are not counted as the median of those that are."""
-    good = counted & np.isfinite(plane)
+def _filled(plane: Plane) -> Plane:
+    """Pixels without a value as the median of the others."""
+    good = np.isfinite(plane)
     return np.where(good, plane, float(np.median(plane[good])) if good.any() else 0.0)

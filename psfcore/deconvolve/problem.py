@@ -43,7 +43,14 @@ class Problem:
 
 
 def pose(
-    image: Image, psf: Psf, conditions: Conditions, *, edges: Edges, margin_share: float, steps: int, stop: Stop
+    image: Image,
+    psf: Psf,
+    conditions: Conditions,
+    *,
+    edges: Edges,
+    margin_share: float,
+    steps: int,
+    stop: Stop,
 ) -> Problem:
     """Check a request and lay it out.
 
@@ -58,9 +65,7 @@ def pose(
         margin_px = margin_for(psf, (image.pixels.shape[0], image.pixels.shape[1]), share=margin_share)
     domain = lay_out(image, edges=conditions.edges or edges, margin_px=margin_px)
     engine = conditions.engine_for(psf, domain.shape, domain.span, conditions.threads)
-    return Problem(
-        image, psf, conditions, domain, engine, judgement(image, psf, domain, engine, conditions)
-    )
+    return Problem(image, psf, conditions, domain, engine, judgement(image, psf, domain, engine, conditions))
 
 
 def first_estimate(problem: Problem) -> NDArray[np.float32]:

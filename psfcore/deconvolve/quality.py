@@ -60,14 +60,16 @@ def quality_plane(
         (MaskBit.NONFINITE, QualityBit.NONFINITE),
         (MaskBit.SATURATED, QualityBit.SATURATED),
     ):
-        plane[(image.mask & mask_bit) != 0] |= bit
+        plane[(image.mask & mask_bit) != 0] |= np.uint8(bit)
     if not image.valid.all():
-        plane[image.valid & (distance_transform_edt(image.valid) <= NEAR_MASKED_PX)] |= QualityBit.NEAR_MASKED
-    plane[_edge_band(result.shape, edge_px)] |= QualityBit.EDGE
-    plane[result < 0] |= QualityBit.NEGATIVE  # False for NaN
+        plane[image.valid & (distance_transform_edt(image.valid) <= NEAR_MASKED_PX)] |= np.uint8(
+            QualityBit.NEAR_MASKED
+        )
+    plane[_edge_band(result.shape, edge_px)] |= np.uint8(QualityBit.EDGE)
+    plane[result < 0] |= np.uint8(QualityBit.NEGATIVE)  # False for NaN
     if suspected is not None:
-        plane[suspected] |= QualityBit.ARTEFACT
-    plane[slice(None) if error is None else ~np.isfinite(error)] |= QualityBit.NO_ERROR
+        plane[suspected] |= np.uint8(QualityBit.ARTEFACT)
+    plane[slice(None) if error is None else ~np.isfinite(error)] |= np.uint8(QualityBit.NO_ERROR)
     return plane
 
 

@@ -95,7 +95,9 @@ class _RichardsonLucy(Iteration):
 
     def update(self, *, last: bool) -> None:
         self._engine.columns(adjoint=True)
-        self._engine.row_stage(_update_rows, self.x, self._dark, not last, self._moved, self._total)  # Eq. (1)
+        self._engine.row_stage(
+            _update_rows, self.x, self._dark, not last, self._moved, self._total
+        )  # Eq. (1)
 
     @property
     def change(self) -> float:

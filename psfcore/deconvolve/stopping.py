@@ -122,7 +122,9 @@ def run(
     Raises DataError "no-noise-model" for a discrepancy without noise.
     """
     if stop == "discrepancy" and not (noise_known and found.count):
-        raise DataError("no-noise-model", "expected photon gain and read noise to stop by discrepancy; got none")
+        raise DataError(
+            "no-noise-model", "expected photon gain and read noise to stop by discrepancy; got none"
+        )
     for step in range(1, steps + 1):
         iteration.measure()
         if stop == "discrepancy" and found.chi2 <= 1:  # Eq. (1)

@@ -11,7 +11,8 @@ are the same picture S of the source, at
 S a cubic spline on the pixels, the plane that of the order nearest to r; the median of each ring away from
 the arms is taken off before. Everything is fitted at once by
 weighted least squares (Gauss-Newton); r_0 is not: where it is off, S shifts. Errors of t and s are those of
-the normal equations with all else free, times the root of the reduced chi^2.
+the normal equations with all else free, times the root of the reduced chi^2. S must be blurred over a pixel
+or more, as images are: orders of a point that fill one pixel each lie where the pixels are.
 
 First values come from a search: at which angles and spacing does the image, freed of what is smooth, have
 more light at the orders than half-way between them.
@@ -125,7 +126,7 @@ def measure_arms(
     difference, usable, patch = _prepared(image, reference, saturated)
     centre, patch_radius = _centre(difference, usable, patch, centre_xy)
     half = source_radius_px or float(np.clip(patch_radius + 2.0, 3.0, 8.0))
-    inner = patch_radius + half
+    inner = 2 * (patch_radius + half)  # farther in, a plane does not follow the halo
     reach = min(reach_px or np.inf, _LARGEST_SEARCH_PX, float(np.hypot(*image.shape)))
     angles, spacing = _search(
         difference, usable, centre, n_arms, spacing_range_px, angles_near_deg, (inner, reach)

@@ -24,7 +24,7 @@ SIZE = 240
 FINE = 6  # samples a pixel, so that orders are not put on whole pixels
 CENTRE = (123.3, 118.8)
 FLARE_PX = 5
-FLARE_PHOTONS = 1e5  # a pixel of the core
+FLARE_PHOTONS = 6e4  # a pixel of the core
 SATURATION = 20_000.0
 READ_NOISE = 2.0
 
@@ -83,8 +83,8 @@ def test_angle_and_spacing_come_out(expected: NDArray[np.float64], seed: int) ->
     assert found.spacing_px == pytest.approx(SPACING_PX, abs=0.02)
     assert 0.005 < min(found.angles_sigma_deg) <= max(found.angles_sigma_deg) < 0.05
     assert 0.0005 < found.spacing_sigma_px < 0.005
-    assert 1 < found.reduced_chi2 < 3  # a sharp-edged flare is a little more than the spline can follow
-    assert len(found.peaks) > 50
+    assert 0.9 < found.reduced_chi2 < 1.5  # a sharp-edged flare is a little more than the spline can follow
+    assert len(found.peaks) > 40
     assert "less than" in found.stopped_because
 
 
