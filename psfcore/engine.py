@@ -111,12 +111,12 @@ class Engine:
 
     # The parts that methods put together ------------------------------------------------------------
 
-    def to_lanes(self, field: NDArray[np.floating]) -> Single:
-        """A field (ny, nx) in the engine's order; rows of padding are zero."""
+    def to_lanes(self, field: NDArray[np.floating], *, padding: float = 0.0) -> Single:
+        """A field (ny, nx) in the engine's order; rows that fill the last block hold `padding`."""
         if field.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {field.shape}")
         ny, nx = self.field_shape
-        padded = np.zeros((self.row_blocks, 2, LANES, nx), np.float32)
+        padded = np.full((self.row_blocks, 2, LANES, nx), padding, np.float32)
         padded.reshape(-1, nx)[:ny] = field
         return np.ascontiguousarray(padded.transpose(0, 3, 1, 2))
 

@@ -18,9 +18,10 @@ from pydantic import ValidationError
 from psfcore.errors import DataError
 from service import cli_diffraction
 from service.client import DEFAULT_SERVER, Heliopsf, Operations, ServiceError, percent
-from workers.contract import Component
+from workers.contract import Component, Method
 from workers.settings import Settings, software_version
 
+METHODS = [get_args(kind.model_fields["name"].annotation)[0] for kind in get_args(get_args(Method)[0])]
 Report = Callable[[str, int, int], None]
 SERVER = click.option(
     "--server", envvar="HELIOPSF_SERVER", help=f"Service to use [default: {DEFAULT_SERVER}]"
@@ -81,7 +82,19 @@ def worker(processes: int | None, data: Path | None, stop_with_parent: int | Non
 @click.argument("image", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path))
 @click.option("--psf", metavar="ID|FILE", help="PSF id, or a PSF file [default: the image's instrument]")
-@click.option("--steps", type=click.IntRange(1, 200), help="Richardson-Lucy steps [default: 20]")
+@click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True)
+@click.option(
+    "--steps", type=click.IntRange(1, 200), help="Steps [default: the method's; Richardson-Lucy 20]"
+)
+@click.option("--stop", type=click.Choice(["fixed", "discrepancy"]), help="When to stop [default: fixed]")
+@click.option(
+    "--edges", type=click.Choice(["zero", "symmetric", "extended"]), help="[default: the method's best]"
+)
+@click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help="DN a photon, DN rms of the readout")
+@click.option("--saturation", "saturation_dn", type=float, help="DN from which a pixel is not trusted")
+@click.option(
+    "--errors", "error_draws", type=click.IntRange(0, 64), default=0, help="Noise draws for an ERROR plane"
+)
 @click.option("--preview", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture too (PNG)")
 @SERVER
 @LOCAL
@@ -89,7 +102,13 @@ def deconvolve(
     image: Path,
     output: Path,
     psf: str | None,
+    method: str,
     steps: int | None,
+    stop: str | None,
+    edges: str | None,
+    noise: tuple[float, float] | None,
+    saturation_dn: float | None,
+    error_draws: int,
     preview: Path | None,
     server: str | None,
     local: bool,
@@ -99,10 +118,22 @@ def deconvolve(
     with _errors(), _connection(server, local) as service, _progress_bar() as report:
         psf_id = _psf_id(service, psf)
         product = service.deconvolve(
-            image, output, psf_id=psf_id, steps=steps, preview=preview, progress=report
+            image,
+            output,
+            psf_id=psf_id,
+            method=method,
+            preview=preview,
+            progress=report,
+            noise=noise or None,
+            saturation_dn=saturation_dn,
+            error_draws=error_draws,
+            steps=steps,
+            stop=stop,
+            edges=edges,
         )
     details = product["details"]
     click.echo(f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}")
+    click.echo(f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}")
     click.echo(
         f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
         f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}"

@@ -60,14 +60,25 @@ class Operations(ABC):
         output: str | Path | None = None,
         *,
         psf_id: str | None = None,
-        steps: int | None = None,
+        method: str = "richardson-lucy",
         preview: str | Path | None = None,
         progress: Progress | None = None,
+        noise: tuple[float, float] | None = None,
+        saturation_dn: float | None = None,
+        error_draws: int = 0,
+        **method_parameters: Any,
     ) -> dict[str, Any]:
-        """Upload an image, have it deconvolved and download the product; returns its description."""
-        method = {"name": "richardson-lucy"} | ({} if steps is None else {"steps": steps})
-        image_id = self.upload_image(image)["id"]
-        job = self.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
+        """Upload an image, have it deconvolved and download the product; returns its description.
+
+        ``noise``: (DN a detected photon, DN rms of the readout). ``error_draws``: 4 or more add an ERROR plane.
+        ``method_parameters``: what the method takes, as ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
+        """
+        given = {name: value for name, value in method_parameters.items() if value is not None}
+        wanted: dict[str, Any] = {"psf_id": psf_id, "method": {"name": method, **given}}
+        if noise is not None:
+            wanted["noise"] = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}
+        wanted |= {"saturation_dn": saturation_dn, "error_draws": error_draws}
+        job = self.submit("deconvolve", image_id=self.upload_image(image)["id"], **wanted)
         product = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(product, output, preview)
         return product

@@ -6,8 +6,10 @@ alike, so the ratio says more than the seconds.
 
 from __future__ import annotations
 
+import json
 import os
-import resource
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -19,12 +21,15 @@ import scipy.fft
 
 from psfcore.build import build_psf
 from psfcore.deconvolve.richardson_lucy import richardson_lucy
+from psfcore.diffraction.fraunhofer import FEWEST_SAMPLES, far_field
+from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.fits_io import read_image
 from psfcore.header import FitsLimits
 from psfcore.instruments.model import load_instrument
 from psfcore.plots import preview_png
 from psfcore.psf import Psf
 from psfcore.simulate.observe import demo_image
+from tests.bench_peers import peak_gib
 from tests.whole import stack as stacks
 
 THREADS = os.cpu_count() or 1
@@ -51,8 +56,7 @@ def reference() -> float:
 
 
 def row(what: str, took_s: float, f_s: float, note: str = "") -> None:
-    peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"{what:<52} {took_s:8.2f} s {took_s / f_s:8.1f} F   peak so far {peak_gib:.2f} GiB  {note}")
+    print(f"{what:<52} {took_s:8.2f} s {took_s / f_s:8.1f} F   peak so far {peak_gib():.2f} GiB  {note}")
 
 
 def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, folder: Path) -> None:
@@ -75,16 +79,43 @@ def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, fold
         row(f"  an equal request again, {name}", again, f_s)
 
 
+def builds(f_s: float) -> None:
+    """PSF builds, and the far field beside one plain transform of its padded pupil, each in a process of its own."""
+    for what in ("build 2048", "build 4096", "far field 1024", "plain padded transform 1024"):
+        answer = subprocess.run(
+            [sys.executable, "-m", "tests.bench", what], capture_output=True, text=True, check=True
+        )
+        measured = json.loads(answer.stdout.splitlines()[-1])
+        print(
+            f"{'hri_euv, ' + what:<52} {measured['seconds']:8.2f} s {measured['seconds'] / f_s:8.1f} F   "
+            f"peak {measured['peak_gib']:.2f} GiB"
+        )
+
+
+def one_build(what: str) -> None:
+    """One line of ``builds``, as JSON."""
+    instrument = load_instrument("hri_euv")
+    if what.startswith("build"):
+        took = seconds(lambda: build_psf(instrument, size=int(what.split()[1]), threads=THREADS))
+    elif what.startswith("far field"):
+        optics = {
+            "wavelength_angstrom": instrument.wavelength_angstrom,
+            "focal_length_mm": instrument.focal_length_mm,
+            "pixel_pitch_um": instrument.detector.pixel_pitch_um,
+        }
+        pupil = entrance_pupil(instrument.aperture, mount=instrument.mount)
+        took = seconds(lambda: far_field(pupil, **optics, size=1024, threads=THREADS))
+    else:
+        padded = np.zeros((FEWEST_SAMPLES * 1024, FEWEST_SAMPLES * 1024), np.float32)
+        took = seconds(lambda: scipy.fft.rfft2(padded, workers=2))
+    print(json.dumps({"seconds": took, "peak_gib": peak_gib()}))
+
+
 def main() -> None:
     f_s = reference()
     print(f"1 F = {f_s:.3f} s, {THREADS} threads")
-    built: list[Psf] = []
-    row(
-        "PSF of hri_euv, 2048 px",
-        seconds(lambda: built.append(build_psf(load_instrument("hri_euv"), threads=THREADS))),
-        f_s,
-    )
-    psf = built[0]
+    builds(f_s)
+    psf = build_psf(load_instrument("hri_euv"), threads=THREADS)
     with TemporaryDirectory(prefix="heliopsf-bench-") as name:
         folder = Path(name)
         path = folder / "image.fits"
@@ -102,4 +133,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    if len(sys.argv) > 1:
+        one_build(sys.argv[1])
+    else:
+        main()

@@ -57,12 +57,77 @@ class _Parameters(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class RichardsonLucy(_Parameters):
-    """Richardson-Lucy with a fixed number of steps, as the paper recommends it."""
+class _Method(_Parameters):
+    """What every method of deconvolution takes. A method's own parameters stand beside."""
 
-    algorithm_version: ClassVar[int] = 1
+    algorithm_version: ClassVar[int]
+    stop: Literal["fixed", "discrepancy"] = Field(
+        "fixed",
+        description="after all steps, or once the residual is down at the noise (needs noise figures)",
+    )
+    edges: Literal["zero", "symmetric", "extended"] | None = Field(
+        None, description="what is taken to lie beyond the field; none: what the method does best with"
+    )
+    margin_px: int | None = Field(
+        None,
+        ge=0,
+        le=4096,
+        description="how far the scene is followed beyond the field; none: as the PSF asks",
+    )
+
+
+class RichardsonLucy(_Method):
+    """Richardson-Lucy; with 20 steps and zero edges it is what the paper recommends."""
+
+    algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy"] = "richardson-lucy"
     steps: int = Field(20, ge=1, le=200, description="iterations; the paper uses 20")
+
+
+class RichardsonLucyAccelerated(_Method):
+    """Richardson-Lucy with the extrapolation of Biggs and Andrews: fewer steps to the same point."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["richardson-lucy-accelerated"]
+    steps: int = Field(10, ge=1, le=200)
+    order: Literal[1, 2] = Field(1, description="of the extrapolation")
+
+
+class RichardsonLucyExtended(_Method):
+    """Richardson-Lucy that finds what lies beyond the edges too (Bertero and Boccacci)."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["richardson-lucy-extended"]
+    steps: int = Field(20, ge=1, le=200)
+
+
+class BasicIterative(_Method):
+    """Basic iterative deconvolution: the paper's advice for a bright source near an edge."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["basic-iterative"]
+    steps: int = Field(20, ge=1, le=200)
+
+
+class Linear(_Method):
+    """The linear reconstruction: no positivity, no bias on faint pixels, settled after about five steps."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["linear"]
+    steps: int = Field(5, ge=1, le=200)
+
+
+Method = Annotated[
+    RichardsonLucy | RichardsonLucyAccelerated | RichardsonLucyExtended | BasicIterative | Linear,
+    Field(discriminator="name"),
+]
+
+
+class NoiseFigures(_Parameters):
+    """Variance of a pixel in DN^2 = photon_gain_dn * signal in DN + read_noise_dn^2."""
+
+    photon_gain_dn: float = Field(ge=0, allow_inf_nan=False, description="DN a detected photon")
+    read_noise_dn: float = Field(ge=0, allow_inf_nan=False, description="DN rms of the readout")
 
 
 Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
@@ -94,7 +159,16 @@ class Deconvolve(_Parameters):
 
     image_id: Identity = Field(description="id that the upload of the image answered")
     psf_id: Identity | None = Field(None, description="a PSF of the catalogue; none: the image's instrument")
-    method: RichardsonLucy = Field(default_factory=lambda: RichardsonLucy())
+    method: Method = Field(default_factory=lambda: RichardsonLucy())
+    noise: NoiseFigures | None = Field(
+        None, description="of the image's gain mode; none: the instrument's, if known"
+    )
+    saturation_dn: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="DN of one exposure; none: the instrument's, if known"
+    )
+    error_draws: int = Field(
+        0, ge=0, le=64, description="noise draws for an ERROR plane (4 or more; each costs one deconvolution)"
+    )
 
 
 class DeconvolveRequest(_Parameters):
@@ -120,7 +194,10 @@ class ResolvedDeconvolve(_Parameters):
     image_id: Identity
     psf_id: Identity
     psf_recipe: PsfBuild | None = None
-    method: RichardsonLucy
+    method: Method
+    noise: NoiseFigures | None = None
+    saturation_dn: float | None = None
+    error_draws: int = 0
 
 
 def canonical_hash(content: dict[str, Any]) -> str:
@@ -152,14 +229,13 @@ def psf_identity(build: PsfBuild) -> str:
     )
 
 
-def product_identity(image_id: str, psf_id: str, method: RichardsonLucy) -> str:
-    """Identity of a deconvolved image: input bytes, PSF, method with parameters, algorithm version."""
+def product_identity(request: ResolvedDeconvolve) -> str:
+    """Identity of a deconvolved image: input bytes, PSF, method with all parameters, algorithm version."""
     return canonical_hash(
         {
             "kind": "deconvolve",
-            "image": image_id,
-            "psf": psf_id,
-            "method": method.model_dump(mode="json"),
-            "algorithm_version": method.algorithm_version,
+            # The PSF's id says what it is; the recipe only how to make it where it is missing.
+            "request": request.model_dump(mode="json", exclude={"psf_recipe"}),
+            "algorithm_version": request.method.algorithm_version,
         }
     )

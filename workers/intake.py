@@ -93,9 +93,9 @@ def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict
             else:
                 raise DataError("no-such-psf", f"the catalogue holds no PSF with id {wanted.psf_id}")
             resolved = ResolvedDeconvolve(
-                image_id=image.id, psf_id=psf_id, psf_recipe=recipe, method=wanted.method
+                psf_id=psf_id, psf_recipe=recipe, **wanted.model_dump(exclude={"psf_id"})
             )
-            return resolved.model_dump(mode="json"), product_identity(image.id, psf_id, wanted.method)
+            return resolved.model_dump(mode="json"), product_identity(resolved)
 
 
 def _default_psf(header: dict[str, Any]) -> PsfBuild:

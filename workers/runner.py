@@ -15,6 +15,7 @@ from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from psfcore.errors import DataError
 from workers import tasks
 from workers.catalogue import Catalogue, JobRow, Lease
+from workers.context import Context
 from workers.contract import Fault, JobError, Phase
 from workers.settings import Settings
 from workers.store import Store
@@ -96,7 +97,7 @@ class Runner:
             heart.join()
 
     def _attempt(self, job: JobRow, lease: Lease, work: _Work) -> None:
-        context = tasks.Context(
+        context = Context(
             catalogue=self._catalogue,
             store=self._store,
             settings=self._settings,

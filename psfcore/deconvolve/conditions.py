@@ -38,7 +38,7 @@ class Noise:
             raise DataError("bad-noise", "expected photon noise or read noise above 0; got neither")
 
     def variance_terms(self, image: Image) -> tuple[float, float]:
-        """(slope, ground): variance of a pixel of `image` = slope * signal + ground, in its own unit.
+        """(slope, readout): variance of a pixel of `image` = slope * signal + readout^2, in its own unit.
 
         Raises DataError "no-exposure" where the unit is per second and the exposure is not known.
         """
@@ -47,7 +47,7 @@ class Noise:
             if not image.exposure_s:
                 raise DataError("no-exposure", f"expected an exposure with pixels in {image.unit}; got none")
             exposure_s = image.exposure_s
-        return self.photon_gain_dn / exposure_s, (self.read_noise_dn / exposure_s) ** 2
+        return self.photon_gain_dn / exposure_s, self.read_noise_dn / exposure_s
 
 
 def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:

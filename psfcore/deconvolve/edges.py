@@ -95,16 +95,22 @@ def edge_band_px(psf: Psf, fraction: float = FLAGGED_SHARE) -> int:
     """Width of the band along an edge in which more than `fraction` of a pixel's light may come from beyond."""
     if not 0 < fraction < 1:
         raise DataError("bad-fraction", f"expected a fraction between 0 and 1; got {fraction}")
-    return int(np.count_nonzero(share_from_beyond(psf) > fraction))
+    return band_px(share_from_beyond(psf), fraction)
 
 
-def margin_for(psf: Psf, field_shape: tuple[int, int], *, share: float) -> int:
+def band_px(shares: NDArray[np.float64], fraction: float) -> int:
+    """The same of b itself, which takes a pass over the whole PSF."""
+    return int(np.count_nonzero(shares > fraction))
+
+
+def margin_for(shares: NDArray[np.float64], field_shape: tuple[int, int], *, share: float) -> int:
     """How far beyond the field to follow the scene: what lies farther gives a pixel at the edge `share` at most.
 
-    Not farther than half the field, whose mirror image it is; rounded up to half a block of the engine.
+    shares: b of Eq. (1). Not farther than half the field, whose mirror image it is; rounded up to half a block
+    of the engine.
     """
     half_block = BLOCK_ROWS // 2
-    wanted = half_block * -(-edge_band_px(psf, share) // half_block)
+    wanted = half_block * -(-band_px(shares, share) // half_block)
     return min(wanted, min(field_shape) // 2)
 
 

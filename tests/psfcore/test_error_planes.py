@@ -79,7 +79,6 @@ def check_widths(scene: Plane, psf: Psf, images: int) -> None:
         "brightest tenth": z[:, truth >= bright].std(),
         "robust": np.diff(np.percentile(z, [15.87, 84.13]))[0] / 2,
     }
-    print({name: round(float(width), 3) for name, width in widths.items()}, "mean", round(float(z.mean()), 4))
     assert all(0.9 <= width <= 1.1 for width in widths.values()), widths
     assert abs(z.mean()) < 0.1
 

@@ -38,7 +38,9 @@ def points_scene() -> Plane:
     return scene
 
 
-def neighbours_off(scene: Plane, psf: Psf, bad: NDArray[np.bool_], bit: MaskBit) -> tuple[Plane, Plane, Plane]:
+def neighbours_off(
+    scene: Plane, psf: Psf, bad: NDArray[np.bool_], bit: MaskBit
+) -> tuple[Plane, Plane, Plane]:
     """Change by losing `bad` pixels, the image without loss, and the distance from them (px)."""
     seen = observe(scene, psf, exposure_s=1.0, photon_gain_dn=0, read_noise_dn=0, seed=1)
     whole = richardson_lucy(make_image(seen), psf, steps=20).pixels
@@ -68,7 +70,6 @@ def test_a_lost_pixel_moves_others_by_less_than_a_percent_beyond_3_px(
     for scene, place in ((smooth_scene(), (64, 64)), (points_scene(), (73, 50))):
         change, whole, distance = neighbours_off(scene, psf, lost_pixels(kind, *place), bit)
         off = np.abs(change / whole)
-        print(kind, bit.name, place, f"beyond {100 * off[distance > 3].max():.3f} %, within {100 * off[(distance > 0) & (distance <= 3)].max():.2f} %")
         assert off[distance > 3].max() < 0.01
 
 
@@ -80,7 +81,6 @@ def test_a_lost_point_source_leaves_less_than_a_percent_of_its_light_beyond_3_px
     """What was lost is 400 times brighter than the sky round it: the sky's own percent is not to be had."""
     change, whole, distance = neighbours_off(points_scene(), psf, lost_pixels(kind), bit)
     far = np.abs(change)[distance > 3].max()
-    print(kind, bit.name, f"of source {100 * far / whole[64, 64]:.3f} %, of sky {100 * far / 20:.1f} %", whole[64,64])
     assert far < 0.01 * whole[64, 64]
 
 

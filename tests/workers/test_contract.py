@@ -9,6 +9,7 @@ from psfcore.errors import DataError
 from workers.contract import (
     JobRequest,
     PsfBuild,
+    ResolvedDeconvolve,
     RichardsonLucy,
     canonical_hash,
     product_identity,
@@ -22,17 +23,29 @@ def test_the_hash_does_not_depend_on_the_order_of_keys() -> None:
     assert canonical_hash({"a": 1, "b": 2}) == canonical_hash({"b": 2, "a": 1})
 
 
+def identity(**changes: object) -> str:
+    base = {"image_id": A, "psf_id": B, "method": {"name": "richardson-lucy"}}
+    return product_identity(ResolvedDeconvolve.model_validate(base | changes))
+
+
 def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = product_identity(A, B, RichardsonLucy())
-    assert base == product_identity(A, B, RichardsonLucy(steps=20))
+    base = identity()
+    assert base == identity(method={"name": "richardson-lucy", "steps": 20})
+    recipe = {"instrument": "hri_euv"}
+    assert base == identity(psf_recipe=recipe), "how a PSF would be made is in its id"
     others = {
-        product_identity(B, B, RichardsonLucy()),
-        product_identity(A, A, RichardsonLucy()),
-        product_identity(A, B, RichardsonLucy(steps=19)),
+        identity(image_id=B),
+        identity(psf_id=A),
+        identity(method={"name": "richardson-lucy", "steps": 19}),
+        identity(method={"name": "richardson-lucy", "edges": "zero"}),
+        identity(method={"name": "linear"}),
+        identity(noise={"photon_gain_dn": 6.0, "read_noise_dn": 2.0}),
+        identity(saturation_dn=4000.0),
+        identity(error_draws=8),
     }
     monkeypatch.setattr(RichardsonLucy, "algorithm_version", RichardsonLucy.algorithm_version + 1)
-    others.add(product_identity(A, B, RichardsonLucy()))
-    assert len(others) == 4 and base not in others
+    others.add(identity())
+    assert len(others) == 9 and base not in others
 
 
 def test_a_built_psf_is_identified_by_its_parameters() -> None:

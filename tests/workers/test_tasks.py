@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from psfcore.deconvolve.methods import method_names
+from psfcore.fits_io import read_planes
+from service.cli import METHODS
 from service.client import ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
-from workers import runner, tasks
+from workers import deconvolve_task, runner, tasks
 from workers.catalogue import Catalogue, ProductRow
 from workers.contract import Phase
 from workers.settings import Settings
@@ -50,7 +53,7 @@ def test_an_equal_request_is_not_computed_again(
 ) -> None:
     psf_id = local.upload_psf(psf_file)["id"]
     first = local.deconvolve(image_file, psf_id=psf_id)
-    monkeypatch.delattr(tasks, "richardson_lucy")
+    monkeypatch.delattr(deconvolve_task, "method_named")
     assert local.deconvolve(image_file, psf_id=psf_id) == first
 
 
@@ -155,3 +158,44 @@ def test_our_own_failure_is_internal_and_is_logged(
         local.build_psf("hri_euv", size=64)
     assert caught.value.code == "internal-error"
     assert "Traceback" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        "richardson-lucy",
+        "richardson-lucy-accelerated",
+        "richardson-lucy-extended",
+        "basic-iterative",
+        "linear",
+    ],
+)
+def test_every_method_of_the_contract_runs_and_says_what_it_did(
+    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path, method: str
+) -> None:
+    psf_id = local.upload_psf(psf_file)["id"]
+    product = local.deconvolve(image_file, tmp_path / "o.fits", psf_id=psf_id, method=method, steps=3)
+    details = product["details"]
+    assert details["steps_done"] == 3 and details["method"]["name"] == method
+    assert abs(details["flux_change_pct"]) < 5
+    with fits.open(tmp_path / "o.fits") as hdus:
+        assert hdus[0].header["DCNVMETH"] == method and hdus[0].header["DCNVEDGE"] == details["edges"]
+        assert "QUALITY" in hdus
+
+
+def test_the_contract_holds_the_methods_that_psfcore_has() -> None:
+    assert sorted(METHODS) == method_names()
+
+
+def test_errors_are_drawn_where_noise_is_known(
+    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
+) -> None:
+    psf_id = local.upload_psf(psf_file)["id"]
+    wanted = {"psf_id": psf_id, "steps": 3, "error_draws": 4}
+    with pytest.raises(ServiceError) as caught:
+        local.deconvolve(image_file, **wanted)
+    assert caught.value.code == "no-noise-figures"
+    product = local.deconvolve(image_file, tmp_path / "o.fits", noise=(6.0, 2.0), **wanted)
+    error = read_planes(tmp_path / "o.fits")["ERROR"]
+    assert error.shape == (96, 128) and (error > 0).all()
+    assert product["details"]["noise_amplification"] > 1

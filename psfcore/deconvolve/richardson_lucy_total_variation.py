@@ -1,0 +1,140 @@
+"""Richardson-Lucy with total variation: Dey et al. 2006, Microscopy Research and Technique 69, 260.
+
+    x <- x / (1 - k div(grad x / |grad x|)) * H^T( w y / (H x) + (1 - w) / s )      Eq. (1), their Eq. (14)
+
+The step of ``richardson_lucy`` with its masks and edges, and a price k on every rise and fall of the scene, in
+counts: noise costs more than it explains, and further steps do not bring it up. In a simulated HRI_EUV image
+(1024 px, 100 photons in a quiet pixel) the rms error after 20 steps falls from 130 to 90 DN/s, where the best
+number of plain steps, which nobody knows, reaches 112. What is as faint as the noise goes with it, and a
+staircase may appear where light rises slowly: for pictures and feature finding, not for photometry of faint spots.
+
+|grad x| is the root of the sum of squares of forward differences and of (SOFTENING times the mean light)^2.
+
+| symbol | name | unit |
+|---|---|---|
+| k | smoothing | - |
+| x, y, w, s | as in richardson_lucy | |
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
+from psfcore.deconvolve.problem import Problem, pose, solution
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.richardson_lucy import agreed
+from psfcore.deconvolve.stopping import Iteration, Stop
+from psfcore.errors import DataError
+from psfcore.image import Image
+from psfcore.psf import Psf
+
+METHOD = "richardson-lucy-total-variation"
+EDGES: Edges = "symmetric"
+MARGIN_SHARE = 0.05
+SOFTENING = 0.002
+# abs(div) is 4 at most: up to this, the divisor of Eq. (1) stays well above 0.
+MOST_SMOOTHING = 0.1
+
+
+def deconvolve(
+    image: Image,
+    psf: Psf,
+    conditions: Conditions,
+    *,
+    steps: int = 20,
+    smoothing: float = 0.01,
+    stop: Stop = "fixed",
+) -> Deconvolved:
+    """Estimate the scene behind `image` [y, x] seen through `psf`, starting from the observation.
+
+    smoothing: k of Eq. (1). The result is NaN where the image is not finite, and not negative.
+    Raises DataError as `problem.pose`, "bad-smoothing", "no-signal".
+    """
+    if not 0 <= smoothing <= MOST_SMOOTHING:
+        raise DataError("bad-smoothing", f"expected smoothing of 0 to {MOST_SMOOTHING}; got {smoothing}")
+    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
+    iteration = _TotalVariation(problem, smoothing)
+    ended = problem.solve(iteration, steps=steps, stop=stop)
+    return solution(
+        problem,
+        iteration.x,
+        ended,
+        method=METHOD,
+        last_change=iteration.change,
+        negatives_count=False,
+    )
+
+
+class _TotalVariation(Iteration):
+    """Eq. (1). x is kept as a plane [y, x], for its differences reach across the engine's blocks."""
+
+    def __init__(self, problem: Problem, smoothing: float) -> None:
+        self.x = light_above_floor(problem)
+        self._new = np.empty_like(self.x)
+        self._engine = problem.engine
+        self._ratio = Ratio(problem, agreed(problem), float(self.x.max()))
+        self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
+        self._smoothing = np.float32(smoothing)
+        self._softening = np.float32(SOFTENING * float(self.x.mean()))
+        self._lanes = problem.engine.to_lanes(self.x)
+        self.change = 0.0
+        self._engine.rows_forward(self._lanes)
+
+    def measure(self) -> None:
+        self._ratio.measure()
+
+    def update(self, *, last: bool) -> None:
+        self._engine.columns(adjoint=True)
+        self._engine.rows_inverse(self._lanes)
+        correction = self._engine.from_lanes(self._lanes)
+        sums = np.zeros((self.x.shape[0], 2))
+
+        def work(start: int, stop: int, _: object) -> None:
+            _smooth_rows(
+                self.x, correction, self._new, self._smoothing, self._softening, self._dark, sums, start, stop
+            )
+
+        self._engine.run(work, self.x.shape[0])
+        self.x, self._new = self._new, self.x
+        moved, total = sums.sum(axis=0)
+        self.change = float(np.sqrt(moved / total)) if total > 0 else 0.0
+        if not last:
+            self._lanes = self._engine.to_lanes(self.x)
+            self._engine.rows_forward(self._lanes)
+
+
+@njit(nogil=True, cache=True)
+def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
+    """grad x / |grad x| at a pixel, (along y, along x); differences across the far edges are 0."""
+    zero = np.float32(0.0)
+    here = x[row, column]
+    dy = x[row + 1, column] - here if row + 1 < x.shape[0] else zero
+    dx = x[row, column + 1] - here if column + 1 < x.shape[1] else zero
+    length = np.sqrt(dy * dy + dx * dx + softening * softening)
+    return dy / length, dx / length
+
+
+@njit(nogil=True, cache=True)
+def _smooth_rows(x, correction, new, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
+    """new <- Eq. (1) on rows [start, stop), zero below `dark`; sums of (change)^2 and x^2 for each row."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    for row in range(start, stop):
+        moved, total = 0.0, 0.0
+        left = zero
+        for column in range(x.shape[1]):
+            down, right = _direction(x, row, column, softening)
+            up = _direction(x, row - 1, column, softening)[0] if row > 0 else zero
+            divergence = down - up + right - left
+            left = right
+            value = (
+                x[row, column] * max(correction[row, column], zero) / (one - smoothing * divergence)
+            )  # Eq. (1)
+            value = zero if value < dark else value
+            new[row, column] = value
+            moved += (value - x[row, column]) ** 2
+            total += value * value
+        sums[row, 0], sums[row, 1] = moved, total

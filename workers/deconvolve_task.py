@@ -1,0 +1,266 @@
+"""The task ``deconvolve``: an uploaded image and a PSF in, an image product out."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore import plots
+from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.effects import Effects, effects
+from psfcore.deconvolve.error_planes import ErrorPlanes, error_planes
+from psfcore.deconvolve.methods import method_named
+from psfcore.deconvolve.quality import QualityBit, edge_band_px, quality_plane
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.errors import DataError
+from psfcore.fits_io import read_image, read_psf, write_image
+from psfcore.header import FitsLimits
+from psfcore.image import Image, MaskBit
+from psfcore.instruments.gain import noise_for, saturation_for
+from psfcore.instruments.model import load_instrument
+from psfcore.noise import Noise
+from psfcore.psf import Psf
+from psfcore.psf_sampling import psf_for_image
+from workers.catalogue import ImageRow, ProductRow, PsfRow
+from workers.context import Context
+from workers.contract import ResolvedDeconvolve, product_identity
+from workers.psf_task import psf_of
+from workers.settings import software_version
+
+# PSFs prepared by this process; its jobs run one after the other, and often with the same PSF.
+_ENGINES = EngineCache()
+# What a method itself takes, beside what stands in its conditions.
+_CONDITIONS = {"name", "edges", "margin_px"}
+
+
+def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Deconvolve an uploaded image and add the product to the catalogue; returns its id."""
+    request = ResolvedDeconvolve.model_validate(parameters)
+    identity = product_identity(request)
+    if context.catalogue.get(ProductRow, identity, context.owner) is not None:
+        return identity
+    psf_row = psf_of(context, request)
+    work = _Work(context, request, psf_row, _load(context, request))
+    result = work.run(work.image, "deconvolving")
+    _save(work, identity, result)
+    return identity
+
+
+def _load(context: Context, request: ResolvedDeconvolve) -> Image:
+    upload = context.catalogue.get(ImageRow, request.image_id, context.owner)
+    if upload is None:
+        raise DataError("no-such-image", f"no image was uploaded with id {request.image_id}")
+    context.report("reading", 0, request.method.steps)
+    path = context.store.path(request.image_id)
+    image = read_image(path, context.limits, saturation_dn=request.saturation_dn)
+    if request.saturation_dn is None and upload.summary["instrument"] is not None:
+        level = saturation_for(load_instrument(upload.summary["instrument"]), image.header)
+        if level is not None:
+            return read_image(path, context.limits, saturation_dn=level)
+    return image
+
+
+@lru_cache(maxsize=2)
+def _read_psf(path: Path, limits: FitsLimits) -> Psf:
+    """A PSF that this process read before is not read again; its file never changes."""
+    return read_psf(path, limits, parts=False)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """One deconvolution: what goes in, and how it is run, once or over and over for its errors."""
+
+    context: Context
+    request: ResolvedDeconvolve
+    psf_row: PsfRow
+    image: Image
+
+    @cached_property
+    def psf(self) -> Psf:
+        """The PSF on the image's pixels."""
+        path = self.context.store.path(self.psf_row.file_sha256)
+        return psf_for_image(_read_psf(path, self.context.limits), self.image.header)
+
+    @cached_property
+    def noise(self) -> Noise | None:
+        """The noise figures asked for, or those of the instrument that made the image."""
+        if self.request.noise is not None:
+            return Noise(**self.request.noise.model_dump())
+        recipe = self.request.psf_recipe
+        if recipe is None or recipe.instrument is None:
+            return None
+        return noise_for(load_instrument(recipe.instrument), self.image.header)
+
+    def run(self, image: Image, stage: str | None = None) -> Deconvolved:
+        """The method on an image of this shape; ``stage`` names its progress, none is silent."""
+        method = self.request.method
+        conditions = Conditions(
+            edges=method.edges,
+            margin_px=method.margin_px,
+            noise=self.noise,
+            threads=self.context.settings.threads,
+            progress=None if stage is None else self.progress(stage),
+            engine_for=_ENGINES,
+        )
+        return method_named(method.name)(
+            image, self.psf, conditions, **method.model_dump(exclude=_CONDITIONS)
+        )
+
+    def progress(self, stage: str) -> Callable[[int, int], None]:
+        """Progress of a stage, for what counts its own steps."""
+        return lambda step, steps: self.context.report(stage, step, steps)
+
+    def errors(self, result: Deconvolved) -> ErrorPlanes | None:
+        """The planes of errors, where they were asked for."""
+        if not self.request.error_draws:
+            return None
+        if self.noise is None:
+            raise DataError(
+                "no-noise-figures",
+                "expected noise (photon_gain_dn and read_noise_dn) to draw errors from; got none, and the "
+                "instrument's are not known",
+            )
+        return error_planes(
+            self.image,
+            self.psf,
+            lambda image: self.run(image).pixels,
+            self.noise,
+            estimate=result.pixels,
+            draws=self.request.error_draws,
+            edge_px=result.edge_band_px,
+            threads=self.context.settings.threads,
+            progress=self.progress("drawing errors"),
+        )
+
+
+def _save(work: _Work, identity: str, result: Deconvolved) -> None:
+    context, image = work.context, work.image
+    errors = work.errors(result)
+    context.report("saving", 0, 1)
+    edge_px = min(edge_band_px(work.psf), min(result.pixels.shape) // 4)
+    found = effects(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
+    planes: dict[str, NDArray[Any]] = {
+        "QUALITY": quality_plane(
+            image,
+            result.pixels,
+            edge_px=edge_px,
+            suspected=found.artefacts.suspected,
+            error=None if errors is None else errors.error,
+        )
+    }
+    if errors is not None:
+        planes["ERROR"] = errors.error
+    with context.store.temporary() as path, context.store.temporary() as picture:
+        write_image(
+            path,
+            dataclasses.replace(image, pixels=result.pixels),
+            cards=_cards(work, identity, result, errors),
+            history=_history(work, result),
+            mask=image.mask,
+            planes=planes,
+            plane_bits={"QUALITY": QualityBit},
+        )
+        plots.preview_png(image.pixels, result.pixels, picture, title=_title(work))
+        file_sha256, preview_sha256 = context.store.keep(path), context.store.keep(picture)
+    context.report("saving", 1, 1)
+    context.catalogue.add(
+        ProductRow(
+            owner=context.owner,
+            id=identity,
+            created_at=time.time(),
+            kind="deconvolved-image",
+            image_id=work.request.image_id,
+            psf_id=work.psf_row.id,
+            psf_version=work.psf_row.version,
+            file_sha256=file_sha256,
+            bytes=context.store.path(file_sha256).stat().st_size,
+            preview_sha256=preview_sha256,
+            details=_details(work, result, errors, found),
+        )
+    )
+
+
+def _cards(
+    work: _Work, identity: str, result: Deconvolved, errors: ErrorPlanes | None
+) -> dict[str, tuple[Any, str]]:
+    # A hash fills its card: there is no room for a comment beside it.
+    cards: dict[str, tuple[Any, str]] = {
+        "PRODID": (identity, ""),
+        "PSFID": (work.psf_row.id, ""),
+        "PSFVERS": (work.psf_row.version, "PSF version"),
+        "PSFNAME": (work.psf_row.name, "PSF name"),
+        "PSFSTAT": (work.psf_row.status, "PSF status"),
+        "DCNVMETH": (work.request.method.name, "deconvolution method"),
+        "DCNVITER": (result.steps_done, "deconvolution steps done"),
+        "DCNVSTOP": (result.stopped_because, "why it stopped"),
+        "DCNVEDGE": (result.edges, "what was taken beyond the edges"),
+        "DCNVBAND": (result.edge_band_px, "[px] edge band that leans on it"),
+        "DCNVALGV": (work.request.method.algorithm_version, "algorithm version"),
+        "SWHELIO": (software_version(), "heliopsf version"),
+        "INPSHA": (work.request.image_id, ""),
+    }
+    if errors is not None:
+        cards["DCNVAMPL"] = (errors.amplification, "noise of the result over that of the input")
+    return cards
+
+
+def _history(work: _Work, result: Deconvolved) -> list[str]:
+    psf = work.psf_row
+    return [
+        f"heliopsf {software_version()}: {work.request.method.name}, {result.steps_done} steps, "
+        f"edges {result.edges}, PSF {psf.name} {psf.version} ({psf.status})"
+    ]
+
+
+def _title(work: _Work) -> str:
+    header = work.image.header
+    parts = [header.get("DETECTOR") or header.get("INSTRUME") or "image"]
+    parts += [str(header[key]) for key in ("DATE-BEG", "DATE-OBS") if header.get(key)][:1]
+    return f"{' '.join(map(str, parts))}   PSF {work.psf_row.name} {work.psf_row.version}"
+
+
+def _details(work: _Work, result: Deconvolved, errors: ErrorPlanes | None, found: Effects) -> dict[str, Any]:
+    """What the catalogue keeps: how it was made, and what changed.
+
+    Bright and dark are the pixels at and above the 99th percentile of the input, and at and below the first.
+    """
+    image = work.image
+    before, after = image.pixels[image.valid], result.pixels[image.valid]
+    low, high = np.percentile(before, [1, 99])
+    dark, bright = before <= low, before >= high
+    details = {
+        "method": work.request.method.model_dump(mode="json"),
+        "algorithm_version": work.request.method.algorithm_version,
+        "software_version": software_version(),
+        "job_id": work.context.job_id,
+        "steps_done": result.steps_done,
+        "stopped_because": result.stopped_because,
+        "last_step_change": result.last_change,
+        "edges": result.edges,
+        "edge_band_px": result.edge_band_px,
+        "noise_amplification": result.noise_amplification if errors is None else errors.amplification,
+        "chi2_per_pixel": result.chi2_per_pixel,
+        "flux_change_pct": 100 * (result.flux_out / result.flux_in - 1),
+        "bright_change_pct": _change_pct(before[bright], after[bright]),
+        "dark_change_pct": _change_pct(before[dark], after[dark]),
+        "negative_pixels": result.negative_pixels,
+        "masked_pixels": {
+            str(bit.name).lower(): int(np.count_nonzero(image.mask & bit.value)) for bit in MaskBit
+        },
+        "effects": found.as_json(),
+    }
+    return details
+
+
+def _change_pct(before: NDArray[np.float64], after: NDArray[np.float64]) -> float | None:
+    """Change of the summed intensity; None where the input's own sum is not positive."""
+    total = float(before.sum())
+    return 100 * (float(after.sum()) / total - 1) if total > 0 else None
