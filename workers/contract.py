@@ -101,6 +101,15 @@ class RichardsonLucyExtended(_Method):
     steps: int = Field(20, ge=1, le=200)
 
 
+class RichardsonLucyTotalVariation(_Method):
+    """Richardson-Lucy with a price on variation: less noise, for pictures more than for photometry."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["richardson-lucy-total-variation"]
+    steps: int = Field(20, ge=1, le=200)
+    smoothing: float = Field(0.01, ge=0, le=0.02, description="the price, in counts; 0 is Richardson-Lucy")
+
+
 class BasicIterative(_Method):
     """Basic iterative deconvolution: the paper's advice for a bright source near an edge."""
 
@@ -118,7 +127,12 @@ class Linear(_Method):
 
 
 Method = Annotated[
-    RichardsonLucy | RichardsonLucyAccelerated | RichardsonLucyExtended | BasicIterative | Linear,
+    RichardsonLucy
+    | RichardsonLucyAccelerated
+    | RichardsonLucyExtended
+    | RichardsonLucyTotalVariation
+    | BasicIterative
+    | Linear,
     Field(discriminator="name"),
 ]
 

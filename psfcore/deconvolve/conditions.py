@@ -8,46 +8,13 @@ from dataclasses import dataclass
 from psfcore.deconvolve.edges import Edges
 from psfcore.engine import Engine
 from psfcore.errors import DataError
-from psfcore.image import Image
+from psfcore.noise import Noise
 from psfcore.psf import Psf
-
-# Units of pixels that count per second of exposure, as FITS headers spell them.
-_PER_SECOND = ("/s", "/sec", "s-1", "s^-1", "s**-1")
 
 Progress = Callable[[int, int], None]
 Shape = tuple[int, int]
 # (psf, shape of the plane, how far apart pixels are joined exactly, threads)
 EngineFor = Callable[[Psf, Shape, Shape, int], Engine]
-
-
-@dataclass(frozen=True)
-class Noise:
-    """What a pixel scatters by: variance (DN^2) = photon_gain_dn * signal (DN) + read_noise_dn^2.
-
-    photon_gain_dn: DN a detected photon. read_noise_dn: rms of the readout, DN. Both are those of the gain mode
-    in which the image was taken. Raises DataError "bad-noise".
-    """
-
-    photon_gain_dn: float
-    read_noise_dn: float
-
-    def __post_init__(self) -> None:
-        if not (self.photon_gain_dn >= 0 and self.read_noise_dn >= 0):
-            raise DataError("bad-noise", f"expected noise figures of at least 0; got {self}")
-        if not self.photon_gain_dn + self.read_noise_dn > 0:
-            raise DataError("bad-noise", "expected photon noise or read noise above 0; got neither")
-
-    def variance_terms(self, image: Image) -> tuple[float, float]:
-        """(slope, readout): variance of a pixel of `image` = slope * signal + readout^2, in its own unit.
-
-        Raises DataError "no-exposure" where the unit is per second and the exposure is not known.
-        """
-        exposure_s = 1.0
-        if (image.unit or "").replace(" ", "").lower().endswith(_PER_SECOND):
-            if not image.exposure_s:
-                raise DataError("no-exposure", f"expected an exposure with pixels in {image.unit}; got none")
-            exposure_s = image.exposure_s
-        return self.photon_gain_dn / exposure_s, self.read_noise_dn / exposure_s
 
 
 def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:

@@ -3,12 +3,15 @@
     x <- x / (1 - k div(grad x / |grad x|)) * H^T( w y / (H x) + (1 - w) / s )      Eq. (1), their Eq. (14)
 
 The step of ``richardson_lucy`` with its masks and edges, and a price k on every rise and fall of the scene, in
-counts: noise costs more than it explains, and further steps do not bring it up. In a simulated HRI_EUV image
-(1024 px, 100 photons in a quiet pixel) the rms error after 20 steps falls from 130 to 90 DN/s, where the best
-number of plain steps, which nobody knows, reaches 112. What is as faint as the noise goes with it, and a
-staircase may appear where light rises slowly: for pictures and feature finding, not for photometry of faint spots.
+counts: noise costs more than it explains, and further steps do not bring it up. In simulated HRI_EUV images
+(100 photons in a quiet pixel) the rms error after 20 steps is 157 instead of 169 DN/s at 512 px, 92 instead of
+130 at 1024 px, where the best number of plain steps, which nobody knows, reaches 166 and 112. What is as
+faint as the noise goes with it: for pictures and feature finding, not for the photometry of small spots, which
+stay smoothed even where there is no noise, and move by up to 0.002 px, for forward differences lean to one side.
 
-|grad x| is the root of the sum of squares of forward differences and of (SOFTENING times the mean light)^2.
+|grad x| is the root of the sum of squares of forward differences and of SOFTENING x: differences below a tenth of
+the light are evened out gently. That is the departure from the paper, which has no softening: there flat light breaks
+up into a pattern of k times 4, for the step overshoots where differences are small.
 
 | symbol | name | unit |
 |---|---|---|
@@ -35,9 +38,9 @@ from psfcore.psf import Psf
 METHOD = "richardson-lucy-total-variation"
 EDGES: Edges = "symmetric"
 MARGIN_SHARE = 0.05
-SOFTENING = 0.002
-# abs(div) is 4 at most: up to this, the divisor of Eq. (1) stays well above 0.
-MOST_SMOOTHING = 0.1
+SOFTENING = 0.1
+# A small difference changes by 8 k / SOFTENING of itself in a step: below 2 it settles.
+MOST_SMOOTHING = 0.02
 
 
 def deconvolve(
@@ -79,7 +82,7 @@ class _TotalVariation(Iteration):
         self._ratio = Ratio(problem, agreed(problem), float(self.x.max()))
         self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
         self._smoothing = np.float32(smoothing)
-        self._softening = np.float32(SOFTENING * float(self.x.mean()))
+        self._softening = np.float32(SOFTENING)
         self._lanes = problem.engine.to_lanes(self.x)
         self.change = 0.0
         self._engine.rows_forward(self._lanes)
@@ -114,7 +117,10 @@ def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
     here = x[row, column]
     dy = x[row + 1, column] - here if row + 1 < x.shape[0] else zero
     dx = x[row, column + 1] - here if column + 1 < x.shape[1] else zero
-    length = np.sqrt(dy * dy + dx * dx + softening * softening)
+    least = softening * here
+    length = np.sqrt(dy * dy + dx * dx + least * least)
+    if length == zero:
+        return zero, zero
     return dy / length, dx / length
 
 

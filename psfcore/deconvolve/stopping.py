@@ -27,6 +27,7 @@ from psfcore.deconvolve.edges import Domain
 from psfcore.engine import Engine
 from psfcore.errors import DataError
 from psfcore.image import Image
+from psfcore.noise import dn_per_unit
 
 Stop = Literal["fixed", "discrepancy"]
 MOST_STEPS = 10_000
@@ -84,8 +85,10 @@ def judgement(
     top, left = (part.start for part in domain.field)
     rows[top + band : top + ny - band] = 1
     judged = (slice(band, ny - band), slice(band, nx - band))
-    noise = conditions.noise
-    slope, readout = noise.variance_terms(image) if noise is not None else (0.0, domain.scale)
+    slope, readout = 0.0, domain.scale
+    if conditions.noise is not None:
+        dn = dn_per_unit(image)
+        slope, readout = conditions.noise.photon_gain_dn / dn, conditions.noise.read_noise_dn / dn
     return Judgement(
         rows=rows.reshape(engine.row_blocks, *engine.lanes_shape[2:]),
         first=left + band,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.artefacts import find_artefacts, noise_from_pixels, ringing_pct
+from psfcore.deconvolve.artefacts import classes_of, find_artefacts, noise_from_pixels, ringing_pct
 from psfcore.deconvolve.effects import BLOCKS_PX, TAILS_PCT, Effects, block_means, effects
 from psfcore.deconvolve.effects_plot import effects_png
 from psfcore.deconvolve.richardson_lucy import richardson_lucy
@@ -175,7 +175,9 @@ def test_noise_is_found_from_the_pixels() -> None:
     expected = np.full((256, 256), 300.0) + np.linspace(0, 600, 256)
     noise = Noise(6.0, 2.0)
     pixels = noise.observe(expected, 1.4, np.random.default_rng(1))
-    found_sigma = noise_from_pixels(pixels, expected, np.ones(pixels.shape, bool))
+    found_sigma = noise_from_pixels(
+        pixels, expected, np.ones(pixels.shape, bool), classes_of(expected.ravel())
+    )
     ratio = found_sigma / np.sqrt(noise.variance(expected, 1.4))
     assert np.abs(ratio - 1).max() < 0.1
 
