@@ -95,11 +95,6 @@ def needed_kernel(
     return psf_kernel[y0:y1, x0:x1], (y0 - psf_kernel.shape[0] // 2, x0 - psf_kernel.shape[1] // 2)
 
 
-def real_transform(a: NDArray[np.float32], *, threads: int = 1) -> NDArray[np.complex64]:
-    """Two-dimensional transform of a real array (ny, nx): shape (ny, nx // 2 + 1)."""
-    return np.asarray(scipy.fft.rfft2(a, workers=threads))
-
-
 def _needed(kernel_size: int, field_size: int) -> tuple[int, int]:
     """Index range of the kernel whose offsets can join two pixels of the field."""
     centre = kernel_size // 2

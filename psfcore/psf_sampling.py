@@ -29,6 +29,8 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
+from psfcore.header import optional_text
+from psfcore.instruments.files import match_instrument
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred, plate_scale_arcsec
 
 LARGEST_FACTOR = 64
@@ -38,8 +40,9 @@ Kernel = NDArray[np.float64]
 def psf_for_image(psf: Psf, header: Header) -> Psf:
     """The PSF on the pixels of an image with this header.
 
-    Same scale to 1 %, or a scale that is not known: `psf` itself. A whole multiple on both axes: rebinned.
-    Raises DataError "plate-scale-mismatch".
+    Same scale to 1 %, or a scale that is not known: `psf` itself. A whole multiple on both axes: rebinned,
+    where the image is of the PSF's own instrument or the PSF names none: another telescope's pixels may be a
+    multiple by chance (an FSI pixel is nine of HRI_EUV's). Raises DataError "plate-scale-mismatch".
     """
     if psf.plate_scale_arcsec is None:
         return psf
@@ -47,11 +50,16 @@ def psf_for_image(psf: Psf, header: Header) -> Psf:
     factors = {_factor(scale / psf.plate_scale_arcsec) for scale in scales if scale is not None}
     if factors <= {1}:
         return psf
-    if len(factors) > 1 or None in factors:
+    if len(factors) > 1 or None in factors or not _same_instrument(psf, header):
         found = " x ".join("unknown" if scale is None else f"{scale:g}" for scale in scales)
-        wanted = f"{psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it, or a whole multiple of it"
+        wanted = f"{psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it, or its own images binned"
         raise DataError("plate-scale-mismatch", f"expected {wanted}; got CDELT1 x CDELT2 = {found} arcsec/px")
     return rebinned(psf, factors.pop() or 1)
+
+
+def _same_instrument(psf: Psf, header: Header) -> bool:
+    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
+    return psf.instrument is None or match_instrument(cards) == psf.instrument
 
 
 def rebinned(psf: Psf, factor: int) -> Psf:

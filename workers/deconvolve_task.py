@@ -18,7 +18,7 @@ from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.deconvolve.effects import Effects, effects
 from psfcore.deconvolve.error_planes import ErrorPlanes, error_planes
 from psfcore.deconvolve.methods import method_named
-from psfcore.deconvolve.quality import QualityBit, edge_band_px, quality_plane
+from psfcore.deconvolve.quality import QualityBit, quality_plane
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.errors import DataError
 from psfcore.fits_io import read_image, read_psf, write_image
@@ -145,7 +145,7 @@ def _save(work: _Work, identity: str, result: Deconvolved) -> None:
     context, image = work.context, work.image
     errors = work.errors(result)
     context.report("saving", 0, 1)
-    edge_px = min(edge_band_px(work.psf), min(result.pixels.shape) // 4)
+    edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
     found = effects(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
     planes: dict[str, NDArray[Any]] = {
         "QUALITY": quality_plane(

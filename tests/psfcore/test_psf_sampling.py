@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io.fits import Header
@@ -136,6 +138,17 @@ def test_the_psf_is_taken_to_the_pixels_of_the_image(made: Header, factor: int) 
 def test_a_scale_that_no_binning_gives_is_a_mismatch(made: Header) -> None:
     with pytest.raises(DataError, match=r"0\.492") as caught:
         psf_for_image(wings(128), made)
+    assert caught.value.code == "plate-scale-mismatch"
+
+
+def test_another_telescopes_pixels_are_no_binned_ones() -> None:
+    """The pixels of FSI are nine of HRI_EUV's to 0.3 %."""
+    psf = replace(wings(128), instrument="hri_euv")
+    own, other = header(0.984), header(4.44012445)
+    own["DETECTOR"], other["DETECTOR"] = "HRI_EUV", "FSI"
+    assert psf_for_image(psf, own).provenance["binning"] == 2
+    with pytest.raises(DataError, match="its own images binned") as caught:
+        psf_for_image(psf, other)
     assert caught.value.code == "plate-scale-mismatch"
 
 

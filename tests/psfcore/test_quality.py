@@ -5,7 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from psfcore.deconvolve.quality import QualityBit, edge_band_px, quality_plane
+from psfcore.deconvolve.edges import edge_band_px
+from psfcore.deconvolve.quality import QualityBit, quality_plane
 from psfcore.deconvolve.richardson_lucy import richardson_lucy
 from psfcore.fourier import Convolver, linear_convolve
 from psfcore.image import MaskBit
@@ -113,12 +114,14 @@ def test_the_first_bits_are_those_of_the_mask() -> None:
     assert all(QualityBit[str(bit.name)] == bit for bit in MaskBit)
 
 
-def test_the_edge_band_ends_where_a_tenth_of_the_light_is_from_outside(psf: Psf) -> None:
+def test_the_edge_band_ends_where_little_of_the_light_is_from_outside(psf: Psf) -> None:
     """By brute force: the share of a uniform Sun's light in each row that came from beyond the first row."""
-    edge_px = edge_band_px(psf)
+    edge_px = edge_band_px(psf, 0.10)
     outside = np.zeros((256, 257))
     outside[:128] = 1.0
     share = Convolver(psf.kernel, outside.shape, dtype=np.float64).apply(outside)[128:, 128]
     assert share[edge_px - 1] > 0.10 >= share[edge_px]
-    assert edge_band_px(make_psf(delta(32))) == 0
-    assert edge_band_px(make_psf(gaussian(64, 3.0))) == 4  # 1 - Phi(3.5 / 3) = 0.12, 1 - Phi(4.5 / 3) = 0.07
+    assert edge_band_px(make_psf(delta(32)), 0.10) == 0
+    assert (
+        edge_band_px(make_psf(gaussian(64, 3.0)), 0.10) == 4
+    )  # 1 - Phi(3.5 / 3) = 0.12, 1 - Phi(4.5 / 3) = 0.07

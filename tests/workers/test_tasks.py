@@ -160,16 +160,7 @@ def test_our_own_failure_is_internal_and_is_logged(
     assert "Traceback" in caplog.text
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        "richardson-lucy",
-        "richardson-lucy-accelerated",
-        "richardson-lucy-extended",
-        "basic-iterative",
-        "linear",
-    ],
-)
+@pytest.mark.parametrize("method", METHODS)
 def test_every_method_of_the_contract_runs_and_says_what_it_did(
     local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path, method: str
 ) -> None:
