@@ -96,6 +96,9 @@ def worker(processes: int | None, data: Path | None, stop_with_parent: int | Non
     "--errors", "error_draws", type=click.IntRange(0, 64), default=0, help="Noise draws for an ERROR plane"
 )
 @click.option("--preview", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture too (PNG)")
+@click.option(
+    "--effects", type=click.Path(dir_okay=False, path_type=Path), help="And one of all effects (PNG)"
+)
 @SERVER
 @LOCAL
 def deconvolve(
@@ -110,11 +113,12 @@ def deconvolve(
     saturation_dn: float | None,
     error_draws: int,
     preview: Path | None,
+    effects: Path | None,
     server: str | None,
     local: bool,
 ) -> None:
     """Deconvolve IMAGE with the PSF of its instrument, or with one that you name."""
-    _check_writable(output, preview)
+    _check_writable(output, preview, effects)
     with _errors(), _connection(server, local) as service, _progress_bar() as report:
         psf_id = _psf_id(service, psf)
         product = service.deconvolve(
@@ -127,6 +131,7 @@ def deconvolve(
             noise=noise or None,
             saturation_dn=saturation_dn,
             error_draws=error_draws,
+            effects=effects,
             steps=steps,
             stop=stop,
             edges=edges,

@@ -66,11 +66,13 @@ class Operations(ABC):
         noise: tuple[float, float] | None = None,
         saturation_dn: float | None = None,
         error_draws: int = 0,
+        effects: str | Path | None = None,
         **method_parameters: Any,
     ) -> dict[str, Any]:
         """Upload an image, have it deconvolved and download the product; returns its description.
 
         ``noise``: (DN a detected photon, DN rms of the readout). ``error_draws``: 4 or more add an ERROR plane.
+        ``effects``: where to write the picture of difference, ratio and histogram.
         ``method_parameters``: what the method takes, as ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
         """
         given = {name: value for name, value in method_parameters.items() if value is not None}
@@ -78,9 +80,12 @@ class Operations(ABC):
         if noise is not None:
             wanted["noise"] = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}
         wanted |= {"saturation_dn": saturation_dn, "error_draws": error_draws}
+        wanted["effects_picture"] = effects is not None
         job = self.submit("deconvolve", image_id=self.upload_image(image)["id"], **wanted)
         product = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(product, output, preview)
+        if effects is not None:
+            self.download(product["effects"], effects)
         return product
 
     def build_psf(

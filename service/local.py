@@ -95,7 +95,12 @@ class LocalService(Operations):
         """Copy a file out."""
         description, _, part = address.rpartition("/")
         row = self._row(description)
-        digest = row.file_sha256 if part == "file" else row.preview_sha256
+        digests = {
+            "file": row.file_sha256,
+            "preview": row.preview_sha256,
+            "effects": row.details.get("effects_picture_sha256"),
+        }
+        digest = digests[part]
         assert digest is not None
         shutil.copyfile(self._store.path(digest), path)
 

@@ -31,6 +31,7 @@ class ProductView(BaseModel):
     details: dict[str, Any] = Field(description="method, versions, what changed in the image")
     file: str = Field(description="address of the FITS file")
     preview: str = Field(description="address of the picture: before, after, change")
+    effects: str | None = Field(description="address of the picture of all effects, where it was asked for")
 
     @classmethod
     def of(cls, row: ProductRow) -> ProductView:
@@ -48,6 +49,7 @@ class ProductView(BaseModel):
             details=row.details,
             file=f"{here}/file",
             preview=f"{here}/preview",
+            effects=f"{here}/effects" if row.details.get("effects_picture_sha256") else None,
         )
 
 
@@ -88,6 +90,17 @@ def get_product_file(product_id: Identity, request: Request, state: Shared) -> R
 def get_product_preview(product_id: Identity, request: Request, state: Shared) -> Response:
     """The picture as PNG."""
     return files.send(request, state.store, _find(state, product_id).preview_sha256, "image/png", None)
+
+
+@router.get("/{product_id}/effects", summary="What changed, as a picture", response_class=Response)
+def get_product_effects(product_id: Identity, request: Request, state: Shared) -> Response:
+    """Before, after, change, difference, ratio and histogram as PNG, where the job was asked for it."""
+    digest = _find(state, product_id).details.get("effects_picture_sha256")
+    if digest is None:
+        raise Problem(
+            404, "no-effects-picture", "expected a job with effects_picture true; this product's had it false"
+        )
+    return files.send(request, state.store, digest, "image/png", None)
 
 
 def _find(state: Shared, product_id: str) -> ProductRow:

@@ -183,6 +183,7 @@ class Deconvolve(_Parameters):
     error_draws: int = Field(
         0, ge=0, le=64, description="noise draws for an ERROR plane (4 or more; each costs one deconvolution)"
     )
+    effects_picture: bool = Field(False, description="also draw difference, ratio and histogram")
 
 
 class DeconvolveRequest(_Parameters):
@@ -212,6 +213,7 @@ class ResolvedDeconvolve(_Parameters):
     noise: NoiseFigures | None = None
     saturation_dn: float | None = None
     error_draws: int = 0
+    effects_picture: bool = False
 
 
 def canonical_hash(content: dict[str, Any]) -> str:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from psfcore import plots
 from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.deconvolve.effects import Effects, effects
+from psfcore.deconvolve.effects_plot import effects_png
 from psfcore.deconvolve.error_planes import ErrorPlanes, error_planes
 from psfcore.deconvolve.methods import method_named
 from psfcore.deconvolve.quality import QualityBit, quality_plane
@@ -170,6 +171,7 @@ def _save(work: _Work, identity: str, result: Deconvolved) -> None:
         )
         plots.preview_png(image.pixels, result.pixels, picture, title=_title(work))
         file_sha256, preview_sha256 = context.store.keep(path), context.store.keep(picture)
+    effects_sha256 = _effects_picture(work, result, found) if work.request.effects_picture else None
     context.report("saving", 1, 1)
     context.catalogue.add(
         ProductRow(
@@ -183,9 +185,15 @@ def _save(work: _Work, identity: str, result: Deconvolved) -> None:
             file_sha256=file_sha256,
             bytes=context.store.path(file_sha256).stat().st_size,
             preview_sha256=preview_sha256,
-            details=_details(work, result, errors, found),
+            details=_details(work, result, errors, found) | {"effects_picture_sha256": effects_sha256},
         )
     )
+
+
+def _effects_picture(work: _Work, result: Deconvolved, found: Effects) -> str:
+    with work.context.store.temporary() as picture:
+        effects_png(work.image.pixels, result.pixels, found, picture, title=_title(work))
+        return work.context.store.keep(picture)
 
 
 def _cards(
