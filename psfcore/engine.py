@@ -203,8 +203,8 @@ class Engine:
         """
         ly, lx = self.column_plan.length, self.row_plan.length
         corner = np.zeros((-(-ly // BLOCK_ROWS) * BLOCK_ROWS, lx), np.float32)
-        corner[: kernel.shape[0], : kernel.shape[1]] = kernel / self.transfer_scale
-        corner[:ly] = np.roll(corner[:ly], first, axis=(0, 1))
+        _wrap(kernel, first, corner[:ly])
+        corner *= np.float32(1 / self.transfer_scale)
         blocks = corner.shape[0] // BLOCK_ROWS
         transfer = np.zeros((self.column_blocks, corner.shape[0], 2, LANES), np.float32)
         rows = corner.reshape(blocks, 2, LANES, lx)
@@ -226,6 +226,16 @@ class Engine:
         odd_part = float(np.abs(transfer[:, :, 1]).max()) * self.transfer_scale
         symmetric = odd_part < SYMMETRIC_TO * float(kernel.sum())
         return np.ascontiguousarray(transfer[:, :, :1] if symmetric else transfer)
+
+
+def _wrap(kernel: NDArray[np.floating], first: tuple[int, int], out: Single) -> None:
+    """A kernel into a plane of zeros with its centre in the corner: what lies before it comes in at the far ends."""
+    (ky, kx), (fy, fx) = kernel.shape, first
+    for y0, y1 in ((0, max(0, -fy)), (max(0, -fy), ky)):
+        for x0, x1 in ((0, max(0, -fx)), (max(0, -fx), kx)):
+            if y1 > y0 and x1 > x0:
+                y, x = (y0 + fy) % out.shape[0], (x0 + fx) % out.shape[1]
+                out[y : y + y1 - y0, x : x + x1 - x0] = kernel[y0:y1, x0:x1]
 
 
 def _numbers(plan: Plan) -> tuple[Any, ...]:

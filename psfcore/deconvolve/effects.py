@@ -16,6 +16,7 @@ noise. Blocks of 4 px and more are hardly touched by that.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -119,17 +120,23 @@ def effects(
         sigma = np.sqrt(noise.variance(np.where(counted, image.pixels, 0.0), dn_per_unit(image)))
     centre = (psf.kernel.shape[0] // 2, psf.kernel.shape[1] // 2)
     peak_weight = float(psf.kernel[centre])
+    with ThreadPoolExecutor(1) as beside:  # filters and percentiles let each other run
+        artefacts = beside.submit(find_artefacts, image.pixels, result, counted, peak_weight, sigma=sigma)
+        blocks = [_blocks(image.pixels, result, counted, block_px) for block_px in BLOCKS_PX]
+        structures = tuple(row for part in blocks for row in _structures(part))
+        ranges = tuple(row for part in blocks for row in _ranges(part))
+        change_pct, difference = _percentiles(change), _percentiles(after - before)
     return Effects(
         pixels=int(before.size),
         edge_px=edge_px,
         flux_change_pct=float(_change_pct(before.sum(), after.sum())),
-        change_pct=_percentiles(change),
-        difference=_percentiles(after - before),
+        change_pct=change_pct,
+        difference=difference,
         not_positive_before=int(np.count_nonzero(~positive)),
         not_positive_after=int(np.count_nonzero(after <= 0)),
-        structures=tuple(_structures(image.pixels, result, counted)),
-        ranges=tuple(_ranges(image.pixels, result, counted)),
-        artefacts=find_artefacts(image.pixels, result, counted, peak_weight, sigma=sigma),
+        structures=structures,
+        ranges=ranges,
+        artefacts=artefacts.result(),
     )
 
 
@@ -143,6 +150,8 @@ def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
 
 def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
     """Means of whole blocks of n x n pixels, all of them counted; shape (n_blocks,)."""
+    if block_px == 1:
+        return np.asarray(plane[counted])
     ny, nx = plane.shape[0] // block_px, plane.shape[1] // block_px
     shape = (ny, block_px, nx, block_px)
     cut = np.s_[: ny * block_px, : nx * block_px]
@@ -151,23 +160,46 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
     return np.asarray(means[whole])
 
 
-def _structures(before: Plane, after: Plane, counted: Flags) -> list[Structure]:
-    rows = []
-    for block_px in BLOCKS_PX:
-        old, new = block_means(before, counted, block_px), block_means(after, counted, block_px)
-        for tail in TAILS_PCT:
-            for kind in ("bright", "dark"):
-                row = _structure(old, new, kind, block_px, tail)
-                rows += [] if row is None else [row]
-    return rows
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Block means (n,) before and after, and their percentiles at both ends by the tail's percent."""
+
+    block_px: int
+    old: Plane
+    new: Plane
+    old_levels: dict[float, tuple[float, float]]
+    new_levels: dict[float, tuple[float, float]]
+
+    @property
+    def tails(self) -> list[float]:
+        """Tails that hold at least one block."""
+        return [tail for tail in TAILS_PCT if self.old.size * tail >= 100]
 
 
-def _structure(old: Plane, new: Plane, kind: str, block_px: int, tail: float) -> Structure | None:
-    """One row, or None where the tail holds no whole block, or no light."""
-    if old.size * tail < 100:
-        return None
+def _blocks(before: Plane, after: Plane, counted: Flags, block_px: int) -> _Blocks:
+    old, new = block_means(before, counted, block_px), block_means(after, counted, block_px)
+    return _Blocks(block_px, old, new, _levels(old), _levels(new))
+
+
+def _levels(means: Plane) -> dict[float, tuple[float, float]]:
+    """(low, high) for each tail, all in one pass."""
+    if means.size == 0:
+        return {}
+    wanted = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
+    found = [float(level) for level in np.percentile(means, wanted)]
+    return {tail: (found[2 * k], found[2 * k + 1]) for k, tail in enumerate(TAILS_PCT)}
+
+
+def _structures(blocks: _Blocks) -> list[Structure]:
+    rows = (_structure(blocks, kind, tail) for tail in blocks.tails for kind in ("bright", "dark"))
+    return [row for row in rows if row is not None]
+
+
+def _structure(blocks: _Blocks, kind: str, tail: float) -> Structure | None:
+    """One row, or None where the tail holds no light."""
+    old, new, block_px = blocks.old, blocks.new, blocks.block_px
     bright = kind == "bright"
-    level = np.percentile(old, 100 - tail if bright else tail)
+    level = blocks.old_levels[tail][bright]
     chosen = (old >= level if bright else old <= level) & (old > 0)
     if not chosen.any():
         return None
@@ -184,27 +216,25 @@ def _structure(old: Plane, new: Plane, kind: str, block_px: int, tail: float) ->
     )
 
 
-def _ranges(before: Plane, after: Plane, counted: Flags) -> list[Range]:
-    rows = []
-    for block_px in BLOCKS_PX:
-        old, new = block_means(before, counted, block_px), block_means(after, counted, block_px)
-        rows += [
-            Range(
-                block_px=block_px,
-                tail_pct=tail,
-                dynamic_before=_dynamic_range(old, tail),
-                dynamic_after=_dynamic_range(new, tail),
-                contrast_before=_contrast(old),
-                contrast_after=_contrast(new),
-            )
-            for tail in TAILS_PCT
-            if old.size * tail >= 100
-        ]
-    return rows
+def _ranges(blocks: _Blocks) -> list[Range]:
+    tails = blocks.tails
+    if not tails:
+        return []
+    contrast_before, contrast_after = _contrast(blocks.old), _contrast(blocks.new)
+    return [
+        Range(
+            block_px=blocks.block_px,
+            tail_pct=tail,
+            dynamic_before=_dynamic_range(*blocks.old_levels[tail]),
+            dynamic_after=_dynamic_range(*blocks.new_levels[tail]),
+            contrast_before=contrast_before,
+            contrast_after=contrast_after,
+        )
+        for tail in tails
+    ]
 
 
-def _dynamic_range(means: Plane, tail: float) -> float | None:
-    low, high = np.percentile(means, [tail, 100 - tail])
+def _dynamic_range(low: float, high: float) -> float | None:
     return float(high / low) if low > 0 else None  # Eq. (2)
 
 
