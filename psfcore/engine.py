@@ -202,19 +202,17 @@ class Engine:
         Without the imaginary part where the PSF is symmetric.
         """
         ly, lx = self.column_plan.length, self.row_plan.length
-        corner = np.zeros((-(-ly // BLOCK_ROWS) * BLOCK_ROWS, lx), np.float32)
-        _wrap(kernel, first, corner[:ly])
-        corner *= np.float32(1 / self.transfer_scale)
-        blocks = corner.shape[0] // BLOCK_ROWS
-        transfer = np.zeros((self.column_blocks, corner.shape[0], 2, LANES), np.float32)
-        rows = corner.reshape(blocks, 2, LANES, lx)
+        blocks = -(-ly // BLOCK_ROWS)
+        transfer = np.zeros((self.column_blocks, blocks * BLOCK_ROWS, 2, LANES), np.float32)
 
         def along_rows(start: int, stop: int, scratch: Scratch) -> None:
-            lanes = np.ascontiguousarray(rows[start:stop].transpose(0, 3, 1, 2))
-            _rows_forward(
-                lanes, transfer[:, start * BLOCK_ROWS : stop * BLOCK_ROWS], scratch.buffer, scratch.corner,
-                0, stop - start, *self.row_numbers,
-            )  # fmt: skip
+            for block in range(start, stop):
+                here = slice(block * BLOCK_ROWS, (block + 1) * BLOCK_ROWS)
+                rows = _wrapped_rows(kernel, first, (ly, lx), here) * np.float32(1 / self.transfer_scale)
+                lanes = np.ascontiguousarray(rows.reshape(1, 2, LANES, lx).transpose(0, 3, 1, 2))
+                _rows_forward(
+                    lanes, transfer[:, here], scratch.buffer, scratch.corner, 0, 1, *self.row_numbers
+                )
 
         def along_columns(start: int, stop: int, _scratch: Scratch) -> None:
             for block in range(start, stop):
@@ -228,14 +226,19 @@ class Engine:
         return np.ascontiguousarray(transfer[:, :, :1] if symmetric else transfer)
 
 
-def _wrap(kernel: NDArray[np.floating], first: tuple[int, int], out: Single) -> None:
-    """A kernel into a plane of zeros with its centre in the corner: what lies before it comes in at the far ends."""
-    (ky, kx), (fy, fx) = kernel.shape, first
-    for y0, y1 in ((0, max(0, -fy)), (max(0, -fy), ky)):
-        for x0, x1 in ((0, max(0, -fx)), (max(0, -fx), kx)):
-            if y1 > y0 and x1 > x0:
-                y, x = (y0 + fy) % out.shape[0], (x0 + fx) % out.shape[1]
-                out[y : y + y1 - y0, x : x + x1 - x0] = kernel[y0:y1, x0:x1]
+def _wrapped_rows(
+    kernel: NDArray[np.floating], first: tuple[int, int], shape: tuple[int, int], rows: slice
+) -> Single:
+    """Some rows of a plane of zeros that holds the kernel, its centre in the corner, wrapped round the ends."""
+    (ky, kx), (fy, fx), (ly, lx) = kernel.shape, first, shape
+    out = np.zeros((rows.stop - rows.start, lx), np.float32)
+    split = min(kx, max(0, -fx))
+    for n, row in enumerate(range(rows.start, min(rows.stop, ly))):
+        source = (row - fy) % ly
+        if source < ky:
+            out[n, (fx % lx) : (fx % lx) + split] = kernel[source, :split]
+            out[n, fx + split : fx + kx] = kernel[source, split:]
+    return out
 
 
 def _numbers(plan: Plan) -> tuple[Any, ...]:
