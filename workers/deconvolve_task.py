@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -147,7 +148,10 @@ def _save(work: _Work, identity: str, result: Deconvolved) -> None:
     errors = work.errors(result)
     context.report("saving", 0, 1)
     edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
-    found = effects(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
+    with ThreadPoolExecutor(1) as beside:
+        preview = beside.submit(_preview, work, result)
+        found = effects(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
+        preview_sha256 = preview.result()
     planes: dict[str, NDArray[Any]] = {
         "QUALITY": quality_plane(
             image,
@@ -159,7 +163,7 @@ def _save(work: _Work, identity: str, result: Deconvolved) -> None:
     }
     if errors is not None:
         planes["ERROR"] = errors.error
-    with context.store.temporary() as path, context.store.temporary() as picture:
+    with context.store.temporary() as path:
         write_image(
             path,
             dataclasses.replace(image, pixels=result.pixels),
@@ -169,8 +173,7 @@ def _save(work: _Work, identity: str, result: Deconvolved) -> None:
             planes=planes,
             plane_bits={"QUALITY": QualityBit},
         )
-        plots.preview_png(image.pixels, result.pixels, picture, title=_title(work))
-        file_sha256, preview_sha256 = context.store.keep(path), context.store.keep(picture)
+        file_sha256 = context.store.keep(path)
     effects_sha256 = _effects_picture(work, result, found) if work.request.effects_picture else None
     context.report("saving", 1, 1)
     context.catalogue.add(
@@ -188,6 +191,12 @@ def _save(work: _Work, identity: str, result: Deconvolved) -> None:
             details=_details(work, result, errors, found) | {"effects_picture_sha256": effects_sha256},
         )
     )
+
+
+def _preview(work: _Work, result: Deconvolved) -> str:
+    with work.context.store.temporary() as picture:
+        plots.preview_png(work.image.pixels, result.pixels, picture, title=_title(work))
+        return work.context.store.keep(picture)
 
 
 def _effects_picture(work: _Work, result: Deconvolved, found: Effects) -> str:
