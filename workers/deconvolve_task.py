@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore import plots
@@ -61,13 +62,15 @@ def _load(context: Context, request: ResolvedDeconvolve) -> Image:
     if upload is None:
         raise DataError("no-such-image", f"no image was uploaded with id {request.image_id}")
     context.report("reading", 0, request.method.steps)
-    path = context.store.path(request.image_id)
-    image = read_image(path, context.limits, saturation_dn=request.saturation_dn)
-    if request.saturation_dn is None and upload.summary["instrument"] is not None:
-        level = saturation_for(load_instrument(upload.summary["instrument"]), image.header)
-        if level is not None:
-            return read_image(path, context.limits, saturation_dn=level)
-    return image
+    level = request.saturation_dn or _known_saturation_dn(upload.summary)
+    return read_image(context.store.path(request.image_id), context.limits, saturation_dn=level)
+
+
+def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
+    """The level of the instrument's gain mode, by what the upload's header said; None where it is not known."""
+    if summary["instrument"] is None or summary["gain_mode"] is None:
+        return None
+    return saturation_for(load_instrument(summary["instrument"]), Header({"GAINCOMB": summary["gain_mode"]}))
 
 
 @lru_cache(maxsize=2)

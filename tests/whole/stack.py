@@ -126,7 +126,7 @@ def served(folder: Path, workers: int = 1) -> Iterator[Stack]:
     """A service on Redis and PostgreSQL, with workers of its own; ``Missing`` where either is not there."""
     with ExitStack() as resources:
         redis = resources.enter_context(Redis(folder))
-        database_url = resources.enter_context(_database())
+        database_url = resources.enter_context(postgres_database())
         stack = Stack(
             folder / "data", {"HELIOPSF_BROKER_URL": redis.url, "HELIOPSF_DATABASE_URL": database_url}
         )
@@ -186,7 +186,7 @@ class Redis:
 
 
 @contextmanager
-def _database() -> Iterator[str]:
+def postgres_database() -> Iterator[str]:
     admin = create_engine(POSTGRES, isolation_level="AUTOCOMMIT", connect_args={"connect_timeout": 3})
     name = f"heliopsf_test_{uuid.uuid4().hex[:12]}"
     try:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import time
-import uuid
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, text
-from sqlalchemy.exc import OperationalError
 
+from tests.whole.stack import Missing, postgres_database
 from workers.catalogue import Catalogue, JobRow, Lease, ProductRow
 from workers.contract import Fault, JobError, Phase
+from workers.settings import Settings
 
-POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
 BROKEN = JobError(fault=Fault.INTERNAL, code="broken", message="broken")
 
 
@@ -28,22 +26,15 @@ def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalo
         yield catalogue
         catalogue.close()
         return
-    admin = create_engine(POSTGRES, isolation_level="AUTOCOMMIT", connect_args={"connect_timeout": 3})
-    name = f"heliopsf_test_{uuid.uuid4().hex[:12]}"
-    try:
-        with admin.connect() as connection:
-            connection.execute(text(f"CREATE DATABASE {name}"))
-    except OperationalError as error:
-        pytest.skip(
-            f"no PostgreSQL to test with at {admin.url} (HELIOPSF_TEST_POSTGRES names one): {error.orig}"
-        )
-    catalogue = Catalogue(admin.url.set(database=name).render_as_string(hide_password=False))
-    catalogue.create_tables()
-    yield catalogue
-    catalogue.close()
-    with admin.connect() as connection:
-        connection.execute(text(f"DROP DATABASE {name}"))
-    admin.dispose()
+    with ExitStack() as resources:
+        try:
+            url = resources.enter_context(postgres_database())
+        except Missing as missing:
+            pytest.skip(str(missing))
+        catalogue = Catalogue(Settings(database_url=url).catalogue_url)
+        catalogue.create_tables()
+        yield catalogue
+        catalogue.close()
 
 
 def submitted(catalogue: Catalogue, key: str = "k") -> JobRow:
