@@ -1,0 +1,1 @@
+"""Transits: an occulter before the Sun, its place, its pixels, and what they say of scattered light."""

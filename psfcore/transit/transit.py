@@ -1,0 +1,87 @@
+"""A transit, ready for analysis: images of a dark disc before the Sun, all in DN/s.
+
+| symbol | name | unit |
+|---|---|---|
+| x, y | x_px, y_px: centre of the occulter, first pixel's centre at 0 | px |
+| r | radius_px of the occulter | px |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.noise import Noise
+
+Pixels = NDArray[np.float32]
+Kernel = NDArray[np.float64]
+Lit = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an occulter is: centre and radius, px."""
+
+    x_px: float
+    y_px: float
+    radius_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of a transit: pixels [y, x] in DN/s (float32, finite), and where the ephemeris puts the occulter.
+
+    fov: the pointing. time_s: since the first frame's start. filled: pixels [y, x] whose value was taken from
+    another frame (saturated) or from neighbours (not finite); none of them may lie in the occulter's analysis.
+    Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure".
+    """
+
+    file: str
+    pixels: Pixels
+    fov: int
+    place: Place
+    exposure_s: float
+    time_s: float
+    gain_mode: str | None = None
+    filled: Lit | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pixels", np.ascontiguousarray(self.pixels, dtype=np.float32))
+        if self.pixels.ndim != 2 or (self.filled is not None and self.filled.shape != self.pixels.shape):
+            raise DataError("frame-shape", f"{self.file}: expected two axes; got {self.pixels.shape}")
+        if not np.isfinite(self.pixels).all():
+            raise DataError("frame-nonfinite", f"{self.file}: expected finite pixels; got NaN or infinite ones")
+        if not (np.isfinite(self.exposure_s) and self.exposure_s > 0):
+            raise DataError("frame-exposure", f"{self.file}: expected an exposure > 0 s; got {self.exposure_s}")
+
+
+@dataclass(frozen=True, eq=False)
+class Transit:
+    """All frames of a transit, in the order of time, of one shape; the known part of the PSF; the noise.
+
+    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1 on its own grid. sha256: of each input file.
+    Raises DataError "transit-shapes" where frames differ in shape, "transit-empty" where there is none.
+    """
+
+    frames: tuple[Frame, ...]
+    diffraction: Kernel
+    noise: Noise
+    instrument: str | None = None
+    plate_scale_arcsec: float | None = None
+    sha256: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.frames:
+            raise DataError("transit-empty", "expected at least one image; got none")
+        shapes = {frame.pixels.shape for frame in self.frames}
+        if len(shapes) > 1:
+            raise DataError("transit-shapes", f"expected images of one shape; got {sorted(shapes)}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx) of every frame."""
+        ny, nx = self.frames[0].pixels.shape
+        return ny, nx
