@@ -222,7 +222,7 @@ class Engine:
         self.run(along_columns, self.column_blocks)
         transfer = transfer[:, :ly]
         odd_part = float(np.abs(transfer[:, :, 1]).max()) * self.transfer_scale
-        symmetric = odd_part < SYMMETRIC_TO * float(kernel.sum())
+        symmetric = odd_part < SYMMETRIC_TO * float(np.abs(kernel).sum())
         return np.ascontiguousarray(transfer[:, :, :1] if symmetric else transfer)
 
 

@@ -70,7 +70,7 @@ class _Linear(Iteration):
     def __init__(self, problem: Problem) -> None:
         domain, engine = problem.domain, problem.engine
         self._engine, self._judgement = engine, problem.judgement
-        self._inverse = _inverse_filter(engine)
+        self._inverse = inverse_filter(engine)
         self.x = engine.to_lanes(first_estimate(problem))
         trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
         self._observed = engine.to_lanes(trusted, padding=np.nan)
@@ -92,7 +92,7 @@ class _Linear(Iteration):
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
-def _inverse_filter(engine: Engine) -> NDArray[np.float32]:
+def inverse_filter(engine: Engine) -> NDArray[np.float32]:
     """G of Eq. (1), laid out as the engine's transfer function."""
     scale = np.float32(engine.transfer_scale)
     power = np.square(engine.transfer).sum(axis=2, keepdims=True) * scale**2

@@ -1,0 +1,100 @@
+"""A PSF on one field: see through it, undo it, and how both change with its parameters.
+
+    undo:   x <- x + G (y - H x)                            Eq. (1), G the inverse on the periodic plane
+    scene:  d x / d q = -G (dH / dq) x                      Eq. (2)
+
+The core of HRI_EUV's PSF holds 0.43 of its light, so that Eq. (1) settles in about five steps; it is linear and
+has no bias on faint pixels, where Richardson-Lucy has one. Fields stay in the engine's own order (its "lanes")
+from step to step; single pixels are picked out of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.deconvolve.linear import inverse_filter
+from psfcore.engine import BLOCK_ROWS, Engine
+from psfcore.fft_kernels import LANES
+
+Lanes = NDArray[np.float32]
+Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # rows, columns
+STEPS = 5
+
+
+class Blur:
+    """Convolution with a kernel on one field, cut to it, in float32.
+
+    kernel: [y, x], centre at [n // 2, n // 2]; of any sign. Beyond the field it is dark.
+    """
+
+    def __init__(
+        self, kernel: NDArray[np.float64], field_shape: tuple[int, int], *, threads: int = 1
+    ) -> None:
+        self.engine = Engine(kernel, field_shape, threads=threads)
+        self._partly_filled = field_shape[0] % BLOCK_ROWS != 0
+
+    def lanes(self, field: NDArray[np.floating]) -> Lanes:
+        """A field [y, x] in the engine's order."""
+        return self.engine.to_lanes(field)
+
+    def field(self, lanes: Lanes) -> NDArray[np.float32]:
+        """The field [y, x] of lanes."""
+        return self.engine.from_lanes(lanes)
+
+    def see(self, lanes: Lanes) -> Lanes:
+        """H x."""
+        return self._through(lanes, self.engine.transfer)
+
+    def see_back(self, lanes: Lanes) -> Lanes:
+        """H^T y."""
+        return self._through(lanes, self.engine.transfer, conjugate=True)
+
+    def _through(self, lanes: Lanes, transfer: NDArray[np.float32], *, conjugate: bool = False) -> Lanes:
+        out = np.empty(self.engine.lanes_shape, np.float32)
+        self.engine.rows_forward(lanes)
+        self.engine.multiply_columns(transfer, conjugate=conjugate)
+        self.engine.rows_inverse(out)
+        if self._partly_filled:  # the last block also holds what fell beyond the field's last row
+            rows = self.engine.field_shape[0] % BLOCK_ROWS
+            out[-1, :, 0, min(rows, LANES) :] = 0.0
+            out[-1, :, 1, max(rows - LANES, 0) :] = 0.0
+        return out
+
+
+class Optics(Blur):
+    """A blur by a PSF, and its approximate inverse."""
+
+    def __init__(
+        self, psf_kernel: NDArray[np.float64], field_shape: tuple[int, int], *, threads: int = 1
+    ) -> None:
+        super().__init__(psf_kernel, field_shape, threads=threads)
+        self._inverse = inverse_filter(self.engine)
+
+    def undo_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
+        """G y; G^T y where adjoint."""
+        return self._through(lanes, self._inverse, conjugate=adjoint)
+
+    def undo(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
+        """The scene x behind an observation, Eq. (1), from a start (none: the observation)."""
+        x = observed.copy() if start is None else start.copy()
+        for _ in range(steps):
+            residual = self.see(x)
+            np.subtract(observed, residual, out=residual)
+            x += self.undo_once(residual)  # Eq. (1)
+        return x
+
+
+def pick(lanes: Lanes, pixels: Pixels) -> NDArray[np.float64]:
+    """The values of single pixels (rows, columns) in lanes."""
+    return np.asarray(lanes[_index(pixels)], dtype=np.float64)
+
+
+def put(lanes: Lanes, pixels: Pixels, values: NDArray[np.floating] | float) -> None:
+    """Set single pixels in lanes."""
+    lanes[_index(pixels)] = values
+
+
+def _index(pixels: Pixels) -> tuple[NDArray[np.intp], ...]:
+    rows, columns = pixels
+    return rows // BLOCK_ROWS, columns, rows % BLOCK_ROWS // LANES, rows % LANES

@@ -1,0 +1,303 @@
+"""Shapes of diffuse scatter that a transit can be fitted with.
+
+Every shape is a falloff f(dx, dy), light at the centre going to (dx, dy), and is scaled on the full reach:
+
+    s(d) = total f(d) / sum over d != 0 of f   for d != 0,   s(0) = 1 - total        Eq. (1)
+
+    softened power law            f = (b + r)^-c                                      Eq. (2), the paper's
+    stretched                     Eq. (2) of r -> |exp(-[[p, q], [q, -p]]) d|         Eq. (3)
+    one-sided                     Eq. (2) times 1 + x_share cos t + y_share sin t      Eq. (4)
+    knee                          Eq. (2) times (1 + (r / r_k)^2)^(-bend / 2)          Eq. (5)
+    two power laws                Eq. (2) + a second, (b_2 + r)^-c                     Eq. (6)
+    core                          Eq. (2) + a Gaussian                                 Eq. (7)
+
+In Eq. (3) the stretch s at angle t of the definitions is ln(1 + s) = hypot(p, q), 2 t = atan2(q, p): two numbers
+that are smooth where nothing is stretched, as an angle is not. In Eq. (6) and (7) the share is of the total.
+
+A fit moves in coordinates that know no bounds: the logarithm of a positive number, the logit of a share.
+
+| symbol | name | unit |
+|---|---|---|
+| b, b_2, r_k, sigma | b_px, halo_b_px, knee_px, core_px | px |
+| c, bend | c, bend | - |
+| p, q | stretch_p, stretch_q | - |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.psf import REACH_GRID_PX, squared_radii
+
+Values = Mapping[str, float]
+Kernel = NDArray[np.float64]
+Vector = NDArray[np.float64]
+
+HALO_B_PX = 120.0
+KNEE_PX = 100.0
+CORE_PX = 1.5
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a shape: where a fit starts, and in what coordinate it moves."""
+
+    name: str
+    unit: str
+    start: float
+    scale: Literal["log", "logit", "linear"]
+    largest_step: float
+    meaning: str
+
+    def coordinate(self, value: float) -> float:
+        """The unbounded coordinate of a value."""
+        if self.scale == "log":
+            return math.log(value)
+        return math.log(value / (1 - value)) if self.scale == "logit" else value
+
+    def value(self, coordinate: float) -> float:
+        """The value at a coordinate."""
+        if self.scale == "log":
+            return math.exp(coordinate)
+        return 1 / (1 + math.exp(-coordinate)) if self.scale == "logit" else coordinate
+
+    def slope(self, coordinate: float) -> float:
+        """d value / d coordinate."""
+        value = self.value(coordinate)
+        if self.scale == "log":
+            return value
+        return value * (1 - value) if self.scale == "logit" else 1.0
+
+
+Falloff = Callable[[Values, int], Kernel]  # unnormalised, on a square of that size
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A shape of scatter: its parameters and its falloff."""
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    falloff: Falloff
+    isotropic: bool
+
+    @property
+    def start(self) -> Vector:
+        """Coordinates where a fit starts."""
+        return np.array([p.coordinate(p.start) for p in self.parameters])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        return tuple(p.name for p in self.parameters)
+
+    def values(self, coordinates: Vector) -> dict[str, float]:
+        """Values by name at these coordinates."""
+        return {p.name: p.value(float(q)) for p, q in zip(self.parameters, coordinates, strict=True)}
+
+    def coordinates(self, values: Values) -> Vector:
+        """Coordinates of these values; a parameter that is not among them is at its start."""
+        return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
+
+    def kernel(self, coordinates: Vector, size: int) -> Kernel:
+        """Scatter kernel [y, x] of Eq. (1) on (size, size), centre at [size // 2, size // 2]."""
+        values = self.values(coordinates)
+        reach = max(size, REACH_GRID_PX)
+        falloff = self.falloff(values, reach)
+        middle = reach // 2
+        falloff[middle, middle] = 0.0
+        first = middle - REACH_GRID_PX // 2
+        within = falloff[first : first + REACH_GRID_PX, first : first + REACH_GRID_PX]
+        scaled = falloff * (values["total"] / within.sum())
+        scaled[middle, middle] = 1 - values["total"]
+        first = middle - size // 2
+        return np.ascontiguousarray(scaled[first : first + size, first : first + size])
+
+
+B = Parameter("b_px", "px", 6.0, "log", 0.5, "radius within which the power law is softened")
+C = Parameter("c", "", 2.5, "linear", 0.3, "exponent of the power law")
+TOTAL = Parameter("total", "", 0.4, "logit", 0.4, "share of light that is scattered, on the full reach")
+_POWER_LAW = (B, C, TOTAL)
+
+
+def _softened(values: Values, size: int) -> Kernel:
+    return _by_radius(size, lambda r: (values["b_px"] + r) ** -values["c"])
+
+
+def _stretched(values: Values, size: int) -> Kernel:
+    return _power_law_of_ellipses(
+        size, values["b_px"], values["c"], values.get("stretch_p", 0.0), values.get("stretch_q", 0.0)
+    )
+
+
+def _one_sided(values: Values, size: int) -> Kernel:
+    d = np.arange(size) - size // 2
+    r = np.hypot(d[:, None], d[None, :])
+    r[size // 2, size // 2] = 1.0
+    lean = 1 + (values["x_share"] * d[None, :] + values["y_share"] * d[:, None]) / r  # Eq. (4)
+    return np.asarray(_softened(values, size) * np.maximum(lean, 0.0))
+
+
+def _knee(values: Values, size: int) -> Kernel:
+    def falloff(r: Vector) -> Vector:
+        bent = (1 + (r / KNEE_PX) ** 2) ** (-values["bend"] / 2)
+        return np.asarray((values["b_px"] + r) ** -values["c"] * bent)  # Eq. (5)
+
+    return _by_radius(size, falloff)
+
+
+def _two(values: Values, size: int) -> Kernel:
+    r, count = _radii(REACH_GRID_PX)
+    first, second = ((b + r) ** -values["c"] for b in (values["b_px"], HALO_B_PX))
+    ratio = float((first * count)[1:].sum() / (second * count)[1:].sum())
+    share = values["halo_share"]
+
+    def falloff(r: Vector) -> Vector:
+        near, far = ((b + r) ** -values["c"] for b in (values["b_px"], HALO_B_PX))
+        return np.asarray((1 - share) * near + share * ratio * far)  # Eq. (6)
+
+    return _by_radius(size, falloff)
+
+
+def _core(values: Values, size: int) -> Kernel:
+    r, count = _radii(REACH_GRID_PX)
+    wide = float(((values["b_px"] + r) ** -values["c"] * count)[1:].sum())
+    narrow = float((np.exp(-0.5 * (r / CORE_PX) ** 2) * count)[1:].sum())
+    share = values["core_share"]
+
+    def falloff(r: Vector) -> Vector:
+        power_law, gaussian = (values["b_px"] + r) ** -values["c"], np.exp(-0.5 * (r / CORE_PX) ** 2)
+        return np.asarray((1 - share) * power_law + share * (wide / narrow) * gaussian)  # Eq. (7)
+
+    return _by_radius(size, falloff)
+
+
+SOFTENED_POWER_LAW = Shape("softened-power-law", _POWER_LAW, _softened, isotropic=True)
+SHAPES: dict[str, Shape] = {
+    shape.name: shape
+    for shape in (
+        SOFTENED_POWER_LAW,
+        Shape(
+            "stretched-along-x",
+            (*_POWER_LAW, Parameter("stretch_p", "", 0.0, "linear", 0.1, "ln(1 + stretch) along x")),
+            _stretched,
+            isotropic=False,
+        ),
+        Shape(
+            "stretched",
+            (
+                *_POWER_LAW,
+                Parameter(
+                    "stretch_p", "", 0.0, "linear", 0.1, "ln(1 + stretch) times cos of twice its angle"
+                ),
+                Parameter(
+                    "stretch_q", "", 0.0, "linear", 0.1, "ln(1 + stretch) times sin of twice its angle"
+                ),
+            ),
+            _stretched,
+            isotropic=False,
+        ),
+        Shape(
+            "one-sided",
+            (
+                *_POWER_LAW,
+                Parameter("x_share", "", 0.0, "linear", 0.2, "excess towards +x, deficit towards -x"),
+                Parameter("y_share", "", 0.0, "linear", 0.2, "excess towards +y, deficit towards -y"),
+            ),
+            _one_sided,
+            isotropic=False,
+        ),
+        Shape(
+            "knee",
+            (*_POWER_LAW, Parameter("bend", "", 0.0, "linear", 0.3, f"steepening beyond {KNEE_PX:g} px")),
+            _knee,
+            isotropic=True,
+        ),
+        Shape(
+            "two-power-laws",
+            (
+                *_POWER_LAW,
+                Parameter(
+                    "halo_share",
+                    "",
+                    0.0,
+                    "linear",
+                    0.1,
+                    f"share of a second one, softened at {HALO_B_PX:g} px",
+                ),
+            ),
+            _two,
+            isotropic=True,
+        ),
+        Shape(
+            "core",
+            (
+                *_POWER_LAW,
+                Parameter("core_share", "", 0.0, "linear", 0.1, f"share of a Gaussian of {CORE_PX:g} px"),
+            ),
+            _core,
+            isotropic=True,
+        ),
+    )
+}
+
+
+def shape_named(name: str) -> Shape:
+    """The shape of that name; DataError "unknown-shape" where there is none."""
+    if name not in SHAPES:
+        raise DataError("unknown-shape", f"expected one of {', '.join(SHAPES)}; got {name!r:.40}")
+    return SHAPES[name]
+
+
+def stretch_of(values: Values) -> tuple[float, float]:
+    """(stretch s, angle t in degrees from +x towards +y, -90 to 90) of Eq. (3)."""
+    p, q = values.get("stretch_p", 0.0), values.get("stretch_q", 0.0)
+    return math.expm1(math.hypot(p, q)), math.degrees(math.atan2(q, p)) / 2
+
+
+@cache
+def _radii(size: int) -> tuple[Vector, Vector]:
+    """Distinct radii of a square's pixels from its centre, the centre first, and how many pixels have each."""
+    squares, count = np.unique(squared_radii((size, size)), return_counts=True)
+    return np.sqrt(squares), count.astype(np.float64)
+
+
+@cache
+def _radius_index(size: int) -> NDArray[np.int32]:
+    squares = squared_radii((size, size))
+    position = np.zeros(int(squares.max()) + 1, np.int32)
+    distinct = np.unique(squares)
+    position[distinct] = np.arange(distinct.size)
+    return np.asarray(position[squares])
+
+
+def _by_radius(size: int, falloff: Callable[[Vector], Vector]) -> Kernel:
+    """An isotropic falloff on a square, worked out once a radius."""
+    return np.asarray(falloff(_radii(size)[0])[_radius_index(size)])
+
+
+@njit(cache=True, nogil=True)
+def _power_law_of_ellipses(size, b, c, p, q):  # type: ignore[no-untyped-def]
+    """Eq. (2) of the radius of Eq. (3) on (size, size)."""
+    out = np.empty((size, size))
+    s = math.hypot(p, q)
+    # exp(-S) for a symmetric matrix without trace: cosh(s) - S sinh(s) / s
+    grow = math.cosh(s)
+    shrink = math.sinh(s) / s if s > 1e-12 else 1.0
+    xx, yy, xy = grow - p * shrink, grow + p * shrink, -q * shrink
+    middle = size // 2
+    for j in range(size):
+        for i in range(size):
+            dx, dy = float(i - middle), float(j - middle)
+            r = math.hypot(xx * dx + xy * dy, xy * dx + yy * dy)
+            out[j, i] = math.exp(-c * math.log(b + r))
+    return out

@@ -1,0 +1,56 @@
+"""The total PSF: scatter convolved with diffraction, and how it changes with the scatter's parameters.
+
+Scattered light is diffracted too, so the two convolve; on the full reach both sum to 1 and so does their
+convolution, but for the little that leaves the grid.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.fourier import Convolver
+from psfcore.psf import REACH_GRID_PX, encircled_energy
+from psfcore.scatter.shapes import Shape, Vector
+
+Kernel = NDArray[np.float64]
+DIFFERENCE = 1e-3  # of a coordinate, for central differences
+CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
+
+
+class TotalPsf:
+    """Total PSFs of one diffraction pattern on the square that a field can see, at most the full reach.
+
+    diffraction: weights [y, x], sum 1 on its own grid. field_shape: (ny, nx) of the images.
+    """
+
+    def __init__(
+        self, diffraction: Kernel, shape: Shape, field_shape: tuple[int, int], *, threads: int = 1
+    ) -> None:
+        self.shape = shape
+        self.size = min(2 * max(field_shape), REACH_GRID_PX)
+        self._convolver = Convolver(diffraction, (self.size, self.size), dtype=np.float64, threads=threads)
+
+    def kernel(self, coordinates: Vector) -> Kernel:
+        """The total PSF [y, x] at these coordinates of the shape."""
+        return np.asarray(self._convolver.apply(self.shape.kernel(coordinates, self.size)))
+
+    def slopes(self, coordinates: Vector) -> list[Kernel]:
+        """d kernel / d coordinate, one array [y, x] a coordinate, by central differences."""
+        slopes = []
+        for k in range(coordinates.size):
+            step = np.zeros_like(coordinates)
+            step[k] = DIFFERENCE
+            ahead = self.shape.kernel(coordinates + step, self.size)
+            behind = self.shape.kernel(coordinates - step, self.size)
+            slopes.append(np.asarray(self._convolver.apply((ahead - behind) / (2 * DIFFERENCE))))
+        return slopes
+
+    @property
+    def radii_px(self) -> Vector:
+        """The curve's radii that lie on the square."""
+        return np.array([r for r in CURVE_RADII_PX if r < self.size // 2])
+
+    def curve_slopes(self, slopes: list[Kernel]) -> NDArray[np.float64]:
+        """d C(R) / d coordinate in percent: (radii, coordinates)."""
+        return np.stack([-100 * encircled_energy(slope, self.radii_px) for slope in slopes], axis=1)

@@ -1,0 +1,279 @@
+"""Where the occulter is: found by simulating it on what its neighbours in time show.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", step (e). The scene
+behind the occulter of frame i is taken from frames of the same pointing that show it unocculted, the nearest in
+time; it is blanked by a disc and seen through the PSF:
+
+    m = scale Q + level - H (P c)                         Eq. (1)
+    chi2 = sum (y - m)^2 / var + ((x - x0)^2 + (y - y0)^2) / s^2   Eq. (2)
+
+Q is the mean of the neighbours as observed, P that of their deconvolved scenes, c the share of a pixel that the
+disc covers, H the PSF near its centre. Scale and level are free: they take up what is smooth over the disc's
+neighbourhood (light of the neighbours' own occulter, a gain that differs), and leave the place alone.
+The paper moves the disc until the simulation looks best; here Eq. (2) is minimised by Gauss-Newton steps.
+
+Where no neighbour shows the place, the disc's surroundings in the frame itself stand in: the mean of a ring.
+
+| symbol | name | unit |
+|---|---|---|
+| y, var | observed, variance: patch round the ephemeris' place | DN/s, (DN/s)^2 |
+| c | coverage | - |
+| s | ephemeris_sigma_px | px |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from psfcore.fourier import Convolver
+from psfcore.noise import Noise
+from psfcore.transit.transit import Frame, Place
+
+Plane = NDArray[np.float64]
+Window = tuple[slice, slice]
+
+EPHEMERIS_SIGMA_PX = 1.0
+LEAST_NEIGHBOURS = 4  # a mean of four adds a quarter to the frame's own noise; the paper's two add half
+ENOUGH_PHOTONS = 300.0  # a pixel, in all neighbours together: fainter places are taken from more of them
+LARGEST_TEMPLATE_NOISE = 0.3  # of its mean, else it is smoothed: the disc would be moved to fit its noise
+LARGEST_SMOOTHING_PX = 8.0
+PATCH_MARGIN_PX = 9
+LARGEST_SHIFT_PX = 5.0
+SETTLED_PX = 1e-3
+STEPS = 20
+DECONVOLUTION_NOISE = 2.3  # how much a deconvolution adds to it, for a core weight of 0.43
+_STRIPS = 32
+_DIFFERENCE_PX = 0.05
+
+
+@dataclass(frozen=True)
+class FoundPlace:
+    """An occulter's place with its error (px, each axis), and how it was found.
+
+    neighbours: how many frames showed the scene behind it; 0: the disc's own surroundings stood in.
+    """
+
+    place: Place
+    sigma_x_px: float
+    sigma_y_px: float
+    chi2_per_pixel: float
+    neighbours: int
+    steps_done: int
+    settled: bool
+
+
+def coverage(shape: tuple[int, int], place: Place) -> Plane:
+    """Share of each pixel [y, x] that a disc covers, 0 to 1: chords exact in x, a mean of strips in y."""
+    strip = (np.arange(shape[0] * _STRIPS) + 0.5) / _STRIPS - 0.5
+    half = np.sqrt(np.maximum(place.radius_px**2 - (strip - place.y_px) ** 2, 0.0))
+    left = np.arange(shape[1])[None, :] - 0.5
+    low = np.maximum(left, (place.x_px - half)[:, None])
+    high = np.minimum(left + 1, (place.x_px + half)[:, None])
+    chord = np.maximum(high - low, 0.0)
+    return np.asarray(chord.reshape(shape[0], _STRIPS, shape[1]).mean(axis=1))
+
+
+def fully_dark(shape: tuple[int, int], place: Place, margin_px: float = 0.0) -> NDArray[np.bool_]:
+    """True for pixels [y, x] that lie whole within the disc, less a margin: their farthest corner counts."""
+    y = np.abs(np.arange(shape[0]) - place.y_px)[:, None] + 0.5
+    x = np.abs(np.arange(shape[1]) - place.x_px)[None, :] + 0.5
+    return np.asarray(np.hypot(y, x) <= place.radius_px - margin_px)
+
+
+def disc_distance(shape: tuple[int, int], place: Place) -> Plane:
+    """Distance of each pixel's centre [y, x] from the occulter's, px."""
+    y = np.arange(shape[0]) - place.y_px
+    x = np.arange(shape[1]) - place.x_px
+    return np.asarray(np.hypot(y[:, None], x[None, :]))
+
+
+def patch_window(shape: tuple[int, int], place: Place, margin_px: float = PATCH_MARGIN_PX) -> Window:
+    """Rows and columns of the square round a disc, cut to the frame."""
+    reach = place.radius_px + margin_px
+    bounds = [
+        slice(max(0, round(centre - reach)), min(size, round(centre + reach) + 1))
+        for centre, size in ((place.y_px, shape[0]), (place.x_px, shape[1]))
+    ]
+    return bounds[0], bounds[1]
+
+
+def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], noise: Noise) -> list[int]:
+    """The frames of the same pointing, nearest in time, whose own disc leaves this one's patch free.
+
+    Four, or as many more as it takes until a pixel of all together holds ENOUGH_PHOTONS.
+    """
+    here, frame = places[index], frames[index]
+    reach = here.radius_px + PATCH_MARGIN_PX
+    free = [
+        k
+        for k, (other, there) in enumerate(zip(frames, places, strict=True))
+        if k != index
+        and other.fov == frame.fov
+        and max(abs(there.x_px - here.x_px), abs(there.y_px - here.y_px)) > reach + there.radius_px
+    ]
+    free.sort(key=lambda k: (abs(frames[k].time_s - frame.time_s), k))
+    window = patch_window(frame.pixels.shape, here)
+    chosen: list[int] = []
+    photons = 0.0
+    for k in free:
+        if len(chosen) >= LEAST_NEIGHBOURS and photons >= ENOUGH_PHOTONS:
+            break
+        level = float(frames[k].pixels[window].mean(dtype=np.float64))
+        # Signal over noise, squared: photons, or what readout noise leaves them worth.
+        photons += level**2 / float(noise.variance(np.array(max(level, 0.0)), frames[k].exposure_s))
+        chosen.append(k)
+    return chosen
+
+
+def find_occulter(
+    index: int,
+    frames: Sequence[Frame],
+    scenes: Sequence[NDArray[np.float32]],
+    places: Sequence[Place],
+    psf_kernel: Plane,
+    noise: Noise,
+    *,
+    ephemeris_sigma_px: float = EPHEMERIS_SIGMA_PX,
+) -> FoundPlace:
+    """The place of the occulter in frame `index`.
+
+    scenes: deconvolved frames [y, x], DN/s. places: the best known of all frames, to see which show what.
+    psf_kernel: weights [y, x], centre at [n // 2, n // 2].
+    """
+    frame, start = frames[index], frames[index].place
+    window = patch_window(frame.pixels.shape, start)
+    observed = frame.pixels[window].astype(np.float64)
+    chosen = neighbours_of(index, frames, places, noise)
+    if chosen:
+        share = _shares(chosen, frames, window, noise)
+        seen, behind = (
+            sum(w * p[window].astype(np.float64) for w, p in zip(share, planes, strict=True))
+            for planes in ([frames[k].pixels for k in chosen], [scenes[k] for k in chosen])
+        )
+        neighbours_noise = sum(
+            w**2 * noise.variance(_level(seen), frames[k].exposure_s)
+            for w, k in zip(share, chosen, strict=True)
+        )
+        behind = _quiet(behind, float(np.sqrt(np.mean(neighbours_noise))) * DECONVOLUTION_NOISE)
+    else:
+        seen = behind = np.full(observed.shape, _ring_mean(frame, start, window))
+        neighbours_noise = np.zeros(observed.shape)
+    simulated = _SimulatedDisc(seen, behind, psf_kernel)
+    local = Place(start.x_px - window[1].start, start.y_px - window[0].start, start.radius_px)
+
+    def variance(model: Plane) -> Plane:
+        return np.asarray(noise.variance(_level(model), frame.exposure_s) + neighbours_noise)
+
+    solved = _solve(simulated, observed, variance, local, ephemeris_sigma_px)
+    place = Place(solved.at[0] + window[1].start, solved.at[1] + window[0].start, start.radius_px)
+    sigma = np.sqrt(np.diag(np.linalg.inv(solved.normal)))
+    return FoundPlace(
+        place=place,
+        sigma_x_px=float(sigma[0]),
+        sigma_y_px=float(sigma[1]),
+        chi2_per_pixel=solved.chi2 / observed.size,
+        neighbours=len(chosen),
+        steps_done=solved.steps_done,
+        settled=solved.settled,
+    )
+
+
+def _shares(
+    chosen: Sequence[int], frames: Sequence[Frame], window: Window, noise: Noise
+) -> NDArray[np.float64]:
+    """Weights of the neighbours in their mean, sum 1: long exposures count for more."""
+    level = np.mean([frames[k].pixels[window].mean(dtype=np.float64) for k in chosen])
+    weight = np.array(
+        [1 / float(noise.variance(np.array(max(level, 0.0)), frames[k].exposure_s)) for k in chosen]
+    )
+    return np.asarray(weight / weight.sum())
+
+
+class _SimulatedDisc:
+    """Eq. (1) on a patch, and what its four numbers (x, y, scale, level) change."""
+
+    def __init__(self, seen: Plane, behind: Plane, psf_kernel: Plane) -> None:
+        self.seen, self.behind = seen, behind
+        ny, nx = seen.shape
+        self._blur = Convolver(psf_kernel, (ny, nx), dtype=np.float64)
+
+    def hidden(self, x_px: float, y_px: float, radius_px: float) -> Plane:
+        """H (P c): the light that a disc takes away."""
+        covered = coverage((self.seen.shape[0], self.seen.shape[1]), Place(x_px, y_px, radius_px))
+        return np.asarray(self._blur.apply(self.behind * covered))
+
+
+@dataclass(frozen=True)
+class _Solved:
+    at: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    chi2: float
+    steps_done: int
+    settled: bool
+
+
+def _solve(
+    disc: _SimulatedDisc,
+    observed: Plane,
+    variance: Callable[[Plane], Plane],
+    start: Place,
+    sigma_px: float,
+) -> _Solved:
+    """Gauss-Newton on Eq. (2), the weights by what the simulation expects and not by what happened to come."""
+    at = np.array([start.x_px, start.y_px, 1.0, 0.0])
+    origin, radius = at.copy(), start.radius_px
+    prior = np.diag([sigma_px**-2, sigma_px**-2, 0.0, 0.0])
+    h = _DIFFERENCE_PX
+    settled, done = False, 0
+    while done < STEPS and not settled:
+        x, y = at[0], at[1]
+        model = at[2] * disc.seen + at[3] - disc.hidden(x, y, radius)
+        misfit, weight = observed - model, 1 / variance(model)
+        slopes = np.array(
+            [
+                (disc.hidden(x - h, y, radius) - disc.hidden(x + h, y, radius)) / (2 * h),
+                (disc.hidden(x, y - h, radius) - disc.hidden(x, y + h, radius)) / (2 * h),
+                disc.seen,
+                np.ones_like(observed),
+            ]
+        ).reshape(4, -1)
+        weighted = slopes * weight.ravel()
+        normal = weighted @ slopes.T + prior
+        step = np.linalg.lstsq(normal, weighted @ misfit.ravel() + prior @ (origin - at), rcond=None)[0]
+        step[:2] = np.clip(step[:2], -1.0, 1.0)
+        at = at + step
+        at[:2] = np.clip(at[:2], origin[:2] - LARGEST_SHIFT_PX, origin[:2] + LARGEST_SHIFT_PX)
+        done += 1
+        settled = bool(np.abs(step[:2]).max() < SETTLED_PX)
+    model = at[2] * disc.seen + at[3] - disc.hidden(at[0], at[1], radius)
+    return _Solved(at, normal, float(np.sum((observed - model) ** 2 / variance(model))), done, settled)
+
+
+def _ring_mean(frame: Frame, place: Place, window: Window) -> float:
+    """Mean of the lit ring 3 to 9 px outside the disc."""
+    local = Place(place.x_px - window[1].start, place.y_px - window[0].start, place.radius_px)
+    patch = frame.pixels[window]
+    distance = disc_distance((patch.shape[0], patch.shape[1]), local) - place.radius_px
+    return float(patch[(distance > 3) & (distance < PATCH_MARGIN_PX)].mean(dtype=np.float64))
+
+
+def _level(plane: Plane) -> Plane:
+    """Expected intensity: smoothed over 3 px, and not below a twentieth of its mean."""
+    return np.asarray(np.maximum(gaussian_filter(plane, 3.0), 0.05 * max(float(plane.mean()), 0.0)))
+
+
+def _quiet(plane: Plane, noise_a_pixel: float) -> Plane:
+    """The plane, smoothed where its noise would be more than LARGEST_TEMPLATE_NOISE of its mean.
+
+    White noise falls by 2 sqrt(pi) sigma under a Gaussian of width sigma.
+    """
+    wanted = LARGEST_TEMPLATE_NOISE * max(float(plane.mean()), 1e-30)
+    sigma = noise_a_pixel / wanted / (2 * np.sqrt(np.pi))
+    if sigma * 2 * np.sqrt(np.pi) <= 1:
+        return plane
+    return np.asarray(gaussian_filter(plane, min(sigma, LARGEST_SMOOTHING_PX)))
