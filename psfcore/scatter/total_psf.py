@@ -33,7 +33,7 @@ class TotalPsf:
 
     def kernel(self, coordinates: Vector) -> Kernel:
         """The total PSF [y, x] at these coordinates of the shape."""
-        return np.asarray(self._convolver.apply(self.shape.kernel(coordinates, self.size)))
+        return np.asarray(self._convolver.apply(self.shape.kernel(coordinates, self.size)), dtype=np.float64)
 
     def slopes(self, coordinates: Vector) -> list[Kernel]:
         """d kernel / d coordinate, one array [y, x] a coordinate, by central differences."""
@@ -43,7 +43,8 @@ class TotalPsf:
             step[k] = DIFFERENCE
             ahead = self.shape.kernel(coordinates + step, self.size)
             behind = self.shape.kernel(coordinates - step, self.size)
-            slopes.append(np.asarray(self._convolver.apply((ahead - behind) / (2 * DIFFERENCE))))
+            slope = self._convolver.apply((ahead - behind) / (2 * DIFFERENCE))
+            slopes.append(np.asarray(slope, dtype=np.float64))
         return slopes
 
     @property

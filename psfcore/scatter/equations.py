@@ -1,0 +1,218 @@
+"""The system of equations of the inversion, and its fits: steps (g) to (i) of the paper.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm":
+
+    I_o = sum over S of psf_S A_S + (1 - sum over S of n_S psf_S) B      Eq. (1)
+
+one line for each pixel chosen, I_o observed. Every line is divided by its scale, and the coefficients are fitted to
+many draws of lines: 1000 from occulted pixels, the same number from each shell of the selection mask, and 100 from
+lit pixels near the edge. The 30 worst of 100 fits are dropped and the others averaged.
+
+    free fit        psf_S >= 0, by the Trust Region Reflective algorithm             Eq. (2)
+    power law       psf_S = a / (b + r)^c, averaged over S, by the same               Eq. (3)
+
+| symbol | name | unit |
+|---|---|---|
+| A_S | ring_sums: the scene summed over segment S round the pixel | DN/s px^2 |
+| B | unscattered: the scene through diffraction | DN/s |
+| n_S | counts: pixels of S | px^2 |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, lsq_linear
+
+from psfcore.errors import DataError
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+DRAWS = 100
+KEPT_DRAWS = 70
+OCCULTED_LINES = 1000
+LIT_LINES = 100
+LIT = -1
+HOLD = 10.0  # times a line's worth of misfit is what a shell with all of the light costs
+PIVOT_PX = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Lines of Eq. (1): observed, unscattered and scale (n,), ring_sums (n, segments).
+
+    stratum: the shell of the selection mask that a pixel lies in (0 outermost), LIT for a lit one. scale: what a
+    line is divided by.
+    """
+
+    observed: Vector
+    ring_sums: Matrix
+    unscattered: Vector
+    scale: Vector
+    stratum: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return int(self.observed.size)
+
+    @staticmethod
+    def joined(parts: Sequence[Lines]) -> Lines:
+        """All lines of several frames."""
+        return Lines(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in ("observed", "ring_sums", "unscattered", "scale", "stratum")
+            )
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Fits to draws of lines: coefficients (draws kept, n), the worst dropped, and their cost a line."""
+
+    fits: Matrix
+    cost: Vector
+
+    @property
+    def mean(self) -> Vector:
+        """The average of the draws kept."""
+        return np.asarray(self.fits.mean(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class PowerLawDrawn:
+    """The average of fits of Eq. (3) to draws of lines, and the fits: a, b (px) and c, (draws kept, 3)."""
+
+    a: float
+    b_px: float
+    c: float
+    fits: Matrix
+    cost: Vector
+
+    @property
+    def law(self) -> Vector:
+        """a, b and c."""
+        return np.array([self.a, self.b_px, self.c])
+
+
+def draw(lines: Lines, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Indices of one draw: as many occulted lines from each stratum, and lit ones; without repetition within one.
+
+    A stratum that holds fewer lines than its share gives all it has.
+    """
+    strata = np.unique(lines.stratum[lines.stratum != LIT])
+    if strata.size == 0:
+        raise DataError("no-lines", "expected occulted pixels to draw lines from; got none")
+    share = -(-OCCULTED_LINES // strata.size)
+    chosen = [_some(np.flatnonzero(lines.stratum == stratum), share, rng) for stratum in strata]
+    return np.concatenate([*chosen, _some(np.flatnonzero(lines.stratum == LIT), LIT_LINES, rng)])
+
+
+def _some(of: NDArray[np.intp], number: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    return of if of.size <= number else rng.choice(of, number, replace=False)
+
+
+def free_fit(lines: Lines, counts: Vector, *, seed: int, draws: int = DRAWS) -> Drawn:
+    """Eq. (2): coefficients (draws kept, segments), per px^2."""
+    rng = np.random.default_rng(seed)
+    return _drawn(lines, counts, rng, draws, lambda matrix, target: _solve_free(matrix, target, counts))
+
+
+def power_law_fit(
+    lines: Lines,
+    counts: Vector,
+    radii: Sequence[tuple[Vector, Vector]],
+    start: Vector,
+    *,
+    seed: int,
+    draws: int = DRAWS,
+) -> PowerLawDrawn:
+    """Eq. (3), a, b (px) and c.
+
+    radii: for each segment the distances of its pixels and how many have each. start: a, b, c.
+    """
+    rng = np.random.default_rng(seed)
+    mean = SegmentMean(radii)
+
+    def solve(matrix: Matrix, target: Vector) -> tuple[Vector, float]:
+        def misfit(theta: Vector) -> Vector:
+            return np.asarray(matrix @ mean(theta) - target)
+
+        # ln a at a distance where the data fix it, not at r = 0: a, b and c trade along a narrow valley.
+        solved = least_squares(
+            misfit,
+            _to_pivot(start),
+            method="trf",
+            bounds=([-np.inf, np.log(0.05), 0.5], [np.inf, np.log(500.0), 8.0]),
+            x_scale=[0.1, 0.3, 0.1],
+        )
+        return solved.x, float(2 * solved.cost)
+
+    drawn = _drawn(lines, counts, rng, draws, solve)
+    # Averaged where a fit's errors are near to Gaussian: a itself spans decades from draw to draw.
+    a, b, c = _from_pivot(drawn.mean)
+    return PowerLawDrawn(
+        float(a), float(b), float(c), fits=np.array([_from_pivot(fit) for fit in drawn.fits]), cost=drawn.cost
+    )
+
+
+class SegmentMean:
+    """Eq. (3) averaged over the pixels of each segment, of (ln of the weight at PIVOT_PX, ln b, c)."""
+
+    def __init__(self, radii: Sequence[tuple[Vector, Vector]]) -> None:
+        self._radius = np.concatenate([r for r, _ in radii])
+        counts = np.array([n.sum() for _, n in radii])
+        share = [n / max(float(n.sum()), 1.0) for _, n in radii]
+        self._share = np.concatenate(share)
+        self._start = np.concatenate(([0], np.cumsum([r.size for r, _ in radii])[:-1])).astype(np.intp)
+        self._empty = counts == 0
+
+    def __call__(self, theta: Vector) -> Vector:
+        weight = np.exp(
+            theta[0] - theta[2] * np.log((np.exp(theta[1]) + self._radius) / (np.exp(theta[1]) + PIVOT_PX))
+        )
+        mean = np.add.reduceat(weight * self._share, np.minimum(self._start, self._share.size - 1))
+        return np.where(self._empty, 0.0, mean)
+
+
+def _to_pivot(abc: Vector) -> Vector:
+    a, b, c = abc
+    return np.array([np.log(a) - c * np.log(b + PIVOT_PX), np.log(b), c])
+
+
+def _from_pivot(theta: Vector) -> Vector:
+    b = np.exp(theta[1])
+    return np.array([np.exp(theta[0] + theta[2] * np.log(b + PIVOT_PX)), b, theta[2]])
+
+
+def _solve_free(matrix: Matrix, target: Vector, counts: Vector) -> tuple[Vector, float]:
+    """Eq. (2) in the light n_S psf_S of each shell, held towards nothing where no line decides.
+
+    A departure: no occulted pixel is near enough to the edge to tell the innermost shells from the centre, and
+    without a hold the system gives them more light than there is (1.3 in the first round on simulated transits).
+    """
+    used = (counts > 0) & (np.linalg.norm(matrix, axis=0) > 0)
+    light = matrix[:, used] / counts[used]
+    held = np.concatenate((light, HOLD * np.eye(light.shape[1])))
+    wanted = np.concatenate((target, np.zeros(light.shape[1])))
+    solved = lsq_linear(held, wanted, bounds=(0.0, np.inf), method="trf")
+    out = np.zeros(matrix.shape[1])
+    out[used] = solved.x / counts[used]
+    return out, float(np.sum((light @ solved.x - target) ** 2))
+
+
+def _drawn(lines: Lines, counts: Vector, rng: np.random.Generator, draws: int, solve) -> Drawn:  # type: ignore[no-untyped-def]
+    """Fit many draws, drop the worst, keep the share that the paper keeps."""
+    matrix = (lines.ring_sums - lines.unscattered[:, None] * counts) / lines.scale[:, None]
+    target = (lines.observed - lines.unscattered) / lines.scale
+    fits, cost = [], []
+    for _ in range(draws):
+        chosen = draw(lines, rng)
+        fit, misfit = solve(matrix[chosen], target[chosen])
+        fits.append(fit)
+        cost.append(misfit / chosen.size)
+    best = np.argsort(cost, kind="stable")[: max(1, draws * KEPT_DRAWS // DRAWS)]
+    return Drawn(np.array(fits)[best], np.array(cost)[best])
