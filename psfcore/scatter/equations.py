@@ -115,10 +115,18 @@ def _some(of: NDArray[np.intp], number: int, rng: np.random.Generator) -> NDArra
     return of if of.size <= number else rng.choice(of, number, replace=False)
 
 
-def free_fit(lines: Lines, counts: Vector, *, seed: int, draws: int = DRAWS) -> Drawn:
-    """Eq. (2): coefficients (draws kept, segments), per px^2."""
+def free_fit(
+    lines: Lines, counts: Vector, *, seed: int, draws: int = DRAWS, towards: Vector | None = None
+) -> Drawn:
+    """Eq. (2): coefficients (draws kept, segments), per px^2.
+
+    towards: the coefficients that hold where no line decides; none: nothing.
+    """
+    held_at = np.zeros_like(counts) if towards is None else towards
     rng = np.random.default_rng(seed)
-    return _drawn(lines, counts, rng, draws, lambda matrix, target: _solve_free(matrix, target, counts))
+    return _drawn(
+        lines, counts, rng, draws, lambda matrix, target: _solve_free(matrix, target, counts, held_at)
+    )
 
 
 def power_law_fit(
@@ -188,18 +196,19 @@ def _from_pivot(theta: Vector) -> Vector:
     return np.array([np.exp(theta[0] + theta[2] * np.log(b + PIVOT_PX)), b, theta[2]])
 
 
-def _solve_free(matrix: Matrix, target: Vector, counts: Vector) -> tuple[Vector, float]:
-    """Eq. (2) in the light n_S psf_S of each shell, held towards nothing where no line decides.
+def _solve_free(matrix: Matrix, target: Vector, counts: Vector, towards: Vector) -> tuple[Vector, float]:
+    """Eq. (2) in the light n_S psf_S of each shell, held where no line decides.
 
     A departure: no occulted pixel is near enough to the edge to tell the innermost shells from the centre, and
     without a hold the system gives them more light than there is (1.3 in the first round on simulated transits).
     """
     used = (counts > 0) & (np.linalg.norm(matrix, axis=0) > 0)
+    out = towards.copy()
+    target = target - matrix[:, ~used] @ towards[~used]
     light = matrix[:, used] / counts[used]
     held = np.concatenate((light, HOLD * np.eye(light.shape[1])))
-    wanted = np.concatenate((target, np.zeros(light.shape[1])))
+    wanted = np.concatenate((target, HOLD * (towards * counts)[used]))
     solved = lsq_linear(held, wanted, bounds=(0.0, np.inf), method="trf")
-    out = np.zeros(matrix.shape[1])
     out[used] = solved.x / counts[used]
     return out, float(np.sum((light @ solved.x - target) ** 2))
 

@@ -138,7 +138,7 @@ class Inversion:
         return sum(frame.chi2 for frame in self.frames) / (pixels - self.coordinates.size)
 
 
-class _Sky:
+class Sky:
     """The frames in the engine's order, their scenes as last reconstructed, their occulters as last found."""
 
     def __init__(self, transit: Transit, optics: Optics, progress: Progress) -> None:
@@ -235,6 +235,42 @@ class _Measured:
         return float(np.sum(self.slopes.weight * self.residual**2))
 
 
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """An inversion and what it was made with, for questions that come after it.
+
+    optics: the total PSF at the solution. sky: scenes and dark pixels of all frames. part: indices of the frames
+    that took part, in the order of inversion.frames.
+    """
+
+    inversion: Inversion
+    transit: Transit
+    total: TotalPsf
+    optics: Optics
+    sky: Sky
+    part: tuple[int, ...]
+    threads: int
+
+    def lit(self, n: int) -> Lanes:
+        """The scene of frame n with its occulter dark, in the engine's order."""
+        scene = self.sky.scenes[n].copy()
+        put(scene, self.sky.dark[n], 0.0)
+        return scene
+
+    def residual(self, n: int) -> tuple[Vector, Vector]:
+        """Eq. (1) for the dark pixels of frame n, and what was expected there, DN/s."""
+        expected = pick(self.optics.see(self.lit(n)), self.sky.dark[n])
+        return pick(self.sky.observed[n], self.sky.dark[n]) - expected, expected
+
+    def weight(self, n: int, expected: Vector) -> Vector:
+        """One over the variance of Eq. (3) at an expected intensity."""
+        return _weight(self.transit, n, expected)
+
+    def answer(self, n: int, slope: Blur) -> Vector:
+        """How the expected dark pixels of frame n change with a change of the PSF, Eq. (4)."""
+        return _answer(self.optics, slope, self.lit(n), self.sky.dark[n])
+
+
 def invert(
     transit: Transit,
     shape: Shape = SOFTENED_POWER_LAW,
@@ -242,7 +278,7 @@ def invert(
     start: Vector | None = None,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
-) -> Inversion:
+) -> Solution:
     """Fit a shape of scatter to a transit.
 
     start: coordinates; none: the shape's own. Raises DataError "too-few-frames" (fewer than three with an occulter
@@ -252,26 +288,24 @@ def invert(
     at = shape.start if start is None else np.asarray(start, dtype=np.float64)
     kernel = total.kernel(at)
     optics = Optics(kernel, transit.shape, threads=threads)
-    sky = _Sky(transit, optics, progress)
+    sky = Sky(transit, optics, progress)
     sky.find(optics, kernel)
     solver = _Solver(sky, total, threads, progress)
     frames = solver.taking_part()
     if len(frames) > PILOT_FRAMES + LEAST_FRAMES:
-        pilot = [
-            frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, PILOT_FRAMES).round().astype(int))
-        ]
-        at = solver.solve(at, pilot, PILOT_CONVERGED_POINTS)
+        spread = np.unique(np.linspace(0, len(frames) - 1, PILOT_FRAMES).round().astype(int))
+        at = solver.solve(at, [frames[k] for k in spread], PILOT_CONVERGED_POINTS)
     at = solver.solve(at, frames, PILOT_CONVERGED_POINTS)
     kernel = total.kernel(at)  # step (e) again, with a PSF that is nearly right
     sky.find(Optics(kernel, transit.shape, threads=threads), kernel)
     at = solver.solve(at, solver.taking_part(), CONVERGED_POINTS)
-    return solver.result(at)
+    return solver.solution(at)
 
 
 class _Solver:
     """Gauss-Newton steps on Eq. (2)."""
 
-    def __init__(self, sky: _Sky, total: TotalPsf, threads: int, progress: Progress) -> None:
+    def __init__(self, sky: Sky, total: TotalPsf, threads: int, progress: Progress) -> None:
         self._sky, self._total, self._threads, self._progress = sky, total, threads, progress
         self.rounds: list[Round] = []
         self.converged = False
@@ -354,7 +388,7 @@ class _Solver:
     def _measure_one(self, model: _Model, n: int, kept: _Slopes | None) -> _Measured:
         """Eq. (1) for one frame; Eq. (3) and (4) unless they are kept from the last round."""
         sky, optics = self._sky, model.optics
-        frame, dark, observed = sky.transit.frames[n], sky.dark[n], sky.observed[n]
+        dark, observed = sky.dark[n], sky.observed[n]
         scene = optics.undo(observed, sky.scenes[n], steps=WARM_STEPS)  # step (d)
         sky.scenes[n] = scene
         lit = scene.copy()
@@ -363,13 +397,12 @@ class _Solver:
         residual = pick(observed, dark) - expected  # Eq. (1)
         if kept is not None:
             return _Measured(residual, expected, kept)
-        level = np.maximum(expected, LEAST_LEVEL * expected.mean())
-        weight = 1 / sky.transit.noise.variance(level, frame.exposure_s)  # Eq. (3)
+        weight = _weight(sky.transit, n, expected)
         answers = np.array([_answer(optics, blur, lit, dark) for blur in model.slope_blurs])
         weighted = answers * weight
         return _Measured(residual, expected, _Slopes(weight, weighted, weighted @ answers.T))
 
-    def result(self, at: Vector) -> Inversion:
+    def solution(self, at: Vector) -> Solution:
         """Everything at the solution: one more look at every frame, for residuals and errors."""
         model = self._model(at, with_slopes=True)
         frames = self.taking_part()
@@ -385,7 +418,7 @@ class _Solver:
             fits.append(self._frame_fit(n, m, mean_noise))
         inverse = np.linalg.inv(normal)
         covariance = inverse @ spread @ inverse
-        return Inversion(
+        inversion = Inversion(
             shape=self._total.shape,
             coordinates=at,
             covariance=covariance,
@@ -396,6 +429,15 @@ class _Solver:
             converged=self.converged,
             frames=tuple(fits),
             left_out=self._sky.left_out(),
+        )
+        return Solution(
+            inversion=inversion,
+            transit=self._sky.transit,
+            total=self._total,
+            optics=model.optics,
+            sky=self._sky,
+            part=tuple(frames),
+            threads=self._threads,
         )
 
     def _noise_of(self, model: _Model, n: int, measured: _Measured) -> tuple[NDArray[np.float64], float]:
@@ -445,6 +487,12 @@ class _Model:
     slope_blurs: list[Blur]
     curve: Vector
     curve_slopes: NDArray[np.float64]
+
+
+def _weight(transit: Transit, n: int, expected: Vector) -> Vector:
+    """One over the variance of Eq. (3)."""
+    level = np.maximum(expected, LEAST_LEVEL * expected.mean())
+    return np.asarray(1 / transit.noise.variance(level, transit.frames[n].exposure_s))
 
 
 def _answer(optics: Optics, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:

@@ -35,17 +35,18 @@ class TotalPsf:
         """The total PSF [y, x] at these coordinates of the shape."""
         return np.asarray(self._convolver.apply(self.shape.kernel(coordinates, self.size)), dtype=np.float64)
 
+    def slope(self, coordinates: Vector, k: int) -> Kernel:
+        """d kernel / d coordinate k, [y, x], by central differences."""
+        step = np.zeros_like(coordinates)
+        step[k] = DIFFERENCE
+        ahead = self.shape.kernel(coordinates + step, self.size)
+        behind = self.shape.kernel(coordinates - step, self.size)
+        slope = self._convolver.apply((ahead - behind) / (2 * DIFFERENCE))
+        return np.asarray(slope, dtype=np.float64)
+
     def slopes(self, coordinates: Vector) -> list[Kernel]:
-        """d kernel / d coordinate, one array [y, x] a coordinate, by central differences."""
-        slopes = []
-        for k in range(coordinates.size):
-            step = np.zeros_like(coordinates)
-            step[k] = DIFFERENCE
-            ahead = self.shape.kernel(coordinates + step, self.size)
-            behind = self.shape.kernel(coordinates - step, self.size)
-            slope = self._convolver.apply((ahead - behind) / (2 * DIFFERENCE))
-            slopes.append(np.asarray(slope, dtype=np.float64))
-        return slopes
+        """d kernel / d coordinate, one array [y, x] a coordinate."""
+        return [self.slope(coordinates, k) for k in range(coordinates.size)]
 
     @property
     def radii_px(self) -> Vector:
