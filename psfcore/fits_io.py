@@ -191,6 +191,15 @@ def write_image(
     _write(path, hdus)
 
 
+def write_plane(path: str | Path, pixels: NDArray[Any], *, cards: Cards) -> None:
+    """Write pixels [y, x] and `cards`, nothing else: integers as int32, numbers as float32."""
+    header = fits.Header()
+    for key, (value, comment) in cards.items():
+        header[key] = (_ascii(value) if isinstance(value, str) else value, _ascii(comment))
+    stored = pixels.astype(np.int32 if pixels.dtype.kind in "iu" else np.float32)
+    _write(path, [fits.PrimaryHDU(stored, header)])
+
+
 def read_planes(path: str | Path) -> dict[str, NDArray[Any]]:
     """The planes [y, x] of a product by name, the mask not among them; floats are float32."""
     planes: dict[str, NDArray[Any]] = {}

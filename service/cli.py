@@ -16,7 +16,7 @@ import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
-from service import cli_diffraction
+from service import cli_diffraction, cli_simulate
 from service.client import DEFAULT_SERVER, Heliopsf, Operations, ServiceError, percent
 from workers.contract import Component, Method
 from workers.settings import Settings, software_version
@@ -320,7 +320,7 @@ def _progress_bar() -> Iterator[Report]:
         sys.stderr.write("\n")
 
 
-for command in cli_diffraction.COMMANDS:
+for command in (*cli_diffraction.COMMANDS, *cli_simulate.COMMANDS):
     main.add_command(command)
 
 

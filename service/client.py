@@ -6,11 +6,16 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any
 
 import httpx
+
+from psfcore.errors import DataError
+from psfcore.transit.archive import pack
 
 DEFAULT_SERVER = "http://127.0.0.1:8765"
 PATIENCE_S = 30.0
@@ -31,6 +36,13 @@ class Operations(ABC):
     @abstractmethod
     def upload_image(self, path: str | Path) -> dict[str, Any]:
         """Upload a FITS image; returns its description, with its ``id``."""
+
+    @abstractmethod
+    def upload_transit(self, path: str | Path) -> dict[str, Any]:
+        """Upload a transit, a folder or an archive of one; returns its description, with its ``id``.
+
+        Of a folder what its transit.json names is sent, as the same bytes each time. Raises ``ServiceError``.
+        """
 
     @abstractmethod
     def upload_psf(
@@ -171,6 +183,11 @@ class Heliopsf(Operations):
         """Upload a FITS image; returns its description, with its ``id``."""
         return self._upload("/v1/images", Path(path), {})
 
+    def upload_transit(self, path: str | Path) -> dict[str, Any]:
+        """Upload a transit, a folder or an archive of one; returns its description, with its ``id``."""
+        with as_archive(Path(path)) as archive:
+            return self._upload("/v1/transits", archive, {}, media_type="application/octet-stream")
+
     def upload_psf(
         self, path: str | Path, *, name: str | None = None, version: str | None = None
     ) -> dict[str, Any]:
@@ -255,7 +272,9 @@ class Heliopsf(Operations):
         finally:
             partial.unlink(missing_ok=True)
 
-    def _upload(self, address: str, path: Path, query: dict[str, str | None]) -> dict[str, Any]:
+    def _upload(
+        self, address: str, path: Path, query: dict[str, str | None], *, media_type: str = "application/fits"
+    ) -> dict[str, Any]:
         known = {key: value for key, value in query.items() if value is not None}
         with path.open("rb") as file:
             return self._json(
@@ -263,7 +282,7 @@ class Heliopsf(Operations):
                 address,
                 params={"filename": path.name, **known},
                 content=iter(lambda: file.read(2**20), b""),
-                headers={"Content-Type": "application/fits", "Content-Length": str(path.stat().st_size)},
+                headers={"Content-Type": media_type, "Content-Length": str(path.stat().st_size)},
             )
 
     def _all(self, address: str, filters: dict[str, str]) -> Iterator[dict[str, Any]]:
@@ -286,6 +305,21 @@ class Heliopsf(Operations):
 
     def _unreachable(self, error: httpx.TransportError) -> ServiceError:
         return ServiceError(f"no answer from {self.server} ({error}); `heliopsf serve` starts a service")
+
+
+@contextmanager
+def as_archive(path: Path) -> Iterator[Path]:
+    """The archive at ``path``, or one made of the folder there, which is gone afterwards."""
+    if not path.is_dir():
+        yield path
+        return
+    with TemporaryDirectory(prefix="heliopsf-") as folder:
+        archive = Path(folder) / f"{path.resolve().name}.tar"
+        try:
+            pack(path, archive)
+        except DataError as error:
+            raise ServiceError(error.message, code=error.code) from error
+        yield archive
 
 
 def percent(value: float | None, digits: int = 1) -> str:

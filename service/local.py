@@ -12,13 +12,15 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from psfcore.header import FitsLimits, read_summary
-from service.client import Operations, Progress, ServiceError
+from psfcore.transit.archive import list_archive
+from service.client import Operations, Progress, ServiceError, as_archive
 from service.jobs import JobView
 from service.products import ProductView
 from service.psfs import PsfView
+from service.transits import TransitDetails
 from workers.catalogue import DEFAULT_OWNER, Catalogue, ProductRow, PsfRow
 from workers.contract import JobRequest, Phase
-from workers.intake import image_row, resolve, uploaded_psf_row
+from workers.intake import image_row, resolve, transit_row, uploaded_psf_row
 from workers.runner import Runner
 from workers.settings import Settings
 from workers.store import Store
@@ -46,6 +48,14 @@ class LocalService(Operations):
         row = image_row(DEFAULT_OWNER, sha256, source.stat().st_size, source.name, summary)
         self._catalogue.add(row)
         return {"id": row.id, "header": row.summary}
+
+    def upload_transit(self, path: str | Path) -> dict[str, Any]:
+        """Take a transit in; its archive's table of contents is checked as a service would."""
+        with as_archive(Path(path)) as source:
+            contents = list_archive(source, self._settings.archive_limits)
+            sha256 = self._keep(source)
+            row = transit_row(DEFAULT_OWNER, sha256, source.stat().st_size, source.name, contents)
+        return TransitDetails.of(self._catalogue.add(row)[0]).model_dump(mode="json")
 
     def upload_psf(
         self, path: str | Path, *, name: str | None = None, version: str | None = None

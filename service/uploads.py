@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
@@ -16,8 +16,16 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect
 
-from psfcore.errors import HeaderError
+from psfcore.errors import DataError, HeaderError
 from psfcore.header import FitsLimits, HeaderSummary, read_summary
+from psfcore.transit.archive import (
+    START_BYTES,
+    ArchiveContents,
+    ArchiveLimits,
+    archive_kind,
+    could_be_archive,
+    list_archive,
+)
 from service.problems import Problem
 from workers.store import Store
 
@@ -26,75 +34,158 @@ if TYPE_CHECKING:
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
 FORM_BYTES = 2**16  # what a form may add to the file
-START_BYTES = max(map(len, FITS_STARTS))
-OPENAPI_BODY: dict[str, Any] = {
-    "parameters": [
-        {
-            "name": "filename",
-            "in": "query",
-            "required": False,
-            "description": "a label for people, where the file is the body itself",
-            "schema": {"type": "string"},
-        }
-    ],
-    "requestBody": {
-        "required": True,
-        "description": "The FITS file, as the body itself or as the part `file` of a form.",
-        "content": {
-            "application/fits": {"schema": {"type": "string", "format": "binary"}},
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "properties": {"file": {"type": "string", "format": "binary"}},
-                    "required": ["file"],
-                }
+_ARCHIVE_STATUS = {"archive-too-large": 413, "not-an-archive": 415}
+
+
+def _body(what: str, media_type: str) -> dict[str, Any]:
+    """How an upload stands in the description of the interface."""
+    return {
+        "parameters": [
+            {
+                "name": "filename",
+                "in": "query",
+                "required": False,
+                "description": "a label for people, where the file is the body itself",
+                "schema": {"type": "string"},
+            }
+        ],
+        "requestBody": {
+            "required": True,
+            "description": f"The {what}, as the body itself or as the part `file` of a form.",
+            "content": {
+                media_type: {"schema": {"type": "string", "format": "binary"}},
+                "multipart/form-data": {
+                    "schema": {
+                        "type": "object",
+                        "properties": {"file": {"type": "string", "format": "binary"}},
+                        "required": ["file"],
+                    }
+                },
             },
         },
-    },
-}
+    }
+
+
+OPENAPI_BODY = _body("FITS file", "application/fits")
+OPENAPI_TRANSIT_BODY = _body("transit's .zip, .tar or .tar.gz", "application/octet-stream")
+
+Found = TypeVar("Found")
+FoundOut = TypeVar("FoundOut", covariant=True)
 
 
 @dataclass(frozen=True)
-class Upload:
-    """A file that came whole and whose header is good; not yet kept."""
+class Upload(Generic[Found]):
+    """A file that came whole, and what a look into it found; not yet kept."""
 
     path: Path
     sha256: str
     bytes: int
     filename: str | None
-    summary: HeaderSummary
+    summary: Found
+
+
+class _Format(Protocol[FoundOut]):
+    """What kind of file is taken."""
+
+    what: str
+    start_bytes: int
+
+    def recognise(self, start: bytes, *, whole: bool) -> None:
+        """Raise ``Problem`` where the first bytes, all there are if ``whole``, rule it out."""
+
+    def inspect(self, path: Path) -> FoundOut:
+        """Look into the file; ``Problem`` where it cannot be used."""
 
 
 @asynccontextmanager
 async def receive(
     request: Request, store: Store, limits: FitsLimits, max_bytes: int
-) -> AsyncIterator[Upload]:
-    """Stream the request's file to a temporary path and inspect its header.
+) -> AsyncIterator[Upload[HeaderSummary]]:
+    """Stream the request's FITS file to a temporary path and inspect its header.
 
     Raises ``Problem`` 413 over the size limit, 415 for what is no FITS, 400 for a broken form or an upload
     that ended early, and 422 for a header that shows a file that cannot be used.
     """
+    async with _receive(request, store, _Fits(limits), max_bytes) as upload:
+        yield upload
+
+
+@asynccontextmanager
+async def receive_transit(
+    request: Request, store: Store, limits: ArchiveLimits, max_bytes: int
+) -> AsyncIterator[Upload[ArchiveContents]]:
+    """Stream a transit's archive to a temporary path and check its table of contents and its transit.json.
+
+    Raises ``Problem`` as ``receive`` does: 413 also where more would come out than the limits allow, 415 for what
+    is no archive, and 422 for one that cannot be used.
+    """
+    async with _receive(request, store, _Archive(limits), max_bytes) as upload:
+        yield upload
+
+
+@asynccontextmanager
+async def _receive(
+    request: Request, store: Store, expected: _Format[Found], max_bytes: int
+) -> AsyncIterator[Upload[Found]]:
     _refuse_by_length(request, max_bytes)
     with store.temporary() as path:
         body = _Body(request, max_bytes)
         digest, size, start = hashlib.sha256(), 0, b""
         with path.open("wb") as file:
             async for chunk in body.chunks():
-                if len(start) < START_BYTES:
-                    start += chunk[: START_BYTES - len(start)]
-                    _recognise(start)
+                if len(start) < expected.start_bytes:
+                    start += chunk[: expected.start_bytes - len(start)]
+                    expected.recognise(start, whole=False)
                 size += len(chunk)
                 if size > max_bytes:
                     raise _too_large(max_bytes)
                 digest.update(chunk)
                 file.write(chunk)
         if size == 0:
-            raise Problem(400, "empty-upload", "expected a FITS file, got 0 bytes")
+            raise Problem(400, "empty-upload", f"expected {expected.what}, got 0 bytes")
+        expected.recognise(start, whole=True)
+        found = await run_in_threadpool(expected.inspect, path)
+        yield Upload(path, digest.hexdigest(), size, body.filename, found)
+
+
+class _Fits:
+    what = "a FITS file"
+    start_bytes = max(map(len, FITS_STARTS))
+
+    def __init__(self, limits: FitsLimits) -> None:
+        self._limits = limits
+
+    def recognise(self, start: bytes, *, whole: bool) -> None:
+        """Refuse at the first bytes what cannot become FITS, before the rest is taken."""
+        if not any(start.startswith(known[: len(start)]) for known in FITS_STARTS):
+            raise Problem(
+                415, "not-fits", f"expected a FITS file (it starts with 'SIMPLE  ='), got {start[:9]!r}"
+            )
+
+    def inspect(self, path: Path) -> HeaderSummary:
         try:
-            summary = await run_in_threadpool(read_summary, path, limits)
+            return read_summary(path, self._limits)
         except HeaderError as error:
             raise Problem(422, error.code, error.message) from error
-        yield Upload(path, digest.hexdigest(), size, body.filename, summary)
+
+
+class _Archive:
+    what = "a .zip, .tar or .tar.gz"
+    start_bytes = START_BYTES
+
+    def __init__(self, limits: ArchiveLimits) -> None:
+        self._limits = limits
+
+    def recognise(self, start: bytes, *, whole: bool) -> None:
+        """Refuse at the first bytes what cannot become an archive, before the rest is taken."""
+        if not (could_be_archive(start) and (not whole or archive_kind(start))):
+            raise Problem(415, "not-an-archive", f"expected {self.what}, got bytes {start[:9]!r}")
+
+    def inspect(self, path: Path) -> ArchiveContents:
+        try:
+            return list_archive(path, self._limits)
+        except DataError as error:
+            raise Problem(_ARCHIVE_STATUS.get(error.code, 422), error.code, error.message) from error
 
 
 def _refuse_by_length(request: Request, max_bytes: int) -> None:
@@ -105,14 +196,6 @@ def _refuse_by_length(request: Request, max_bytes: int) -> None:
 
 def _too_large(max_bytes: int) -> Problem:
     return Problem(413, "too-large", f"expected a file of at most {max_bytes} bytes, got more")
-
-
-def _recognise(start: bytes) -> None:
-    """Refuse at the first bytes what cannot become FITS, before the rest is taken."""
-    if not any(start.startswith(known[: len(start)]) for known in FITS_STARTS):
-        raise Problem(
-            415, "not-fits", f"expected a FITS file (it starts with 'SIMPLE  ='), got {start[:9]!r}"
-        )
 
 
 class _Body:

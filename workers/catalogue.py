@@ -1,4 +1,4 @@
-"""The catalogue: images, PSFs, products and jobs, in SQLite or PostgreSQL through SQLAlchemy.
+"""The catalogue: images, transits, PSFs, products and jobs, in SQLite or PostgreSQL through SQLAlchemy.
 
 The job table is the only truth about jobs; the broker may lose what it likes. Every change of a job's phase
 is a compare-and-set on the row, so that any number of workers, servers and reconcilers may try at once.
@@ -48,6 +48,18 @@ class ImageRow(Base):
     """An uploaded image; its id is the hash of its bytes."""
 
     __tablename__ = "images"
+    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    created_at: Mapped[float] = mapped_column(index=True)
+    bytes: Mapped[int] = mapped_column(BigInteger)
+    filename: Mapped[str | None]
+    summary: Mapped[dict[str, Any]]
+
+
+class TransitRow(Base):
+    """An uploaded transit; its id is the hash of the archive's bytes."""
+
+    __tablename__ = "transits"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     created_at: Mapped[float] = mapped_column(index=True)
@@ -139,8 +151,8 @@ class Lease:
     token: str
 
 
-Row = TypeVar("Row", ImageRow, PsfRow, ProductRow)
-AnyRow = TypeVar("AnyRow", ImageRow, PsfRow, ProductRow, JobRow)
+Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow)
+AnyRow = TypeVar("AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, JobRow)
 
 
 def open_engine(url: str) -> Engine:
@@ -195,7 +207,7 @@ class Catalogue:
         with self._reading() as session:
             session.execute(select(1))
 
-    # Images, PSFs, products -------------------------------------------------------------------------
+    # Images, transits, PSFs, products ---------------------------------------------------------------
 
     def add(self, row: Row) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row of that identity, and whether it is new."""

@@ -10,7 +10,8 @@ from typing import Any
 from psfcore.errors import DataError
 from psfcore.header import HeaderSummary
 from psfcore.instruments.model import parse_instrument
-from workers.catalogue import Catalogue, ImageRow, PsfRow
+from psfcore.transit.archive import ArchiveContents
+from workers.catalogue import Catalogue, ImageRow, PsfRow, TransitRow
 from workers.contract import (
     DeconvolveRequest,
     JobRequest,
@@ -34,6 +35,30 @@ def image_row(
         bytes=size_bytes,
         filename=filename,
         summary=dataclasses.asdict(summary),
+    )
+
+
+def transit_row(
+    owner: str, sha256: str, size_bytes: int, filename: str | None, contents: ArchiveContents
+) -> TransitRow:
+    """The row of an uploaded transit; its summary is what the table of contents and transit.json say."""
+    manifest = contents.manifest
+    return TransitRow(
+        owner=owner,
+        id=sha256,
+        created_at=time.time(),
+        bytes=size_bytes,
+        filename=filename,
+        summary={
+            "archive": contents.kind,
+            "instrument": manifest.instrument,
+            "images": len(manifest.images),
+            "pointings": [{"fov": fov, "images": images} for fov, images in manifest.pointings.items()],
+            "noise": None if manifest.noise is None else manifest.noise.model_dump(mode="json"),
+            "known_psf": manifest.known_psf,
+            "files": [{"name": name, "bytes": contents.files[name]} for name in manifest.files],
+            "unpacked_bytes": sum(contents.files.values()),
+        },
     )
 
 

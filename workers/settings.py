@@ -13,6 +13,8 @@ from pathlib import Path
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from psfcore.transit.archive import ArchiveLimits
+
 EMBEDDED_BROKER = "filesystem://"
 
 
@@ -26,6 +28,10 @@ class Settings(BaseSettings):
     broker_url: str = Field(EMBEDDED_BROKER, description="Celery broker; the default needs no server")
     max_upload_mib: int = Field(160, ge=1, le=65_536, description="largest file taken, as sent")
     max_pixels: int = Field(4096 * 4096, ge=256, description="largest image or PSF taken, by its header")
+    max_transit_mib: int = Field(4096, ge=1, le=1_048_576, description="largest transit taken, as sent")
+    max_transit_unpacked_mib: int = Field(
+        8192, ge=1, le=1_048_576, description="most that may come out of a transit's archive"
+    )
     worker_processes: int = Field(1, ge=1)
     worker_threads: int | None = Field(None, ge=1, description="none means cores / worker_processes")
     heartbeat_s: float = Field(2.0, gt=0, description="how often a running job says that it is alive")
@@ -61,6 +67,16 @@ class Settings(BaseSettings):
     def max_upload_bytes(self) -> int:
         """Largest file taken, in bytes."""
         return self.max_upload_mib * 2**20
+
+    @property
+    def max_transit_bytes(self) -> int:
+        """Largest transit taken, in bytes."""
+        return self.max_transit_mib * 2**20
+
+    @property
+    def archive_limits(self) -> ArchiveLimits:
+        """Bounds on what comes out of a transit's archive."""
+        return ArchiveLimits(max_bytes=self.max_transit_unpacked_mib * 2**20)
 
 
 def cores() -> int:

@@ -52,14 +52,14 @@ class Choices:
 
     weighed_by_observed: each line divided by its own noisy intensity, which pulls faint discs low; mended, by the
     noise expected of the disc's mean. added: scatter is added to the diffraction, Eq. (1) of `equations`; mended, the
-    two convolve: the ring sums are those of the diffracted scene. counted_to_field: the light that is not scattered
-    is one less what falls on an array as large as the image; mended, on the full reach. whole_disc_blanked: all
+    two convolve: the ring sums are those of the diffracted scene. counted_on_array: the light that is not scattered
+    is one less what falls on the array of the known PSF; mended, on the full reach. whole_disc_blanked: all
     pixels within the radius; mended, only those that are fully dark.
     """
 
     weighed_by_observed: bool = True
     added: bool = True
-    counted_to_field: bool = True
+    counted_on_array: bool = True
     whole_disc_blanked: bool = True
 
 
@@ -67,7 +67,7 @@ AS_PUBLISHED = Choices()
 MENDED_ALONE = {
     "weights from the expected intensity": replace(AS_PUBLISHED, weighed_by_observed=False),
     "scatter and diffraction convolved": replace(AS_PUBLISHED, added=False),
-    "light counted on the full reach": replace(AS_PUBLISHED, counted_to_field=False),
+    "light counted on the full reach": replace(AS_PUBLISHED, counted_on_array=False),
     "only fully dark pixels blanked": replace(AS_PUBLISHED, whole_disc_blanked=False),
 }
 ALL_MENDED = Choices(False, False, False, False)
@@ -130,8 +130,10 @@ class _Recipe:
         self.transit, self.choices, self.seed, self.draws = transit, choices, seed, draws
         self.threads, self.progress = threads, progress
         field = max(transit.shape)
-        # "Out to the edge of the PSF": the paper's PSF is an array as large as its images.
-        self.grid = REACH_GRID_PX if not choices.counted_to_field else min(field, REACH_GRID_PX)
+        # "Out to the edge of the PSF": the array of the known part, which in the paper is as large as the images.
+        self.grid = (
+            min(transit.diffraction.shape[0], REACH_GRID_PX) if choices.counted_on_array else REACH_GRID_PX
+        )
         reach = float(np.hypot(self.grid // 2, self.grid // 2)) + 1.0
         self.segments = Segments(tuple(shells_as_published(reach)), reach_grid_px=self.grid)
         self.psf_size = min(2 * field, REACH_GRID_PX)

@@ -2,7 +2,8 @@
 
 Everything is drawn in units of the field's longer edge, so that a scene keeps its look at any size:
 quiet-Sun texture (lognormal, power over many scales), two active regions with bright moss and thin loops,
-a dark coronal hole, a filament, a limb, and a corona beyond it that falls off with height.
+a dark coronal hole, a filament, a limb, and a corona beyond it that falls off with height. A layout says which of
+them, and where; a margin draws on beyond the field.
 """
 
 from __future__ import annotations
@@ -17,9 +18,7 @@ Plane = NDArray[np.float64]
 
 QUIET_DN_PER_S = 420.0
 SKY_DN_PER_S = 12.0
-_LIMB_CENTRE = (1.52, 0.30)  # x, y in field edges
-_LIMB_RADIUS = 1.33
-_CORONA_HEIGHT = 0.22
+_BRIGHT_POINTS = 60  # in a field
 
 
 @dataclass(frozen=True)
@@ -49,33 +48,74 @@ class _Bundle:
 _REGIONS = (_Region(0.78, 0.24, 0.13, 2300.0, 34), _Region(0.44, 0.31, 0.075, 1800.0, 16))
 
 
-def solar_scene(shape: tuple[int, int], seed: int) -> Plane:
-    """True intensities [y, x] in DN/s, positive, the same for the same shape and seed."""
+@dataclass(frozen=True)
+class Layout:
+    """What is where in a field: limb (x, y, radius in field edges), corona (DN/s at the limb, height in field
+    edges), sky (DN/s), and which of the rest there is."""
+
+    limb_centre: tuple[float, float] = (1.52, 0.30)
+    limb_radius: float = 1.33
+    corona_dn_per_s: float = 900.0
+    corona_height: float = 0.22
+    sky_dn_per_s: float = SKY_DN_PER_S
+    regions: tuple[_Region, ...] = _REGIONS
+    filament: bool = True
+
+
+LIMB_AND_REGIONS = Layout()
+
+
+@dataclass(frozen=True)
+class _Canvas:
+    """What is drawn on: shape of all of it, the field's longer edge, and the margin before the field's first
+    pixel; px."""
+
+    shape: tuple[int, int]
+    edge: int
+    margin: int
+
+    @property
+    def fields(self) -> float:
+        """Its area in fields."""
+        inner = (self.shape[0] - 2 * self.margin) * (self.shape[1] - 2 * self.margin)
+        return self.shape[0] * self.shape[1] / inner
+
+    def coordinates(self) -> tuple[Plane, Plane]:
+        """x and y of each pixel in field edges."""
+        y, x = np.mgrid[: self.shape[0], : self.shape[1]]
+        return (x - self.margin) / self.edge, (y - self.margin) / self.edge
+
+
+def solar_scene(
+    shape: tuple[int, int], seed: int, *, layout: Layout = LIMB_AND_REGIONS, margin_px: int = 0
+) -> Plane:
+    """True intensities [y, x] in DN/s, positive, the same for the same shape, layout, margin and seed.
+
+    shape: of the field. The result is margin_px larger on each side: what the Sun shows beyond the field.
+    """
     rng = np.random.default_rng(seed)
-    x, y = _coordinates(shape)
-    height = _LIMB_RADIUS - np.hypot(x - _LIMB_CENTRE[0], y - _LIMB_CENTRE[1])  # inside the disc: > 0
-    on_disc = 1 / (1 + np.exp(-height / 0.0015))
-    quiet = QUIET_DN_PER_S * _texture(shape, rng) * _large_scale(x, y)
+    canvas = _Canvas((shape[0] + 2 * margin_px, shape[1] + 2 * margin_px), max(shape), margin_px)
+    x, y = canvas.coordinates()
+    distance = np.hypot(x - layout.limb_centre[0], y - layout.limb_centre[1])
+    height = layout.limb_radius - distance  # inside the disc: > 0
+    on_disc = 1 / (1 + np.exp(np.minimum(-height / 0.0015, 700.0)))
+    quiet = QUIET_DN_PER_S * _texture(canvas, rng) * _large_scale(x, y)
     brightening = 1 + 1.3 * np.exp(-np.abs(height) / 0.02)
-    scene = on_disc * quiet * brightening + (1 - on_disc) * _corona(x, y, height, rng)
-    scene += _bright_points(shape, rng) * on_disc
-    for region in _REGIONS:
-        scene += _moss(x, y, region, shape, rng) + _loops(shape, region, rng)
-    return np.asarray(scene * (1 - 0.85 * _filament(x, y)) + SKY_DN_PER_S)
+    scene = on_disc * quiet * brightening + (1 - on_disc) * _corona(x, y, height, layout, rng)
+    scene += _bright_points(canvas, rng) * on_disc
+    for region in layout.regions:
+        scene += _moss(x, y, region, canvas, rng) + _loops(canvas, region, rng)
+    if layout.filament:
+        scene = scene * (1 - 0.85 * _filament(x, y))
+    return np.asarray(scene + layout.sky_dn_per_s)
 
 
-def _coordinates(shape: tuple[int, int]) -> tuple[Plane, Plane]:
-    edge = max(shape)
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    return x / edge, y / edge
-
-
-def _octaves(shape: tuple[int, int], rng: np.random.Generator, *, slope: float, coarsest: float) -> Plane:
+def _octaves(canvas: _Canvas, rng: np.random.Generator, *, slope: float, coarsest: float) -> Plane:
     """Gaussian noise, rms 1, whose amplitude grows with scale to the power `slope`.
 
     A sum of smooth random planes, each on half the scale of the one before, down to a pixel.
     """
-    edge = max(shape)
+    shape, edge = canvas.shape, canvas.edge
     total = np.zeros(shape)
     scale = coarsest * edge
     while scale >= 1:
@@ -88,10 +128,10 @@ def _octaves(shape: tuple[int, int], rng: np.random.Generator, *, slope: float, 
     return np.asarray((total - total.mean()) / total.std())
 
 
-def _texture(shape: tuple[int, int], rng: np.random.Generator) -> Plane:
+def _texture(canvas: _Canvas, rng: np.random.Generator) -> Plane:
     """Network and cells: lognormal, mean about 1."""
-    fine = _octaves(shape, rng, slope=0.45, coarsest=0.10)
-    ridges = 1 - np.minimum(np.abs(_octaves(shape, rng, slope=0.9, coarsest=0.07)), 1)
+    fine = _octaves(canvas, rng, slope=0.45, coarsest=0.10)
+    ridges = 1 - np.minimum(np.abs(_octaves(canvas, rng, slope=0.9, coarsest=0.07)), 1)
     return np.exp(0.5 * fine - 0.13) * (0.75 + 0.5 * ridges**2)
 
 
@@ -102,37 +142,38 @@ def _large_scale(x: Plane, y: Plane) -> Plane:
     return (1 - 0.88 * hole) * belt
 
 
-def _corona(x: Plane, y: Plane, height: Plane, rng: np.random.Generator) -> Plane:
+def _corona(x: Plane, y: Plane, height: Plane, layout: Layout, rng: np.random.Generator) -> Plane:
     """Off the limb: falls off with height, streaked along the radius."""
-    angle = np.arctan2(y - _LIMB_CENTRE[1], _LIMB_CENTRE[0] - x)
+    angle = np.arctan2(y - layout.limb_centre[1], layout.limb_centre[0] - x)
     bins = np.linspace(-0.9, 0.9, 4000)
     rays = gaussian_filter(rng.standard_normal(bins.size), 12) * 5
     rays += gaussian_filter(rng.standard_normal(bins.size), 60) * 14
     rays += gaussian_filter(rng.standard_normal(bins.size), 250) * 24
     streaks = np.exp(0.32 * np.interp(angle, bins, rays))
     steepness = 1.2 + 1.5 * np.maximum(y - 0.5, 0)
-    falloff = np.exp(-steepness * np.maximum(-height, 0) / _CORONA_HEIGHT)
-    return np.asarray(900.0 * falloff * streaks)
+    falloff = np.exp(-steepness * np.maximum(-height, 0) / layout.corona_height)
+    return np.asarray(layout.corona_dn_per_s * falloff * streaks)
 
 
-def _moss(x: Plane, y: Plane, region: _Region, shape: tuple[int, int], rng: np.random.Generator) -> Plane:
+def _moss(x: Plane, y: Plane, region: _Region, canvas: _Canvas, rng: np.random.Generator) -> Plane:
     """Fine bright patches where loops are rooted, and the haze of the region."""
     r = np.hypot(x - region.x, (y - region.y) * 1.5) / region.size
-    patches = np.exp(1.1 * _octaves(shape, rng, slope=0.5, coarsest=0.05) - 1.0)
-    outline = np.exp(-((r + 0.35 * _octaves(shape, rng, slope=1.1, coarsest=0.2)) ** 2))
+    patches = np.exp(1.1 * _octaves(canvas, rng, slope=0.5, coarsest=0.05) - 1.0)
+    outline = np.exp(-((r + 0.35 * _octaves(canvas, rng, slope=1.1, coarsest=0.2)) ** 2))
     haze = 0.16 * np.exp(-(r**2) / 5)
     return np.asarray(region.moss_dn_per_s * (0.5 * patches * outline + haze))
 
 
-def _loops(shape: tuple[int, int], region: _Region, rng: np.random.Generator) -> Plane:
+def _loops(canvas: _Canvas, region: _Region, rng: np.random.Generator) -> Plane:
     """Bundles of thin arcs that share their footpoints, most strands about one pixel wide."""
-    edge = max(shape)
+    shape, edge = canvas.shape, canvas.edge
     layers = [np.zeros(shape) for _ in range(3)]
     for _ in range(region.bundles):
         bundle = _draw_bundle(region, rng)
         for _ in range(int(rng.integers(6, 16))):
             x, y, light = _strand(bundle, edge, rng)
-            column, row = np.rint(x * edge).astype(int), np.rint(y * edge).astype(int)
+            column = np.rint(x * edge).astype(int) + canvas.margin
+            row = np.rint(y * edge).astype(int) + canvas.margin
             seen = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
             np.add.at(layers[int(rng.choice(3, p=[0.4, 0.3, 0.3]))], (row[seen], column[seen]), light[seen])
     widths_px = [max(0.7, width * edge) for width in (0.0004, 0.0011, 0.0035)]
@@ -169,11 +210,11 @@ def _strand(bundle: _Bundle, edge: int, rng: np.random.Generator) -> tuple[Plane
     return x, y, np.asarray(0.4 * light)
 
 
-def _bright_points(shape: tuple[int, int], rng: np.random.Generator) -> Plane:
+def _bright_points(canvas: _Canvas, rng: np.random.Generator) -> Plane:
     """Scattered compact brightenings."""
+    shape, edge = canvas.shape, canvas.edge
     plane = np.zeros(shape)
-    edge = max(shape)
-    count = 60
+    count = round(_BRIGHT_POINTS * canvas.fields)
     rows, columns = rng.integers(0, shape[0], count), rng.integers(0, shape[1], count)
     np.add.at(plane, (rows, columns), rng.lognormal(8.6, 0.7, count))
     return gaussian_filter(plane, max(0.8, 0.0009 * edge)) + 0.5 * gaussian_filter(plane, 0.003 * edge)

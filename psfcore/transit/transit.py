@@ -53,9 +53,13 @@ class Frame:
         if self.pixels.ndim != 2 or (self.filled is not None and self.filled.shape != self.pixels.shape):
             raise DataError("frame-shape", f"{self.file}: expected two axes; got {self.pixels.shape}")
         if not np.isfinite(self.pixels).all():
-            raise DataError("frame-nonfinite", f"{self.file}: expected finite pixels; got NaN or infinite ones")
+            raise DataError(
+                "frame-nonfinite", f"{self.file}: expected finite pixels; got NaN or infinite ones"
+            )
         if not (np.isfinite(self.exposure_s) and self.exposure_s > 0):
-            raise DataError("frame-exposure", f"{self.file}: expected an exposure > 0 s; got {self.exposure_s}")
+            raise DataError(
+                "frame-exposure", f"{self.file}: expected an exposure > 0 s; got {self.exposure_s}"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from service.openapi import description
 
 HERE = Path(__file__).parents[2]
 # What --local and the demo need is imported by the command line alone.
-COMMAND_LINE = {"cli.py", "cli_diffraction.py", "local.py", "demo.py"}
+COMMAND_LINE = {"cli.py", "cli_diffraction.py", "cli_simulate.py", "local.py", "demo.py"}
 
 
 def imports(path: Path) -> Iterator[str]:
@@ -51,13 +51,18 @@ def test_imports_run_one_way(package: str, forbidden: tuple[str, ...]) -> None:
     assert wrong == []
 
 
-def test_the_service_imports_of_psfcore_the_header_reader_and_its_errors_alone() -> None:
+# Of psfcore the service reads what shows without a pixel: FITS headers, and a transit's archive and manifest, whose
+# table of contents is checked at upload as headers are. None of these loads numerics.
+LIGHT = ("psfcore.header", "psfcore.errors", "psfcore.transit.archive", "psfcore.transit.manifest")
+
+
+def test_the_service_imports_of_psfcore_what_reads_headers_and_tables_of_contents_alone() -> None:
     wrong = [
         (path.name, name)
         for path in sources("service")
         if path.name not in COMMAND_LINE
         for name in imports(path)
-        if name.startswith("psfcore") and not name.startswith(("psfcore.header", "psfcore.errors"))
+        if name.startswith("psfcore") and not name.startswith(LIGHT)
     ]
     assert wrong == []
 
@@ -80,6 +85,13 @@ def test_the_web_process_carries_no_numerics_and_no_task() -> None:
         "service.local",
     }
     assert loaded & heavy == set()
+
+
+def test_a_transit_s_archive_is_looked_into_without_numerics() -> None:
+    code = "import sys, psfcore.transit.archive; print('\\n'.join(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert "psfcore.transit.manifest" in loaded.split()
+    assert {"numpy", "astropy"} & set(loaded.split()) == set()
 
 
 def test_fits_and_fourier_have_one_home_each() -> None:

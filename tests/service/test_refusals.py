@@ -161,6 +161,10 @@ def test_an_image_of_an_unknown_instrument_asks_for_a_psf(api: TestClient, image
         ("DELETE", f"/v1/jobs/{A[:32]}", 404),
         ("GET", f"/v1/images/{A}", 404),
         ("GET", "/v1/images/short", 422),
+        ("GET", f"/v1/transits/{A}", 404),
+        ("GET", "/v1/transits/short", 422),
+        ("GET", "/v1/transits?cursor=nonsense", 422),
+        ("PUT", "/v1/transits", 405),
         ("GET", f"/v1/psfs/{A}", 404),
         ("GET", f"/v1/psfs/{A}/file", 404),
         ("GET", f"/v1/psfs/{A}/preview", 404),
@@ -198,7 +202,9 @@ FORM = "multipart/form-data"
         (f"{FORM}; boundary=x", b'--x\r\nContent-Disposition: form-data; name="file"\r\n\r\nSIMPLE  ='),
     ],
 )
-def test_bad_forms(api: TestClient, kind: str, content: bytes) -> None:
-    answer = api.post("/v1/images", content=content, headers={"Content-Type": kind})
+@pytest.mark.parametrize("where", ["/v1/images", "/v1/transits"])
+def test_bad_forms(api: TestClient, where: str, kind: str, content: bytes) -> None:
+    content = content.replace(b"SIMPLE  =", b"PK\3\4") if where == "/v1/transits" else content
+    answer = api.post(where, content=content, headers={"Content-Type": kind})
     assert answer.status_code == 400, answer.text
     assert answer.json()["type"] in ("urn:heliopsf:bad-form", "urn:heliopsf:upload-ended-early")

@@ -1,0 +1,403 @@
+"""From a transit to a total PSF with its errors, its doubts and its history: the whole way, for people and services.
+
+The default is the inversion with the four biases of the published fit mended (`inversion`); beside it stand a free
+fit without a formula, other shapes judged on held-out images, the first guess, and, where asked for, the published
+recipe to the letter with what each of its four biases does (`published`).
+
+Errors: photon and readout noise of every pixel, carried through (`inversion`). Where the discs scatter by more than
+that from image to image, by a factor f in chi2 beyond what chance allows, all errors are multiplied by sqrt(f) and
+the report says so: something is not modelled, and the errors of a mean do not shrink below what it leaves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.fourier import Convolver
+from psfcore.psf import REACH_GRID_PX, Psf, cumulative_curve, encircled_energy
+from psfcore.scatter.equations import Drawn, Lines, free_fit
+from psfcore.scatter.inversion import Inversion, Progress, Solution, invert
+from psfcore.scatter.optics import Blur, pick
+from psfcore.scatter.published import AS_PUBLISHED, MENDED_ALONE, Published, crop_or_pad, invert_as_published
+from psfcore.scatter.ring_sums import segment_sums
+from psfcore.scatter.segments import Segments, shells_as_published
+from psfcore.scatter.shape_comparison import ComparedShape, compare_shapes
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named, stretch_of
+from psfcore.scatter.total_psf import CURVE_RADII_PX
+from psfcore.transit.first_guess import FirstGuess, first_guess
+from psfcore.transit.occulter import disc_distance
+from psfcore.transit.transit import Transit
+
+Kernel = NDArray[np.float64]
+
+SCHEMA = "psf-fit/1"
+RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
+ALONE_DRAWS = 30  # of each bias mended alone: differences between recipes that share their draws
+OPEN_POINTS = 3.0  # an error of the curve from which a radius is said to be open
+ONE_SIGMA, TWO_SIGMA = (15.87, 84.13), (2.275, 97.725)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A cumulative curve C(R) in percent with its standard error, at radii in px."""
+
+    radii_px: Vector
+    pct: Vector
+    sigma: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class FreeShells:
+    """Scatter without a formula: weights by shell (draws kept, shells) on `segments`, and the light beyond each edge.
+
+    Where no pixel decides, a shell is held at the fitted shape: its spread there says nothing.
+    """
+
+    segments: Segments
+    drawn: Drawn
+
+    def weights_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
+        """Percentiles over the draws of the weight of a pixel of each shell: (percentiles, shells)."""
+        return np.asarray(np.percentile(self.drawn.fits, percentiles, axis=0))
+
+    def beyond_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
+        """Percentiles over the draws of the diffuse light beyond each shell's inner edge, percent."""
+        light = self.drawn.fits * self.segments.counts
+        beyond = 100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1]
+        return np.asarray(np.percentile(beyond, percentiles, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class TransitFit:
+    """Everything that a transit says of a PSF."""
+
+    transit: Transit
+    solution: Solution
+    overdispersion: float
+    curve: Curve
+    diffuse_curve: Curve
+    kernel: Kernel
+    scatter: Kernel
+    first_guess: FirstGuess
+    free: FreeShells | None
+    shapes: tuple[ComparedShape, ...]
+    published: Published | None
+    published_alone: dict[str, Published]
+    limits: tuple[str, ...]
+
+    @property
+    def inversion(self) -> Inversion:
+        """The fit of the shape."""
+        return self.solution.inversion
+
+    @property
+    def value_sigma(self) -> dict[str, float]:
+        """Standard errors of the parameters, overdispersion included."""
+        factor = math.sqrt(self.overdispersion)
+        return {name: factor * sigma for name, sigma in self.inversion.value_sigma.items()}
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Of the shape's coordinates, overdispersion included."""
+        return self.inversion.covariance * self.overdispersion
+
+
+def fit_transit(
+    transit: Transit,
+    *,
+    shape: str = SOFTENED_POWER_LAW.name,
+    as_published: bool = False,
+    seed: int = 1,
+    threads: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> TransitFit:
+    """Fit a transit. as_published: the published recipe too, and each of its biases mended alone.
+
+    Raises DataError as `inversion.invert`, "unknown-shape".
+    """
+    wanted = shape_named(shape)
+    guess = first_guess(transit)
+    solution = invert(transit, wanted, threads=threads, progress=progress)
+    factor = overdispersion(solution.inversion)
+    kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
+    free = _free_shells(solution, seed, progress) if wanted.isotropic else None
+    shapes = compare_shapes(solution, progress=progress) if wanted is SOFTENED_POWER_LAW else ()
+    published, alone = None, {}
+    if as_published:
+        published = invert_as_published(transit, AS_PUBLISHED, seed=seed, threads=threads, progress=progress)
+        alone = {
+            name: invert_as_published(
+                transit, choices, seed=seed, draws=ALONE_DRAWS, threads=threads, progress=progress
+            )
+            for name, choices in MENDED_ALONE.items()
+        }
+    return TransitFit(
+        transit=transit,
+        solution=solution,
+        overdispersion=factor,
+        curve=curve,
+        diffuse_curve=diffuse,
+        kernel=kernel,
+        scatter=scatter,
+        first_guess=guess,
+        free=free,
+        shapes=shapes,
+        published=published,
+        published_alone=alone,
+        limits=_limits(solution, curve, factor),
+    )
+
+
+def overdispersion(inversion: Inversion) -> float:
+    """By how much the discs' means scatter beyond noise, as a factor on chi2; 1 where chance could do it.
+
+    Chance: two standard deviations of a chi2 with as many degrees of freedom as images less parameters.
+    """
+    freedom = len(inversion.frames) - inversion.coordinates.size
+    if freedom < 1:
+        return 1.0
+    chi2 = sum(((f.expected - f.observed) / f.noise) ** 2 for f in inversion.frames)
+    factor = chi2 / freedom
+    return float(factor) if factor > 1 + 2 * math.sqrt(2 / freedom) else 1.0
+
+
+def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Kernel, Kernel, Curve, Curve]:
+    """Total PSF and scatter [y, x] on the full reach, and their cumulative curves with errors."""
+    inversion = solution.inversion
+    shape, at = inversion.shape, inversion.coordinates
+    radii = np.array(RADII_PX)
+    grid = (REACH_GRID_PX, REACH_GRID_PX)
+    diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float64, threads=threads)
+    scatter = shape.kernel(at, REACH_GRID_PX)
+    kernel = np.maximum(diffract.apply(scatter), 0.0)
+    # Slopes need no more than single precision, which takes half the time.
+    diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float32, threads=threads)
+    total_slopes, diffuse_slopes = [], []
+    for k in range(at.size):
+        step = np.zeros_like(at)
+        step[k] = 1e-3
+        slope = (shape.kernel(at + step, REACH_GRID_PX) - shape.kernel(at - step, REACH_GRID_PX)) / 2e-3
+        diffuse_slopes.append(-100 * encircled_energy(slope, radii))
+        total_slopes.append(-100 * encircled_energy(np.asarray(diffract.apply(slope), np.float64), radii))
+
+    def curve(of: Kernel, slopes: list[Vector]) -> Curve:
+        s = np.stack(slopes, axis=1)
+        variance = np.einsum("rk,kl,rl->r", s, inversion.covariance * factor, s)
+        return Curve(radii, cumulative_curve(of, radii), np.sqrt(np.maximum(variance, 0.0)))
+
+    return kernel, scatter, curve(kernel, total_slopes), curve(scatter, diffuse_slopes)
+
+
+def _free_shells(solution: Solution, seed: int, progress: Progress) -> FreeShells:
+    """The free fit on the reconstructed scenes, its biases mended, held at the fitted shape where nothing decides."""
+    segments = Segments(tuple(shells_as_published()))
+    diffract = Blur(solution.transit.diffraction, solution.transit.shape, threads=solution.threads)
+    parts = []
+    for step, n in enumerate(solution.part):
+        progress("free shells", step, len(solution.part))
+        frame, dark = solution.transit.frames[n], solution.sky.dark[n]
+        diffracted = diffract.see(solution.lit(n))
+        expected = pick(solution.optics.see(solution.lit(n)), dark)
+        distance = disc_distance(solution.transit.shape, solution.sky.found[n].place)[dark]
+        parts.append(
+            Lines(
+                observed=pick(solution.sky.observed[n], dark),
+                ring_sums=segment_sums(
+                    diffract.field(diffracted), np.stack(dark, axis=1), segments, threads=solution.threads
+                ),
+                unscattered=pick(diffracted, dark),
+                scale=1 / np.sqrt(solution.weight(n, expected)),
+                stratum=np.maximum(np.floor(frame.place.radius_px - distance), 0).astype(np.int64),
+            )
+        )
+    shape, at = solution.inversion.shape, solution.inversion.coordinates
+    towards = segments.mean_of_map(shape.kernel(at, REACH_GRID_PX))
+    counts = segments.counts.astype(np.float64)
+    return FreeShells(segments, free_fit(Lines.joined(parts), counts, seed=seed, towards=towards))
+
+
+def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
+    """What these data cannot say, or where the fit is not to be trusted, in words."""
+    inversion, out = solution.inversion, []
+    if not inversion.converged:
+        out.append(f"the fit had not settled after {len(inversion.rounds)} rounds")
+    pointings = {frame.fov for frame in solution.transit.frames}
+    if len(pointings) < 3:
+        out.append(
+            f"{len(pointings)} pointing{'s' if len(pointings) > 1 else ''}: scatter over short and long distances "
+            "can hardly be told apart; the errors hold for the fitted shape alone"
+        )
+    open_at = [r for r, s in zip(curve.radii_px, curve.sigma, strict=True) if s > OPEN_POINTS]
+    if open_at:
+        radii = ", ".join(f"{r:g}" for r in open_at)
+        out.append(f"the light beyond {radii} px is open to more than {OPEN_POINTS:g} points")
+    if factor > 1:
+        out.append(
+            f"the discs scatter {math.sqrt(factor):.1f} times as much as noise allows: an effect is not modelled, "
+            "and all errors are larger by that factor"
+        )
+    short = min(solution.transit.shape)
+    if short < REACH_GRID_PX:
+        out.append(
+            f"the field is {short} px: what the PSF holds beyond that distance follows from the shape alone"
+        )
+    unsettled = [f.file for f in inversion.frames if not f.found.settled]
+    if unsettled:
+        out.append(f"the occulter's place is not settled in {len(unsettled)} images")
+    return tuple(out)
+
+
+def psf_of(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
+    """The PSF of a fit on the full reach, its components DIFFRACTION and SCATTER beside it."""
+    return Psf(
+        kernel=fit.kernel,
+        name=name,
+        version=version,
+        instrument=fit.transit.instrument,
+        status="draft",
+        plate_scale_arcsec=fit.transit.plate_scale_arcsec,
+        components={
+            "DIFFRACTION": crop_or_pad(fit.transit.diffraction, REACH_GRID_PX),
+            "SCATTER": fit.scatter,
+        },
+        provenance=provenance,
+    )
+
+
+def report(fit: TransitFit) -> dict[str, Any]:
+    """The fit as JSON: numbers with errors, one frame a line, what was tried beside it, and what it cannot say."""
+    inversion = fit.inversion
+    values, sigma = inversion.values, fit.value_sigma
+    out: dict[str, Any] = {
+        "schema": SCHEMA,
+        "sentence": sentence(fit),
+        "shape": inversion.shape.name,
+        "parameters": {
+            p.name: {"value": values[p.name], "sigma": sigma[p.name], "unit": p.unit, "meaning": p.meaning}
+            for p in inversion.shape.parameters
+        },
+        "coordinates": {
+            "scales": [p.scale for p in inversion.shape.parameters],
+            "values": inversion.coordinates.tolist(),
+            "covariance": fit.covariance.tolist(),
+        },
+        "curve": _curve_json(fit.curve),
+        "diffuse_curve": _curve_json(fit.diffuse_curve),
+        "chi2_per_pixel": inversion.chi2_per_pixel,
+        "overdispersion": fit.overdispersion,
+        "converged": inversion.converged,
+        "rounds": [
+            {
+                "frames": r.frames,
+                "parameters": r.values,
+                "curve_pct": list(r.curve_pct),
+                "moved_points": r.moved_points,
+                "chi2_per_pixel": r.chi2_per_pixel,
+            }
+            for r in inversion.rounds
+        ],
+        "frames": [
+            {
+                "file": f.file,
+                "fov": f.fov,
+                "x": f.found.place.x_px,
+                "y": f.found.place.y_px,
+                "r": f.found.place.radius_px,
+                "x_sigma": f.found.sigma_x_px,
+                "y_sigma": f.found.sigma_y_px,
+                "neighbours": f.found.neighbours,
+                "dark_pixels": int(f.dark[0].size),
+                "observed_dn_s": f.observed,
+                "expected_dn_s": f.expected,
+                "noise_dn_s": f.noise,
+                "residual_pct": f.residual_pct,
+            }
+            for f in inversion.frames
+        ],
+        "left_out": inversion.left_out,
+        "limits": list(fit.limits),
+        "first_guess": fit.first_guess.to_json(),
+        "inputs_sha256": fit.transit.sha256,
+    }
+    if "stretch_p" in values:
+        stretch, angle = stretch_of(values)
+        out["stretch"] = {"stretch": stretch, "angle_deg": angle}
+    out["shapes"] = [
+        {
+            "name": s.name,
+            "added": {name: {"value": v, "sigma": e} for name, (v, e) in s.added.items()},
+            "delta_chi2": s.gain,
+            "delta_chi2_held_out": s.held_out_gain,
+        }
+        for s in fit.shapes
+    ]
+    if fit.free is not None:
+        out["free_shells"] = _free_json(fit.free)
+    if fit.published is not None:
+        out["as_published"] = _published_json(fit)
+    return out
+
+
+def sentence(fit: TransitFit) -> str:
+    """What a person reads first."""
+    values, sigma, curve = fit.inversion.values, fit.value_sigma, fit.curve
+    at = {r: (c, s) for r, c, s in zip(curve.radii_px, curve.pct, curve.sigma, strict=True)}
+    beyond = ", ".join(f"{at[r][0]:.2f} ± {at[r][1]:.2f} % beyond {r:g} px" for r in (10.0, 100.0))
+    return (
+        f"{100 * values['total']:.2f} ± {100 * sigma['total']:.2f} % of the light is scattered diffusely; scattered "
+        f"and diffracted together {at[0.5][0]:.2f} ± {at[0.5][1]:.2f} % leaves its pixel, {beyond} "
+        f"({len(fit.inversion.frames)} images, chi2 {fit.inversion.chi2_per_pixel:.3f} a pixel)."
+    )
+
+
+def _curve_json(curve: Curve) -> dict[str, list[float]]:
+    return {
+        "radii_px": curve.radii_px.tolist(),
+        "light_beyond_pct": curve.pct.tolist(),
+        "sigma": curve.sigma.tolist(),
+    }
+
+
+def _free_json(free: FreeShells) -> dict[str, Any]:
+    percentiles = (50.0, *ONE_SIGMA, *TWO_SIGMA)
+    names = ("median", "minus_1_sigma", "plus_1_sigma", "minus_2_sigma", "plus_2_sigma")
+    weights, beyond = free.weights_pct(percentiles), free.beyond_pct(percentiles)
+    return {
+        "edges_px": list(free.segments.edges_px),
+        "weight": dict(zip(names, weights.tolist(), strict=True)),
+        "diffuse_light_beyond_inner_edge_pct": dict(zip(names, beyond.tolist(), strict=True)),
+    }
+
+
+def _published_json(fit: TransitFit) -> dict[str, Any]:
+    published = fit.published
+    assert published is not None
+    here = dict(zip(fit.curve.radii_px, fit.curve.pct, strict=True))
+
+    def one(p: Published) -> dict[str, Any]:
+        return {
+            "a": p.a,
+            "b_px": p.b_px,
+            "c": p.c,
+            "total": p.total,
+            "counted_on_grid_px": p.grid_px,
+            "lines": p.lines,
+            "radii_px": p.radii_px.tolist(),
+            "light_beyond_pct": p.curve_pct.tolist(),
+            "minus_default_points": [c - here[r] for r, c in zip(p.radii_px, p.curve_pct, strict=True)],
+            "rounds": [{"fit": r.fit, "curve_pct": list(r.curve_pct)} for r in p.rounds],
+        }
+
+    return {
+        "whole": one(published) | {"spread_of_draws": published.spread},
+        "one_bias_mended": {
+            name: one(p) | {"minus_published_points": (p.curve_pct - published.curve_pct).tolist()}
+            for name, p in fit.published_alone.items()
+            if p.radii_px.size == published.radii_px.size
+        },
+    }

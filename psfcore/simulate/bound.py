@@ -1,0 +1,262 @@
+"""The photon bound: how well a transit can say anything at all, whoever analyses it.
+
+Fisher information with the true scenes and the diffraction given, and only photon and read noise:
+
+    F_jk = sum over pixels of (dm / dp_j) (dm / dp_k) / var(m)       Eq. (1)
+    var(m) = (g m t + r^2) / t^2                                      Eq. (2)
+    dm / dp_j = (ds / dp_j) * d * (S - h)                             Eq. (3)
+    sigma^2(f) = (df / dp)^T F^-1 (df / dp)                           Eq. (4)
+
+A pixel's information is 1 / var: what an estimator linear in the pixels can take from it. The whole likelihood of
+a Poisson count with Gaussian readout holds no more than g / (m t) a pixel, which is 5 % more at 2.5 photons and 2 DN.
+
+What counts as data: for the scatter, every fully dark pixel (all four corners within the radius) of every image. The
+pixels round the disc are left out, as the method leaves them out: they are the scene, and the scene is given here. For
+an occulter's place, all pixels whose centre is within the radius and 5 px of its centre, the PSF given; of
+high-only images those that do not clip.
+
+| symbol | name | unit |
+|---|---|---|
+| m | expected pixel | DN/s |
+| p | b, c, total; and the stretch with all three free | px, -, -, - |
+| s, d | scatter kernel, diffraction; * is linear convolution | - |
+| S, h | scene, what the disc hides of it | DN/s |
+| g, r, t | photon_gain_dn, read_noise_dn, exposure_s | DN, DN, s |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.fourier import Convolver
+from psfcore.psf import REACH_GRID_PX, cumulative_curve, encircled_energy
+from psfcore.simulate.disc import fully_dark
+from psfcore.simulate.plan import HIGH
+from psfcore.simulate.scatter_truth import (
+    PARAMETERS,
+    amplitude_slopes,
+    anisotropic_kernel,
+    convolved,
+    kernel_slopes,
+)
+from psfcore.simulate.sky import TrueSky, on_field
+from psfcore.simulate.transit import SimulatedTransit
+from psfcore.simulate.transit_files import read_sky
+
+Plane = NDArray[np.float64]
+Kernel = NDArray[np.float64]
+Window = tuple[slice, slice]
+
+CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
+PLACE_MARGIN_PX = 5.0
+_LAW = 3  # the first of PARAMETERS: b, c, total
+
+
+@dataclass(frozen=True)
+class CurveBound:
+    """A cumulative curve at one radius, the total PSF's and the scatter's own: percent, and percentage points."""
+
+    radius_px: float
+    total_pct: float
+    total_sigma: float
+    diffuse_pct: float
+    diffuse_sigma: float
+
+
+@dataclass(frozen=True)
+class PhotonBound:
+    """Smallest standard errors that photons and readout allow.
+
+    b_px, c, total, a: errors of the power law's parameters, fitted together. covariance: of b, c, total.
+    stretch: error of the stretch along stretch_angle_deg, b, c and total free too. places_px: of the occulter's x
+    and y in each image. dark_pixels: how many pixels there were, of images images.
+    """
+
+    images: int
+    dark_pixels: int
+    b_px: float
+    c: float
+    total: float
+    a: float
+    covariance: tuple[tuple[float, ...], ...]
+    curve: tuple[CurveBound, ...]
+    stretch: float
+    stretch_angle_deg: float
+    places_px: tuple[tuple[float, float], ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, as `heliopsf simulate bound --json` writes them."""
+        return {
+            "images": self.images,
+            "dark_pixels": self.dark_pixels,
+            "sigma": {"b": self.b_px, "c": self.c, "total": self.total, "a": self.a},
+            "covariance": [list(row) for row in self.covariance],
+            "curve": [vars(at) for at in self.curve],
+            "stretch": {"sigma": self.stretch, "angle_deg": self.stretch_angle_deg},
+            "places": [{"x": x, "y": y} for x, y in self.places_px],
+        }
+
+
+def photon_bound(simulated: SimulatedTransit, *, threads: int = 1) -> PhotonBound:
+    """The bound of a simulated transit. Raises DataError "no-bound" where the dark pixels fix nothing."""
+    return bound_of_sky(simulated.sky, threads=threads)
+
+
+def bound_of_folder(folder: str | Path, *, threads: int = 1) -> PhotonBound:
+    """The bound of a folder that psfcore.simulate.transit_files.write wrote; raises as read_sky does too."""
+    return bound_of_sky(read_sky(folder, threads=threads), threads=threads)
+
+
+def bound_of_sky(sky: TrueSky, *, threads: int = 1) -> PhotonBound:
+    """The bound of one more transit of a sky."""
+    slopes = kernel_slopes(sky.scatter)
+    sizes = (*[REACH_GRID_PX] * _LAW, sky.kernel.shape[0])  # of the stretch only what reaches a disc is asked
+    total_slopes = {
+        name: convolved(slope, sky.diffraction, size, threads=threads)
+        for (name, slope), size in zip(slopes.items(), sizes, strict=True)
+    }
+    information, dark_pixels = _scatter_information(sky, total_slopes, threads)
+    law = _inverse(information[:_LAW, :_LAW])
+    with_stretch = _inverse(information)
+    by_a = np.array(list(amplitude_slopes(sky.scatter).values())[:_LAW])
+    sigmas = np.sqrt(np.diag(law))
+    return PhotonBound(
+        images=len(sky.plan.shots),
+        dark_pixels=dark_pixels,
+        b_px=float(sigmas[0]),
+        c=float(sigmas[1]),
+        total=float(sigmas[2]),
+        a=float(np.sqrt(by_a @ law @ by_a)),
+        covariance=tuple(tuple(float(value) for value in row) for row in law),
+        curve=_curve(sky, law, slopes, total_slopes, threads),
+        stretch=float(np.sqrt(with_stretch[-1, -1])),
+        stretch_angle_deg=sky.scatter.angle_deg,
+        places_px=tuple(_place_bound(sky, index) for index in range(len(sky.plan.shots))),
+    )
+
+
+def _scatter_information(sky: TrueSky, total_slopes: dict[str, Kernel], threads: int) -> tuple[Plane, int]:
+    """F of Eq. (1) for PARAMETERS from the fully dark pixels, and how many there are."""
+    plan = sky.plan
+    information, dark_pixels = np.zeros((len(PARAMETERS), len(PARAMETERS))), 0
+    for fov in plan.fovs:
+        scene = sky.scenes[fov]
+        whole = {name: _seen(scene, kernel, plan.margin_px, threads) for name, kernel in total_slopes.items()}
+        for index in (n for n, shot in enumerate(plan.shots) if shot.fov == fov):
+            window = _window(sky, index)
+            hidden = _hidden(sky, index, window)
+            slopes = np.stack(
+                [whole[name][window] - _through(total_slopes[name], hidden) for name in PARAMETERS]
+            )
+            expected = sky.seen_scenes[fov][window] - _through(sky.kernel, hidden)
+            dark = fully_dark(plan.place(index), _first(window), hidden.shape)
+            variance = plan.noise.variance(expected[dark], plan.shots[index].exposure_s)  # Eq. (2)
+            information += (slopes[:, dark] / variance) @ slopes[:, dark].T  # Eq. (1)
+            dark_pixels += int(dark.sum())
+    return information, dark_pixels
+
+
+def _place_bound(sky: TrueSky, index: int) -> tuple[float, float]:
+    """Errors of x and y (px) of one image's occulter."""
+    plan, shot = sky.plan, sky.plan.shots[index]
+    place, window = plan.place(index), _window(sky, index)
+    hidden = _hidden(sky, index, window)
+    expected = sky.seen_scenes[shot.fov][window] - _through(sky.kernel, hidden)
+    by_place = []
+    for slope in sky.behind[index].hidden_slopes(place):
+        moved = np.zeros_like(hidden)
+        moved[_inside(sky, index, window)] = slope
+        by_place.append(-_through(sky.kernel, moved))  # Eq. (3)
+    top, left = _first(window)
+    y, x = np.mgrid[top : top + hidden.shape[0], left : left + hidden.shape[1]]
+    used = np.hypot(x - place.x_px, y - place.y_px) <= place.radius_px + PLACE_MARGIN_PX
+    if plan.saturation_dn is not None and shot.gain_mode == HIGH:
+        used &= expected * shot.exposure_s + plan.dark_offset_dn < plan.saturation_dn
+    slopes = np.stack(by_place)[:, used]
+    variance = plan.noise.variance(expected[used], shot.exposure_s)
+    sigma_x, sigma_y = np.sqrt(np.diag(_inverse((slopes / variance) @ slopes.T)))
+    return float(sigma_x), float(sigma_y)
+
+
+def _curve(
+    sky: TrueSky, law: Plane, slopes: dict[str, Kernel], total_slopes: dict[str, Kernel], threads: int
+) -> tuple[CurveBound, ...]:
+    """Both curves with their errors, Eq. (4)."""
+    diffuse = anisotropic_kernel(sky.scatter)
+    total = convolved(diffuse, sky.diffraction, REACH_GRID_PX, threads=threads)
+    radii = np.array(CURVE_RADII_PX)
+    values = [cumulative_curve(kernel, radii) for kernel in (total, diffuse)]
+    sigmas = []
+    for parts in (total_slopes, slopes):
+        by_law = np.stack([-100 * encircled_energy(parts[name], radii) for name in PARAMETERS[:_LAW]])
+        sigmas.append(np.sqrt(np.einsum("jr,jk,kr->r", by_law, law, by_law)))  # Eq. (4)
+    return tuple(
+        CurveBound(
+            radius_px=radius,
+            total_pct=float(values[0][n]),
+            total_sigma=float(sigmas[0][n]),
+            diffuse_pct=float(values[1][n]),
+            diffuse_sigma=float(sigmas[1][n]),
+        )
+        for n, radius in enumerate(CURVE_RADII_PX)
+    )
+
+
+def _inverse(information: Plane) -> Plane:
+    """F^-1, of parameters brought to one scale first."""
+    scale = np.sqrt(np.diag(information))
+    if not (np.isfinite(scale).all() and (scale > 0).all()):
+        raise DataError("no-bound", "expected dark pixels that every parameter changes; got none for some")
+    correlation = information / np.outer(scale, scale)
+    if np.linalg.cond(correlation) > 1 / np.finfo(np.float64).eps:
+        raise DataError(
+            "no-bound", "expected parameters that the dark pixels tell apart; got a singular matrix"
+        )
+    return np.asarray(np.linalg.inv(correlation) / np.outer(scale, scale))
+
+
+def _seen(scene: Plane, kernel: Kernel, margin_px: int, threads: int) -> Plane:
+    shape = (scene.shape[0], scene.shape[1])
+    through = Convolver(kernel, shape, dtype=np.float64, threads=threads).apply(scene)
+    return on_field(np.asarray(through, dtype=np.float64), margin_px)
+
+
+def _through(kernel: Kernel, patch: Plane) -> Plane:
+    """A patch seen through a kernel, on the patch itself."""
+    shape = (patch.shape[0], patch.shape[1])
+    return np.asarray(Convolver(kernel, shape, dtype=np.float64).apply(patch), dtype=np.float64)
+
+
+def _window(sky: TrueSky, index: int) -> Window:
+    """The part of the field that holds the occulter, what it hides, and all pixels that show its place."""
+    place, size = sky.plan.place(index), sky.plan.size_px
+    half = int(np.ceil(place.radius_px + PLACE_MARGIN_PX)) + 1
+    row, column = int(np.rint(place.y_px)), int(np.rint(place.x_px))
+    return (
+        slice(max(0, row - half), min(size, row + half + 1)),
+        slice(max(0, column - half), min(size, column + half + 1)),
+    )
+
+
+def _first(window: Window) -> tuple[int, int]:
+    return window[0].start, window[1].start
+
+
+def _inside(sky: TrueSky, index: int, window: Window) -> Window:
+    """Where, in a window, the patch lies that the occulter can hide."""
+    rows, columns = sky.behind[index].window()
+    top, left = _first(window)
+    return slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+
+
+def _hidden(sky: TrueSky, index: int, window: Window) -> Plane:
+    """What the occulter hides, DN/s, on a window."""
+    plane = np.zeros((window[0].stop - window[0].start, window[1].stop - window[1].start))
+    plane[_inside(sky, index, window)] = sky.behind[index].hidden(sky.plan.place(index))
+    return plane

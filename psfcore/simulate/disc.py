@@ -1,0 +1,126 @@
+"""The light that a dark disc hides, to the fraction of a pixel.
+
+A pixel's share behind the disc is the area of a circle cut by the pixel's square, in closed form: with F(x, y) the
+circle's area left of x and below y,
+
+    share = F(x1, y1) - F(x0, y1) - F(x1, y0) + F(x0, y0)                              Eq. (1)
+    F(x, y) = integral from -r to x of max(0, min(y, s) + s) dX,  s = sqrt(r^2 - X^2)   Eq. (2)
+
+| symbol | name | unit |
+|---|---|---|
+| x0, x1, y0, y1 | edges of a pixel, from the disc's centre | px |
+| r | radius_px | px |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.transit.transit import Place
+
+Plane = NDArray[np.float64]
+
+_PLACE_STEP_PX = 1e-3
+_ROUNDING = 1e-11  # of a share: differences of areas of 100 px^2
+
+
+def covered_share(place: Place, first: tuple[int, int], shape: tuple[int, int], fine: int = 1) -> Plane:
+    """Share (0 to 1) of each pixel behind the disc, Eq. (1); shape (fine * ny, fine * nx).
+
+    first: (row, column) of the first of `shape` detector pixels. fine: pixels drawn per detector pixel and axis.
+    Exact to rounding; a pixel wholly within or without gets 1 or 0.
+    """
+    y = first[0] - 0.5 + np.arange(fine * shape[0] + 1) / fine - place.y_px
+    x = first[1] - 0.5 + np.arange(fine * shape[1] + 1) / fine - place.x_px
+    corner = _area_left_below(x[None, :], y[:, None], place.radius_px)
+    area = corner[1:, 1:] - corner[1:, :-1] - corner[:-1, 1:] + corner[:-1, :-1]
+    share = area * fine**2
+    return np.where(share < _ROUNDING, 0.0, np.where(share > 1 - _ROUNDING, 1.0, share))
+
+
+def _area_left_below(x: Plane, y: Plane, r: float) -> Plane:
+    """F(x, y), Eq. (2)."""
+    x, y = np.broadcast_arrays(np.clip(x, -r, r), np.clip(y, -r, r))
+    half = np.sqrt(r**2 - y**2)  # of the chord at y
+    middle = np.clip(x, -half, half)
+    area = y * (middle + half) + _half_segment(middle, r) - _half_segment(-half, r)
+    caps = _half_segment(np.minimum(x, -half), r) - _half_segment(np.full_like(x, -r), r)
+    caps = caps + _half_segment(np.maximum(x, half), r) - _half_segment(half, r)
+    return np.asarray(np.where(y >= 0, area + 2 * caps, area))
+
+
+def _half_segment(x: Plane, r: float) -> Plane:
+    """Integral of sqrt(r^2 - X^2) from 0 to x."""
+    root = np.sqrt(np.maximum(r**2 - x**2, 0.0))
+    return np.asarray((x * root + r**2 * np.arcsin(np.clip(x / r, -1, 1))) / 2)
+
+
+def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Pixels [y, x] all of whose corners lie within the disc's radius."""
+    y = np.abs(first[0] + np.arange(shape[0]) - place.y_px) + 0.5
+    x = np.abs(first[1] + np.arange(shape[1]) - place.x_px) + 0.5
+    return np.asarray(np.hypot(x[None, :], y[:, None]) <= place.radius_px)
+
+
+@dataclass(frozen=True, eq=False)
+class Behind:
+    """The scene round one place of the disc: fine pixels [y, x] in DN/s, `fine` per detector pixel and axis.
+
+    first: (row, column) of its first detector pixel on the field.
+    """
+
+    first: tuple[int, int]
+    scene: Plane
+    fine: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx) in detector pixels."""
+        return self.scene.shape[0] // self.fine, self.scene.shape[1] // self.fine
+
+    def window(self, margin_px: int = 0) -> tuple[slice, slice]:
+        """Where the patch lies in a plane that has margin_px more than the field on each side."""
+        (top, left), (ny, nx) = self.first, self.shape
+        return (
+            slice(top + margin_px, top + margin_px + ny),
+            slice(left + margin_px, left + margin_px + nx),
+        )
+
+    def hidden(self, place: Place) -> Plane:
+        """Light that a disc at `place` hides from each detector pixel of the patch, DN/s."""
+        return binned(self.scene * covered_share(place, self.first, self.shape, self.fine), self.fine)
+
+    def hidden_slopes(self, place: Place) -> tuple[Plane, Plane]:
+        """What a pixel to the right, and one up, add to it: DN/s a px, by differences of 0.001 px."""
+        return self._slope(place, _PLACE_STEP_PX, 0.0), self._slope(place, 0.0, _PLACE_STEP_PX)
+
+    def _slope(self, place: Place, dx: float, dy: float) -> Plane:
+        ahead = self.hidden(Place(place.x_px + dx, place.y_px + dy, place.radius_px))
+        back = self.hidden(Place(place.x_px - dx, place.y_px - dy, place.radius_px))
+        return (ahead - back) / (2 * (dx + dy))
+
+
+def behind(fine_scene: Plane, place: Place, *, fine: int, margin_px: int) -> Behind:
+    """The part of a scene that a disc at `place`, or less than a pixel off, can hide on the field.
+
+    fine_scene: pixels [y, x], DN/s, `fine` per detector pixel and axis, margin_px detector pixels beyond the
+    field on each side.
+    """
+    reach = place.radius_px + 2
+    field = (fine_scene.shape[0] // fine - 2 * margin_px, fine_scene.shape[1] // fine - 2 * margin_px)
+    spans = []
+    for at, n in zip((place.y_px, place.x_px), field, strict=True):
+        spans.append((max(0, int(np.floor(at - reach))), min(n, int(np.ceil(at + reach)) + 1)))
+    rows, columns = (slice((low + margin_px) * fine, (high + margin_px) * fine) for low, high in spans)
+    return Behind((spans[0][0], spans[1][0]), fine_scene[rows, columns].copy(), fine)
+
+
+def binned(fine_plane: Plane, fine: int) -> Plane:
+    """Mean of each block of (fine, fine) pixels."""
+    if fine == 1:
+        return fine_plane
+    ny, nx = fine_plane.shape
+    return np.asarray(fine_plane.reshape(ny // fine, fine, nx // fine, fine).mean(axis=(1, 3)))

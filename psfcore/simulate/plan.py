@@ -1,0 +1,207 @@
+"""The plan of a simulated transit: which images are taken where, how long, and with what errors.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "The observations": three pointings, the planet far
+off the east limb and approaching it, across the disc, and away from the west limb; 5 s exposures in combined gain far
+off the limb, 0.9 s in high gain near it, 1.8 s in high gain on the disc.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from psfcore.errors import DataError
+from psfcore.noise import Noise
+from psfcore.transit.transit import Place
+
+RADIUS_PX = 10.75
+SMALLEST_SIZE_PX = 64
+LARGEST_FINE_SIZE_PX = 1024  # of a field drawn on half pixels by default
+EAST, DISC, WEST = "east_limb", "disc", "west_limb"
+VIEWS = (EAST, DISC, WEST)
+DARK, ON = "dark", "on"
+COMBINED, HIGH = "combined", "high-only"
+CAMERA = Noise(photon_gain_dn=6.0, read_noise_dn=2.0)
+
+_THIRDS_UP_TO = 60  # images; more are shared out as the paper's 126
+_PAPER_LIMB_SHARE = 24 / 126
+_PAPER_FAR_SHARE = 10 / 24
+_MARGIN_PX = 6.0  # least distance of the disc's edge from the field's
+_MINUTE_S = 60.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image: its pointing (from 1), the occulter's exact centre (px), exposure (s), gain mode, start (s)."""
+
+    fov: int
+    x_px: float
+    y_px: float
+    exposure_s: float
+    gain_mode: str
+    time_s: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that decides a simulated transit but the PSF and the seed.
+
+    views: what each pointing shows, fov 1 first, each of VIEWS. ephemeris_error_px: rms on each axis.
+    saturation_dn: level that high-only images clip at, None for none; combined ones do not saturate.
+    brightness: factor on the scenes. oversampling: drawn pixels per detector pixel and axis, 1 or 2.
+    beyond: "dark" where the scene ends with the field; "on" where the Sun goes on for beyond_px on each side
+    (None: half the field). Raises DataError "bad-plan".
+    """
+
+    size_px: int
+    shots: tuple[Shot, ...]
+    views: tuple[str, ...] = VIEWS
+    radius_px: float = RADIUS_PX
+    ephemeris_error_px: float = 0.6
+    noise: Noise = CAMERA
+    saturation_dn: float | None = None
+    dark_offset_dn: float = 0.0
+    whole_dn: bool = True
+    brightness: float = 1.0
+    oversampling: int = 2
+    beyond: str = DARK
+    beyond_px: int | None = None
+
+    def __post_init__(self) -> None:
+        _expect(self.size_px >= SMALLEST_SIZE_PX, f"a field of {SMALLEST_SIZE_PX} px or more", self.size_px)
+        _expect(len(self.shots) > 0, "at least one image", "none")
+        _expect(self.oversampling in (1, 2), "an oversampling of 1 or 2", self.oversampling)
+        _expect(self.beyond in (DARK, ON), f"beyond {DARK!r} or {ON!r}", self.beyond)
+        _expect(self.beyond_px is None or self.beyond_px >= 0, "beyond_px >= 0", self.beyond_px)
+        _expect(set(self.views) <= set(VIEWS), f"views of {VIEWS}", self.views)
+        _expect(self.brightness > 0, "a brightness above 0", self.brightness)
+        _expect(self.ephemeris_error_px >= 0, "an ephemeris error >= 0", self.ephemeris_error_px)
+        level = self.saturation_dn
+        _expect(level is None or level > 0, "a saturation level above 0 DN", level)
+        _expect(np.isfinite(self.dark_offset_dn), "a finite dark offset", self.dark_offset_dn)
+        for shot in self.shots:
+            _expect(1 <= shot.fov <= len(self.views), f"a pointing of 1 to {len(self.views)}", shot.fov)
+            _expect(shot.exposure_s > 0, "an exposure above 0 s", shot.exposure_s)
+            low, high = self.radius_px, self.size_px - 1 - self.radius_px
+            inside = low <= shot.x_px <= high and low <= shot.y_px <= high
+            _expect(inside, "the whole occulter on the field", f"({shot.x_px:.1f}, {shot.y_px:.1f})")
+
+    @property
+    def margin_px(self) -> int:
+        """How far the scene goes on beyond the field on each side."""
+        if self.beyond == DARK:
+            return 0
+        return self.size_px // 2 if self.beyond_px is None else self.beyond_px
+
+    @property
+    def fovs(self) -> tuple[int, ...]:
+        """The pointings that have images."""
+        return tuple(sorted({shot.fov for shot in self.shots}))
+
+    def place(self, index: int) -> Place:
+        """Where the occulter exactly is in an image."""
+        return Place(self.shots[index].x_px, self.shots[index].y_px, self.radius_px)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; plan_from_json gives the plan back."""
+        return dataclasses.asdict(self)
+
+
+def plan_from_json(content: dict[str, Any]) -> Plan:
+    """The plan that Plan.as_json wrote. Raises DataError "bad-plan"."""
+    try:
+        shots = tuple(Shot(**shot) for shot in content["shots"])
+        known = content | {
+            "shots": shots,
+            "noise": Noise(**content["noise"]),
+            "views": tuple(content["views"]),
+        }
+        return Plan(**known)
+    except (KeyError, TypeError) as error:
+        raise DataError(
+            "bad-plan", f"expected a plan as `heliopsf simulate` writes it; got: {error}"
+        ) from None
+
+
+def default_plan(images: int = 30, size_px: int = 512, **changes: Any) -> Plan:
+    """A transit like the paper's: any number of images, a third a pointing up to 60, else as its 24, 78, 24.
+
+    Of a limb pointing's images 10 in 24 are taken far off the limb (5 s, combined), the others near it (0.9 s,
+    high-only); on the disc all are 1.8 s, high-only. changes: fields of Plan other than its size and images.
+    Fields above 1024 px are drawn on whole pixels. Raises DataError "bad-plan".
+    """
+    _expect(images >= 1, "at least one image", images)
+    limb = images // 3 if images <= _THIRDS_UP_TO else round(images * _PAPER_LIMB_SHARE)
+    far = int(np.ceil(limb * _PAPER_FAR_SHARE))
+    counts = (far, limb - far, images - 2 * limb, limb - far, far)
+    radius_px = changes.get("radius_px", RADIUS_PX)
+    shots = [
+        shot
+        for phase, count in zip(_PHASES, counts, strict=True)
+        for shot in _shots(phase, count, size_px, radius_px)
+    ]
+    drawn = {"oversampling": 2 if size_px <= LARGEST_FINE_SIZE_PX else 1}
+    return Plan(size_px, tuple(shots), **(drawn | changes))
+
+
+@dataclass(frozen=True)
+class _Track:
+    """Where the occulter enters and leaves a pointing (field edges), and when (minutes after 03:42)."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    start_min: float
+    end_min: float
+
+
+@dataclass(frozen=True)
+class _Phase:
+    """Images of one kind in a row: pointing, start and end (minutes after 03:42 UT), exposure, gain mode."""
+
+    fov: int
+    start_min: float
+    end_min: float
+    exposure_s: float
+    gain_mode: str
+
+
+_TRACKS = (
+    _Track((0.108, 0.361), (0.735, 0.428), 0.0, 53.0),
+    _Track((0.104, 0.462), (0.896, 0.417), 62.0, 190.0),
+    _Track((0.265, 0.571), (0.892, 0.648), 209.0, 261.0),
+)
+_PHASES = (
+    _Phase(1, 0.0, 29.0, 5.0, COMBINED),
+    _Phase(1, 31.0, 53.0, 0.9, HIGH),
+    _Phase(2, 62.0, 190.0, 1.8, HIGH),
+    _Phase(3, 209.0, 230.0, 0.9, HIGH),
+    _Phase(3, 231.0, 261.0, 5.0, COMBINED),
+)
+
+
+def _shots(phase: _Phase, count: int, size_px: int, radius_px: float) -> list[Shot]:
+    """Images evenly in time; the planet moves evenly along its track, kept off the field's edge."""
+    if count == 1:
+        times = np.array([(phase.start_min + phase.end_min) / 2])
+    else:
+        times = np.linspace(phase.start_min, phase.end_min, count)
+    track = _TRACKS[phase.fov - 1]
+    low = radius_px + _MARGIN_PX
+    _expect(2 * low < size_px - 1, f"a field of more than {2 * low + 1:.0f} px", size_px)
+    start, end = (
+        np.clip(np.multiply(at, size_px), low, size_px - 1 - low) for at in (track.start, track.end)
+    )
+    shots = []
+    for minute in times:
+        x, y = start + (end - start) * (minute - track.start_min) / (track.end_min - track.start_min)
+        place = (float(x), float(y))
+        shots.append(Shot(phase.fov, *place, phase.exposure_s, phase.gain_mode, float(minute * _MINUTE_S)))
+    return shots
+
+
+def _expect(holds: bool | np.bool_, wanted: str, got: object) -> None:
+    if not holds:
+        raise DataError("bad-plan", f"expected {wanted}; got {got}")

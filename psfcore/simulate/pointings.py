@@ -1,0 +1,58 @@
+"""Scenes of a transit's pointings: limb to the east, disc, limb to the west; drawn, or taken from an image."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import zoom
+
+from psfcore.errors import DataError
+from psfcore.simulate.plan import DISC, EAST, WEST, Plan
+from psfcore.simulate.scene import Layout, solar_scene
+
+Plane = NDArray[np.float64]
+
+_LIMB = Layout(
+    limb_centre=(2.10, 0.45),
+    corona_dn_per_s=420.0,
+    corona_height=0.075,
+    sky_dn_per_s=4.0,
+    regions=(),
+    filament=False,
+)
+_DISC = Layout(limb_centre=(0.5, 0.5))
+_LAYOUTS = {EAST: _LIMB, DISC: _DISC, WEST: _LIMB}
+
+
+def drawn_scene(plan: Plan, fov: int, seed: int) -> Plane:
+    """A pointing's scene in DN/s on drawn pixels [y, x]: oversampling per detector pixel, margins included.
+
+    The west limb is drawn as an east limb of another seed, and mirrored. The same for the same plan and seed.
+    """
+    view = plan.views[fov - 1]
+    edge = plan.size_px * plan.oversampling
+    own = int(np.random.SeedSequence([seed, fov]).generate_state(1)[0])
+    margin = plan.margin_px * plan.oversampling
+    scene = solar_scene((edge, edge), own, layout=_LAYOUTS[view], margin_px=margin)
+    return np.ascontiguousarray(plan.brightness * (scene[:, ::-1] if view == WEST else scene))
+
+
+def scene_from_image(image: Plane, plan: Plan) -> Plane:
+    """A scene on drawn pixels from an image's pixels [y, x] in DN/s, its middle where it is larger.
+
+    Pixels that are not finite or below zero become 0. An image smaller than what is drawn is enlarged
+    (bilinear, light per pixel kept), its shorter edge to the scene's. Raises DataError "bad-scene".
+    """
+    if image.ndim != 2 or min(image.shape) < 2:
+        raise DataError("bad-scene", f"expected an image of two axes; got shape {image.shape}")
+    light = np.maximum(np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0), 0.0)
+    if light.max() <= 0:
+        raise DataError(
+            "bad-scene", "expected an image with light; all its pixels are 0, negative or not finite"
+        )
+    edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
+    if min(light.shape) < edge:
+        factor = edge / min(light.shape)
+        light = np.maximum(zoom(light, [max(edge, round(n * factor)) / n for n in light.shape], order=1), 0.0)
+    top, left = (light.shape[0] - edge) // 2, (light.shape[1] - edge) // 2
+    return np.ascontiguousarray(plan.brightness * light[top : top + edge, left : left + edge])

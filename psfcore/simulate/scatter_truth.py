@@ -1,0 +1,147 @@
+"""Scatter as a simulator knows it: a softened power law that may be stretched and lopsided.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light", and beyond it: the
+paper's scatter has no direction. Written apart from the fit, so that neither hides the other's errors.
+
+    s(u, v) = a F(u, v)  off the centre,  s(0) = 1 - total                            Eq. (1)
+    F = (b + r')^-c (1 + d cos(theta - t)),  r'^2 = (u / (1 + s))^2 + (v (1 + s))^2    Eq. (2)
+    a = total / sum of F off the centre on the full reach                             Eq. (3)
+
+| symbol | name | unit |
+|---|---|---|
+| b, c, total | b_px, c, total | px, -, - |
+| s | stretch along t | - |
+| t | angle_deg, from +x towards +y | degrees |
+| d | dipole: light lands farther towards t | - |
+| u, v | offset from the centre along t and across it | px |
+| theta | angle of the offset, from +x towards +y | - |
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.fourier import linear_convolve
+from psfcore.psf import REACH_GRID_PX, crop_centred
+
+Kernel = NDArray[np.float64]
+PARAMETERS = ("b", "c", "total", "stretch")
+
+
+@dataclass(frozen=True)
+class ScatterTruth:
+    """The true scatter. Raises DataError "bad-scatter" where it would be no PSF."""
+
+    b_px: float
+    c: float
+    total: float
+    stretch: float = 0.0
+    angle_deg: float = 0.0
+    dipole: float = 0.0
+
+    def __post_init__(self) -> None:
+        numbers = (self.b_px, self.c, self.total, self.stretch, self.angle_deg, self.dipole)
+        if not all(math.isfinite(value) for value in numbers):
+            raise DataError("bad-scatter", f"expected finite numbers; got {self}")
+        if not (self.b_px > 0 and self.c > 0 and 0 <= self.total < 1 and self.stretch > -1):
+            raise DataError("bad-scatter", f"expected b > 0, c > 0, 0 <= total < 1, stretch > -1; got {self}")
+        if not abs(self.dipole) <= 1:
+            raise DataError("bad-scatter", f"expected a dipole of -1 to 1; got {self.dipole}")
+
+    @property
+    def a(self) -> float:
+        """Amplitude of Eq. (3), px^c."""
+        return float(self.total / _falloff(self).sum())
+
+
+def anisotropic_kernel(scatter: ScatterTruth, size: int = REACH_GRID_PX) -> Kernel:
+    """Eq. (1) on (size, size), size <= 2048, centre at [size // 2, size // 2]; sums to 1 on 2048."""
+    falloff = _falloff(scatter)
+    kernel = falloff * (scatter.total / falloff.sum())  # Eq. (1), Eq. (3)
+    kernel[REACH_GRID_PX // 2, REACH_GRID_PX // 2] = 1 - scatter.total
+    return crop_centred(kernel, (size, size))
+
+
+def total_kernel(
+    scatter: ScatterTruth, diffraction: Kernel, size: int = REACH_GRID_PX, *, threads: int = 1
+) -> Kernel:
+    """Scatter convolved linearly with diffraction on (size, size), cut to the full reach, not renormalised.
+
+    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1.
+    """
+    return convolved(anisotropic_kernel(scatter), diffraction, size, threads=threads)
+
+
+def convolved(full_kernel: Kernel, diffraction: Kernel, size: int, *, threads: int = 1) -> Kernel:
+    """A kernel on the full reach with diffraction, on (size, size); only the part that reaches it is transformed."""
+    needed = size + max(diffraction.shape) + 2
+    part = full_kernel if needed >= REACH_GRID_PX else crop_centred(full_kernel, (needed, needed))
+    return linear_convolve(part, diffraction, (size, size), threads=threads)
+
+
+def kernel_slopes(scatter: ScatterTruth) -> dict[str, Kernel]:
+    """What a unit of each of PARAMETERS adds to the kernel, on the full reach; its sum is kept by Eq. (3)."""
+    falloff = _falloff(scatter)
+    norm = falloff.sum()
+    # The centre holds 1 - total whatever the shape: the falloff is 0 there, and so are its slopes.
+    found = {
+        name: (scatter.total / norm) * (slope - falloff * (slope.sum() / norm))
+        for name, slope in _falloff_slopes(scatter, falloff).items()
+    }
+    found["total"] = falloff / norm
+    found["total"][REACH_GRID_PX // 2, REACH_GRID_PX // 2] = -1.0
+    return {name: found[name] for name in PARAMETERS}
+
+
+def amplitude_slopes(scatter: ScatterTruth) -> dict[str, float]:
+    """What a unit of each of PARAMETERS adds to the amplitude a, Eq. (3)."""
+    falloff = _falloff(scatter)
+    norm = float(falloff.sum())
+    sums = {name: float(slope.sum()) for name, slope in _falloff_slopes(scatter, falloff).items()}
+    found = {name: -scatter.total * total / norm**2 for name, total in sums.items()}
+    return {name: found.get(name, 1 / norm) for name in PARAMETERS}
+
+
+def _falloff_slopes(scatter: ScatterTruth, falloff: Kernel) -> dict[str, Kernel]:
+    """What a unit of b, of c and of the stretch adds to F."""
+    radius = _radius(scatter)
+    by_b = -scatter.c * falloff / (scatter.b_px + radius)
+    by_c = -np.log(scatter.b_px + radius) * falloff
+    return {"b": by_b, "c": by_c, "stretch": by_b * _radius_slope(scatter, radius)}
+
+
+def _falloff(scatter: ScatterTruth) -> Kernel:
+    """F of Eq. (2) on the full reach, 0 at the centre."""
+    falloff: Kernel = (scatter.b_px + _radius(scatter)) ** -scatter.c
+    if scatter.dipole:
+        along, across = _offsets(scatter.angle_deg)
+        falloff = falloff * (1 + scatter.dipole * along / np.maximum(np.hypot(along, across), 1e-300))
+    falloff[REACH_GRID_PX // 2, REACH_GRID_PX // 2] = 0.0
+    return falloff
+
+
+def _radius(scatter: ScatterTruth) -> Kernel:
+    """r' of Eq. (2)."""
+    along, across = _offsets(scatter.angle_deg)
+    factor = 1 + scatter.stretch
+    return np.asarray(np.sqrt((along / factor) ** 2 + (across * factor) ** 2))
+
+
+def _radius_slope(scatter: ScatterTruth, radius: Kernel) -> Kernel:
+    """What a unit of stretch adds to r'."""
+    along, across = _offsets(scatter.angle_deg)
+    factor = 1 + scatter.stretch
+    return (across**2 * factor - along**2 / factor**3) / np.maximum(radius, 1e-300)
+
+
+def _offsets(angle_deg: float) -> tuple[Kernel, Kernel]:
+    """u and v of each pixel of the full reach."""
+    axis = np.arange(REACH_GRID_PX, dtype=np.float64) - REACH_GRID_PX // 2
+    x, y = axis[None, :], axis[:, None]
+    cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
+    return x * cos + y * sin, y * cos - x * sin

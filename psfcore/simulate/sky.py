@@ -1,0 +1,156 @@
+"""The sky of a simulated transit, and what a camera without noise sees of it.
+
+    I_i = P (S_f - h_i),   h_i what the disc hides of the scene S_f in image i    Eq. (1)
+
+P is linear: a pointing's whole scene is seen through it once, what the disc hides once an image. Its kernel is
+scatter convolved with diffraction, cut to the full reach, a grid of 2048 px.
+
+| symbol | name | unit |
+|---|---|---|
+| S_f | scenes[f]: static scene of pointing f, what lies beyond the field included | DN/s |
+| P S_f | seen_scenes[f] | DN/s |
+| h_i | Behind.hidden | DN/s |
+| I_i | expected(i), noise_free[i] | DN/s |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.fourier import Convolver
+from psfcore.psf import REACH_GRID_PX
+from psfcore.simulate.disc import Behind, behind, binned
+from psfcore.simulate.plan import Plan
+from psfcore.simulate.pointings import drawn_scene
+from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
+
+Plane = NDArray[np.float64]
+Kernel = NDArray[np.float64]
+
+_SUM_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class TrueSky:
+    """Scenes, occulter and PSF of a transit; all planes float64 [y, x] in DN/s on detector pixels.
+
+    diffraction, kernel: weights [y, x], centre at [n // 2, n // 2]; kernel is the total PSF, as far as the scenes
+    need it. scenes: by pointing, plan.margin_px larger than the field on each side. seen_scenes: by pointing,
+    through the PSF, without the occulter, on the field. behind: the scene round the occulter of each image.
+    """
+
+    plan: Plan
+    scatter: ScatterTruth
+    diffraction: Kernel
+    kernel: Kernel
+    scenes: Mapping[int, Plane]
+    seen_scenes: Mapping[int, Plane]
+    behind: tuple[Behind, ...]
+    seed: int
+    threads: int = 1
+
+    def true_scene(self, index: int) -> Plane:
+        """Scene of an image with its occulter dark, on the field."""
+        return on_field(self.true_scene_and_beyond(index), self.plan.margin_px)
+
+    def true_scene_and_beyond(self, index: int) -> Plane:
+        """The same with what lies beyond the field, plan.margin_px on each side."""
+        scene = self.scenes[self.plan.shots[index].fov].copy()
+        around = self.behind[index]
+        rows, columns = around.window(self.plan.margin_px)
+        scene[rows, columns] -= around.hidden(self.plan.place(index))
+        return np.asarray(np.maximum(scene, 0.0))  # a hidden pixel is 0, not 1e-14 below it
+
+    def expected(self, index: int) -> Plane:
+        """What a camera without noise sees of an image, Eq. (1), on the field."""
+        around = self.behind[index]
+        hidden = np.zeros((self.plan.size_px, self.plan.size_px))
+        hidden[around.window()] = around.hidden(self.plan.place(index))
+        return np.asarray(
+            self.seen_scenes[self.plan.shots[index].fov] - self._hiding.apply(hidden)
+        )  # Eq. (1)
+
+    @cached_property
+    def noise_free(self) -> tuple[Plane, ...]:
+        """Every image as expected() has it; computed at first use and kept, 8 bytes a pixel and image."""
+        return tuple(self.expected(index) for index in range(len(self.plan.shots)))
+
+    @cached_property
+    def _hiding(self) -> Convolver:
+        field = (self.plan.size_px, self.plan.size_px)
+        return Convolver(self.kernel, field, dtype=np.float64, threads=self.threads)
+
+
+def true_sky(
+    plan: Plan,
+    scatter: ScatterTruth,
+    diffraction: Kernel,
+    seed: int,
+    *,
+    scenes: Mapping[int, Plane] | None = None,
+    threads: int = 1,
+) -> TrueSky:
+    """The sky of a plan: scenes drawn from `seed`, or `scenes` by pointing as scene_from_image gives them.
+
+    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. Raises DataError "bad-diffraction", "bad-scene".
+    """
+    _check_diffraction(diffraction)
+    whole_px = plan.size_px + 2 * plan.margin_px
+    kernel = total_kernel(scatter, diffraction, min(REACH_GRID_PX, 2 * whole_px), threads=threads)
+    coarse: dict[int, Plane] = {}
+    seen: dict[int, Plane] = {}
+    around: dict[int, Behind] = {}
+    for fov in plan.fovs:
+        fine = drawn_scene(plan, fov, seed) if scenes is None else _given(scenes, fov, plan)
+        for index in (n for n, shot in enumerate(plan.shots) if shot.fov == fov):
+            around[index] = behind(fine, plan.place(index), fine=plan.oversampling, margin_px=plan.margin_px)
+        coarse[fov] = binned(fine, plan.oversampling)
+        del fine
+        through = Convolver(kernel, (whole_px, whole_px), dtype=np.float64, threads=threads)
+        seen[fov] = on_field(np.asarray(through.apply(coarse[fov]), dtype=np.float64), plan.margin_px).copy()
+    return TrueSky(
+        plan=plan,
+        scatter=scatter,
+        diffraction=diffraction,
+        kernel=kernel,
+        scenes=coarse,
+        seen_scenes=seen,
+        behind=tuple(around[index] for index in range(len(plan.shots))),
+        seed=seed,
+        threads=threads,
+    )
+
+
+def on_field(plane: Plane, margin_px: int) -> Plane:
+    """A plane without what lies beyond the field."""
+    ny, nx = plane.shape
+    return plane[margin_px : ny - margin_px, margin_px : nx - margin_px]
+
+
+def _given(scenes: Mapping[int, Plane], fov: int, plan: Plan) -> Plane:
+    edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
+    if fov not in scenes or scenes[fov].shape != (edge, edge):
+        got = scenes[fov].shape if fov in scenes else f"scenes of pointings {sorted(scenes)}"
+        raise DataError("bad-scene", f"expected a scene of ({edge}, {edge}) for pointing {fov}; got {got}")
+    scene = np.asarray(scenes[fov], dtype=np.float64)
+    if not np.isfinite(scene).all() or scene.min() < 0:
+        raise DataError(
+            "bad-scene", f"expected finite pixels >= 0; got others in the scene of pointing {fov}"
+        )
+    return scene
+
+
+def _check_diffraction(diffraction: Kernel) -> None:
+    if diffraction.ndim != 2 or not np.isfinite(diffraction).all() or diffraction.min() < -1e-12:
+        raise DataError(
+            "bad-diffraction", f"expected finite weights [y, x] >= 0; got shape {diffraction.shape}"
+        )
+    total = float(diffraction.sum())
+    if abs(total - 1) > _SUM_TOLERANCE:
+        raise DataError("bad-diffraction", f"expected weights that sum to 1 on their grid; got {total:.6g}")

@@ -1,0 +1,232 @@
+"""A first guess of how much light is diffracted and scattered far, straight from the occulted pixels.
+
+Paper (Hofmeister et al.), section "A first guess on the amount of scattered and diffracted light": before a
+homogeneous Sun, the intensity in the middle of a small dark disc is all light that came farther than its radius:
+
+    I_o,dc = I_t sum over dr > r_disk of psf(dr),  mean I_o = I_t
+    sum over dr > r_disk of psf(dr) = I_o,dc / mean I_o                     Eq. (1)
+
+The characteristic intensity, mean I_o, is taken three ways: the image's mean, its median, and the mean in a shell of
+50 px round the disc.
+
+| symbol | name | unit |
+|---|---|---|
+| I_o,dc | centre_dn_s: mean within CENTRE_PX of the disc's centre | DN/s |
+| mean I_o | image_mean, image_median, shell | DN/s |
+| I_o,dc / mean I_o | ratio | 1 |
+| r_disk | radius_px | px |
+
+How homogeneous a Sun is, the paper tells by eye. Here it is a figure: the larger of how far the three estimators lie
+apart and how far the shell's four quadrants do, each over its mean.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.transit.transit import Frame, Place, Transit
+
+CENTRE_PX = 2.0
+SHELL_PX = 50.0
+EDGE_PX = 2.0  # a departure: the shell leaves out the disc's blurred edge, and an ephemeris' error of a pixel
+ESTIMATORS = ("image_mean", "image_median", "shell")
+
+Progress = Callable[[int, int], None]
+Flat = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameGuess:
+    """One image: intensities in DN/s; ratio and characteristic intensity by estimator, NaN where there is none;
+    inhomogeneity infinite where the disc's middle is not seen before light."""
+
+    file: str
+    fov: int
+    time_s: float
+    centre_dn_s: float
+    characteristic_dn_s: Mapping[str, float]
+    inhomogeneity: float
+
+    @property
+    def ratio(self) -> dict[str, float]:
+        """The share of light from farther than the disc's radius, by estimator."""
+        return {name: _ratio(self.centre_dn_s, level) for name, level in self.characteristic_dn_s.items()}
+
+
+@dataclass(frozen=True)
+class PointingGuess:
+    """One pointing: mean and scatter (standard deviation over its images) of the ratio, by estimator.
+
+    inhomogeneity: the median of its images'.
+    """
+
+    fov: int
+    images: int
+    mean: Mapping[str, float]
+    scatter: Mapping[str, float]
+    inhomogeneity: float
+
+
+@dataclass(frozen=True)
+class FirstGuess:
+    """All images in the order of time, all pointings, and what they imply.
+
+    best_fov: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratio over its
+    images and the three estimators: the light beyond radius_px, as a fraction.
+    """
+
+    frames: tuple[FrameGuess, ...]
+    pointings: tuple[PointingGuess, ...]
+    best_fov: int
+    share: float
+    share_spread: float
+    radius_px: float
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-able; what is not a number is null."""
+        return {
+            "best_fov": self.best_fov,
+            "share": _number(self.share),
+            "share_spread": _number(self.share_spread),
+            "radius_px": self.radius_px,
+            "pointings": [
+                {
+                    "fov": pointing.fov,
+                    "images": pointing.images,
+                    "mean": _numbers(pointing.mean),
+                    "scatter": _numbers(pointing.scatter),
+                    "inhomogeneity": _number(pointing.inhomogeneity),
+                }
+                for pointing in self.pointings
+            ],
+            "frames": [
+                {
+                    "file": frame.file,
+                    "fov": frame.fov,
+                    "time_s": frame.time_s,
+                    "centre_dn_s": _number(frame.centre_dn_s),
+                    "ratio": _numbers(frame.ratio),
+                    "inhomogeneity": _number(frame.inhomogeneity),
+                }
+                for frame in self.frames
+            ],
+        }
+
+
+def first_guess(
+    transit: Transit, *, places: Sequence[Place] | None = None, progress: Progress | None = None
+) -> FirstGuess:
+    """The first guess of a transit. places: exact ones, one a frame; none: the ephemeris'.
+
+    progress(done, of) is called after each image.
+    Raises DataError "no-first-guess" where no image shows the middle of the occulter before light.
+    """
+    places = [frame.place for frame in transit.frames] if places is None else places
+    guesses = []
+    for done, (frame, place) in enumerate(zip(transit.frames, places, strict=True), start=1):
+        guesses.append(_frame_guess(frame, place))
+        if progress is not None:
+            progress(done, len(transit.frames))
+    pointings = tuple(_pointing_guess(fov, guesses) for fov in sorted({guess.fov for guess in guesses}))
+    telling = [p for p in pointings if math.isfinite(p.inhomogeneity)]
+    if not telling:
+        message = "expected an image with the occulter's middle inside it, before the Sun; got none"
+        raise DataError("no-first-guess", message)
+    best = min(telling, key=lambda pointing: pointing.inhomogeneity)
+    ratios = _finite([r for g in guesses if g.fov == best.fov for r in g.ratio.values()])
+    radii = [place.radius_px for g, place in zip(guesses, places, strict=True) if g.fov == best.fov]
+    return FirstGuess(
+        frames=tuple(guesses),
+        pointings=pointings,
+        best_fov=best.fov,
+        share=float(ratios.mean()),
+        share_spread=float(ratios.std()),
+        radius_px=float(np.mean(radii)),
+    )
+
+
+def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
+    pixels, dx, dy = _surroundings(frame, place)
+    r = np.hypot(dx, dy)
+    centre = pixels[r <= CENTRE_PX]
+    inner = place.radius_px + EDGE_PX
+    in_shell = (r > inner) & (r <= inner + SHELL_PX)
+    shell = pixels[in_shell]
+    levels = {
+        "image_mean": float(frame.pixels.mean(dtype=np.float64)),
+        "image_median": float(np.median(frame.pixels)),
+        "shell": _mean(shell),
+    }
+    quadrant = (dx[in_shell] > 0).astype(np.int8) + 2 * (dy[in_shell] > 0)
+    quadrants = [_mean(shell[quadrant == q]) for q in range(4)]
+    apart = [_range_over_mean(list(levels.values())), _range_over_mean(quadrants)]
+    shown = centre.size > 0 and all(level > 0 for level in levels.values())
+    return FrameGuess(
+        file=frame.file,
+        fov=frame.fov,
+        time_s=frame.time_s,
+        centre_dn_s=_mean(centre),
+        characteristic_dn_s=levels,
+        inhomogeneity=max(apart) if shown else math.inf,
+    )
+
+
+def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
+    """Pixels (one axis, none of them filled in) out to the shell's edge, and their x and y from the centre."""
+    reach = place.radius_px + EDGE_PX + SHELL_PX + 2
+    ny, nx = frame.pixels.shape
+    top, bottom = (min(max(int(place.y_px + side * reach), 0), ny) for side in (-1, 1))
+    left, right = (min(max(int(place.x_px + side * reach), 0), nx) for side in (-1, 1))
+    here = (slice(top, bottom), slice(left, right))
+    y, x = np.mgrid[here]
+    seen = np.ones(x.shape, dtype=bool) if frame.filled is None else ~frame.filled[here]
+    pixels = frame.pixels[here][seen].astype(np.float64)
+    return pixels, x[seen] - place.x_px, y[seen] - place.y_px
+
+
+def _pointing_guess(fov: int, guesses: Sequence[FrameGuess]) -> PointingGuess:
+    mine = [guess for guess in guesses if guess.fov == fov]
+    values = {name: _finite([guess.ratio[name] for guess in mine]) for name in ESTIMATORS}
+    return PointingGuess(
+        fov=fov,
+        images=len(mine),
+        mean={name: _mean(ratios) for name, ratios in values.items()},
+        scatter={name: float(ratios.std()) if ratios.size else math.nan for name, ratios in values.items()},
+        inhomogeneity=float(np.median([guess.inhomogeneity for guess in mine])),
+    )
+
+
+def _ratio(centre_dn_s: float, level_dn_s: float) -> float:
+    return centre_dn_s / level_dn_s if level_dn_s > 0 else math.nan  # Eq. (1)
+
+
+def _range_over_mean(values: list[float]) -> float:
+    """Largest minus smallest over the mean of those that are numbers; infinite for a mean that is not above 0."""
+    known = _finite(values)
+    if known.size == 0 or known.mean() <= 0:
+        return math.inf
+    return float((known.max() - known.min()) / known.mean())
+
+
+def _mean(values: Flat) -> float:
+    return float(values.mean()) if values.size else math.nan
+
+
+def _finite(values: Sequence[float]) -> Flat:
+    array = np.asarray(values, dtype=np.float64)
+    return np.asarray(array[np.isfinite(array)])
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _numbers(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: _number(value) for name, value in values.items()}

@@ -1,0 +1,280 @@
+"""A transit read from its folder: transit.json, its images one after the other, and the known part of the PSF.
+
+Headers are looked at first, all of them, so that a file that is missing or of another shape is told before the
+minutes of reading pixels. Only float32 pixels are kept: 126 images of 2048 px are 2.1 GiB.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from astropy.io.fits import Header
+
+from psfcore.errors import DataError
+from psfcore.fits_io import read_image, read_plane
+from psfcore.header import FitsLimits, HeaderSummary, read_summary
+from psfcore.instruments.files import instrument_names
+from psfcore.instruments.gain import saturation_for
+from psfcore.instruments.model import Instrument, load_instrument
+from psfcore.noise import Noise
+from psfcore.psf import CENTRE_TOLERANCE, plate_scale_arcsec
+from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest, read_manifest
+from psfcore.transit.prepare import Exposure, Prepared, exposure_of, prepare
+from psfcore.transit.transit import Kernel, Place, Transit
+
+KNOWN_PSF_SUM_TOLERANCE = 1e-3
+SMALLEST_KNOWN_PSF_PX = 16
+LARGEST_RADIUS_SHARE = 0.25  # of the frame's smaller side
+_NEGATIVE_TOLERANCE = 1e-6  # of the peak: what rounding leaves below zero
+
+Progress = Callable[[int, int], None]
+KernelSource = Kernel | Callable[[str | None, tuple[int, int]], Kernel]
+
+
+def read_transit(
+    folder: str | Path,
+    limits: FitsLimits,
+    *,
+    progress: Progress | None = None,
+    diffraction: KernelSource | None = None,
+    noise: Noise | None = None,
+    saturation_dn: float | None = None,
+) -> Transit:
+    """The transit in a folder, prepared: as ``read_prepared``, without the counts."""
+    return read_prepared(
+        folder,
+        limits,
+        progress=progress,
+        diffraction=diffraction,
+        noise=noise,
+        saturation_dn=saturation_dn,
+    )[0]
+
+
+def read_prepared(
+    folder: str | Path,
+    limits: FitsLimits,
+    *,
+    progress: Progress | None = None,
+    diffraction: KernelSource | None = None,
+    noise: Noise | None = None,
+    saturation_dn: float | None = None,
+) -> tuple[Transit, Prepared]:
+    """The transit in a folder, in DN/s, frames in the order of time; and what was done to saturated pixels.
+
+    progress(done, of) is called after each image. diffraction: weights [y, x], or a function of (instrument's
+    name or None, shape of the images) that makes them, used where transit.json names no known_psf. noise:
+    instead of transit.json's. saturation_dn: level in DN of one exposure, besides those of the headers;
+    none: the instrument's for the image's gain mode, where known. Times come from DATE-BEG or DATE-OBS; where one
+    image has neither, the order of transit.json counts, a second an image.
+
+    Raises DataError: "no-manifest", "bad-manifest", "missing-file", "transit-shapes", "occulter-outside",
+    "occulter-too-large", "no-noise-figures", "no-known-psf", "known-psf-..." (see ``checked_kernel``), what
+    ``read_image`` raises with the file's name, what ``prepare`` raises; HeaderError for what headers show.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    noise = noise or _noise(manifest)
+    _check_present(folder, manifest)
+    headers = [_summary(folder / image.file, limits) for image in manifest.images]
+    _check_frames(manifest.images, headers)
+    instrument = manifest.instrument or next((h.instrument for h in headers if h.instrument), None)
+    known = _known_psf(folder, manifest, limits, diffraction, instrument, headers[0].shape)
+    looks = [
+        _Look(entry, time_s, header, _level_dn(header, saturation_dn))
+        for entry, time_s, header in zip(manifest.images, _times_s(headers), headers, strict=True)
+    ]
+    looks.sort(key=lambda look: look.time_s)  # stable: equal times stay in the order of transit.json
+    exposures: list[Exposure] = []
+    scales: list[float | None] = []
+    for done, look in enumerate(looks, start=1):
+        exposure, scale = _read(folder, look, limits)
+        exposures.append(exposure)
+        scales.append(scale)
+        if progress is not None:
+            progress(done, len(looks))
+    frames, prepared = prepare(exposures)
+    transit = Transit(
+        frames=frames,
+        diffraction=known,
+        noise=noise,
+        instrument=instrument,
+        plate_scale_arcsec=next((scale for scale in scales if scale is not None), None),
+        sha256={name: _sha256(folder / name) for name in (MANIFEST_NAME, *manifest.files)},
+    )
+    return transit, prepared
+
+
+# --- images -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What is known of an image before its pixels are read."""
+
+    entry: ImageEntry
+    time_s: float
+    header: HeaderSummary
+    saturation_dn: float | None
+
+
+def _read(folder: Path, look: _Look, limits: FitsLimits) -> tuple[Exposure, float | None]:
+    """One exposure, and its plate scale in arcsec/px."""
+    entry = look.entry
+    with _naming(entry.file):
+        image = read_image(folder / entry.file, limits, saturation_dn=look.saturation_dn)
+    exposure = exposure_of(
+        image,
+        file=entry.file,
+        fov=entry.fov,
+        place=Place(entry.x, entry.y, entry.r),
+        time_s=look.time_s,
+        gain_mode=look.header.gain_mode,
+    )
+    return exposure, plate_scale_arcsec(image.header)
+
+
+@contextmanager
+def _naming(file: str) -> Iterator[None]:
+    """Put the file's name before the message of what it raises."""
+    try:
+        yield
+    except DataError as error:
+        raise type(error)(error.code, f"{file}: {error.message}") from None
+
+
+def _summary(path: Path, limits: FitsLimits) -> HeaderSummary:
+    with _naming(path.name):
+        return read_summary(path, limits)
+
+
+def _check_present(folder: Path, manifest: TransitManifest) -> None:
+    missing = [name for name in manifest.files if not (folder / name).is_file()]
+    if missing:
+        named = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
+        raise DataError("missing-file", f"expected every file that {MANIFEST_NAME} names; missing: {named}")
+
+
+def _check_frames(images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]) -> None:
+    first = headers[0].shape
+    for index, (image, header) in enumerate(zip(images, headers, strict=True)):
+        label = f"images[{index}] ({image.file})"
+        ny, nx = header.shape
+        if header.shape != first:
+            size = f"{first[1]} x {first[0]} px as {images[0].file}"
+            raise DataError("transit-shapes", f"{label}: expected {size}; got {nx} x {ny}")
+        largest = LARGEST_RADIUS_SHARE * min(ny, nx)
+        if image.r > largest:
+            message = f"expected an occulter's radius r of at most {largest:g} px in {nx} x {ny} px"
+            raise DataError("occulter-too-large", f"{label}: {message}; got {image.r:g}")
+        out_x = max(-0.5 - image.x, image.x - (nx - 0.5))
+        out_y = max(-0.5 - image.y, image.y - (ny - 0.5))
+        if max(out_x, out_y) > image.r:
+            message = f"expected an occulter that reaches into the {nx} x {ny} px"
+            got = f"x = {image.x:g}, y = {image.y:g}, r = {image.r:g}"
+            raise DataError("occulter-outside", f"{label}: {message}; got {got}")
+
+
+def _times_s(headers: Sequence[HeaderSummary]) -> list[float]:
+    """Start of each image, s after the first; the index where any of them has no readable date."""
+    starts = [_instant(header.date_obs) for header in headers]
+    known = [start for start in starts if start is not None]
+    if len(known) < len(starts):
+        return [float(index) for index in range(len(headers))]
+    first = min(known)
+    return [(start - first).total_seconds() for start in known]
+
+
+def _instant(text: str | None) -> datetime | None:
+    """A date of a header, in UTC unless it says otherwise."""
+    if text is None:
+        return None
+    try:
+        instant = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    return instant if instant.tzinfo is not None else instant.replace(tzinfo=UTC)
+
+
+def _level_dn(header: HeaderSummary, saturation_dn: float | None) -> float | None:
+    """Level of one exposure in DN: the one given, or the instrument's for the image's gain mode."""
+    if saturation_dn is not None or header.gain_mode is None or header.instrument not in instrument_names():
+        return saturation_dn
+    return saturation_for(_instrument(header.instrument), Header({"GAINCOMB": header.gain_mode}))
+
+
+def _instrument(name: str | None) -> Instrument:
+    assert name is not None
+    return load_instrument(name)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# --- noise and the known PSF ------------------------------------------------------------------------------
+
+
+def _noise(manifest: TransitManifest) -> Noise:
+    if manifest.noise is None:
+        raise DataError(
+            "no-noise-figures",
+            f'expected "noise": {{"photon_gain_dn": ..., "read_noise_dn": ...}} in {MANIFEST_NAME}, or both '
+            "figures with the request (DN a detected photon, DN rms of the readout); got none",
+        )
+    return Noise(manifest.noise.photon_gain_dn, manifest.noise.read_noise_dn)
+
+
+def _known_psf(
+    folder: Path,
+    manifest: TransitManifest,
+    limits: FitsLimits,
+    fallback: KernelSource | None,
+    instrument: str | None,
+    shape: tuple[int, int],
+) -> Kernel:
+    if manifest.known_psf is not None:
+        with _naming(manifest.known_psf):
+            kernel = read_plane(folder / manifest.known_psf, limits)
+        return checked_kernel(kernel, manifest.known_psf)
+    if fallback is None:
+        wanted = f'expected "known_psf" in {MANIFEST_NAME}, or an instrument that diffraction is known of'
+        raise DataError("no-known-psf", f"{wanted}; got none")
+    return checked_kernel(fallback(instrument, shape) if callable(fallback) else fallback, "diffraction")
+
+
+def checked_kernel(kernel: Kernel, label: str) -> Kernel:
+    """A known part of a PSF [y, x] that sums to 1 exactly, centre at [ny // 2, nx // 2]; label names it in errors.
+
+    A sum within KNOWN_PSF_SUM_TOLERANCE of 1 is rounding and divided out.
+    Raises DataError "known-psf-small", "known-psf-nonfinite", "known-psf-negative", "known-psf-sum",
+    "known-psf-not-centred".
+    """
+    if kernel.ndim != 2 or min(kernel.shape) < SMALLEST_KNOWN_PSF_PX:
+        message = f"expected at least {SMALLEST_KNOWN_PSF_PX} px a side"
+        raise DataError("known-psf-small", f"{label}: {message}; got shape {kernel.shape}")
+    if not np.isfinite(kernel).all():
+        bad = int(np.count_nonzero(~np.isfinite(kernel)))
+        raise DataError("known-psf-nonfinite", f"{label}: expected finite weights; got {bad} that are not")
+    smallest, largest = float(kernel.min()), float(kernel.max())
+    if smallest < -_NEGATIVE_TOLERANCE * max(largest, 0.0):
+        message = f"expected weights >= 0; the smallest is {smallest:.3g}"
+        raise DataError("known-psf-negative", f"{label}: {message}")
+    total = float(kernel.sum(dtype=np.float64))
+    if abs(total - 1) > KNOWN_PSF_SUM_TOLERANCE:
+        message = "expected weights that sum to 1 on their own grid"
+        raise DataError("known-psf-sum", f"{label}: {message}; got a sum of {total:.6g}")
+    centre = (kernel.shape[0] // 2, kernel.shape[1] // 2)
+    if kernel[centre] < largest * (1 - CENTRE_TOLERANCE):
+        peak = tuple(int(p) for p in np.unravel_index(int(kernel.argmax()), kernel.shape))
+        message = f"expected the peak at [y, x] = {centre}"
+        raise DataError("known-psf-not-centred", f"{label}: {message}; got {peak}")
+    weights = np.maximum(kernel, 0.0, dtype=np.float64)
+    return np.ascontiguousarray(weights / weights.sum())

@@ -1,0 +1,190 @@
+"""transit.json: which files a transit is made of, and where the ephemeris puts the occulter in each.
+
+No numerics are loaded here, so that the web process may look into an upload. Keys that are not known are
+ignored, so that a newer writer's file can be read.
+
+| symbol | name | unit |
+|---|---|---|
+| x, y | where the ephemeris puts the occulter's centre, first pixel's centre at 0 | px |
+| r | the occulter's radius | px |
+| fov | the pointing | |
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from psfcore.errors import DataError
+
+MANIFEST_NAME = "transit.json"
+MAX_IMAGES = 2000
+MAX_MANIFEST_BYTES = 4 * 2**20
+FARTHEST_PX = 1e6
+LARGEST_RADIUS_PX = 4096.0
+_DRIVE = re.compile(r"[A-Za-z]:")
+
+
+def is_plain_name(name: str) -> bool:
+    """True for the name of a file inside a folder: no path, no climbing, no drive, nothing unprintable."""
+    return (
+        0 < len(name.encode("utf-8", "replace")) <= 255
+        and name.isprintable()
+        and not set("/\\") & set(name)
+        and name not in (".", "..")
+        and name == name.strip()
+        and _DRIVE.match(name) is None
+    )
+
+
+def _plain(name: str) -> str:
+    if not is_plain_name(name):
+        raise ValueError("expected a plain file name inside the folder")
+    return name
+
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("expected printable characters")
+    return text
+
+
+FileName = Annotated[str, AfterValidator(_plain)]
+# Strict, so that neither "12.5" nor true passes for a number.
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Coordinate = Annotated[Number, Field(ge=-FARTHEST_PX, le=FARTHEST_PX)]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class NoiseEntry(_Frozen):
+    """DN a detected photon, and DN rms of the readout; not both zero."""
+
+    photon_gain_dn: Annotated[Number, Field(ge=0)]
+    read_noise_dn: Annotated[Number, Field(ge=0)]
+
+
+class ImageEntry(_Frozen):
+    """One image of a transit: its file, its pointing, and the occulter's place and radius in it, px."""
+
+    file: FileName
+    fov: Annotated[int, Field(strict=True, ge=0, le=10_000)]
+    x: Coordinate
+    y: Coordinate
+    r: Annotated[Number, Field(gt=0, le=LARGEST_RADIUS_PX)]
+
+
+class TransitManifest(_Frozen):
+    """What transit.json says, in its own order of images."""
+
+    schema_: Literal["transit/1"] = Field(alias="schema")
+    instrument: Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_printable)] | None = None
+    known_psf: FileName | None = None
+    noise: NoiseEntry | None = None
+    images: Annotated[tuple[ImageEntry, ...], Field(min_length=1, max_length=MAX_IMAGES)]
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Every file named: the images in their order, then the known PSF."""
+        known = () if self.known_psf is None else (self.known_psf,)
+        return (*(image.file for image in self.images), *known)
+
+    @property
+    def pointings(self) -> dict[int, int]:
+        """How many images each pointing has, by its number."""
+        counts: dict[int, int] = {}
+        for image in self.images:
+            counts[image.fov] = counts.get(image.fov, 0) + 1
+        return dict(sorted(counts.items()))
+
+
+def read_manifest(folder: str | Path) -> TransitManifest:
+    """The transit.json of a folder.
+
+    Raises DataError "no-manifest" where there is none, else as ``parse_manifest``.
+    """
+    path = Path(folder) / MANIFEST_NAME
+    if not path.is_file():
+        raise DataError("no-manifest", f"expected a file {MANIFEST_NAME} in {Path(folder).name}; got none")
+    with path.open("rb") as file:
+        return parse_manifest(file.read(MAX_MANIFEST_BYTES + 1))
+
+
+def parse_manifest(content: bytes) -> TransitManifest:
+    """A manifest from the bytes of transit.json.
+
+    Raises DataError "bad-manifest": what was expected and got, naming the image by index and file, for JSON that
+    cannot be read, a wrong schema, missing or wrong values, more than MAX_IMAGES images or none, a name that is
+    no plain file name or stands twice, noise figures that are both zero.
+    """
+    if len(content) > MAX_MANIFEST_BYTES:
+        raise _bad(f"expected at most {MAX_MANIFEST_BYTES} bytes; got more")
+    try:
+        data = json.loads(content.decode("utf-8-sig"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError, ValueError) as error:
+        raise _bad(f"expected JSON in UTF-8; got: {str(error) or type(error).__name__:.120}") from None
+    if not isinstance(data, dict):
+        raise _bad(f"expected a JSON object; got {type(data).__name__}")
+    try:
+        manifest = TransitManifest.model_validate(data)
+    except ValidationError as error:
+        raise _bad(_first_problem(error, data)) from None
+    _check_once(manifest)
+    if manifest.noise is not None and not (manifest.noise.photon_gain_dn or manifest.noise.read_noise_dn):
+        raise _bad("noise: expected photon_gain_dn and read_noise_dn not both zero; got 0 and 0")
+    return manifest
+
+
+def _bad(message: str) -> DataError:
+    return DataError("bad-manifest", f"{MANIFEST_NAME}: {message}")
+
+
+def _check_once(manifest: TransitManifest) -> None:
+    seen: dict[str, int] = {}
+    for index, image in enumerate(manifest.images):
+        if image.file in seen:
+            message = f"expected each file once; got it in images[{seen[image.file]}] too"
+            raise _bad(f"images[{index}] ({image.file}): {message}")
+        if image.file in (MANIFEST_NAME, manifest.known_psf):
+            raise _bad(
+                f"images[{index}] ({image.file}): expected an image's file; got the {_role(manifest, image)}"
+            )
+        seen[image.file] = index
+    if manifest.known_psf == MANIFEST_NAME:
+        raise _bad(f"known_psf: expected a FITS file; got {MANIFEST_NAME}")
+
+
+def _role(manifest: TransitManifest, image: ImageEntry) -> str:
+    return "known PSF's" if image.file == manifest.known_psf else "manifest"
+
+
+def _first_problem(error: ValidationError, data: dict[str, Any]) -> str:
+    first = error.errors()[0]
+    missing = first["type"] == "missing"
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    got = "no such key" if missing else f"{first['input']!r:.80}"
+    if first["type"] in ("too_long", "too_short"):
+        got = f"{len(data['images'])}"
+    expected = first["msg"].removeprefix("Value error, ")
+    expected = expected if expected.startswith("expected") else f"expected: {expected}"
+    return f"{_where(first['loc'], data)}: {expected}; got {got}{more}"
+
+
+def _where(location: tuple[int | str, ...], data: dict[str, Any]) -> str:
+    """A place in the file as people read it, an image with the name of its file."""
+    match location:
+        case ("images", int() as index, *rest):
+            entry = data["images"][index]
+            name = entry.get("file") if isinstance(entry, dict) else None
+            label = f"images[{index}]" + (
+                f" ({name:.80})" if isinstance(name, str) and name.isprintable() else ""
+            )
+            return ".".join([label, *map(str, rest)])
+        case _:
+            return ".".join(map(str, location)) or "file"

@@ -1,0 +1,258 @@
+"""From exposures to frames: DN/s everywhere, and no pixel without a value.
+
+Paper (Hofmeister et al.), section "The observations": images are normalised by their exposure time, and pixels that
+are saturated are replaced by those of the nearest-in-time, unsaturated image. Here that image is of the same
+pointing, because the scene moves over the detector with the pointing, and its values are scaled:
+
+    s = median of I_i / I_j over the bright pixels near the gap, unsaturated in both    Eq. (1)
+    I_i(gap) = s I_j(gap)                                                               Eq. (2)
+
+| symbol | name | unit |
+|---|---|---|
+| I_i, I_j | pixels of the frame with the gap, of the frame it is filled from | DN/s |
+| s | scale | 1 |
+
+Whatever was replaced is marked in ``Frame.filled`` and takes no part in an analysis of the occulter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from psfcore.errors import DataError
+from psfcore.image import Image, MaskBit
+from psfcore.transit.transit import Frame, Lit, Pixels, Place
+
+NEAR_PX = 16  # how far from a gap the pixels lie that set the scale
+FEWEST_SCALE_PIXELS = 100
+OCCULTER_MARGIN_PX = 5.0  # the ephemeris' pixel, and the blurred edge
+NEIGHBOUR_PX = 2  # half width of the window of the local median
+_CHUNK = 65_536
+
+Places = NDArray[np.intp]
+
+
+@dataclass(eq=False)
+class Exposure:
+    """An image as read, normalised: pixels [y, x] in DN/s, with gaps.
+
+    gaps: True where a pixel is saturated or not finite, None where none is; saturated: how many of them are. The
+    pixels are changed in place when gaps are filled.
+    """
+
+    file: str
+    pixels: Pixels
+    fov: int
+    place: Place
+    exposure_s: float
+    time_s: float
+    gain_mode: str | None = None
+    gaps: Lit | None = None
+    saturated: int = 0
+
+
+@dataclass(frozen=True)
+class FrameCounts:
+    """What was wrong with the pixels of one frame, and what became of it; all in pixels.
+
+    unfilled: saturated pixels that no frame of the pointing shows, kept as they are.
+    """
+
+    file: str
+    saturated: int = 0
+    nonfinite: int = 0
+    from_frames: int = 0
+    from_neighbours: int = 0
+    unfilled: int = 0
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The counts of all frames, in their order."""
+
+    frames: tuple[FrameCounts, ...]
+
+    @property
+    def unfilled(self) -> int:
+        """Saturated pixels over all frames that had to stay."""
+        return sum(frame.unfilled for frame in self.frames)
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-able: only frames with something to tell, and how many there are in all."""
+        told = [asdict(frame) for frame in self.frames if frame.saturated or frame.nonfinite]
+        return {"images": len(self.frames), "unfilled": self.unfilled, "frames": told}
+
+
+def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
+    """Pixels [y, x] in DN/s (float32) of an image in DN or DN/s, and its exposure, s.
+
+    Raises DataError "no-exposure", and "unknown-unit" where BUNIT is neither.
+    """
+    unit = (image.unit or "").replace(" ", "").lower()
+    if unit not in ("dn", "dn/s"):
+        raise DataError("unknown-unit", f"{file}: expected BUNIT 'DN' or 'DN/s'; got {image.unit!r:.40}")
+    if image.exposure_s is None:
+        raise DataError("no-exposure", f"{file}: expected XPOSURE or EXPTIME above 0 s; got neither")
+    rate = image.pixels if unit == "dn/s" else image.pixels / image.exposure_s
+    with np.errstate(over="ignore"):  # beyond float32 it is not finite, and a gap like any other
+        return rate.astype(np.float32), image.exposure_s
+
+
+def exposure_of(
+    image: Image, *, file: str, fov: int, place: Place, time_s: float, gain_mode: str | None
+) -> Exposure:
+    """An exposure from an image as read; its gaps are the pixels that the mask marks, or that are not finite.
+
+    Raises as ``to_rate``.
+    """
+    pixels, exposure_s = to_rate(image, file)
+    gaps = (image.mask != 0) | ~np.isfinite(pixels)
+    return Exposure(
+        file=file,
+        pixels=pixels,
+        fov=fov,
+        place=place,
+        exposure_s=exposure_s,
+        time_s=time_s,
+        gain_mode=gain_mode,
+        gaps=gaps if gaps.any() else None,
+        saturated=int(np.count_nonzero(image.mask & MaskBit.SATURATED)),
+    )
+
+
+def prepare(exposures: Sequence[Exposure]) -> tuple[tuple[Frame, ...], Prepared]:
+    """Frames without gaps, in the order given, and what was done to each.
+
+    A gap is filled from the frame of the same pointing nearest in time that has none there, then from the next.
+    Gaps that no frame fills: a saturated pixel keeps its value, any other takes the median of its neighbours.
+    The exposures' pixels are changed in place and become the frames'.
+    Raises DataError "all-saturated" where more than half of a frame's pixels are saturated and stay so.
+    """
+    done = [(_frame(exposure), counts) for exposure, counts in ((e, _fill(e, exposures)) for e in exposures)]
+    return tuple(frame for frame, _ in done), Prepared(tuple(counts for _, counts in done))
+
+
+def _frame(exposure: Exposure) -> Frame:
+    return Frame(
+        file=exposure.file,
+        pixels=exposure.pixels,
+        fov=exposure.fov,
+        place=exposure.place,
+        exposure_s=exposure.exposure_s,
+        time_s=exposure.time_s,
+        gain_mode=exposure.gain_mode,
+        filled=exposure.gaps,
+    )
+
+
+def _fill(exposure: Exposure, exposures: Sequence[Exposure]) -> FrameCounts:
+    """Fill the gaps of one exposure in place."""
+    if exposure.gaps is None:
+        return FrameCounts(exposure.file)
+    left = _fill_from_frames(exposure, exposures)
+    of_gaps = int(np.count_nonzero(exposure.gaps))
+    unfinished = int(np.count_nonzero(left))
+    kept = left & np.isfinite(exposure.pixels)
+    unfilled = int(np.count_nonzero(kept))
+    if 2 * unfilled > kept.size:
+        message = "expected an image with unsaturated pixels, or another of its pointing to fill it from"
+        share = 100 * unfilled / kept.size
+        raise DataError("all-saturated", f"{exposure.file}: {message}; {share:.0f} % stay saturated")
+    _fill_from_neighbours(exposure.pixels, left & ~kept, exposure.gaps)
+    return FrameCounts(
+        file=exposure.file,
+        saturated=exposure.saturated,
+        nonfinite=of_gaps - exposure.saturated,
+        from_frames=of_gaps - unfinished,
+        from_neighbours=unfinished - unfilled,
+        unfilled=unfilled,
+    )
+
+
+def _fill_from_frames(exposure: Exposure, exposures: Sequence[Exposure]) -> Lit:
+    """Fill what other frames show; returns the gaps [y, x] that are left."""
+    assert exposure.gaps is not None
+    left = exposure.gaps.copy()
+    rows, columns = np.nonzero(left)
+    # Another frame shows the Sun where this one has its occulter.
+    off = ~_on_disc(exposure.place, rows, columns)
+    rows, columns = rows[off], columns[off]
+    for donor in _donors(exposure, exposures):
+        if not rows.size:
+            break
+        shown = ~_on_disc(donor.place, rows, columns)
+        if donor.gaps is not None:
+            shown &= ~donor.gaps[rows, columns]
+        if shown.any():
+            here = rows[shown], columns[shown]
+            exposure.pixels[here] = _scale(exposure, donor, here) * donor.pixels[here]  # Eq. (2)
+            left[here] = False
+            rows, columns = rows[~shown], columns[~shown]
+    return left
+
+
+def _donors(exposure: Exposure, exposures: Sequence[Exposure]) -> list[Exposure]:
+    same = [other for other in exposures if other is not exposure and other.fov == exposure.fov]
+    return sorted(same, key=lambda other: abs(other.time_s - exposure.time_s))
+
+
+def _on_disc(place: Place, rows: Places, columns: Places) -> Lit:
+    """Which of the places lie on the occulter or in a margin round it."""
+    dy, dx = rows - place.y_px, columns - place.x_px
+    return np.asarray(dx * dx + dy * dy <= (place.radius_px + OCCULTER_MARGIN_PX) ** 2)
+
+
+def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> float:
+    """How much brighter the frame is than the donor, near the gaps and else over the whole; 1 where nothing tells."""
+    wanted = np.zeros(exposure.pixels.shape, dtype=bool)
+    wanted[here] = True
+    known = np.ones_like(wanted)
+    for gaps in (exposure.gaps, donor.gaps):
+        if gaps is not None:
+            known &= ~gaps
+    if not known.any():
+        return 1.0
+    floors = [max(0.0, float(np.median(one.pixels[known]))) for one in (exposure, donor)]
+    bright = known & (exposure.pixels > floors[0]) & (donor.pixels > floors[1])
+    near = bright & ndimage.maximum_filter(wanted, size=2 * NEAR_PX + 1)
+    for these in (near, bright):
+        if np.count_nonzero(these) >= FEWEST_SCALE_PIXELS:
+            ratio = exposure.pixels[these].astype(np.float64) / donor.pixels[these]
+            return float(np.median(ratio))  # Eq. (1)
+    return 1.0
+
+
+def _fill_from_neighbours(pixels: Pixels, wanted: Lit, gaps: Lit) -> None:
+    """Each wanted pixel becomes the median of the valid ones near it; far from any, of those near the nearest."""
+    if not wanted.any():
+        return
+    rows, columns = np.nonzero(wanted)
+    known = np.where(gaps, np.float32(np.nan), pixels)
+    values = _local_median(known, rows, columns)
+    lost = np.isnan(values)
+    if lost.any() and not gaps.all():
+        nearest = ndimage.distance_transform_edt(gaps, return_distances=False, return_indices=True)
+        values[lost] = _local_median(known, *(axis[rows[lost], columns[lost]] for axis in nearest))
+    pixels[rows, columns] = np.nan_to_num(values, nan=0.0)
+
+
+def _local_median(known: Pixels, rows: Places, columns: Places) -> NDArray[np.float32]:
+    """Median of the known (not NaN) pixels in a window round each of the places; NaN where there is none."""
+    padded = np.pad(known, NEIGHBOUR_PX, constant_values=np.nan)
+    side = 2 * NEIGHBOUR_PX + 1
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
+    parts = [np.empty(0, dtype=np.float32)]
+    for start in range(0, rows.size, _CHUNK):
+        these = slice(start, start + _CHUNK)
+        window = np.sort(windows[rows[these], columns[these]].reshape(-1, side * side), axis=1)  # NaN last
+        count = np.count_nonzero(np.isfinite(window), axis=1)
+        line = np.arange(count.size)
+        middle = window[line, np.maximum(count - 1, 0) // 2] + window[line, count // 2 * (count > 0)]
+        parts.append(np.where(count > 0, 0.5 * middle, np.nan).astype(np.float32))
+    return np.concatenate(parts)

@@ -1,0 +1,494 @@
+"""An archive is taken apart whole or not at all, whatever it claims."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import shutil
+import stat
+import struct
+import tarfile
+import tracemalloc
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psfcore.errors import DataError
+from psfcore.transit import archive
+from psfcore.transit.archive import (
+    START_BYTES,
+    ArchiveLimits,
+    archive_kind,
+    could_be_archive,
+    list_archive,
+    pack,
+    unpack,
+)
+from tests.transit_files import write_transit
+
+LIMITS = ArchiveLimits()
+SMALL = ArchiveLimits(max_files=100, max_bytes=2**20, max_member_bytes=2**19)
+MIB = 2**20
+Member = tuple[str, bytes]
+Maker = Callable[[Path, list[Member]], Path]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_transit(tmp_path_factory.mktemp("written") / "transit", images=3)
+
+
+@pytest.fixture
+def folder(written: Path, tmp_path: Path) -> Path:
+    """A transit of the test's own."""
+    return shutil.copytree(written, tmp_path / "transit")
+
+
+def members_of(folder: Path, top: str = "") -> list[Member]:
+    return [(top + path.name, path.read_bytes()) for path in sorted(folder.iterdir())]
+
+
+def as_zip(path: Path, members: list[Member]) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as out:
+        for name, content in members:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # a name that stands twice
+                out.writestr(zipfile.ZipInfo(name) if name.endswith("/") else name, content)
+    return path
+
+
+def as_tar(path: Path, members: list[Member], mode: str = "w", form: int = tarfile.PAX_FORMAT) -> Path:
+    with tarfile.open(path, mode, format=form) as out:  # type: ignore[call-overload]
+        for name, content in members:
+            info = tarfile.TarInfo(name)
+            info.size, info.type = len(content), tarfile.DIRTYPE if name.endswith("/") else tarfile.REGTYPE
+            out.addfile(info, io.BytesIO(content))
+    return path
+
+
+def as_tar_gz(path: Path, members: list[Member]) -> Path:
+    return as_tar(path, members, "w:gz")
+
+
+KINDS = [as_zip, as_tar, as_tar_gz]
+
+
+def refused(
+    path: Path, target: Path, code: str, limits: ArchiveLimits = LIMITS, *, listed: bool = True
+) -> str:
+    """Refused when unpacked, and when listed where that can show; nothing is left. Returns the message."""
+    for look in [lambda: list_archive(path, limits)] if listed else []:
+        with pytest.raises(DataError) as caught:
+            look()
+        assert caught.value.code == code, caught.value
+    with pytest.raises(DataError) as caught:
+        unpack(path, target, limits)
+    assert caught.value.code == code, caught.value
+    assert "expected" in caught.value.message
+    assert not target.exists(), "nothing is left behind"
+    return caught.value.message
+
+
+# --- what is taken ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize("top", ["", "p1/", "./", "./p1/"])
+def test_files_come_out_as_they_went_in(folder: Path, tmp_path: Path, make: Maker, top: str) -> None:
+    members = members_of(folder, top)
+    path = make(tmp_path / "no-ending", [(top, b""), *members] if top not in ("", "./") else members)
+    contents = list_archive(path, LIMITS)
+    assert contents.kind == {as_zip: "zip", as_tar: "tar", as_tar_gz: "tar.gz"}[make]
+    assert contents.files == {p.name: p.stat().st_size for p in folder.iterdir()}
+    assert len(contents.manifest.images) == 3
+    out = tmp_path / "out"
+    assert sorted(unpack(path, out, LIMITS)) == sorted(contents.files)
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == {
+        p.name: p.read_bytes() for p in folder.iterdir()
+    }
+
+
+@pytest.mark.parametrize("make", KINDS)
+def test_what_systems_add_is_left_out(folder: Path, tmp_path: Path, make: Maker) -> None:
+    extra = [
+        ".DS_Store",
+        "__MACOSX/._000.fits",
+        "p1/.DS_Store",
+        "p1/.git/config",
+        "PaxHeader/000.fits",
+        "p1/._a",
+    ]
+    members = [*members_of(folder, "p1/"), *((name, b"x") for name in extra)]
+    names = unpack(make(tmp_path / "a", members), tmp_path / "out", LIMITS)
+    assert sorted(names) == sorted(p.name for p in folder.iterdir())
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(names)
+
+
+@pytest.mark.parametrize("form", [tarfile.PAX_FORMAT, tarfile.GNU_FORMAT, tarfile.USTAR_FORMAT])
+def test_long_and_foreign_names_in_a_tar(tmp_path: Path, form: int) -> None:
+    names = ["a" * 90 + ".fits"] if form == tarfile.USTAR_FORMAT else ["a" * 200 + ".fits", "Ü.fits"]
+    path = as_tar(tmp_path / "a.tar", [(name, b"1234") for name in names], form=form)
+    assert unpack(path, tmp_path / "out", LIMITS) == tuple(names)
+    assert (tmp_path / "out" / names[0]).read_bytes() == b"1234"
+
+
+def test_a_packed_folder_is_the_same_bytes_each_time_and_comes_back(folder: Path, tmp_path: Path) -> None:
+    (folder / "notes.txt").write_text("not named in transit.json")
+    pack(folder, tmp_path / "a.tar")
+    again = tmp_path / "elsewhere"
+    shutil.copytree(folder, again, copy_function=shutil.copyfile)
+    (again / "notes.txt").unlink()
+    (again / "000.fits").chmod(0o600)
+    pack(again, tmp_path / "b.tar")
+    assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
+    unpack(tmp_path / "a.tar", tmp_path / "out", LIMITS)
+    assert (tmp_path / "out/002.fits").read_bytes() == (folder / "002.fits").read_bytes()
+    assert not (tmp_path / "out/notes.txt").exists()
+    (folder / "001.fits").unlink()
+    with pytest.raises(DataError, match=r"missing: 001\.fits"):
+        pack(folder, tmp_path / "c.tar")
+
+
+def test_kinds_are_told_by_their_first_bytes(folder: Path, tmp_path: Path) -> None:
+    for make, kind in ((as_zip, "zip"), (as_tar, "tar"), (as_tar_gz, "gzip")):
+        start = make(tmp_path / kind, members_of(folder)).read_bytes()[:START_BYTES]
+        assert archive_kind(start) == kind
+        assert all(could_be_archive(start[:count]) for count in range(START_BYTES + 1))
+    assert archive_kind(b"SIMPLE  =" + bytes(300)) is None
+    assert not could_be_archive(b"SIMPLE  =" + bytes(300))
+
+
+# --- what is refused --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../evil.fits",
+        "p1/../../evil.fits",
+        "/etc/evil",
+        "a\\..\\evil",
+        "C:evil",
+        "p1/C:/evil",
+        "..",
+        "__MACOSX/../e",
+    ],
+)
+def test_names_that_climb(folder: Path, tmp_path: Path, make: Maker, name: str) -> None:
+    path = make(tmp_path / "a", [*members_of(folder), (name, b"evil")])
+    message = refused(path, tmp_path / "deep/er/out", "archive-climbs")
+    assert ascii(name) in message
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize(
+    "extra",
+    [
+        ["a/b/x.fits"],
+        ["other/x.fits"],
+        ["a/b/"],
+        ["000.fits"],
+        ["bell\x07.fits"],
+        [" .fits"],
+        ["x" * 300],
+    ],
+)
+def test_what_is_not_plain(folder: Path, tmp_path: Path, make: Maker, extra: list[str]) -> None:
+    path = make(tmp_path / "a", [*members_of(folder), *((name, b"") for name in extra)])
+    refused(path, tmp_path / "out", "archive-not-plain")
+
+
+def test_two_folders_at_the_top(folder: Path, tmp_path: Path) -> None:
+    path = as_zip(tmp_path / "a", [*members_of(folder, "p1/"), ("p2/x.fits", b"")])
+    refused(path, tmp_path / "out", "archive-not-plain")
+
+
+@pytest.mark.parametrize(
+    "kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.FIFOTYPE, b"S", b"Z"]
+)
+def test_links_and_devices_in_a_tar(folder: Path, tmp_path: Path, kind: bytes) -> None:
+    path = tmp_path / "a.tar"
+    as_tar(path, members_of(folder))
+    with tarfile.open(path, "a") as out:
+        link = tarfile.TarInfo("x.fits")
+        link.type, link.linkname = kind, "/etc/passwd"
+        out.addfile(link)
+    refused(path, tmp_path / "out", "archive-not-plain")
+
+
+@pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFCHR, stat.S_IFIFO])
+@pytest.mark.parametrize("name", ["x.fits", "x/"])
+def test_links_and_devices_in_a_zip(folder: Path, tmp_path: Path, kind: int, name: str) -> None:
+    path = as_zip(tmp_path / "a.zip", members_of(folder))
+    with zipfile.ZipFile(path, "a") as out:
+        info = zipfile.ZipInfo(name)
+        info.external_attr, info.create_system = (kind | 0o777) << 16, 3
+        out.writestr(info, "/etc/passwd")
+    refused(path, tmp_path / "out", "archive-not-plain")
+
+
+def patched(path: Path, member: str, offset_central: int, offset_local: int, form: str, value: int) -> Path:
+    """A zip with a field of one member overwritten, in its table of contents and before its bytes."""
+    with zipfile.ZipFile(path) as out:
+        at_local = out.getinfo(member).header_offset
+    content = bytearray(path.read_bytes())
+    at_central = content.rindex(member.encode()) - 46
+    struct.pack_into(form, content, at_central + offset_central, value)
+    struct.pack_into(form, content, at_local + offset_local, value)
+    path.write_bytes(content)
+    return path
+
+
+def test_an_encrypted_zip(folder: Path, tmp_path: Path) -> None:
+    path = patched(as_zip(tmp_path / "a.zip", members_of(folder)), "001.fits", 8, 6, "<H", 1)
+    assert "encrypted" in refused(path, tmp_path / "out", "archive-not-plain")
+
+
+def test_a_method_that_is_not_taken(folder: Path, tmp_path: Path) -> None:
+    path = patched(as_zip(tmp_path / "a.zip", members_of(folder)), "001.fits", 10, 8, "<H", 12)
+    assert "deflated" in refused(path, tmp_path / "out", "archive-not-plain")
+
+
+def test_too_many_members(folder: Path, tmp_path: Path) -> None:
+    for make in KINDS:
+        members = [(f".{i}", b"") for i in range(101)]
+        refused(make(tmp_path / "a", members), tmp_path / "out", "archive-too-large", SMALL)
+
+
+def test_a_table_of_contents_too_large(tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as out:
+        for index in range(25):
+            info = zipfile.ZipInfo(f"{index}.fits")
+            info.comment = bytes(60_000)
+            out.writestr(info, b"")
+    assert "table of contents" in refused(path, tmp_path / "out", "archive-too-large", SMALL)
+
+
+# --- bombs ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", KINDS)
+def test_a_member_that_is_too_large(folder: Path, tmp_path: Path, make: Maker) -> None:
+    path = make(tmp_path / "a", [*members_of(folder), ("x.fits", bytes(600_000))])
+    refused(path, tmp_path / "out", "archive-too-large", SMALL)
+
+
+@pytest.mark.parametrize("make", KINDS)
+def test_members_that_are_too_large_together(folder: Path, tmp_path: Path, make: Maker) -> None:
+    path = make(tmp_path / "a", [*members_of(folder), *((f"{i}.x", bytes(400_000)) for i in range(3))])
+    refused(path, tmp_path / "out", "archive-too-large", SMALL)
+
+
+def test_more_comes_out_than_goes_in(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for make in (as_zip, as_tar_gz):
+        path = make(tmp_path / "a", [*members_of(folder), ("x.fits", bytes(5 * MIB))])
+        assert len(list_archive(path, LIMITS).files) == 6, "little comes out: the ratio does not count"
+        with monkeypatch.context() as patch:
+            patch.setattr(archive, "RATIO_FLOOR_BYTES", MIB)
+            refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_ratio=20))
+
+
+@contextmanager
+def held_below(limit_bytes: int) -> Iterator[None]:
+    """Fails where more memory was taken than that."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < limit_bytes
+    finally:
+        tracemalloc.stop()
+
+
+def endless_gz(path: Path, start: bytes, mib: int) -> Path:
+    """A gzip of ``start`` and then nothing but zeros."""
+    with gzip.open(path, "wb", compresslevel=1) as out:
+        out.write(start)
+        for _ in range(mib):
+            out.write(bytes(MIB))
+    return path
+
+
+def tar_header(name: str, size: int, kind: bytes = tarfile.REGTYPE) -> bytes:
+    info = tarfile.TarInfo(name)
+    info.size, info.type = size, kind
+    return info.tobuf(tarfile.GNU_FORMAT)
+
+
+@pytest.mark.parametrize("name", ["x.fits", ".hidden"])
+def test_a_gzip_without_end_stops_at_the_limit(tmp_path: Path, name: str) -> None:
+    path = endless_gz(tmp_path / "a.tar.gz", tar_header(name, 2**50), mib=48)
+    limits = ArchiveLimits(max_bytes=4 * MIB, max_member_bytes=2**60)
+    with held_below(8 * MIB):
+        refused(path, tmp_path / "out", "archive-too-large", limits)
+
+
+def test_what_comes_out_is_counted_where_little_is_declared(tmp_path: Path) -> None:
+    """A hundred small members that are left out still have to be inflated."""
+    inside = b"".join(tar_header(f".{i}", 100_000) + bytes(100_352) for i in range(90))
+    path = endless_gz(tmp_path / "a.tar.gz", inside, mib=0)
+    refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_bytes=4 * MIB))
+
+
+@pytest.mark.parametrize("kind", [b"x", b"g", b"L"])
+def test_a_name_without_end(tmp_path: Path, kind: bytes) -> None:
+    path = endless_gz(tmp_path / "a.tar.gz", tar_header("x", 2**33, kind), mib=32)
+    with held_below(8 * MIB):
+        refused(path, tmp_path / "out", "archive-broken")
+
+
+@pytest.mark.parametrize("declared", [10_000, 30_000])
+def test_a_zip_whose_sizes_lie(tmp_path: Path, declared: int) -> None:
+    """50 KiB that hold 48 MiB, said to hold little: stopped there, and told; at once where it cannot be true."""
+    content = as_zip(tmp_path / "a.zip", [("x.fits", bytes(48 * MIB))])
+    path = patched(content, "x.fits", 24, 22, "<I", declared)
+    assert path.stat().st_size > 40_000
+    with held_below(16 * MIB):
+        refused(path, tmp_path / "out", "archive-broken", listed=declared == 10_000)
+
+
+def test_a_zip_that_holds_less_than_it_says(folder: Path, tmp_path: Path) -> None:
+    path = patched(as_zip(tmp_path / "a.zip", members_of(folder)), "001.fits", 24, 22, "<I", 10**6)
+    refused(path, tmp_path / "out", "archive-broken", listed=False)
+
+
+def test_many_names_for_the_same_bytes(tmp_path: Path) -> None:
+    """A table of contents whose entries all name one member's bytes."""
+    path = as_zip(tmp_path / "a.zip", [("000.fits", bytes(MIB))])
+    content = path.read_bytes()
+    at, end = content.index(b"PK\1\2"), content.index(b"PK\5\6")
+    entries = b"".join(content[at:end].replace(b"000.fits", b"%03d.fits" % i) for i in range(50))
+    tail = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 50, 50, len(entries), at, 0)
+    path.write_bytes(content[:at] + entries + tail)
+    with pytest.raises(DataError):
+        unpack(path, tmp_path / "out", LIMITS)
+    refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_bytes=20 * MIB), listed=True)
+
+
+# --- damage -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.9, 0.97])
+def test_an_archive_that_stops_short(folder: Path, tmp_path: Path, make: Maker, share: float) -> None:
+    path = make(tmp_path / "a", members_of(folder))
+    content = path.read_bytes().rstrip(b"\0")
+    path.write_bytes(content[: int(share * len(content))])
+    refused(path, tmp_path / "out", "archive-broken")
+
+
+def test_a_wrong_byte_in_a_zip_is_seen_when_it_is_unpacked(folder: Path, tmp_path: Path) -> None:
+    noise = np.random.default_rng(1).bytes(100_000)
+    path = as_zip(tmp_path / "a.zip", [*members_of(folder), ("x.fits", noise)])
+    content = bytearray(path.read_bytes())
+    content[content.index(b"x.fits") + 50_000] ^= 0xFF
+    path.write_bytes(content)
+    list_archive(path, LIMITS)
+    refused(path, tmp_path / "out", "archive-broken", listed=False)
+
+
+@pytest.mark.parametrize("content", [b"", b"x", b"PK", b"SIMPLE  =" + bytes(5000), bytes(1024)])
+def test_what_is_no_archive(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a").write_bytes(content)
+    refused(tmp_path / "a", tmp_path / "out", "not-an-archive")
+
+
+def test_a_gzip_of_something_else(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(gzip.compress(b"SIMPLE  =" + bytes(5000)))
+    refused(tmp_path / "a", tmp_path / "out", "not-an-archive")
+
+
+@pytest.mark.parametrize("make", KINDS)
+def test_damage_anywhere_is_told_and_leaves_nothing(tmp_path: Path, make: Maker) -> None:
+    path = make(tmp_path / "a", [("transit.json", b"{}"), ("000.fits", bytes(range(256)) * 3)])
+    whole = path.read_bytes()
+    rng = np.random.default_rng(5)
+    told = set()
+    for _ in range(200):
+        content = bytearray(whole)
+        for at in rng.integers(0, len(content), size=rng.integers(1, 4)):
+            content[at] = rng.integers(256)
+        path.write_bytes(content)
+        for look in (list_archive, lambda p, limits: unpack(p, tmp_path / "out", limits)):
+            try:
+                look(path, SMALL)
+                shutil.rmtree(tmp_path / "out", ignore_errors=True)
+            except DataError as error:
+                told.add(error.code)
+        assert not (tmp_path / "out").exists()
+    assert "archive-broken" in told
+
+
+def test_what_the_disk_reports_is_no_fault_of_the_archive(folder: Path, tmp_path: Path) -> None:
+    path = as_tar(tmp_path / "a", members_of(folder))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "001.fits").write_text("was here before")
+    with pytest.raises(FileExistsError):
+        unpack(path, out, LIMITS)
+    assert [p.name for p in out.iterdir()] == ["001.fits"], "what was there stays, what came goes"
+
+
+# --- the table of contents --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize(
+    ("missing", "code"),
+    [("transit.json", "no-manifest"), ("001.fits", "missing-file"), ("diffraction.fits", "missing-file")],
+)
+def test_what_is_missing(folder: Path, tmp_path: Path, make: Maker, missing: str, code: str) -> None:
+    members = [member for member in members_of(folder) if member[0] != missing]
+    with pytest.raises(DataError) as caught:
+        list_archive(make(tmp_path / "a", members), LIMITS)
+    assert caught.value.code == code and missing in caught.value.message
+
+
+@pytest.mark.parametrize("make", KINDS)
+def test_what_is_no_image(folder: Path, tmp_path: Path, make: Maker) -> None:
+    (folder / "001.fits").write_bytes(b"hello")
+    with pytest.raises(DataError, match=r"001\.fits") as caught:
+        list_archive(make(tmp_path / "a", members_of(folder)), LIMITS)
+    assert caught.value.code == "not-fits"
+
+
+@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize("content", [b"{}", b"{" * 10, b" " * (5 * MIB)])
+def test_a_bad_manifest(folder: Path, tmp_path: Path, make: Maker, content: bytes) -> None:
+    (folder / "transit.json").write_bytes(content)
+    with pytest.raises(DataError) as caught:
+        list_archive(make(tmp_path / "a", members_of(folder)), LIMITS)
+    assert caught.value.code == "bad-manifest"
+
+
+def test_pixels_are_not_touched_to_list_a_zip(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = as_zip(tmp_path / "a.zip", [*members_of(folder), ("x.fits", bytes(48 * MIB))])
+    inflated = 0
+    original = zlib.decompressobj
+
+    class Counting:
+        def __init__(self, *arguments: int) -> None:
+            self._inner = original(*arguments)
+
+        def decompress(self, data: bytes, most: int = 0) -> bytes:
+            nonlocal inflated
+            got = self._inner.decompress(data, most)
+            inflated += len(got)
+            return got
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._inner, name)
+
+    monkeypatch.setattr(zlib, "decompressobj", Counting)
+    list_archive(path, LIMITS)
+    assert 0 < inflated < 2**18

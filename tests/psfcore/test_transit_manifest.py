@@ -1,0 +1,158 @@
+"""transit.json is read as it is meant, and what is wrong with it is told by image and key."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from psfcore.errors import DataError
+from psfcore.transit.manifest import MAX_IMAGES, is_plain_name, parse_manifest, read_manifest
+
+GOOD: dict[str, Any] = {
+    "schema": "transit/1",
+    "instrument": "hri_euv",
+    "known_psf": "diffraction.fits",
+    "noise": {"photon_gain_dn": 6.0, "read_noise_dn": 2},
+    "images": [
+        {"file": "000.fits", "fov": 1, "x": 14.6, "y": 171.0, "r": 10.75},
+        {"file": "001.fits", "fov": 2, "x": -3, "y": 171.0, "r": 10.75},
+        {"file": "002.fits", "fov": 2, "x": 20.0, "y": 171.0, "r": 10.75},
+    ],
+}
+Change = Callable[[dict[str, Any]], object]
+
+
+def changed(change: Change) -> bytes:
+    content = copy.deepcopy(GOOD)
+    change(content)
+    return json.dumps(content).encode()
+
+
+def test_what_is_read_is_what_is_written() -> None:
+    manifest = parse_manifest(json.dumps(GOOD).encode())
+    assert manifest.instrument == "hri_euv"
+    assert manifest.noise is not None and manifest.noise.read_noise_dn == 2.0
+    assert manifest.files == ("000.fits", "001.fits", "002.fits", "diffraction.fits")
+    assert manifest.pointings == {1: 1, 2: 2}
+    assert (manifest.images[1].x, manifest.images[1].r) == (-3.0, 10.75)
+
+
+def test_what_may_be_missing_and_what_is_not_known() -> None:
+    def strip(content: dict[str, Any]) -> None:
+        for key in ("instrument", "known_psf", "noise"):
+            del content[key]
+        content["made_by"] = {"a": 1}
+        content["images"][0]["comment"] = "egress"
+
+    manifest = parse_manifest(changed(strip))
+    assert (manifest.instrument, manifest.known_psf, manifest.noise) == (None, None, None)
+    assert manifest.files == ("000.fits", "001.fits", "002.fits")
+
+
+def image(index: int, **values: Any) -> Change:
+    return lambda content: content["images"][index].update(values)
+
+
+def top(**values: Any) -> Change:
+    return lambda content: content.update(values)
+
+
+def many(content: dict[str, Any]) -> None:
+    content["images"] = [
+        {"file": f"{i}.fits", "fov": 1, "x": 1, "y": 1, "r": 1} for i in range(MAX_IMAGES + 1)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (top(schema="transit/2"), ["schema", "transit/1", "transit/2"]),
+        (lambda content: content.pop("schema"), ["schema", "no such key"]),
+        (top(images=[]), ["images", "at least 1", "got 0"]),
+        (top(images={}), ["images"]),
+        (lambda content: content.pop("images"), ["images", "no such key"]),
+        (many, ["images", str(MAX_IMAGES), str(MAX_IMAGES + 1)]),
+        (image(1, file="../001.fits"), ["images[1] (../001.fits).file", "plain file name"]),
+        (image(1, file="a/001.fits"), ["images[1]", "plain file name"]),
+        (image(1, file="a\\001.fits"), ["images[1]", "plain file name"]),
+        (image(1, file="/001.fits"), ["images[1]", "plain file name"]),
+        (image(1, file="C:001.fits"), ["images[1]", "plain file name"]),
+        (image(1, file=".."), ["images[1]", "plain file name"]),
+        (image(1, file=""), ["images[1]", "plain file name"]),
+        (image(1, file="a\0b"), ["images[1]", "plain file name"]),
+        (image(1, file=7), ["images[1]", "got 7"]),
+        (image(2, file="000.fits"), ["images[2] (000.fits)", "once", "images[0]"]),
+        (image(2, file="diffraction.fits"), ["images[2]", "known PSF"]),
+        (image(2, file="transit.json"), ["images[2]", "manifest"]),
+        (top(known_psf="transit.json"), ["known_psf"]),
+        (top(known_psf="../psf.fits"), ["known_psf", "plain file name"]),
+        (image(2, x=float("nan")), ["images[2] (002.fits).x", "finite"]),
+        (image(2, y=float("inf")), ["images[2] (002.fits).y", "finite"]),
+        (image(2, x="12"), ["images[2] (002.fits).x", "got '12'"]),
+        (image(2, x=True), ["images[2] (002.fits).x"]),
+        (image(2, x=10**400), ["images[2] (002.fits).x"]),
+        (image(2, y=1e9), ["images[2] (002.fits).y"]),
+        (image(2, r=0), ["images[2] (002.fits).r", "greater than 0", "got 0"]),
+        (image(2, r=-1), ["images[2] (002.fits).r"]),
+        (image(2, r=1e5), ["images[2] (002.fits).r"]),
+        (image(2, fov=1.5), ["images[2] (002.fits).fov"]),
+        (lambda content: content["images"][0].pop("r"), ["images[0] (000.fits).r", "no such key"]),
+        (lambda content: content["images"].insert(1, None), ["images[1]", "None"]),
+        (top(noise={"photon_gain_dn": -1, "read_noise_dn": 2}), ["noise.photon_gain_dn", "-1"]),
+        (top(noise={"photon_gain_dn": 6}), ["noise.read_noise_dn", "no such key"]),
+        (top(noise={"photon_gain_dn": 0, "read_noise_dn": 0}), ["noise", "not both zero"]),
+        (top(instrument="a\0b"), ["instrument", "printable"]),
+    ],
+)
+def test_what_is_wrong_is_named(change: Change, told: list[str]) -> None:
+    with pytest.raises(DataError) as caught:
+        parse_manifest(changed(change))
+    assert caught.value.code == "bad-manifest"
+    assert "expected" in caught.value.message and "got" in caught.value.message
+    assert [part for part in told if part not in caught.value.message] == [], caught.value.message
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b"\xff\xfe",
+        b"[" * 100_000,
+        b'{"schema": ' + b"9" * 5000 + b"}",
+        b" " * 2**23,
+    ],
+)
+def test_what_is_no_manifest(content: bytes) -> None:
+    with pytest.raises(DataError) as caught:
+        parse_manifest(content)
+    assert caught.value.code == "bad-manifest" and "expected" in caught.value.message
+
+
+def test_a_folder_without_a_manifest(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
+        read_manifest(tmp_path)
+    assert caught.value.code == "no-manifest"
+
+
+def test_a_byte_order_mark_does_no_harm() -> None:
+    assert len(parse_manifest(b"\xef\xbb\xbf" + json.dumps(GOOD).encode()).images) == 3
+
+
+@pytest.mark.parametrize(
+    "name", ["000.fits", "a b.fits", "x:y.fits.gz", "solar-eui_2023T04:43.fits", "ü.fits"]
+)
+def test_plain_names(name: str) -> None:
+    assert is_plain_name(name) == (name != "x:y.fits.gz")
+
+
+def test_practice(shared: Path) -> None:
+    manifest = read_manifest(shared / "data/practice/p1")
+    assert manifest.pointings == {1: 10, 2: 10, 3: 10} and len(manifest.files) == 31

@@ -1,0 +1,179 @@
+"""Gaps are filled with what another frame of the pointing shows, at this frame's brightness; all is marked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.image import Image, MaskBit
+from psfcore.transit.prepare import Exposure, exposure_of, prepare, to_rate
+from psfcore.transit.transit import Place
+from tests.transit_files import SHAPE, SPOT, true_rate
+
+Flat = NDArray[np.float64]
+AWAY = Place(10.0, 10.0, 4.0)
+
+
+def image(pixels: Flat, mask: NDArray[np.uint8] | None = None, unit: str = "DN/s") -> Image:
+    plane = np.zeros(pixels.shape, np.uint8) if mask is None else mask
+    return Image(pixels=pixels, mask=plane, header=Header(), unit=unit, exposure_s=2.0)
+
+
+def exposure(
+    rate: Flat,
+    *,
+    saturated: object = None,
+    nonfinite: object = None,
+    fov: int = 1,
+    time_s: float = 0.0,
+    place: Place = AWAY,
+) -> Exposure:
+    """An exposure of ``rate`` with gaps at the places given: index expressions, or masks."""
+    pixels, mask = rate.copy(), np.zeros(rate.shape, np.uint8)
+    if saturated is not None:
+        mask[saturated] |= int(MaskBit.SATURATED)
+        pixels[saturated] = 500.0
+    if nonfinite is not None:
+        mask[nonfinite] |= int(MaskBit.NONFINITE)
+        pixels[nonfinite] = np.nan
+    return exposure_of(
+        image(pixels, mask), file=f"{time_s:g}.fits", fov=fov, place=place, time_s=time_s, gain_mode=None
+    )
+
+
+def test_dn_become_dn_per_second() -> None:
+    rate = true_rate(1)
+    pixels, exposure_s = to_rate(image(2 * rate, unit="dn"), "a")
+    assert exposure_s == 2.0 and pixels.dtype == np.float32 and np.allclose(pixels, rate)
+    assert np.allclose(to_rate(image(rate, unit="DN/s"), "a")[0], rate)
+    with pytest.raises(DataError, match="unknown-unit: a: "):
+        to_rate(image(rate, unit="erg"), "a")
+
+
+def test_what_has_no_gap_stays_as_it_is() -> None:
+    rate = true_rate(1)
+    frames, prepared = prepare([exposure(rate, time_s=t) for t in (0, 1)])
+    assert all(np.array_equal(frame.pixels, rate.astype(np.float32)) for frame in frames)
+    assert all(frame.filled is None for frame in frames)
+    assert prepared.to_json() == {"images": 2, "unfilled": 0, "frames": []}
+
+
+def test_the_gap_is_filled_at_the_frame_s_own_brightness() -> None:
+    """The donor is 1.3 times as bright and has noise: the scale takes that out, to the noise of a median."""
+    rate = true_rate(1)
+    rng = np.random.default_rng(2)
+    donor = 1.3 * rate * rng.normal(1, 0.01, SHAPE)
+    frames, prepared = prepare([exposure(rate, saturated=SPOT), exposure(donor, time_s=60)])
+    filled = frames[0].filled
+    assert filled is not None and filled[SPOT].all() and np.count_nonzero(filled) == 48
+    assert frames[0].pixels[SPOT].mean() == pytest.approx(1000, rel=0.005)
+    outside = ~filled
+    assert np.array_equal(frames[0].pixels[outside], rate.astype(np.float32)[outside])
+    assert np.array_equal(frames[1].pixels, donor.astype(np.float32)), "the donor stays"
+    counts = prepared.frames[0]
+    assert (counts.saturated, counts.from_frames, counts.from_neighbours, counts.unfilled) == (48, 48, 0, 0)
+
+
+def test_the_nearest_in_time_of_the_same_pointing_is_taken() -> None:
+    rate, marked = true_rate(1), [true_rate(1) for _ in range(4)]
+    for number, frame in enumerate(marked):
+        frame[SPOT] = 2000.0 + number
+    frames, _ = prepare(
+        [
+            exposure(marked[0], time_s=0),
+            exposure(marked[1], time_s=90),
+            exposure(rate, time_s=100, saturated=SPOT),
+            exposure(marked[2], time_s=105, fov=2),  # nearer, but of another pointing
+            exposure(rate, time_s=107, saturated=SPOT),  # nearer, but saturated there too
+            exposure(marked[3], time_s=111),
+        ]
+    )
+    assert np.allclose(frames[2].pixels[SPOT], 2001)
+    assert np.allclose(frames[4].pixels[SPOT], 2003)
+
+
+def test_what_the_nearest_lacks_the_next_gives() -> None:
+    rate = true_rate(1)
+    half = (slice(40, 43), SPOT[1])
+    frames, prepared = prepare(
+        [
+            exposure(rate, saturated=SPOT),
+            exposure(rate, time_s=10, saturated=half),
+            exposure(rate, time_s=20),
+        ]
+    )
+    assert np.allclose(frames[0].pixels, rate, rtol=1e-6)
+    assert prepared.frames[0].from_frames == 48 and prepared.frames[1].from_frames == 24
+
+
+def test_a_donor_s_occulter_is_no_sun() -> None:
+    rate = true_rate(1)
+    over_the_spot = exposure(rate, time_s=10, place=Place(63.5, 42.5, 4.0))
+    over_the_spot.pixels[SPOT] = 1.0
+    frames, _ = prepare([exposure(rate, saturated=SPOT), over_the_spot, exposure(rate, time_s=99)])
+    assert np.allclose(frames[0].pixels[SPOT], 1000)
+
+
+def test_a_saturated_pixel_that_no_frame_shows_keeps_its_value_and_is_marked() -> None:
+    rate = true_rate(1)
+    frames, prepared = prepare([exposure(rate, time_s=t, saturated=SPOT) for t in (0, 60)])
+    for frame, counts in zip(frames, prepared.frames, strict=True):
+        assert (frame.pixels[SPOT] == 500).all()
+        assert frame.filled is not None and frame.filled[SPOT].all()
+        assert (counts.saturated, counts.from_frames, counts.unfilled) == (48, 0, 48)
+    assert prepared.unfilled == 96 and prepared.to_json()["frames"][0]["unfilled"] == 48
+
+
+def test_nan_is_filled_from_frames_and_else_from_neighbours() -> None:
+    rate = np.full(SHAPE, 80.0)
+    rate[:, 40:] = 120.0
+    gap = (slice(30, 32), slice(20, 22))
+    frames, prepared = prepare([exposure(rate, nonfinite=gap), exposure(rate, time_s=5)])
+    assert np.allclose(frames[0].pixels, rate) and prepared.frames[0].from_frames == 4
+    frames, prepared = prepare([exposure(rate, nonfinite=gap)])
+    assert np.allclose(frames[0].pixels, rate) and prepared.frames[0].from_neighbours == 4
+    assert prepared.frames[0].nonfinite == 4 and np.count_nonzero(frames[0].filled) == 4
+
+
+def test_a_wide_gap_is_filled_from_the_nearest_pixels() -> None:
+    rate = np.full(SHAPE, 80.0)
+    rate[:, 40:] = 120.0
+    frames, _ = prepare([exposure(rate, nonfinite=(slice(None), slice(0, 25)))])
+    assert np.allclose(frames[0].pixels, rate)
+
+
+def test_nan_on_the_occulter_stays_dark() -> None:
+    """Another frame shows the Sun there."""
+    rate = true_rate(1)
+    dark = rate.copy()
+    y, x = np.indices(SHAPE)
+    dark[np.hypot(x - 30, y - 30) <= 4] = 10.0
+    one = exposure(dark, nonfinite=(30, 30), place=Place(30.0, 30.0, 4.0))
+    frames, _ = prepare([one, exposure(rate, time_s=1)])
+    assert frames[0].pixels[30, 30] == pytest.approx(10.0)
+    assert frames[0].filled is not None and frames[0].filled[30, 30]
+
+
+def test_a_value_beyond_float32_is_a_gap() -> None:
+    rate = np.full(SHAPE, 80.0)
+    huge = rate.copy()
+    huge[3, 3] = 1e60
+    frames, prepared = prepare([exposure(huge)])
+    assert np.allclose(frames[0].pixels, rate) and prepared.frames[0].nonfinite == 1
+
+
+def test_mostly_saturated_and_nothing_to_fill_it_from() -> None:
+    rate = true_rate(1)
+    most = (slice(None), slice(0, 41))
+    with pytest.raises(DataError, match=r"0\.fits.* 51 %") as caught:
+        prepare([exposure(rate, saturated=most), exposure(rate, time_s=60, fov=2)])
+    assert caught.value.code == "all-saturated"
+    frames, _ = prepare([exposure(rate, saturated=most), exposure(rate, time_s=60)])
+    y, x = np.indices(SHAPE)
+    far = np.hypot(x - AWAY.x_px, y - AWAY.y_px) > 10
+    assert np.allclose(frames[0].pixels[far], rate[far], rtol=1e-3)
+    less = (slice(None), slice(0, 39))
+    prepare([exposure(rate, saturated=less)])

@@ -1,0 +1,109 @@
+"""A transit so small that it is written and read in milliseconds, whose every pixel is known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+SHAPE = (64, 80)
+RADIUS_PX = 4.0
+READ_NOISE = {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
+SPOT = (slice(40, 46), slice(60, 68))  # far brighter than the rest
+
+
+def true_rate(fov: int) -> NDArray[np.float64]:
+    """DN/s [y, x] of a pointing's scene: a slope, stripes and a bright spot."""
+    y, x = np.indices(SHAPE)
+    scene = 100.0 + 20 * fov + 0.5 * x + 10 * np.sin(y / 3.0)
+    scene[SPOT] = 1000.0
+    return scene
+
+
+def place_of(index: int) -> tuple[float, float]:
+    """Where the occulter of an image is, x and y in px."""
+    return 10.0 + 4.0 * index, 20.0
+
+
+def write_transit(
+    folder: Path,
+    *,
+    images: int = 6,
+    cards: dict[str, object] | None = None,
+    **manifest: Any,
+) -> Path:
+    """Write images in DN, exposed 2 s and 1 s in turn, of two pointings; with their PSF and transit.json.
+
+    cards: further ones for every image; None takes one away. manifest: keys to replace; None takes one away.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    entries = []
+    for index in range(images):
+        name, fov = f"{index:03d}.fits", 1 + index // 3
+        x, y = place_of(index)
+        entries.append({"file": name, "fov": fov, "x": x, "y": y, "r": RADIUS_PX})
+        write_frame(folder / name, index, fov, cards or {})
+    write_kernel(folder / "diffraction.fits")
+    content = {
+        "schema": "transit/1",
+        "instrument": "hri_euv",
+        "known_psf": "diffraction.fits",
+        "noise": READ_NOISE,
+        "images": entries,
+    } | manifest
+    save_manifest(folder, {key: value for key, value in content.items() if value is not None})
+    return folder
+
+
+def write_frame(path: Path, index: int, fov: int, cards: dict[str, object]) -> None:
+    """One image of the transit."""
+    exposure_s = 2.0 if index % 2 == 0 else 1.0
+    rate = true_rate(fov)
+    y, x = np.indices(SHAPE)
+    cx, cy = place_of(index)
+    rate[np.hypot(x - cx, y - cy) <= RADIUS_PX] = 10.0
+    header = fits.Header(
+        {
+            "INSTRUME": "EUI",
+            "DETECTOR": "HRI_EUV",
+            "BUNIT": "DN",
+            "XPOSURE": exposure_s,
+            "GAINCOMB": "high-only",
+            "DATE-BEG": f"2023-01-03T04:{index:02d}:00",
+            "CDELT1": 0.492,
+        }
+    )
+    for key, value in cards.items():
+        if value is None:
+            del header[key]
+        else:
+            header[key] = value
+    pixels = np.rint(rate * exposure_s)
+    level = cards.get("SATURATE")
+    if isinstance(level, (int, float)):
+        pixels = np.minimum(pixels, level)
+    fits.PrimaryHDU(pixels.astype("i4"), header).writeto(path, overwrite=True)
+
+
+def write_kernel(path: Path, kernel: NDArray[np.float64] | None = None) -> None:
+    """A known part of a PSF; by default one of 32 px that sums to 1."""
+    if kernel is None:
+        y, x = np.indices((32, 32)) - 16
+        kernel = np.exp(-0.5 * (x * x + y * y) / 1.5**2)
+        kernel /= kernel.sum()
+    fits.PrimaryHDU(np.asarray(kernel, dtype=np.float64)).writeto(path, overwrite=True)
+
+
+def load_manifest(folder: Path) -> dict[str, Any]:
+    """What transit.json holds."""
+    content: dict[str, Any] = json.loads((folder / "transit.json").read_text())
+    return content
+
+
+def save_manifest(folder: Path, content: object) -> None:
+    """Write transit.json anew."""
+    (folder / "transit.json").write_text(json.dumps(content))
