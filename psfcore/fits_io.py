@@ -30,7 +30,14 @@ from psfcore.header import (
     read_summary,
 )
 from psfcore.image import Image, MaskBit
-from psfcore.psf import Psf, cumulative_curve, encircled_energy, plate_scale_arcsec, radial_profile
+from psfcore.psf import (
+    FittedShape,
+    Psf,
+    cumulative_curve,
+    encircled_energy,
+    plate_scale_arcsec,
+    radial_profile,
+)
 
 CardValue = str | int | float | bool
 Cards = Mapping[str, tuple[CardValue, str]]
@@ -325,6 +332,8 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
         component.header["PSFSUM"] = (float(kernel.sum()), "sum of weights on this array")
         hdus.append(component)
     hdus.append(_profile_hdu(psf))
+    if psf.fitted is not None:
+        hdus.append(_fitted_hdu(psf.fitted))
     if instrument_file is not None:
         hdus.append(_instrument_hdu(instrument_file))
     _write(path, hdus)
@@ -370,6 +379,32 @@ def _profile_hdu(psf: Psf) -> fits.BinTableHDU:
     return fits.BinTableHDU.from_columns(columns, name="PROFILE")
 
 
+def _fitted_hdu(fitted: FittedShape) -> fits.BinTableHDU:
+    """One row a parameter: its name, coordinate, and row of the coordinates' covariance."""
+    count = len(fitted.parameters)
+    columns = [
+        fits.Column(name="parameter", format="16A", array=np.array(fitted.parameters)),
+        fits.Column(name="coordinate", format="D", array=np.array(fitted.coordinates)),
+        fits.Column(name="covariance", format=f"{count}D", array=np.array(fitted.covariance)),
+    ]
+    hdu = fits.BinTableHDU.from_columns(columns, name="FIT")
+    hdu.header["SHAPE"] = (_ascii(fitted.shape), "formula that SCATTER was fitted with")
+    return hdu
+
+
+def _read_fitted(hdu: fits.BinTableHDU) -> FittedShape:
+    table = hdu.data
+    return FittedShape(
+        shape=str(hdu.header["SHAPE"]),
+        parameters=tuple(str(name) for name in table["parameter"]),
+        coordinates=tuple(float(value) for value in table["coordinate"]),
+        covariance=tuple(
+            tuple(float(value) for value in row)
+            for row in np.atleast_2d(table["covariance"]).reshape(len(table), -1)
+        ),
+    )
+
+
 def _instrument_hdu(text: bytes) -> fits.BinTableHDU:
     values = np.frombuffer(text, dtype=np.uint8)[None]
     column = fits.Column(name="TOML", format=f"{values.size}B", array=values)
@@ -386,7 +421,7 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     summary = read_summary(path, limits)
     kernel, header = _read_pixels(path, summary)
     own = "PSFNAME" in header
-    components, provenance = _read_extras(path, limits) if own and parts else ({}, {})
+    components, provenance, fitted = _read_extras(path, limits) if own and parts else ({}, {}, None)
     return Psf(
         kernel=kernel,
         name=optional_text(header, "PSFNAME") or Path(path).name.split(".")[0],
@@ -397,13 +432,15 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
         wavelength_angstrom=summary.wavelnth,
         components=components,
         provenance={"file": Path(path).name, **provenance},
+        fitted=fitted,
     )
 
 
 def _read_extras(
     path: str | Path, limits: FitsLimits
-) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
-    """Components and the instrument's text of a file that write_psf wrote."""
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any], FittedShape | None]:
+    """Components, the instrument's text and the fitted shape of a file that write_psf wrote."""
+    fitted: FittedShape | None = None
     components: dict[str, NDArray[np.float64]] = {}
     provenance: dict[str, Any] = {}
     try:
@@ -415,10 +452,12 @@ def _read_extras(
                 elif hdu.name == "INSTRUMENT":
                     text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
                     provenance["instrument_toml"] = text.decode("utf-8")
+                elif hdu.name == "FIT":
+                    fitted = _read_fitted(hdu)
     except _PIXEL_TROUBLE as error:
         message = f"expected readable extensions in {Path(path).name}; got: {error!s:.120}"
         raise DataError("unreadable-pixels", message) from None
-    return components, provenance
+    return components, provenance, fitted
 
 
 def _extensions(hdus: fits.HDUList, limits: FitsLimits) -> Iterator[Any]:

@@ -33,11 +33,25 @@ Kernel = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class FittedShape:
+    """The formula that a scatter kernel was fitted with, and how well it is known.
+
+    shape: its name in psfcore.scatter.shapes. parameters: their names; coordinates: the unbounded ones that the fit
+    moves in; covariance: of these.
+    """
+
+    shape: str
+    parameters: tuple[str, ...]
+    coordinates: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class Psf:
     """Weights [y, x] (fraction of a point's light per pixel) round [ny // 2, nx // 2], and their origin.
 
     `components` are kernels with the same centring ("DIFFRACTION", "SCATTER"); `provenance` is free,
-    JSON-able text and numbers. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative",
+    JSON-able text and numbers; `fitted` what SCATTER was fitted with. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative",
     "psf-sum", "psf-not-centred".
     """
 
@@ -50,6 +64,7 @@ class Psf:
     wavelength_angstrom: float | None = None
     components: dict[str, Kernel] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
+    fitted: FittedShape | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", np.ascontiguousarray(self.kernel, dtype=np.float64))

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from psfcore.errors import DataError
 from service import cli_diffraction, cli_simulate
 from service.client import DEFAULT_SERVER, Heliopsf, Operations, ServiceError, percent
-from workers.contract import Component, Method
+from workers.contract import Component, Method, ShapeName
 from workers.settings import Settings, software_version
 
 METHODS = [get_args(kind.model_fields["name"].annotation)[0] for kind in get_args(get_args(Method)[0])]
@@ -193,6 +193,59 @@ def psf_build(
         click.echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
 
 
+@psf.command("fit")
+@click.argument("transit", type=click.Path(exists=True, path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path))
+@click.option(
+    "--json", "report_file", type=click.Path(dir_okay=False, path_type=Path), help="Write the report"
+)
+@click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture too (PNG)")
+@click.option("--shape", type=click.Choice(get_args(ShapeName)), help="[default: softened-power-law]")
+@click.option("--as-published", is_flag=True, help="Also the published recipe and its four biases (slow)")
+@click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help="DN a photon, DN rms of the readout")
+@click.option("--saturation", "saturation_dn", type=float, help="DN from which a pixel is not trusted")
+@SERVER
+@LOCAL
+def psf_fit(
+    transit: Path,
+    output: Path,
+    report_file: Path | None,
+    plot: Path | None,
+    shape: str | None,
+    as_published: bool,
+    noise: tuple[float, float] | None,
+    saturation_dn: float | None,
+    server: str | None,
+    local: bool,
+) -> None:
+    """Fit the scattered light of TRANSIT, a folder (or a .zip or .tar of one) with a transit.json."""
+    _check_writable(output, report_file, plot)
+    with _errors(), _connection(server, local) as service, _progress_bar() as report:
+        fitted = service.fit_psf(
+            transit,
+            output,
+            report=report_file,
+            preview=plot,
+            progress=report,
+            noise=noise or None,
+            shape=shape,
+            as_published=as_published,
+            saturation_dn=saturation_dn,
+        )
+    found = fitted["details"]["fit"]
+    click.echo(f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']})")
+    click.echo(found["sentence"])
+    for name, parameter in found["parameters"].items():
+        click.echo(f"  {name:<12} {parameter['value']:10.4f} +- {parameter['sigma']:.4f} {parameter['unit']}")
+    curve = found["curve"]
+    for radius, beyond, sigma in zip(
+        curve["radii_px"], curve["light_beyond_pct"], curve["sigma"], strict=True
+    ):
+        click.echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} +- {sigma:.2f} %")
+    for limit in found["limits"]:
+        click.echo(f"  note: {limit}")
+
+
 @psf.command("show")
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture (PNG)")
@@ -310,8 +363,10 @@ def _progress_bar() -> Iterator[Report]:
     def report(stage: str, step: int, steps: int) -> None:
         done = step / steps
         bar = "#" * round(30 * done) + "-" * (30 - round(30 * done))
+        elapsed = time.monotonic() - started
+        left = f", {elapsed * (steps - step) / step:.0f} s left" if step else ""
         with lock:
-            sys.stderr.write(f"\r{stage:<18} [{bar}] {step}/{steps}  {time.monotonic() - started:5.1f} s ")
+            sys.stderr.write(f"\r{stage:<24.24} [{bar}] {step}/{steps}  {elapsed:5.1f} s{left:<14}")
             sys.stderr.flush()
 
     try:

@@ -128,6 +128,32 @@ class Operations(ABC):
         self._fetch(psf, output, preview)
         return psf
 
+    def fit_psf(
+        self,
+        transit: str | Path,
+        output: str | Path | None = None,
+        *,
+        report: str | Path | None = None,
+        preview: str | Path | None = None,
+        progress: Progress | None = None,
+        noise: tuple[float, float] | None = None,
+        **parameters: Any,
+    ) -> dict[str, Any]:
+        """Upload a transit (a folder or an archive), have its scatter fitted and download the PSF; its description.
+
+        ``report``, ``preview``: where to write the report (JSON) and the picture. ``noise``: as for ``deconvolve``.
+        ``parameters``: what the fit takes, as ``shape="stretched"``, ``as_published=True``.
+        """
+        given = {name: value for name, value in parameters.items() if value is not None}
+        if noise is not None:
+            given["noise"] = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}
+        job = self.submit("psf-fit", transit_id=self.upload_transit(transit)["id"], **given)
+        psf = self.get(self.wait(job, progress=progress)["result"])
+        self._fetch(psf, output, preview)
+        if report is not None:
+            self.download(psf["report"], report)
+        return psf
+
     def _fetch(self, result: dict[str, Any], output: str | Path | None, preview: str | Path | None) -> None:
         if output is not None:
             self.download(result["file"], output)

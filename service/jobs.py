@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
@@ -17,8 +18,15 @@ from workers.intake import resolve
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
-STATUS_OF = {"no-such-image": 404, "no-such-psf": 404, "no-psf-for-instrument": 409}
-RESULTS = {"deconvolve": "/v1/products", "psf-build": "/v1/psfs"}
+STATUS_OF = {
+    "no-such-image": 404,
+    "no-such-psf": 404,
+    "no-such-transit": 404,
+    "no-psf-for-instrument": 409,
+}
+RESULTS = {"deconvolve": "/v1/products", "psf-build": "/v1/psfs", "psf-fit": "/v1/psfs"}
+# Kinds whose steps count the whole job, so that what is left can be told from what was done.
+COUNTED_WHOLE = {"psf-build", "psf-fit"}
 
 
 class Progress(BaseModel):
@@ -27,6 +35,7 @@ class Progress(BaseModel):
     stage: str
     step: int
     steps: int
+    time_left_s: float | None = Field(description="estimated from what was done; null where nothing is known")
 
 
 class JobView(BaseModel):
@@ -57,7 +66,7 @@ class JobView(BaseModel):
             ended_at=row.ended_at,
             attempt=row.attempt,
             cancel_requested=row.cancel_requested,
-            progress=Progress(stage=row.stage, step=row.step, steps=row.steps),
+            progress=Progress(stage=row.stage, step=row.step, steps=row.steps, time_left_s=_time_left_s(row)),
             parameters=row.parameters,
             result=f"{RESULTS[row.kind]}/{row.result_id}" if row.result_id else None,
             error=JobError.model_validate(row.error) if row.error else None,
@@ -67,7 +76,7 @@ class JobView(BaseModel):
 @router.post(
     "",
     status_code=202,
-    summary="Ask for a PSF build or a deconvolution",
+    summary="Ask for a deconvolution, a PSF build or a fit of a transit",
     responses={200: {"model": JobView, "description": "An equal request was made before; this is its job."}},
 )
 def submit_job(body: JobRequest, response: Response, state: Shared) -> JobView:
@@ -105,6 +114,13 @@ def cancel_job(job_id: JobId, state: Shared) -> JobView:
     _find(state, job_id)
     state.catalogue.cancel(job_id)
     return JobView.of(_find(state, job_id))
+
+
+def _time_left_s(row: JobRow) -> float | None:
+    """What a running job will take, if it goes on as it went."""
+    if row.kind not in COUNTED_WHOLE or row.phase != Phase.EXECUTING or not row.step or not row.started_at:
+        return None
+    return max(0.0, (time.time() - row.started_at) * (row.steps - row.step) / row.step)
 
 
 def _find(state: Shared, job_id: str) -> JobRow:

@@ -109,6 +109,7 @@ class LocalService(Operations):
             "file": row.file_sha256,
             "preview": row.preview_sha256,
             "effects": row.details.get("effects_picture_sha256"),
+            "report": row.details.get("report_sha256"),
         }
         digest = digests[part]
         assert digest is not None

@@ -30,11 +30,12 @@ class PsfView(BaseModel):
     version: str
     instrument: str | None
     status: str = Field(description="draft, or uploaded")
-    origin: str = Field(description="built here, or uploaded")
+    origin: str = Field(description="built here, fitted to a transit, or uploaded")
     bytes: int
     details: dict[str, Any] = Field(description="shape, curve, parameters, where it came from")
     file: str = Field(description="address of the FITS file")
     preview: str | None = Field(description="address of a picture; null for an uploaded PSF")
+    report: str | None = Field(description="address of the fit's report; null where nothing was fitted")
 
     @classmethod
     def of(cls, row: PsfRow) -> PsfView:
@@ -52,6 +53,7 @@ class PsfView(BaseModel):
             details=row.details,
             file=f"{here}/file",
             preview=f"{here}/preview" if row.preview_sha256 else None,
+            report=f"{here}/report" if "report_sha256" in row.details else None,
         )
 
 
@@ -137,6 +139,17 @@ def get_psf_preview(psf_id: Identity, request: Request, state: Shared) -> Respon
     if row.preview_sha256 is None:
         raise Problem(404, "no-preview", "an uploaded PSF has no picture; its file can be downloaded")
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
+
+
+@router.get("/{psf_id}/report", summary="What a fit found, as JSON", response_class=Response)
+def get_psf_report(psf_id: Identity, request: Request, state: Shared) -> Response:
+    """Parameters with errors, curves and bands, every image's residual, and what these data cannot say."""
+    digest = _find(state, psf_id).details.get("report_sha256")
+    if digest is None:
+        raise Problem(
+            404, "no-report", "this PSF was not fitted to a transit; its details say where it is from"
+        )
+    return files.send(request, state.store, digest, "application/json", f"psf-{psf_id[:12]}.json")
 
 
 def _find(state: Shared, psf_id: str) -> PsfRow:

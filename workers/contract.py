@@ -186,6 +186,36 @@ class Deconvolve(_Parameters):
     effects_picture: bool = Field(False, description="also draw difference, ratio and histogram")
 
 
+ShapeName = Literal[
+    "softened-power-law",
+    "stretched-along-x",
+    "stretched",
+    "one-sided",
+    "knee",
+    "two-power-laws",
+    "core",
+]
+
+
+class PsfFit(_Parameters):
+    """Fit the diffuse scatter of an uploaded transit: a PSF version with its errors, curves and report."""
+
+    algorithm_version: ClassVar[int] = 1
+    transit_id: Identity = Field(description="id that the upload of the transit answered")
+    shape: ShapeName = Field("softened-power-law", description="the formula that scatter is fitted with")
+    as_published: bool = Field(
+        False, description="also the published recipe, and what each of its four biases does (slow)"
+    )
+    noise: NoiseFigures | None = Field(None, description="instead of those in transit.json")
+    saturation_dn: float | None = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="DN of one exposure; none: header's or instrument's, if known",
+    )
+    seed: int = Field(1, ge=0, lt=2**31, description="of the draws of the free and the published fits")
+
+
 class DeconvolveRequest(_Parameters):
     """A request for a deconvolution."""
 
@@ -200,7 +230,20 @@ class PsfBuildRequest(_Parameters):
     parameters: PsfBuild
 
 
-JobRequest = Annotated[DeconvolveRequest | PsfBuildRequest, Field(discriminator="kind")]
+class PsfFitRequest(_Parameters):
+    """A request for a fit of a transit."""
+
+    kind: Literal["psf-fit"]
+    parameters: PsfFit
+
+
+JobRequest = Annotated[DeconvolveRequest | PsfBuildRequest | PsfFitRequest, Field(discriminator="kind")]
+
+
+class ResolvedPsfFit(PsfFit):
+    """A fit as the worker gets it: with the recipe of the diffraction, where the transit brings none."""
+
+    diffraction_recipe: PsfBuild | None = None
 
 
 class ResolvedDeconvolve(_Parameters):
@@ -253,5 +296,18 @@ def product_identity(request: ResolvedDeconvolve) -> str:
             # The PSF's id says what it is; the recipe only how to make it where it is missing.
             "request": request.model_dump(mode="json", exclude={"psf_recipe"}),
             "algorithm_version": request.method.algorithm_version,
+        }
+    )
+
+
+def psf_fit_identity(request: ResolvedPsfFit) -> str:
+    """Identity of a fitted PSF: the transit's bytes, parameters, the diffraction's identity, algorithm version."""
+    recipe = request.diffraction_recipe
+    return canonical_hash(
+        {
+            "kind": "psf-fit",
+            "request": request.model_dump(mode="json", exclude={"diffraction_recipe"}),
+            "diffraction": None if recipe is None else psf_identity(recipe),
+            "algorithm_version": request.algorithm_version,
         }
     )

@@ -19,7 +19,7 @@ from psfcore import plots
 from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.deconvolve.effects import Effects, effects
 from psfcore.deconvolve.effects_plot import effects_png
-from psfcore.deconvolve.error_planes import ErrorPlanes, error_planes
+from psfcore.deconvolve.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
 from psfcore.deconvolve.methods import method_named
 from psfcore.deconvolve.quality import QualityBit, quality_plane
 from psfcore.deconvolve.result import Deconvolved
@@ -32,6 +32,7 @@ from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
+from psfcore.scatter.samples import possible_psfs
 from workers.catalogue import ImageRow, ProductRow, PsfRow
 from workers.context import Context
 from workers.contract import ResolvedDeconvolve, product_identity
@@ -104,7 +105,16 @@ class _Work:
             return None
         return noise_for(load_instrument(recipe.instrument), self.image.header)
 
-    def run(self, image: Image, stage: str | None = None) -> Deconvolved:
+    @cached_property
+    def possible_psfs(self) -> list[Psf]:
+        """What the PSF might be instead, on the image's pixels; none where its file does not say how well it is known."""
+        psf = read_psf(self.context.store.path(self.psf_row.file_sha256), self.context.limits)
+        if psf.fitted is None:
+            return []
+        possible = possible_psfs(psf, threads=self.context.settings.threads)
+        return [psf_for_image(one, self.image.header) for one in possible]
+
+    def run(self, image: Image, stage: str | None = None, psf: Psf | None = None) -> Deconvolved:
         """The method on an image of this shape; ``stage`` names its progress, none is silent."""
         method = self.request.method
         conditions = Conditions(
@@ -116,7 +126,7 @@ class _Work:
             engine_for=_ENGINES,
         )
         return method_named(method.name)(
-            image, self.psf, conditions, **method.model_dump(exclude=_CONDITIONS)
+            image, psf or self.psf, conditions, **method.model_dump(exclude=_CONDITIONS)
         )
 
     def progress(self, stage: str) -> Callable[[int, int], None]:
@@ -133,7 +143,7 @@ class _Work:
                 "expected noise (photon_gain_dn and read_noise_dn) to draw errors from; got none, and the "
                 "instrument's are not known",
             )
-        return error_planes(
+        planes = error_planes(
             self.image,
             self.psf,
             lambda image: self.run(image).pixels,
@@ -144,6 +154,15 @@ class _Work:
             threads=self.context.settings.threads,
             progress=self.progress("drawing errors"),
         )
+        if not self.possible_psfs:
+            return planes
+        from_psf = psf_error_plane(
+            self.possible_psfs,
+            lambda psf: self.run(self.image, psf=psf).pixels,
+            chance=False,
+            progress=self.progress("errors of the PSF"),
+        )
+        return with_psf_error(planes, from_psf)
 
 
 def _save(work: _Work, identity: str, result: Deconvolved) -> None:
@@ -166,6 +185,8 @@ def _save(work: _Work, identity: str, result: Deconvolved) -> None:
     }
     if errors is not None:
         planes["ERROR"] = errors.error
+        if errors.psf_error is not None:
+            planes["PSF_ERROR"] = errors.psf_error
     with context.store.temporary() as path:
         write_image(
             path,

@@ -9,6 +9,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.header import HeaderSummary
+from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import parse_instrument
 from psfcore.transit.archive import ArchiveContents
 from workers.catalogue import Catalogue, ImageRow, PsfRow, TransitRow
@@ -17,9 +18,13 @@ from workers.contract import (
     JobRequest,
     PsfBuild,
     PsfBuildRequest,
+    PsfFit,
+    PsfFitRequest,
     ResolvedDeconvolve,
+    ResolvedPsfFit,
     instrument_text,
     product_identity,
+    psf_fit_identity,
     psf_identity,
 )
 
@@ -106,6 +111,14 @@ def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict
             if build.mask_id is not None and catalogue.get(ImageRow, build.mask_id, owner) is None:
                 raise DataError("no-such-image", f"no image was uploaded with id {build.mask_id}")
             return build.model_dump(mode="json"), psf_identity(build)
+        case PsfFitRequest(parameters=fit):
+            row = catalogue.get(TransitRow, fit.transit_id, owner)
+            if row is None:
+                raise DataError("no-such-transit", f"no transit was uploaded with id {fit.transit_id}")
+            resolved_fit = ResolvedPsfFit(
+                diffraction_recipe=_diffraction_of(row.summary, fit), **fit.model_dump(mode="json")
+            )
+            return resolved_fit.model_dump(mode="json"), psf_fit_identity(resolved_fit)
         case DeconvolveRequest(parameters=wanted):
             image = catalogue.get(ImageRow, wanted.image_id, owner)
             if image is None:
@@ -121,6 +134,24 @@ def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict
                 psf_id=psf_id, psf_recipe=recipe, **wanted.model_dump(exclude={"psf_id"})
             )
             return resolved.model_dump(mode="json"), product_identity(resolved)
+
+
+def _diffraction_of(summary: dict[str, Any], fit: PsfFit) -> PsfBuild | None:
+    """How the known part of a transit's PSF is made; None where the transit brings it."""
+    if fit.noise is None and summary["noise"] is None:
+        raise DataError(
+            "no-noise-figures",
+            "expected noise figures in transit.json or in the request (photon_gain_dn, read_noise_dn); got neither",
+        )
+    if summary["known_psf"] is not None:
+        return None
+    if summary["instrument"] not in instrument_names():
+        raise DataError(
+            "no-known-psf",
+            f"expected known_psf in transit.json, or an instrument of {', '.join(instrument_names())}; "
+            f"got neither ({summary['instrument']!r})",
+        )
+    return PsfBuild(instrument=summary["instrument"], component="diffraction")
 
 
 def _default_psf(header: dict[str, Any]) -> PsfBuild:

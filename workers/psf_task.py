@@ -79,7 +79,7 @@ def built_psf(context: Context, build: PsfBuild) -> PsfRow:
     with context.store.temporary() as path, context.store.temporary() as picture:
         write_psf(path, psf, instrument_file=text.encode())
         plots.psf_png(psf, picture)
-        row = _psf_row(
+        row = psf_row(
             psf,
             identity,
             context.owner,
@@ -108,7 +108,7 @@ def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> N
     return read_image(context.store.path(build.mask_id), context.limits).pixels
 
 
-def _psf_row(
+def psf_row(
     psf: Psf,
     identity: str,
     owner: str,
@@ -117,8 +117,9 @@ def _psf_row(
     file_sha256: str,
     store: Store,
     preview_sha256: str | None,
+    details: Mapping[str, Any] | None = None,
 ) -> PsfRow:
-    """The catalogue's row of a PSF whose file is in the store."""
+    """The catalogue's row of a PSF whose file is in the store. details: more than can be read off its kernel."""
     curve = cumulative_curve(psf.kernel, np.array(CURVE_RADII_PX, dtype=float))
     return PsfRow(
         owner=owner,
@@ -140,5 +141,6 @@ def _psf_row(
             "components": sorted(psf.components),
             "cumulative_curve_pct": {str(r): float(c) for r, c in zip(CURVE_RADII_PX, curve, strict=True)},
             "provenance": psf.provenance,
+            **(details or {}),
         },
     )

@@ -87,3 +87,8 @@ def cores() -> int:
 def software_version() -> str:
     """Version of the installed package, as products name it."""
     return version("heliopsf")
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of the libraries that a product's numbers come from."""
+    return {name: version(name) for name in ("numpy", "scipy", "numba", "astropy")}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import time
 import uuid
 from collections.abc import Iterator
@@ -28,7 +29,10 @@ class Store:
         """Remove temporary files that a killed process left behind."""
         for path in self._tmp.iterdir():
             if time.time() - path.stat().st_mtime > older_than_s:
-                path.unlink(missing_ok=True)
+                if path.is_dir():
+                    shutil.rmtree(path, ignore_errors=True)  # another sweep may be at it too
+                else:
+                    path.unlink(missing_ok=True)
 
     def path(self, digest: str) -> Path:
         """Where the file of this SHA-256 is, or would be."""
@@ -42,6 +46,16 @@ class Store:
             yield path
         finally:
             path.unlink(missing_ok=True)
+
+    @contextmanager
+    def temporary_folder(self) -> Iterator[Path]:
+        """An empty folder to unpack into, removed at the end with all that it holds."""
+        folder = self._tmp / uuid.uuid4().hex
+        folder.mkdir()
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder)
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
         """Move a finished file to its place, durably; returns its SHA-256 (computed where not given)."""

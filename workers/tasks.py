@@ -7,8 +7,9 @@ from typing import Any
 
 from workers.context import Context
 from workers.deconvolve_task import deconvolve
+from workers.psf_fit_task import psf_fit
 from workers.psf_task import psf_build
 
 Task = Callable[[Context, Mapping[str, Any]], str]
 
-TASKS: dict[str, Task] = {"psf-build": psf_build, "deconvolve": deconvolve}
+TASKS: dict[str, Task] = {"psf-build": psf_build, "psf-fit": psf_fit, "deconvolve": deconvolve}

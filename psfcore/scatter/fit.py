@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.fourier import Convolver
-from psfcore.psf import REACH_GRID_PX, Psf, cumulative_curve, encircled_energy
+from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, cumulative_curve, encircled_energy
 from psfcore.scatter.equations import Drawn, Lines, free_fit
 from psfcore.scatter.inversion import Inversion, Progress, Solution, invert
 from psfcore.scatter.optics import Blur, pick
@@ -122,6 +122,12 @@ def fit_transit(
     """
     wanted = shape_named(shape)
     guess = first_guess(transit)
+    progress = _Whole(
+        progress,
+        len(transit.frames),
+        compared=wanted is SOFTENED_POWER_LAW,
+        published=1 + len(MENDED_ALONE) if as_published else 0,
+    )
     solution = invert(transit, wanted, threads=threads, progress=progress)
     factor = overdispersion(solution.inversion)
     kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
@@ -151,6 +157,32 @@ def fit_transit(
         published_alone=alone,
         limits=_limits(solution, curve, factor),
     )
+
+
+class _Whole:
+    """Progress of the whole fit out of that of its stages: each call of a stage is a visit to one frame.
+
+    The rounds that a fit will take are a guess; the total grows where there are more.
+    """
+
+    _COST: ClassVar[dict[str, float]] = {"reconstructing": 1.0, "errors": 1.2, "comparing": 2.5, "free": 1.0}
+    _ROUND, _ROUNDS, _PUBLISHED_ROUND = 1.2, 4.0, 2.0
+
+    def __init__(self, progress: Progress, frames: int, *, compared: bool, published: int) -> None:
+        self._progress, self._done = progress, 0.0
+        visits = (
+            sum(self._COST.values())
+            + self._ROUND * self._ROUNDS
+            - (0 if compared else self._COST["comparing"])
+        )
+        self._total = frames * (visits + published * 6 * 2 * self._PUBLISHED_ROUND)
+
+    def __call__(self, stage: str, step: int, steps: int) -> None:
+        first = stage.split()[0]
+        cost = self._PUBLISHED_ROUND if ":" in stage else self._ROUND
+        self._done += self._COST.get(first, cost)
+        self._total = max(self._total, 1.02 * self._done)
+        self._progress(stage, round(10 * self._done), round(10 * self._total))
 
 
 def overdispersion(inversion: Inversion) -> float:
@@ -266,6 +298,12 @@ def psf_of(fit: TransitFit, *, name: str, version: str, provenance: dict[str, An
             "SCATTER": fit.scatter,
         },
         provenance=provenance,
+        fitted=FittedShape(
+            shape=fit.inversion.shape.name,
+            parameters=fit.inversion.shape.names,
+            coordinates=tuple(fit.inversion.coordinates.tolist()),
+            covariance=tuple(tuple(row) for row in fit.covariance.tolist()),
+        ),
     )
 
 

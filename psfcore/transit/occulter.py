@@ -45,7 +45,8 @@ LARGEST_SMOOTHING_PX = 8.0
 PATCH_MARGIN_PX = 9
 LARGEST_SHIFT_PX = 5.0
 SETTLED_PX = 1e-3
-STEPS = 20
+STEPS = 30
+DAMPED_FROM = 6  # steps: before a faint scene they may swing to and fro
 DECONVOLUTION_NOISE = 2.3  # how much a deconvolution adds to it, for a core weight of 0.43
 _STRIPS = 32
 _DIFFERENCE_PX = 0.05
@@ -245,7 +246,7 @@ def _solve(
         weighted = slopes * weight.ravel()
         normal = weighted @ slopes.T + prior
         step = np.linalg.lstsq(normal, weighted @ misfit.ravel() + prior @ (origin - at), rcond=None)[0]
-        step[:2] = np.clip(step[:2], -1.0, 1.0)
+        step[:2] = np.clip(step[:2], -1.0, 1.0) * (0.5 if done >= DAMPED_FROM else 1.0)
         at = at + step
         at[:2] = np.clip(at[:2], origin[:2] - LARGEST_SHIFT_PX, origin[:2] + LARGEST_SHIFT_PX)
         done += 1
