@@ -10,6 +10,11 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.scatter_truth import ScatterTruth
+from psfcore.simulate.transit import simulate
+from psfcore.simulate.transit_files import write
+
 SHAPE = (64, 80)
 RADIUS_PX = 4.0
 READ_NOISE = {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
@@ -107,3 +112,21 @@ def load_manifest(folder: Path) -> dict[str, Any]:
 def save_manifest(folder: Path, content: object) -> None:
     """Write transit.json anew."""
     (folder / "transit.json").write_text(json.dumps(content))
+
+
+TRUTH = ScatterTruth(b_px=6.0, c=2.5, total=0.41)
+
+
+def diffraction(size: int = 64) -> NDArray[np.float64]:
+    """A core that spreads, and arms: sum 1."""
+    y, x = np.indices((size, size)) - size // 2
+    r = np.hypot(x, y)
+    kernel = np.exp(-r / 0.8) + 1e-4 * ((x == 0) | (y == 0)) * np.exp(-r / 12)
+    return np.asarray(kernel / kernel.sum())
+
+
+def write_simulated(folder: Path) -> Path:
+    """Nine bright images of 128 px, seen through TRUTH and diffraction()."""
+    plan = default_plan(9, 128, oversampling=1, brightness=30.0)
+    write(simulate(plan, TRUTH, diffraction(), seed=4), folder)
+    return folder

@@ -248,7 +248,7 @@ def _cards(
         "SWHELIO": (software_version(), "heliopsf version"),
         "INPSHA": (work.request.image_id, ""),
     }
-    if errors is not None:
+    if errors is not None and errors.amplification is not None:
         cards["DCNVAMPL"] = (errors.amplification, "noise of the result over that of the input")
     return cards
 

@@ -65,13 +65,14 @@ class ErrorPlanes:
     """1-sigma planes [y, x] of a deconvolved image, in its unit, NaN where a pixel is not trusted.
 
     error: from photon and read noise. psf_error: from the PSF's uncertainty, None where it is not known.
-    amplification: median of error over the noise of the observation. degrees_of_freedom: how well a pixel's
+    amplification: median of error over the noise of the observation, none where
+    the edge bands leave no pixel. degrees_of_freedom: how well a pixel's
     variance is known (its relative error is sqrt(2 / degrees_of_freedom)).
     """
 
     error: Plane
     psf_error: Plane | None
-    amplification: float
+    amplification: float | None
     degrees_of_freedom: float
     draws: int
     seed: int
@@ -118,7 +119,7 @@ def error_planes(
     return ErrorPlanes(
         error=np.where(image.valid, error, np.nan),
         psf_error=None,
-        amplification=float(np.median(ratio)) if ratio.size else math.nan,
+        amplification=float(np.median(ratio)) if ratio.size else None,
         degrees_of_freedom=freedom,
         draws=draws,
         seed=seed,

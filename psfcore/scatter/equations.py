@@ -37,6 +37,7 @@ KEPT_DRAWS = 70
 OCCULTED_LINES = 1000
 LIT_LINES = 100
 LIT = -1
+LEAST_LIGHT = 1e-5
 HOLD = 10.0  # times a line's worth of misfit is what a shell with all of the light costs
 PIVOT_PX = 15.0
 
@@ -120,12 +121,15 @@ def free_fit(
 ) -> Drawn:
     """Eq. (2): coefficients (draws kept, segments), per px^2.
 
-    towards: the coefficients that hold where no line decides; none: nothing.
+    towards: the coefficients that hold where no line decides, each loosely enough to double or vanish at the price
+    of one line's misfit; none: all are held to nothing, by HOLD.
     """
     held_at = np.zeros_like(counts) if towards is None else towards
+    light = held_at * counts
+    hold = np.full_like(counts, HOLD) if towards is None else 1 / np.maximum(light, LEAST_LIGHT)
     rng = np.random.default_rng(seed)
     return _drawn(
-        lines, counts, rng, draws, lambda matrix, target: _solve_free(matrix, target, counts, held_at)
+        lines, counts, rng, draws, lambda matrix, target: _solve_free(matrix, target, counts, held_at, hold)
     )
 
 
@@ -196,7 +200,9 @@ def _from_pivot(theta: Vector) -> Vector:
     return np.array([np.exp(theta[0] + theta[2] * np.log(b + PIVOT_PX)), b, theta[2]])
 
 
-def _solve_free(matrix: Matrix, target: Vector, counts: Vector, towards: Vector) -> tuple[Vector, float]:
+def _solve_free(
+    matrix: Matrix, target: Vector, counts: Vector, towards: Vector, hold: Vector
+) -> tuple[Vector, float]:
     """Eq. (2) in the light n_S psf_S of each shell, held where no line decides.
 
     A departure: no occulted pixel is near enough to the edge to tell the innermost shells from the centre, and
@@ -206,8 +212,8 @@ def _solve_free(matrix: Matrix, target: Vector, counts: Vector, towards: Vector)
     out = towards.copy()
     target = target - matrix[:, ~used] @ towards[~used]
     light = matrix[:, used] / counts[used]
-    held = np.concatenate((light, HOLD * np.eye(light.shape[1])))
-    wanted = np.concatenate((target, HOLD * (towards * counts)[used]))
+    held = np.concatenate((light, np.diag(hold[used])))
+    wanted = np.concatenate((target, (hold * towards * counts)[used]))
     # The triangle of a QR factorisation has the same least-squares solution in a twentieth of the lines.
     turned, triangle = np.linalg.qr(held)
     solved = lsq_linear(triangle, turned.T @ wanted, bounds=(0.0, np.inf), method="trf")

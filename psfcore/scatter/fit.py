@@ -38,6 +38,7 @@ Kernel = NDArray[np.float64]
 SCHEMA = "psf-fit/1"
 RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
 ALONE_DRAWS = 30  # of each bias mended alone: differences between recipes that share their draws
+WORST_CHI2 = 1.5  # a pixel; that of 10,000 pixels is known to 0.014
 OPEN_POINTS = 3.0  # an error of the curve from which a radius is said to be open
 ONE_SIGMA, TWO_SIGMA = (15.87, 84.13), (2.275, 97.725)
 
@@ -272,6 +273,11 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
         out.append(
             f"the discs scatter {math.sqrt(factor):.1f} times as much as noise allows: an effect is not modelled, "
             "and all errors are larger by that factor"
+        )
+    if inversion.chi2_per_pixel > WORST_CHI2:
+        out.append(
+            f"the model does not describe the occulted pixels: chi2 {inversion.chi2_per_pixel:.2f} a pixel where 1 is "
+            "expected; the noise figures are wrong, or the discs are not what transit.json says"
         )
     short = min(solution.transit.shape)
     if short < REACH_GRID_PX:

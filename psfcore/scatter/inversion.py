@@ -41,7 +41,7 @@ from psfcore.psf import cumulative_curve
 from psfcore.scatter.optics import Blur, Lanes, Optics, Pixels, pick, put
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
 from psfcore.scatter.total_psf import Kernel, TotalPsf
-from psfcore.transit.occulter import FoundPlace, find_occulter, fully_dark
+from psfcore.transit.occulter import LARGEST_SHIFT_PX, FoundPlace, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
 
 Progress = Callable[[str, int, int], None]
@@ -166,8 +166,18 @@ class Sky:
     def left_out(self) -> dict[str, str]:
         """Frames that cannot take part, and why."""
         reasons = {}
-        for frame, dark in zip(self.transit.frames, self.dark, strict=True):
-            if dark[0].size < LEAST_DARK_PIXELS:
+        for frame, dark, found in zip(self.transit.frames, self.dark, self.found, strict=True):
+            if not found.within_reach:
+                reasons[frame.file] = (
+                    f"expected an occulter at ({frame.place.x_px:g}, {frame.place.y_px:g}) px; "
+                    f"found none within {LARGEST_SHIFT_PX:g} px"
+                )
+            elif not found.seen:
+                reasons[frame.file] = (
+                    f"expected an occulter at ({frame.place.x_px:g}, {frame.place.y_px:g}) px; "
+                    f"{100 * found.depth:.0f} +- {100 * found.depth_sigma:.0f} % of the light it would hide is missing"
+                )
+            elif dark[0].size < LEAST_DARK_PIXELS:
                 reasons[frame.file] = (
                     f"expected at least {LEAST_DARK_PIXELS} fully dark pixels, got {dark[0].size}"
                 )

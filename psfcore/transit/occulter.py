@@ -46,6 +46,8 @@ PATCH_MARGIN_PX = 9
 LARGEST_SHIFT_PX = 5.0
 SETTLED_PX = 1e-3
 STEPS = 30
+LEAST_DEPTH = 0.5
+DOUBT_SIGMAS = 3.0
 DAMPED_FROM = 6  # steps: before a faint scene they may swing to and fro
 DECONVOLUTION_NOISE = 2.3  # how much a deconvolution adds to it, for a core weight of 0.43
 _STRIPS = 32
@@ -56,7 +58,8 @@ _DIFFERENCE_PX = 0.05
 class FoundPlace:
     """An occulter's place with its error (px, each axis), and how it was found.
 
-    neighbours: how many frames showed the scene behind it; 0: the disc's own surroundings stood in.
+    neighbours: how many frames showed the scene behind it; 0: the disc's own surroundings stood in. depth: how much
+    of the light that a disc would hide is missing, 1 for an occulter and 0 for none, with its error.
     """
 
     place: Place
@@ -66,6 +69,15 @@ class FoundPlace:
     neighbours: int
     steps_done: int
     settled: bool
+    depth: float = 1.0
+    depth_sigma: float = 0.0
+    within_reach: bool = True
+
+    @property
+    def seen(self) -> bool:
+        """Whether an occulter may be there: False where the light is not missing, beyond doubt, or where the search
+        ran to the end of LARGEST_SHIFT_PX."""
+        return self.within_reach and self.depth + DOUBT_SIGMAS * self.depth_sigma >= LEAST_DEPTH
 
 
 def coverage(shape: tuple[int, int], place: Place) -> Plane:
@@ -171,8 +183,10 @@ def find_occulter(
         return np.asarray(noise.variance(_level(model), frame.exposure_s) + neighbours_noise)
 
     solved = _solve(simulated, observed, variance, local, ephemeris_sigma_px)
-    place = Place(solved.at[0] + window[1].start, solved.at[1] + window[0].start, start.radius_px)
-    sigma = np.sqrt(np.diag(np.linalg.inv(solved.normal)))
+    place = Place(
+        float(solved.at[0] + window[1].start), float(solved.at[1] + window[0].start), start.radius_px
+    )
+    sigma = np.sqrt(np.diag(_inverse(solved.normal)))
     return FoundPlace(
         place=place,
         sigma_x_px=float(sigma[0]),
@@ -181,6 +195,10 @@ def find_occulter(
         neighbours=len(chosen),
         steps_done=solved.steps_done,
         settled=solved.settled,
+        depth=solved.depth,
+        depth_sigma=solved.depth_sigma,
+        within_reach=max(abs(place.x_px - start.x_px), abs(place.y_px - start.y_px))
+        < LARGEST_SHIFT_PX - 1e-6,
     )
 
 
@@ -216,6 +234,8 @@ class _Solved:
     chi2: float
     steps_done: int
     settled: bool
+    depth: float
+    depth_sigma: float
 
 
 def _solve(
@@ -251,8 +271,29 @@ def _solve(
         at[:2] = np.clip(at[:2], origin[:2] - LARGEST_SHIFT_PX, origin[:2] + LARGEST_SHIFT_PX)
         done += 1
         settled = bool(np.abs(step[:2]).max() < SETTLED_PX)
-    model = at[2] * disc.seen + at[3] - disc.hidden(at[0], at[1], radius)
-    return _Solved(at, normal, float(np.sum((observed - model) ** 2 / variance(model))), done, settled)
+    hidden = disc.hidden(at[0], at[1], radius)
+    model = at[2] * disc.seen + at[3] - hidden
+    misfit, weight = observed - model, 1 / variance(model)
+    # What is missing beside what a disc hides, the scale free with it: both dim the patch as a whole.
+    templates = np.array([-hidden, disc.seen]).reshape(2, -1)
+    normal_2 = (templates * weight.ravel()) @ templates.T
+    inverse = _inverse(normal_2)
+    more = inverse @ (templates * weight.ravel()) @ misfit.ravel()
+    return _Solved(
+        at=at,
+        normal=normal,
+        chi2=float(np.sum(weight * misfit**2)),
+        steps_done=done,
+        settled=settled,
+        depth=float(1 + more[0]),
+        depth_sigma=float(np.sqrt(inverse[0, 0])),
+    )
+
+
+def _inverse(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse, or the pseudo-inverse where a combination is open: scale and level before an even scene."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return np.asarray(np.linalg.pinv(normal / np.outer(size, size), hermitian=True) / np.outer(size, size))
 
 
 def _ring_mean(frame: Frame, place: Place, window: Window) -> float:

@@ -1,0 +1,94 @@
+"""Transits so small that a fit takes a second, their truth, and fits of them that many tests look at."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.psf import cumulative_curve
+from psfcore.scatter.fit import TransitFit, fit_transit
+from psfcore.scatter.inversion import Solution, invert
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
+from psfcore.simulate.sky import TrueSky, true_sky
+from psfcore.simulate.transit import SimulatedTransit, observed_transit
+from psfcore.transit.transit import Transit
+from tests.psfcore.conftest import gaussian
+
+Plane = NDArray[np.float64]
+
+IMAGES, SIZE_PX, BRIGHTNESS = 12, 128, 5.0
+SCATTER = ScatterTruth(6.15, 2.53, 0.411)
+
+
+def diffraction() -> Plane:
+    """A core as sharp as HRI_EUV's and a tenth of the light in wings, 31 px, sum 1."""
+    y, x = np.indices((31, 31)) - 15
+    wings = (1 + (x**2 + y**2) / 9) ** -1.6
+    return np.asarray(0.9 * gaussian(31, 0.4) + 0.1 * wings / wings.sum())
+
+
+DIFFRACTION = diffraction()
+
+
+@cache
+def sky(
+    scatter: ScatterTruth = SCATTER,
+    images: int = IMAGES,
+    size_px: int = SIZE_PX,
+    brightness: float = BRIGHTNESS,
+    ephemeris_error_px: float = 0.6,
+) -> TrueSky:
+    """A sky in whole pixels, dark beyond the field."""
+    plan = default_plan(
+        images, size_px, oversampling=1, brightness=brightness, ephemeris_error_px=ephemeris_error_px
+    )
+    return true_sky(plan, scatter, DIFFRACTION, 3)
+
+
+@cache
+def observed(of: TrueSky, seed: int = 3) -> SimulatedTransit:
+    """A transit of a sky, with noise."""
+    return observed_transit(of, seed)
+
+
+@cache
+def noise_free(of: TrueSky, seed: int = 3) -> Transit:
+    """The same transit as a camera without noise sees it; the ephemeris errs as in the noisy one."""
+    transit = observed(of, seed).transit
+    return with_pixels(transit, of.noise_free)
+
+
+def with_pixels(transit: Transit, pixels: Sequence[NDArray[np.floating]]) -> Transit:
+    """A transit with other pixels."""
+    frames = zip(transit.frames, pixels, strict=True)
+    changed = tuple(dataclasses.replace(f, pixels=p.astype(np.float32)) for f, p in frames)
+    return dataclasses.replace(transit, frames=changed)
+
+
+@cache
+def solved() -> Solution:
+    """The inversion of the noisy transit."""
+    return invert(observed(sky()).transit)
+
+
+@cache
+def solved_noise_free() -> Solution:
+    """The inversion of the same without noise."""
+    return invert(noise_free(sky()))
+
+
+@cache
+def fitted() -> TransitFit:
+    """The whole fit of the noisy transit."""
+    return fit_transit(observed(sky()).transit)
+
+
+@cache
+def true_curve(radii_px: tuple[float, ...], scatter: ScatterTruth = SCATTER) -> Plane:
+    """C(R) of the true total PSF, percent, on the full reach."""
+    return cumulative_curve(total_kernel(scatter, DIFFRACTION), radii_px)

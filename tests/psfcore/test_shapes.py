@@ -1,0 +1,159 @@
+"""Every shape of scatter holds the light that it says, where its formula says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from psfcore.errors import DataError
+from psfcore.psf import REACH_GRID_PX, crop_centred
+from psfcore.scatter.power_law import scatter_kernel
+from psfcore.scatter.shapes import (
+    CORE_PX,
+    HALO_B_PX,
+    KNEE_PX,
+    SHAPES,
+    SOFTENED_POWER_LAW,
+    Parameter,
+    Shape,
+    shape_named,
+    stretch_of,
+)
+from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel
+
+LAW = {"b_px": 6.15, "c": 2.53, "total": 0.411}
+MORE = {
+    "stretch_p": 0.1,
+    "stretch_q": -0.06,
+    "x_share": 0.2,
+    "y_share": -0.1,
+    "bend": 0.4,
+    "halo_share": 0.07,
+    "core_share": 0.05,
+}
+OTHERS = [shape for shape in SHAPES.values() if shape is not SOFTENED_POWER_LAW]
+MIDDLE = REACH_GRID_PX // 2
+
+
+def kernel_of(shape: Shape, size: int = 64, **values: float) -> np.ndarray:
+    return shape.kernel(shape.coordinates(LAW | values), size)
+
+
+def name_of(shape: Shape) -> str:
+    return shape.name
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=name_of)
+def test_light_off_the_centre_is_the_total(shape: Shape) -> None:
+    kernel = kernel_of(shape, REACH_GRID_PX, **MORE)
+    assert kernel[MIDDLE, MIDDLE] == pytest.approx(1 - 0.411, abs=1e-14)
+    assert kernel.sum() == pytest.approx(1, abs=1e-12)
+    assert kernel.min() >= 0
+
+
+@pytest.mark.parametrize("shape", OTHERS, ids=name_of)
+def test_nothing_added_is_the_softened_power_law(shape: Shape) -> None:
+    assert all(p.start == 0 for p in shape.parameters[3:])
+    np.testing.assert_allclose(kernel_of(shape, 256), kernel_of(SOFTENED_POWER_LAW, 256), rtol=1e-12)
+    np.testing.assert_allclose(kernel_of(shape, 256), scatter_kernel(6.15, 2.53, 0.411, 256), rtol=1e-11)
+
+
+@pytest.mark.parametrize("angle_deg", [-15.0, 40.0, 90.0])
+def test_a_stretch_is_the_one_of_the_definitions(angle_deg: float) -> None:
+    log, turn = math.log(1.15), 2 * math.radians(angle_deg)
+    found = kernel_of(
+        SHAPES["stretched"], 128, stretch_p=log * math.cos(turn), stretch_q=log * math.sin(turn)
+    )
+    truth = ScatterTruth(6.15, 2.53, 0.411, stretch=0.15, angle_deg=angle_deg)
+    np.testing.assert_allclose(found, anisotropic_kernel(truth, 128), rtol=1e-10)
+
+
+def test_a_stretch_along_x_is_one_at_no_angle() -> None:
+    found = kernel_of(SHAPES["stretched-along-x"], 128, stretch_p=math.log(0.9))
+    truth = ScatterTruth(6.15, 2.53, 0.411, stretch=-0.1)
+    np.testing.assert_allclose(found, anisotropic_kernel(truth, 128), rtol=1e-10)
+
+
+@pytest.mark.parametrize("angle_deg", [-15.0, 90.0])
+def test_a_side_is_the_simulators_dipole(angle_deg: float) -> None:
+    turn = math.radians(angle_deg)
+    found = kernel_of(SHAPES["one-sided"], 128, x_share=0.25 * math.cos(turn), y_share=0.25 * math.sin(turn))
+    truth = ScatterTruth(6.15, 2.53, 0.411, dipole=0.25, angle_deg=angle_deg)
+    np.testing.assert_allclose(found, anisotropic_kernel(truth, 128), rtol=1e-10, atol=1e-18)
+
+
+def test_a_knee_steepens_the_law_beyond_it() -> None:
+    kernel, law = kernel_of(SHAPES["knee"], 1024, bend=0.4), kernel_of(SOFTENED_POWER_LAW, 1024)
+    ratio = kernel[512] / law[512]
+    r = np.array([1, 50, 100, 200, 500])
+    expected = ((1 + (r / KNEE_PX) ** 2) / (1 + 1 / KNEE_PX**2)) ** -0.2
+    np.testing.assert_allclose(ratio[512 + r] / ratio[513], expected, rtol=1e-12)
+    assert ratio[513] > 1 > ratio[1012]  # what is lost far out is found near
+
+
+def test_a_second_law_and_a_core_hold_their_share() -> None:
+    law = kernel_of(SOFTENED_POWER_LAW, REACH_GRID_PX)
+    r = np.hypot(*(np.indices(law.shape) - MIDDLE))
+    wide = (HALO_B_PX + r) ** -2.53
+    core = np.exp(-0.5 * (r / CORE_PX) ** 2)
+    for name, share, added in (("two-power-laws", "halo_share", wide), ("core", "core_share", core)):
+        added[MIDDLE, MIDDLE] = 0
+        expected = 0.93 * law + 0.07 * 0.411 * added / added.sum()
+        expected[MIDDLE, MIDDLE] = 1 - 0.411
+        found = kernel_of(SHAPES[name], REACH_GRID_PX, **{share: 0.07})
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["softened-power-law", "stretched", "two-power-laws"])
+def test_any_size_is_a_cut_of_the_same_kernel(name: str) -> None:
+    """Weights are scaled on the full reach, not on the array: not on a smaller one and not on a larger."""
+    whole = kernel_of(SHAPES[name], REACH_GRID_PX, **MORE)
+    for size in (65, 128):
+        np.testing.assert_allclose(
+            kernel_of(SHAPES[name], size, **MORE), crop_centred(whole, (size, size)), rtol=1e-12
+        )
+    larger = kernel_of(SHAPES[name], REACH_GRID_PX + 2, **MORE)
+    assert larger.shape == (REACH_GRID_PX + 2, REACH_GRID_PX + 2)
+    np.testing.assert_allclose(crop_centred(larger, whole.shape), whole, rtol=1e-12)
+    assert larger.sum() > 1 + 1e-6
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=name_of)
+def test_coordinates_and_values_are_two_ways_to_say_one_thing(shape: Shape) -> None:
+    values = {name: (LAW | MORE)[name] for name in shape.names}
+    assert shape.values(shape.coordinates(values)) == pytest.approx(values, rel=1e-14)
+    at = np.linspace(-0.7, 1.9, len(shape.parameters))
+    np.testing.assert_allclose(shape.coordinates(shape.values(at)), at, rtol=1e-12)
+    np.testing.assert_allclose(shape.coordinates({}), shape.start)
+
+
+@pytest.mark.parametrize(
+    "parameter", SHAPES["stretched"].parameters[:4], ids=lambda parameter: parameter.name
+)
+def test_slope_is_the_values_over_the_coordinates(parameter: Parameter) -> None:
+    at = parameter.coordinate(0.3)
+    ahead, behind = parameter.value(at + 1e-5), parameter.value(at - 1e-5)
+    assert parameter.slope(at) == pytest.approx((ahead - behind) / 2e-5, rel=1e-7)
+
+
+def test_no_coordinate_leads_where_no_scatter_is() -> None:
+    for at in (-30.0, 30.0):
+        values = SOFTENED_POWER_LAW.values(np.array([at, 2.5, at]))
+        assert values["b_px"] > 0 and 0 < values["total"] < 1
+
+
+@pytest.mark.parametrize("stretch, angle_deg", [(0.15, -15.0), (0.05, 89.0), (0.3, 45.0)])
+def test_stretch_and_angle_are_read_back(stretch: float, angle_deg: float) -> None:
+    log, turn = math.log(1 + stretch), 2 * math.radians(angle_deg)
+    found = stretch_of({"stretch_p": log * math.cos(turn), "stretch_q": log * math.sin(turn)})
+    assert found == pytest.approx((stretch, angle_deg))
+    assert stretch_of({"stretch_p": log}) == pytest.approx((stretch, 0.0))
+    assert stretch_of(LAW) == (0.0, 0.0)
+
+
+def test_a_shape_that_is_not_there_is_named() -> None:
+    assert shape_named("knee") is SHAPES["knee"]
+    with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*'spiral'"):
+        shape_named("spiral")
