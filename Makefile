@@ -29,6 +29,8 @@ test-full: $(DEV)
 
 bench: $(DEV)
 	$(BIN)/python -m tests.bench
+	$(BIN)/python -m tests.bench_ring_sums --quick
+	$(BIN)/python -m tests.bench_fit
 
 # What others use, in an environment of its own, timed in turn with ours on the same data.
 bench-peers: $(DEV)

@@ -1,0 +1,276 @@
+"""The occulter's place on transits whose truth is known, and the geometry of its disc."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psfcore.noise import Noise
+from psfcore.simulate.disc import covered_share
+from psfcore.simulate.plan import Shot, default_plan
+from psfcore.simulate.sky import TrueSky, true_sky
+from psfcore.transit.occulter import (
+    LEAST_NEIGHBOURS,
+    PATCH_MARGIN_PX,
+    FoundPlace,
+    coverage,
+    disc_distance,
+    find_occulter,
+    fully_dark,
+    neighbours_of,
+    patch_window,
+)
+from psfcore.transit.transit import Frame, Place, Transit
+from tests.psfcore.small_transits import (
+    DIFFRACTION,
+    IMAGES,
+    SCATTER,
+    SIZE_PX,
+    noise_free,
+    observed,
+    sky,
+    with_pixels,
+)
+
+RADIUS_PX = 10.75
+PLACES = [Place(20.0, 20.0, RADIUS_PX), Place(20.3, 18.77, RADIUS_PX), Place(19.5, 20.5, 6.2)]
+
+
+# --- the disc ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_what_is_covered_is_the_discs_area(place: Place) -> None:
+    share = coverage((41, 40), place)
+    assert share.sum() == pytest.approx(np.pi * place.radius_px**2, rel=1e-3)
+    np.testing.assert_allclose(share, covered_share(place, (0, 0), (41, 40), 1), atol=0.02)
+    assert share.min() == 0 and share.max() == pytest.approx(1, abs=1e-12)
+
+
+def test_what_is_covered_changes_smoothly() -> None:
+    """Each step uncovers what it covers, and as much as every other step: the disc's width times the step."""
+    step, n = 0.05, 40
+    for axis in ("x_px", "y_px"):
+        start = Place(20.0, 20.0, RADIUS_PX)
+        moved = [
+            coverage((41, 40), dataclasses.replace(start, **{axis: 20.0 + step * k})) for k in range(n + 1)
+        ]
+        change = np.array([np.abs(b - a).sum() for a, b in itertools.pairwise(moved)])
+        np.testing.assert_allclose(change, 4 * RADIUS_PX * step, rtol=0.03)
+
+
+@pytest.mark.parametrize("place", [*PLACES, Place(3.0, 38.2, RADIUS_PX), Place(-30.0, 10.0, RADIUS_PX)])
+@pytest.mark.parametrize("margin_px", [0.0, 1.3])
+def test_a_dark_pixel_has_all_its_corners_in_the_disc(place: Place, margin_px: float) -> None:
+    expected = np.ones((41, 40), bool)
+    for y in range(41):
+        for x in range(40):
+            for dy, dx in ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)):
+                corner = np.hypot(y + dy - place.y_px, x + dx - place.x_px)
+                expected[y, x] &= corner <= place.radius_px - margin_px
+    np.testing.assert_array_equal(fully_dark((41, 40), place, margin_px), expected)
+
+
+def test_distances_and_patches() -> None:
+    place = Place(12.0, 30.4, 5.0)
+    distance = disc_distance((41, 40), place)
+    assert distance.shape == (41, 40)
+    assert distance[30, 15] == pytest.approx(np.hypot(3, 0.4))
+    rows, columns = patch_window((41, 60), place)
+    assert (rows.start, rows.stop) == (16, 41)  # cut at the frame's edge
+    assert (columns.start, columns.stop) == (0, 12 + 5 + PATCH_MARGIN_PX + 1)
+
+
+# --- finding it -------------------------------------------------------------------------------------------
+
+
+def found_in(
+    of: TrueSky, transit: Transit, indices: Sequence[int], *, ephemeris_sigma_px: float = 1.0
+) -> list[FoundPlace]:
+    """The places of some frames, the scenes and the PSF given."""
+    scenes = [of.true_scene(n).astype(np.float32) for n in range(len(transit.frames))]
+    places = [frame.place for frame in transit.frames]
+    return [
+        find_occulter(
+            n,
+            transit.frames,
+            scenes,
+            places,
+            of.kernel,
+            transit.noise,
+            ephemeris_sigma_px=ephemeris_sigma_px,
+        )
+        for n in indices
+    ]
+
+
+def errors(of: TrueSky, found: Sequence[FoundPlace], indices: Sequence[int]) -> NDArray[np.float64]:
+    exact = [of.plan.place(n) for n in indices]
+    return apart([f.place for f in found], exact)
+
+
+def apart(places: Sequence[Place], exact: Sequence[Place]) -> NDArray[np.float64]:
+    """Errors of places, (n, 2), px."""
+    pairs = zip(places, exact, strict=True)
+    return np.array([(place.x_px - true.x_px, place.y_px - true.y_px) for place, true in pairs])
+
+
+EVERY = range(IMAGES)
+
+
+def test_without_noise_places_are_exact() -> None:
+    """From an ephemeris that errs by 0.6 px; what is left is the light of the neighbours' own occulters."""
+    of = sky(brightness=200.0)
+    for sigma_px, tolerance_px in ((100.0, 0.02), (1.0, 0.02)):
+        found = found_in(of, noise_free(of), EVERY, ephemeris_sigma_px=sigma_px)
+        assert np.abs(errors(of, found, EVERY)).max() < tolerance_px
+        assert all(f.settled and f.seen and f.neighbours > 0 for f in found)
+        assert all(f.place.radius_px == RADIUS_PX for f in found)
+        assert [f.depth for f in found] == pytest.approx([1.0] * IMAGES, abs=0.05)
+    reported = apart(places_of(noise_free(of)), [of.plan.place(n) for n in EVERY])
+    assert np.hypot(*reported.T).max() > 1
+
+
+def test_errors_on_the_disc_are_those_stated() -> None:
+    of, on_disc = sky(), range(4, 8)
+    pulls = []
+    for seed in range(5):
+        found = found_in(of, observed(of, seed).transit, on_disc)
+        stated = np.array([(f.sigma_x_px, f.sigma_y_px) for f in found])
+        assert np.all((stated > 0.001) & (stated < 0.05))
+        assert 0.8 < np.mean([f.chi2_per_pixel for f in found]) < 1.2
+        pulls.append(errors(of, found, on_disc) / stated)
+    assert 0.7 < np.std(pulls) < 1.5  # 40 of them
+    assert np.abs(pulls).max() < 4.5
+
+
+def test_far_off_the_limb_faint_places_are_found_to_two_pixels() -> None:
+    of = sky(brightness=1.0)
+    for seed in range(2):
+        found = found_in(of, observed(of, seed).transit, EVERY)
+        assert np.hypot(*errors(of, found, EVERY).T).max() < 2
+        assert all(f.seen for f in found)
+
+
+def test_the_ephemeris_decides_where_the_image_says_nothing() -> None:
+    of = sky(brightness=1.0)
+    nothing = Noise(photon_gain_dn=6.0, read_noise_dn=1e6)
+    transit = dataclasses.replace(noise_free(of), noise=nothing)
+    for f, frame in zip(found_in(of, transit, [0, 5]), (transit.frames[0], transit.frames[5]), strict=True):
+        assert (f.place.x_px, f.place.y_px) == pytest.approx((frame.place.x_px, frame.place.y_px), abs=0.05)
+        assert (f.sigma_x_px, f.sigma_y_px) == pytest.approx((1.0, 1.0), abs=0.02)
+
+
+def displaced(transit: Transit, index: int, place: Place) -> Transit:
+    frames = list(transit.frames)
+    frames[index] = dataclasses.replace(frames[index], place=place)
+    return dataclasses.replace(transit, frames=tuple(frames))
+
+
+def test_an_ephemeris_off_by_pixels_is_put_right_and_one_off_by_more_is_told() -> None:
+    of = sky(brightness=200.0)
+    exact = of.plan.place(5)
+    near = Place(exact.x_px + 2.5, exact.y_px - 3.0, RADIUS_PX)
+    found = found_in(of, displaced(noise_free(of), 5, near), [5])
+    assert np.abs(errors(of, found, [5])).max() < 0.03
+    far = Place(exact.x_px + 30.0, exact.y_px + 40.0, RADIUS_PX)
+    lost = found_in(of, displaced(noise_free(of), 5, far), [5])[0]
+    assert not lost.seen
+
+
+def test_an_image_without_an_occulter_is_told() -> None:
+    of = sky()
+    pixels = [frame.pixels for frame in noise_free(of).frames]
+    pixels[6] = of.seen_scenes[2].astype(np.float32)
+    lost = found_in(of, with_pixels(noise_free(of), pixels), [6])[0]
+    assert not lost.seen
+
+
+# --- neighbours -------------------------------------------------------------------------------------------
+
+
+def overlap(one: Place, other: Place) -> bool:
+    """Whether the other's disc reaches into the square round the one."""
+    reach = one.radius_px + PATCH_MARGIN_PX + other.radius_px
+    return abs(one.x_px - other.x_px) <= reach and abs(one.y_px - other.y_px) <= reach
+
+
+def places_of(transit: Transit) -> list[Place]:
+    return [frame.place for frame in transit.frames]
+
+
+def test_neighbours_show_the_patch_and_are_the_nearest_in_time() -> None:
+    """Before a faint sky there are more of them, before a bright one four."""
+    for brightness, most in ((0.02, 8), (20.0, LEAST_NEIGHBOURS)):
+        transit = observed(sky(images=30, size_px=192, brightness=brightness)).transit
+        assert most == max(len(neighbours) for neighbours in checked_neighbours(transit))
+
+
+def checked_neighbours(transit: Transit) -> list[list[int]]:
+    """The neighbours of all frames: free, of the same pointing, the nearest in time, and four where so many are."""
+    places, found = places_of(transit), []
+    for n, frame in enumerate(transit.frames):
+        chosen = neighbours_of(n, transit.frames, places, transit.noise)
+        free = [
+            k
+            for k, other in enumerate(transit.frames)
+            if k != n and other.fov == frame.fov and not overlap(places[n], places[k])
+        ]
+        assert set(chosen) <= set(free)
+        waits = [abs(transit.frames[k].time_s - frame.time_s) for k in chosen]
+        assert waits == sorted(waits)
+        left = [abs(transit.frames[k].time_s - frame.time_s) for k in set(free) - set(chosen)]
+        assert min(left, default=np.inf) >= max(waits)
+        assert len(chosen) >= min(LEAST_NEIGHBOURS, len(free))
+        found.append(chosen)
+    return found
+
+
+def test_places_as_known_decide_who_is_free() -> None:
+    transit = observed(sky()).transit
+    places = places_of(transit)
+    before = neighbours_of(5, transit.frames, places, transit.noise)
+    places[before[0]] = places[5]
+    assert neighbours_of(5, transit.frames, places, transit.noise) == before[1:]
+
+
+def even_sky(shots: tuple[Shot, ...]) -> TrueSky:
+    """A Sun of one brightness, but for a texture of 5 %."""
+    plan = dataclasses.replace(default_plan(3, SIZE_PX, oversampling=1), shots=shots)
+    rng = np.random.default_rng(1)
+    scenes = {fov: 2000 * rng.normal(1, 0.05, (SIZE_PX, SIZE_PX)) for fov in plan.fovs}
+    return true_sky(plan, SCATTER, DIFFRACTION, 1, scenes=scenes)
+
+
+def shot(fov: int, x_px: float, y_px: float) -> Shot:
+    return Shot(fov, x_px, y_px, 1.8, "high-only", 60.0 * fov)
+
+
+def test_without_neighbours_an_even_sun_gives_the_place_to_a_tenth_of_a_pixel() -> None:
+    of = even_sky((shot(1, 60.3, 70.8), shot(2, 40.5, 30.1), shot(3, 90.0, 90.0)))
+    for transit in (noise_free(of), observed(of).transit):
+        found = found_in(of, transit, range(3))
+        assert [f.neighbours for f in found] == [0, 0, 0]
+        assert np.abs(errors(of, found, range(3))).max() < 0.1
+        assert all(f.seen for f in found)
+
+
+def test_a_disc_that_touches_the_edge_is_found() -> None:
+    """Also one that the field's edge cuts: the field without its first columns."""
+    of = even_sky((shot(1, RADIUS_PX, 60.2), shot(1, 60.0, 60.0), shot(1, 100.4, SIZE_PX - 1 - RADIUS_PX)))
+    found = found_in(of, noise_free(of), range(3), ephemeris_sigma_px=10.0)
+    assert np.abs(errors(of, found, range(3))).max() < 0.03
+    cut = [crop(frame, 8) for frame in noise_free(of).frames]
+    scenes = [of.true_scene(n)[:, 8:].astype(np.float32) for n in range(3)]
+    one = find_occulter(0, cut, scenes, [f.place for f in cut], of.kernel, of.plan.noise)
+    assert (one.place.x_px, one.place.y_px) == pytest.approx((RADIUS_PX - 8, 60.2), abs=0.1)
+
+
+def crop(frame: Frame, columns: int) -> Frame:
+    place = dataclasses.replace(frame.place, x_px=frame.place.x_px - columns)
+    return dataclasses.replace(frame, pixels=frame.pixels[:, columns:], place=place)
