@@ -206,7 +206,7 @@ def places_of(transit: Transit) -> list[Place]:
 
 def test_neighbours_show_the_patch_and_are_the_nearest_in_time() -> None:
     """Before a faint sky there are more of them, before a bright one four."""
-    for brightness, most in ((0.02, 8), (20.0, LEAST_NEIGHBOURS)):
+    for brightness, most in ((0.02, 8), (500.0, LEAST_NEIGHBOURS)):
         transit = observed(sky(images=30, size_px=192, brightness=brightness)).transit
         assert most == max(len(neighbours) for neighbours in checked_neighbours(transit))
 
