@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.psf import cumulative_curve
+from psfcore.scatter.noise_transfer import noise_covariance
 from psfcore.scatter.optics import Blur, Lanes, Optics, Pixels, pick, put
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
 from psfcore.scatter.total_psf import Kernel, TotalPsf
@@ -77,7 +78,8 @@ class FrameFit:
     """One frame at the solution: where the occulter is, how dark it was and how dark it should be.
 
     observed, expected: means over the fully dark pixels, DN/s; noise: of the observed mean, DN/s.
-    normal, score: this frame's share of the normal equations, in coordinates (a sum over its pixels).
+    normal, score: this frame's share of the normal equations, in coordinates (a sum over its pixels). answer: how
+    the expected mean changes with the coordinates, DN/s.
     """
 
     file: str
@@ -90,6 +92,7 @@ class FrameFit:
     chi2: float
     normal: NDArray[np.float64]
     score: Vector
+    answer: Vector
 
     @property
     def residual_pct(self) -> float:
@@ -286,12 +289,14 @@ def invert(
     shape: Shape = SOFTENED_POWER_LAW,
     *,
     start: Vector | None = None,
+    counts: Sequence[int] | None = None,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Solution:
     """Fit a shape of scatter to a transit.
 
-    start: coordinates; none: the shape's own. Raises DataError "too-few-frames" (fewer than three with an occulter
+    start: coordinates; none: the shape's own. counts: how often each frame counts, 0 for one that is held out (it is
+    still looked at, as a neighbour in time and for its occulter's place); none: once each. Raises DataError "too-few-frames" (fewer than three with an occulter
     in them), "transit-says-too-little" (the frames leave a parameter open).
     """
     total = TotalPsf(transit.diffraction, shape, transit.shape, threads=threads)
@@ -300,7 +305,7 @@ def invert(
     optics = Optics(kernel, transit.shape, threads=threads)
     sky = Sky(transit, optics, progress)
     sky.find(optics, kernel)
-    solver = _Solver(sky, total, threads, progress)
+    solver = _Solver(sky, total, counts or [1] * len(transit.frames), threads, progress)
     frames = solver.taking_part()
     if len(frames) > PILOT_FRAMES + LEAST_FRAMES:
         spread = np.unique(np.linspace(0, len(frames) - 1, PILOT_FRAMES).round().astype(int))
@@ -315,15 +320,22 @@ def invert(
 class _Solver:
     """Gauss-Newton steps on Eq. (2)."""
 
-    def __init__(self, sky: Sky, total: TotalPsf, threads: int, progress: Progress) -> None:
+    def __init__(
+        self, sky: Sky, total: TotalPsf, counts: Sequence[int], threads: int, progress: Progress
+    ) -> None:
         self._sky, self._total, self._threads, self._progress = sky, total, threads, progress
+        self._counts = counts
         self.rounds: list[Round] = []
         self.converged = False
 
     def taking_part(self) -> list[int]:
         """Indices of the frames with enough dark pixels; DataError "too-few-frames"."""
         left_out = self._sky.left_out()
-        frames = [n for n, f in enumerate(self._sky.transit.frames) if f.file not in left_out]
+        frames = [
+            n
+            for n, f in enumerate(self._sky.transit.frames)
+            if f.file not in left_out and self._counts[n] > 0
+        ]
         if len(frames) < LEAST_FRAMES:
             reasons = "; ".join(f"{file}: {why}" for file, why in list(left_out.items())[:3])
             raise DataError(
@@ -344,7 +356,7 @@ class _Solver:
             model = self._model(at, with_slopes=not kept)
             measured = self._measure(model, frames, kept)
             kept = {n: m.slopes for n, m in measured.items()}
-            chi2 = sum(m.chi2 for m in measured.values())
+            chi2 = sum(self._counts[n] * m.chi2 for n, m in measured.items())
             if before is not None and chi2 > 1.2 * before[1]:
                 at, kept = (at + before[0]) / 2, {}  # too far: half-way back
                 before = (before[0], before[1])
@@ -352,7 +364,7 @@ class _Solver:
             before = (at, chi2)
             step, whole = self._step(measured, at)
             moved = float(np.abs(model.curve_slopes @ step).max())
-            pixels = sum(m.residual.size for m in measured.values())
+            pixels = sum(self._counts[n] * m.residual.size for n, m in measured.items())
             self.rounds.append(
                 Round(
                     frames=len(frames),
@@ -370,9 +382,10 @@ class _Solver:
 
     def _step(self, measured: dict[int, _Measured], at: Vector) -> tuple[Vector, bool]:
         """The Gauss-Newton step, shortened to the largest that each parameter may take; whether it is whole."""
-        normal = np.sum([m.slopes.normal for m in measured.values()], axis=0)
+        normal = np.sum([self._counts[n] * m.slopes.normal for n, m in measured.items()], axis=0)
         _check_determined(normal, self._total.shape)
-        step = np.linalg.solve(normal, np.sum([m.score for m in measured.values()], axis=0))
+        score = np.sum([self._counts[n] * m.score for n, m in measured.items()], axis=0)
+        step = np.linalg.solve(normal, score)
         largest = np.array([p.largest_step for p in self._total.shape.parameters])
         too_far = float((np.abs(step) / largest).max())
         return (step, True) if too_far <= 1 else (step / too_far, False)
@@ -417,14 +430,14 @@ class _Solver:
         model = self._model(at, with_slopes=True)
         frames = self.taking_part()
         measured = self._measure(model, frames, {})
-        normal = np.sum([m.slopes.normal for m in measured.values()], axis=0)
+        normal = np.sum([self._counts[n] * m.slopes.normal for n, m in measured.items()], axis=0)
         _check_determined(normal, self._total.shape)
         spread = np.zeros_like(normal)
         fits = []
         for step, (n, m) in enumerate(measured.items()):
             self._progress("errors", step, len(measured))
             scatter, mean_noise = self._noise_of(model, n, m)
-            spread += scatter
+            spread += self._counts[n] ** 2 * scatter
             fits.append(self._frame_fit(n, m, mean_noise))
         inverse = np.linalg.inv(normal)
         covariance = inverse @ spread @ inverse
@@ -451,27 +464,11 @@ class _Solver:
         )
 
     def _noise_of(self, model: _Model, n: int, measured: _Measured) -> tuple[NDArray[np.float64], float]:
-        """What the noise of all of a frame's pixels does to its score, and to its mean residual.
-
-        A template t of dark pixels has t . r = b . n, with b = t - H^-T (1 - D) H^T t for noise n: the disc's own
-        noise, and that of the scene which scatters into it.
-        """
-        sky, optics = self._sky, model.optics
-        frame, dark = sky.transit.frames[n], sky.dark[n]
+        """What the noise of all of a frame's pixels does to its score, and to its mean residual."""
+        sky, dark = self._sky, self._sky.dark[n]
         templates = [*measured.slopes.weighted, np.full(dark[0].size, 1 / dark[0].size)]
-        spread = []
-        for template in templates:
-            here = np.zeros(optics.engine.lanes_shape, np.float32)
-            put(here, dark, template)
-            scattered = optics.see_back(here)
-            put(scattered, dark, 0.0)
-            here -= optics.undo_once(scattered, adjoint=True)
-            spread.append(optics.field(here).ravel())
-        b = np.array(spread, dtype=np.float32)
-        # Linear in the observed value, so its own noise averages out.
-        variance = sky.transit.noise.variance(frame.pixels.astype(np.float64), frame.exposure_s).ravel()
-        covariance = (b * variance.astype(np.float32)) @ b.T
-        return np.asarray(covariance[:-1, :-1], dtype=np.float64), float(np.sqrt(covariance[-1, -1]))
+        covariance = noise_covariance(model.optics, sky.transit.frames[n], dark, templates, sky.transit.noise)
+        return covariance[:-1, :-1], float(np.sqrt(covariance[-1, -1]))
 
     def _frame_fit(self, n: int, measured: _Measured, mean_noise: float) -> FrameFit:
         frame = self._sky.transit.frames[n]
@@ -486,6 +483,7 @@ class _Solver:
             chi2=measured.chi2,
             normal=measured.slopes.normal,
             score=measured.score,
+            answer=(measured.slopes.weighted / measured.slopes.weight).mean(axis=1),
         )
 
 

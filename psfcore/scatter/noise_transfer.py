@@ -1,0 +1,46 @@
+"""What the noise of all of a frame's pixels does to what is read off its occulter.
+
+With y = H x + n a frame, D its fully dark pixels and G the inverse of H, the light that a PSF leaves unexplained in
+the disc is r = D [y - H (1 - D) G y]. A template t of the dark pixels has
+
+    t . r = b . n + what there is without noise,   b = t - G^T (1 - D) H^T t          Eq. (1)
+    cov(t_1 . r, t_2 . r) = sum over all pixels of b_1 b_2 var(n)                     Eq. (2)
+
+the disc's own noise, and that of the scene which scatters into it.
+
+| symbol | name | unit |
+|---|---|---|
+| t | template: a weight for each dark pixel | - |
+| n | noise of photons and readout | DN/s |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.noise import Noise
+from psfcore.scatter.optics import Optics, Pixels, put
+from psfcore.transit.transit import Frame
+
+Vector = NDArray[np.float64]
+
+
+def noise_covariance(
+    optics: Optics, frame: Frame, dark: Pixels, templates: Sequence[Vector], noise: Noise
+) -> NDArray[np.float64]:
+    """Eq. (2): covariance (templates, templates) of each template's sum over the dark pixels, in (DN/s)^2."""
+    spread = []
+    for template in templates:
+        here = np.zeros(optics.engine.lanes_shape, np.float32)
+        put(here, dark, template)
+        scattered = optics.see_back(here)
+        put(scattered, dark, 0.0)
+        here -= optics.undo_once(scattered, adjoint=True)  # Eq. (1)
+        spread.append(optics.field(here).ravel())
+    b = np.array(spread, dtype=np.float32)
+    # Linear in the observed value, so its own noise averages out.
+    variance = noise.variance(frame.pixels.astype(np.float64), frame.exposure_s).ravel()
+    return np.asarray((b * variance.astype(np.float32)) @ b.T, dtype=np.float64)  # Eq. (2)
