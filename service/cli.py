@@ -246,6 +246,49 @@ def psf_fit(
         click.echo(f"  note: {limit}")
 
 
+@psf.command("crossval")
+@click.argument("transit", type=click.Path(exists=True, path_type=Path))
+@click.option(
+    "--json",
+    "report_file",
+    required=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Write the report",
+)
+@click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture too (PNG)")
+@click.option("--scheme", type=click.Choice(["shared", "exact"]), help="[default: shared; exact is slow]")
+@click.option("--runs", type=click.IntRange(1, 50), help="Each holds every block out once [default: 10]")
+@click.option("--shape", type=click.Choice(get_args(ShapeName)), help="[default: softened-power-law]")
+@click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help="DN a photon, DN rms of the readout")
+@SERVER
+@LOCAL
+def psf_crossval(
+    transit: Path,
+    report_file: Path,
+    plot: Path | None,
+    scheme: str | None,
+    runs: int | None,
+    shape: str | None,
+    noise: tuple[float, float] | None,
+    server: str | None,
+    local: bool,
+) -> None:
+    """Say how well the fit of TRANSIT is known: blocks of images held out, the others drawn again."""
+    _check_writable(report_file, plot)
+    with _errors(), _connection(server, local) as service, _progress_bar() as report:
+        found = service.cross_validate(
+            transit,
+            report_file,
+            preview=plot,
+            progress=report,
+            noise=noise or None,
+            scheme=scheme,
+            runs=runs,
+            shape=shape,
+        )
+    click.echo(f"{report_file}: {found['details']['sentence']}")
+
+
 @psf.command("show")
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Write a picture (PNG)")

@@ -154,6 +154,28 @@ class Operations(ABC):
             self.download(psf["report"], report)
         return psf
 
+    def cross_validate(
+        self,
+        transit: str | Path,
+        report: str | Path | None = None,
+        *,
+        preview: str | Path | None = None,
+        progress: Progress | None = None,
+        noise: tuple[float, float] | None = None,
+        **parameters: Any,
+    ) -> dict[str, Any]:
+        """Upload a transit, have its fit cross-validated and download the report (JSON); its description.
+
+        ``parameters``: as for ``fit_psf``, and ``scheme="exact"``, ``runs=10``.
+        """
+        given = {name: value for name, value in parameters.items() if value is not None}
+        if noise is not None:
+            given["noise"] = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}
+        job = self.submit("cross-validate", transit_id=self.upload_transit(transit)["id"], **given)
+        found = self.get(self.wait(job, progress=progress)["result"])
+        self._fetch(found, report, preview)
+        return found
+
     def _fetch(self, result: dict[str, Any], output: str | Path | None, preview: str | Path | None) -> None:
         if output is not None:
             self.download(result["file"], output)

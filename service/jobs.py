@@ -24,9 +24,15 @@ STATUS_OF = {
     "no-such-transit": 404,
     "no-psf-for-instrument": 409,
 }
-RESULTS = {"deconvolve": "/v1/products", "psf-build": "/v1/psfs", "psf-fit": "/v1/psfs"}
+RESULTS = {
+    "deconvolve": "/v1/products",
+    "psf-build": "/v1/psfs",
+    "psf-fit": "/v1/psfs",
+    "psf-tables": "/v1/psfs",
+    "cross-validate": "/v1/reports",
+}
 # Kinds whose steps count the whole job, so that what is left can be told from what was done.
-COUNTED_WHOLE = {"psf-build", "psf-fit"}
+COUNTED_WHOLE = {"psf-build", "psf-fit", "cross-validate"}
 
 
 class Progress(BaseModel):
@@ -76,7 +82,7 @@ class JobView(BaseModel):
 @router.post(
     "",
     status_code=202,
-    summary="Ask for a deconvolution, a PSF build or a fit of a transit",
+    summary="Ask for a deconvolution, a PSF build, a fit of a transit or its cross-validation",
     responses={200: {"model": JobView, "description": "An equal request was made before; this is its job."}},
 )
 def submit_job(body: JobRequest, response: Response, state: Shared) -> JobView:

@@ -17,8 +17,9 @@ from service.client import Operations, Progress, ServiceError, as_archive
 from service.jobs import JobView
 from service.products import ProductView
 from service.psfs import PsfView
+from service.reports import ReportView
 from service.transits import TransitDetails
-from workers.catalogue import DEFAULT_OWNER, Catalogue, ProductRow, PsfRow
+from workers.catalogue import DEFAULT_OWNER, Catalogue, ProductRow, PsfRow, ReportRow
 from workers.contract import JobRequest, Phase
 from workers.intake import image_row, resolve, transit_row, uploaded_psf_row
 from workers.runner import Runner
@@ -98,8 +99,13 @@ class LocalService(Operations):
     def get(self, address: str) -> dict[str, Any]:
         """The description at an address of the service."""
         row = self._row(address)
-        view = ProductView.of(row) if isinstance(row, ProductRow) else PsfView.of(row)
-        return view.model_dump(mode="json")
+        match row:
+            case ProductRow():
+                return ProductView.of(row).model_dump(mode="json")
+            case ReportRow():
+                return ReportView.of(row).model_dump(mode="json")
+            case _:
+                return PsfView.of(row).model_dump(mode="json")
 
     def download(self, address: str, path: str | Path) -> None:
         """Copy a file out."""
@@ -115,11 +121,13 @@ class LocalService(Operations):
         assert digest is not None
         shutil.copyfile(self._store.path(digest), path)
 
-    def _row(self, address: str) -> ProductRow | PsfRow:
+    def _row(self, address: str) -> ProductRow | PsfRow | ReportRow:
         _, collection, identity = address.rsplit("/", 2)
-        row: ProductRow | PsfRow | None
+        row: ProductRow | PsfRow | ReportRow | None
         if collection == "products":
             row = self._catalogue.get(ProductRow, identity)
+        elif collection == "reports":
+            row = self._catalogue.get(ReportRow, identity)
         else:
             row = self._catalogue.get(PsfRow, identity)
         assert row is not None

@@ -143,6 +143,46 @@ class JobRow(Base):
     )
 
 
+class ReportRow(Base):
+    """What a study of a transit found (a cross-validation); its id is the identity of the request that made it."""
+
+    __tablename__ = "reports"
+    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    created_at: Mapped[float] = mapped_column(index=True)
+    kind: Mapped[str]
+    transit_id: Mapped[str] = mapped_column(String(64), index=True)
+    file_sha256: Mapped[str] = mapped_column(String(64))
+    bytes: Mapped[int] = mapped_column(BigInteger)
+    preview_sha256: Mapped[str | None] = mapped_column(String(64))
+    details: Mapped[dict[str, Any]]
+
+
+class PartRow(Base):
+    """A part of a job that several workers share: open, taken under a token, or done with its result.
+
+    Parts belong to the request, not to the job: what is done stays done when the job is tried again.
+    """
+
+    __tablename__ = "parts"
+    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
+    request_key: Mapped[str] = mapped_column(String(64), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True)
+    token: Mapped[str | None] = mapped_column(String(32))
+    heartbeat_at: Mapped[float | None]
+    result: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+
+
+@dataclass(frozen=True)
+class Part:
+    """The right to work on a part; results written under a lost right do nothing."""
+
+    owner: str
+    request_key: str
+    number: int
+    token: str
+
+
 @dataclass(frozen=True)
 class Lease:
     """The right to work on a job: changes made under a lost lease do nothing."""
@@ -151,8 +191,8 @@ class Lease:
     token: str
 
 
-Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow)
-AnyRow = TypeVar("AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, JobRow)
+Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow)
+AnyRow = TypeVar("AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow)
 
 
 def open_engine(url: str) -> Engine:
@@ -245,6 +285,16 @@ class Catalogue:
         query = query.order_by(table.created_at.desc(), table.id.desc()).limit(limit)
         with self._reading() as session:
             return session.scalars(query).all()
+
+    def describe_psf(
+        self, psf_id: str, owner: str = DEFAULT_OWNER, *, tables_sha256: str, preview_sha256: str
+    ) -> None:
+        """Note where the tables and the picture of a PSF are; both follow from its file, which stays as it is."""
+        with self._session.begin() as session:
+            row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
+            if row is not None:
+                row.details = {**row.details, "tables_sha256": tables_sha256}
+                row.preview_sha256 = preview_sha256
 
     # Jobs -------------------------------------------------------------------------------------------
 
@@ -402,12 +452,79 @@ class Catalogue:
             or row.submitted_at < now - resubmit_s * 2 ** min(row.submissions - 1, 8)
         ]
 
+    # Parts of jobs ----------------------------------------------------------------------------------
+
+    def open_parts(self, owner: str, request_key: str, count: int) -> None:
+        """Make the parts 0 to count - 1 that are not there yet."""
+        with self._session.begin() as session:
+            there = set(
+                session.scalars(
+                    select(PartRow.number).where(PartRow.owner == owner, PartRow.request_key == request_key)
+                )
+            )
+            for number in range(count):
+                if number not in there:
+                    session.add(PartRow(owner=owner, request_key=request_key, number=number))
+
+    def take_part(self, owner: str, request_key: str, lease_s: float) -> Part | None:
+        """A part that is open, or whose holder fell silent; None where there is none."""
+        free = [
+            PartRow.owner == owner,
+            PartRow.request_key == request_key,
+            PartRow.result.is_(None),
+            or_(PartRow.token.is_(None), PartRow.heartbeat_at < time.time() - lease_s),
+        ]
+        while True:
+            with self._reading() as session:
+                number = session.scalars(select(PartRow.number).where(*free).order_by(PartRow.number)).first()
+            if number is None:
+                return None
+            part = Part(owner, request_key, number, uuid.uuid4().hex)
+            if self._set_part([*free, PartRow.number == number], token=part.token, heartbeat_at=time.time()):
+                return part
+
+    def part_heartbeat(self, part: Part) -> bool:
+        """Say that the part is worked on; False where it was taken by another."""
+        return self._set_part(_holding(part), heartbeat_at=time.time())
+
+    def finish_part(self, part: Part, result: dict[str, Any]) -> bool:
+        """Write a part's result; False where it was taken by another, whose result will count."""
+        return self._set_part(_holding(part), result=result, token=None)
+
+    def release_part(self, part: Part) -> None:
+        """Give a part back undone."""
+        self._set_part(_holding(part), token=None)
+
+    def part_results(self, owner: str, request_key: str) -> list[dict[str, Any]]:
+        """Results of the parts that are done, in order."""
+        query = select(PartRow.result).where(
+            PartRow.owner == owner, PartRow.request_key == request_key, PartRow.result.is_not(None)
+        )
+        with self._reading() as session:
+            return [dict(result) for result in session.scalars(query.order_by(PartRow.number)) if result]
+
+    def _set_part(self, conditions: Sequence[Any], **values: Any) -> bool:
+        with self._session.begin() as session:
+            result = session.execute(update(PartRow).where(and_(*conditions)).values(**values))
+            assert isinstance(result, CursorResult)
+            return bool(result.rowcount)
+
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
         """One UPDATE; True where it changed a row."""
         with self._session.begin() as session:
             result = session.execute(update(JobRow).where(and_(*conditions)).values(**values))
             assert isinstance(result, CursorResult)
             return bool(result.rowcount)
+
+
+def _holding(part: Part) -> list[Any]:
+    return [
+        PartRow.owner == part.owner,
+        PartRow.request_key == part.request_key,
+        PartRow.number == part.number,
+        PartRow.token == part.token,
+        PartRow.result.is_(None),
+    ]
 
 
 def _held(lease: Lease) -> list[Any]:

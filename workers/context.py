@@ -13,7 +13,10 @@ from workers.store import Store
 
 @dataclass(frozen=True)
 class Context:
-    """Where things are, and how to say how far the work is; ``report`` raises where it should stop."""
+    """Where things are, and how to say how far the work is; ``report`` raises where it should stop.
+
+    ``call_for_help(n)`` asks up to n idle workers to share the job's parts.
+    """
 
     catalogue: Catalogue
     store: Store
@@ -21,6 +24,7 @@ class Context:
     owner: str
     job_id: str
     report: Callable[[str, int, int], None]
+    call_for_help: Callable[[int], None] = lambda workers: None
 
     @property
     def limits(self) -> FitsLimits:

@@ -216,6 +216,24 @@ class PsfFit(_Parameters):
     seed: int = Field(1, ge=0, lt=2**31, description="of the draws of the free and the published fits")
 
 
+class CrossValidate(PsfFit):
+    """How well a fit is known: blocks of images held out, the others drawn again, in many runs."""
+
+    algorithm_version: ClassVar[int] = 1
+    as_published: Literal[False] = False
+    scheme: Literal["shared", "exact"] = Field(
+        "shared", description="folds that share every reconstruction, or fits of their own (slow, fanned out)"
+    )
+    runs: int = Field(10, ge=1, le=50, description="each holds every block out once; the paper has ten")
+
+
+class PsfTables(_Parameters):
+    """Make the tables that questions about a PSF are answered from: those that are built or fitted here have them."""
+
+    algorithm_version: ClassVar[int] = 1
+    psf_id: Identity = Field(description="a PSF of the catalogue, as one that was uploaded")
+
+
 class DeconvolveRequest(_Parameters):
     """A request for a deconvolution."""
 
@@ -237,7 +255,24 @@ class PsfFitRequest(_Parameters):
     parameters: PsfFit
 
 
-JobRequest = Annotated[DeconvolveRequest | PsfBuildRequest | PsfFitRequest, Field(discriminator="kind")]
+class CrossValidateRequest(_Parameters):
+    """A request for a cross-validation."""
+
+    kind: Literal["cross-validate"]
+    parameters: CrossValidate
+
+
+class PsfTablesRequest(_Parameters):
+    """A request for a PSF's tables."""
+
+    kind: Literal["psf-tables"]
+    parameters: PsfTables
+
+
+JobRequest = Annotated[
+    DeconvolveRequest | PsfBuildRequest | PsfFitRequest | PsfTablesRequest | CrossValidateRequest,
+    Field(discriminator="kind"),
+]
 
 
 class ResolvedPsfFit(PsfFit):
@@ -288,6 +323,13 @@ def psf_identity(build: PsfBuild) -> str:
     )
 
 
+def psf_tables_identity(request: PsfTables) -> str:
+    """Identity of a PSF's tables: the PSF and the algorithm's version."""
+    return canonical_hash(
+        {"kind": "psf-tables", "psf_id": request.psf_id, "algorithm_version": request.algorithm_version}
+    )
+
+
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: input bytes, PSF, method with all parameters, algorithm version."""
     return canonical_hash(
@@ -300,12 +342,18 @@ def product_identity(request: ResolvedDeconvolve) -> str:
     )
 
 
-def psf_fit_identity(request: ResolvedPsfFit) -> str:
-    """Identity of a fitted PSF: the transit's bytes, parameters, the diffraction's identity, algorithm version."""
+class ResolvedCrossValidate(CrossValidate):
+    """A cross-validation as the worker gets it."""
+
+    diffraction_recipe: PsfBuild | None = None
+
+
+def psf_fit_identity(request: ResolvedPsfFit | ResolvedCrossValidate) -> str:
+    """Identity of a fit or a cross-validation: the transit's bytes, parameters, the diffraction's identity, version."""
     recipe = request.diffraction_recipe
     return canonical_hash(
         {
-            "kind": "psf-fit",
+            "kind": "psf-fit" if isinstance(request, ResolvedPsfFit) else "cross-validate",
             "request": request.model_dump(mode="json", exclude={"diffraction_recipe"}),
             "diffraction": None if recipe is None else psf_identity(recipe),
             "algorithm_version": request.algorithm_version,

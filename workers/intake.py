@@ -14,18 +14,23 @@ from psfcore.instruments.model import parse_instrument
 from psfcore.transit.archive import ArchiveContents
 from workers.catalogue import Catalogue, ImageRow, PsfRow, TransitRow
 from workers.contract import (
+    CrossValidate,
+    CrossValidateRequest,
     DeconvolveRequest,
     JobRequest,
     PsfBuild,
     PsfBuildRequest,
     PsfFit,
     PsfFitRequest,
+    PsfTablesRequest,
+    ResolvedCrossValidate,
     ResolvedDeconvolve,
     ResolvedPsfFit,
     instrument_text,
     product_identity,
     psf_fit_identity,
     psf_identity,
+    psf_tables_identity,
 )
 
 
@@ -111,14 +116,19 @@ def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict
             if build.mask_id is not None and catalogue.get(ImageRow, build.mask_id, owner) is None:
                 raise DataError("no-such-image", f"no image was uploaded with id {build.mask_id}")
             return build.model_dump(mode="json"), psf_identity(build)
-        case PsfFitRequest(parameters=fit):
+        case PsfFitRequest(parameters=fit) | CrossValidateRequest(parameters=fit):
             row = catalogue.get(TransitRow, fit.transit_id, owner)
             if row is None:
                 raise DataError("no-such-transit", f"no transit was uploaded with id {fit.transit_id}")
-            resolved_fit = ResolvedPsfFit(
+            kind = ResolvedCrossValidate if isinstance(fit, CrossValidate) else ResolvedPsfFit
+            resolved_fit = kind(
                 diffraction_recipe=_diffraction_of(row.summary, fit), **fit.model_dump(mode="json")
             )
             return resolved_fit.model_dump(mode="json"), psf_fit_identity(resolved_fit)
+        case PsfTablesRequest(parameters=asked):
+            if catalogue.get(PsfRow, asked.psf_id, owner) is None:
+                raise DataError("no-such-psf", f"the catalogue holds no PSF with id {asked.psf_id}")
+            return asked.model_dump(mode="json"), psf_tables_identity(asked)
         case DeconvolveRequest(parameters=wanted):
             image = catalogue.get(ImageRow, wanted.image_id, owner)
             if image is None:

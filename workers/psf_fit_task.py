@@ -18,7 +18,7 @@ from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 from workers.catalogue import PsfRow, TransitRow
 from workers.context import Context
-from workers.contract import ResolvedPsfFit, psf_fit_identity
+from workers.contract import ResolvedCrossValidate, ResolvedPsfFit, psf_fit_identity
 from workers.psf_task import built_psf, psf_row
 from workers.settings import library_versions, software_version
 
@@ -29,7 +29,7 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
     identity = psf_fit_identity(request)
     if context.catalogue.get(PsfRow, identity, context.owner) is not None:
         return identity
-    transit, prepared = _load(context, request)
+    transit, prepared = load_transit(context, request)
     fit = fit_transit(
         transit,
         shape=request.shape,
@@ -42,7 +42,10 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
     return identity
 
 
-def _load(context: Context, request: ResolvedPsfFit) -> tuple[Transit, Prepared]:
+def load_transit(
+    context: Context, request: ResolvedPsfFit | ResolvedCrossValidate
+) -> tuple[Transit, Prepared]:
+    """The transit of a request, unpacked, read and prepared."""
     upload = context.catalogue.get(TransitRow, request.transit_id, context.owner)
     if upload is None:
         raise DataError("no-such-transit", f"no transit was uploaded with id {request.transit_id}")
@@ -60,7 +63,7 @@ def _load(context: Context, request: ResolvedPsfFit) -> tuple[Transit, Prepared]
         )
 
 
-def _built_diffraction(context: Context, request: ResolvedPsfFit) -> Kernel:
+def _built_diffraction(context: Context, request: ResolvedPsfFit | ResolvedCrossValidate) -> Kernel:
     """The diffraction of the transit's instrument, built now or before; cut to nothing, it sums to 1 on 2048 px."""
     if request.diffraction_recipe is None:
         raise DataError("no-known-psf", "expected known_psf in transit.json; got none")
@@ -92,7 +95,7 @@ def _save(
     ):
         write_psf(file, psf)
         fit_png(fit, picture)
-        _write_json(text, said)
+        write_json(text, said)
         row = psf_row(
             psf,
             identity,
@@ -117,10 +120,11 @@ def _save(
                     )
                 },
             },
+            threads=context.settings.threads,
         )
     context.catalogue.add(row)
 
 
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """JSON for people too; a number that is none would be no JSON and is an error of ours."""
     path.write_text(json.dumps(content, indent=1, allow_nan=False), "utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -17,6 +18,7 @@ from psfcore.errors import DataError
 from psfcore.fits_io import read_image, write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.psf import Psf, cumulative_curve
+from psfcore.psf_tables import tables_of
 from workers.catalogue import PsfRow
 from workers.context import Context
 from workers.contract import PsfBuild, ResolvedDeconvolve, instrument_text, psf_identity
@@ -87,6 +89,7 @@ def built_psf(context: Context, build: PsfBuild) -> PsfRow:
             file_sha256=context.store.keep(path),
             store=context.store,
             preview_sha256=context.store.keep(picture),
+            threads=context.settings.threads,
         )
     return context.catalogue.add(row)[0]
 
@@ -118,8 +121,12 @@ def psf_row(
     store: Store,
     preview_sha256: str | None,
     details: Mapping[str, Any] | None = None,
+    threads: int = 1,
 ) -> PsfRow:
-    """The catalogue's row of a PSF whose file is in the store. details: more than can be read off its kernel."""
+    """The catalogue's row of a PSF whose file is in the store, where its tables are put too.
+
+    details: more than can be read off its kernel.
+    """
     curve = cumulative_curve(psf.kernel, np.array(CURVE_RADII_PX, dtype=float))
     return PsfRow(
         owner=owner,
@@ -141,6 +148,14 @@ def psf_row(
             "components": sorted(psf.components),
             "cumulative_curve_pct": {str(r): float(c) for r, c in zip(CURVE_RADII_PX, curve, strict=True)},
             "provenance": psf.provenance,
+            "tables_sha256": keep_tables(psf, store, threads),
             **(details or {}),
         },
     )
+
+
+def keep_tables(psf: Psf, store: Store, threads: int) -> str:
+    """Write the tables that questions about a PSF are answered from; returns their file's SHA-256."""
+    with store.temporary() as path:
+        path.write_text(json.dumps(tables_of(psf, threads=threads), separators=(",", ":"), allow_nan=False))
+        return store.keep(path)

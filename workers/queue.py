@@ -17,6 +17,7 @@ from redis.exceptions import RedisError
 from workers.settings import Settings
 
 RUN_JOB = "heliopsf.run_job"
+ASSIST = "heliopsf.assist"
 log = logging.getLogger(__name__)
 
 
@@ -48,6 +49,15 @@ def submit(app: Celery, job_id: str) -> bool:
         log.warning("broker away, job %s stays queued: %s", job_id, error)
         return False
     return True
+
+
+def call_for_help(app: Celery, job_id: str, workers: int) -> None:
+    """Ask idle workers to share a job's parts. Where the messages are lost, its own worker does them all."""
+    try:
+        for _ in range(workers):
+            app.send_task(ASSIST, args=[job_id], retry=False)
+    except (OperationalError, KombuError, RedisError, OSError) as error:
+        log.warning("broker away, job %s goes on alone: %s", job_id, error)
 
 
 def _transport_options(settings: Settings) -> dict[str, Any]:

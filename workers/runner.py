@@ -76,8 +76,15 @@ class _Work:
 class Runner:
     """Runs jobs of the catalogue in this process."""
 
-    def __init__(self, settings: Settings, catalogue: Catalogue, store: Store) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        catalogue: Catalogue,
+        store: Store,
+        call_for_help: Callable[[str, int], None] = lambda job_id, workers: None,
+    ) -> None:
         self._settings, self._catalogue, self._store = settings, catalogue, store
+        self._call_for_help = call_for_help
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
         """Run the job if it is queued; else do nothing (it was redelivered, cancelled or taken)."""
@@ -96,6 +103,39 @@ class Runner:
             work.ended.set()
             heart.join()
 
+    def assist(self, job_id: str) -> None:
+        """Share the parts of a job that is executing elsewhere, until none is left or it ends."""
+        job = self._catalogue.job(job_id)
+        if job is None or job.phase != Phase.EXECUTING or job.kind not in tasks.ASSISTANTS:
+            return
+
+        looked_at = time.monotonic()
+
+        def report(_stage: str, _step: int, _steps: int) -> None:
+            nonlocal looked_at
+            if time.monotonic() - looked_at < REPORT_EVERY_S:
+                return
+            looked_at = time.monotonic()
+            now = self._catalogue.job(job_id)
+            if now is None or now.phase != Phase.EXECUTING or now.cancel_requested:
+                raise Cancelled(job_id)
+
+        context = Context(
+            catalogue=self._catalogue,
+            store=self._store,
+            settings=self._settings,
+            owner=job.owner,
+            job_id=job.id,
+            report=report,
+        )
+        try:
+            tasks.ASSISTANTS[job.kind](context, job.parameters)
+        except Cancelled:
+            log.info("job %s: no more help wanted", job_id)
+        except Exception:
+            # The job's own worker meets the same trouble and says so; its error is the one that counts.
+            log.exception("job %s: help failed", job_id)
+
     def _attempt(self, job: JobRow, lease: Lease, work: _Work) -> None:
         context = Context(
             catalogue=self._catalogue,
@@ -104,6 +144,7 @@ class Runner:
             owner=job.owner,
             job_id=job.id,
             report=work.report,
+            call_for_help=lambda workers: self._call_for_help(job.id, workers),
         )
         try:
             result_id = tasks.TASKS[job.kind](context, job.parameters)

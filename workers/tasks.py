@@ -6,10 +6,22 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from workers.context import Context
+from workers.crossval_task import assist_cross_validation, cross_validate
 from workers.deconvolve_task import deconvolve
 from workers.psf_fit_task import psf_fit
+from workers.psf_tables_task import psf_tables
 from workers.psf_task import psf_build
 
 Task = Callable[[Context, Mapping[str, Any]], str]
 
-TASKS: dict[str, Task] = {"psf-build": psf_build, "psf-fit": psf_fit, "deconvolve": deconvolve}
+TASKS: dict[str, Task] = {
+    "psf-build": psf_build,
+    "psf-fit": psf_fit,
+    "psf-tables": psf_tables,
+    "cross-validate": cross_validate,
+    "deconvolve": deconvolve,
+}
+# What other workers do of a job that calls for help.
+ASSISTANTS: dict[str, Callable[[Context, Mapping[str, Any]], None]] = {
+    "cross-validate": assist_cross_validation
+}

@@ -30,6 +30,12 @@ def run_job(job_id: str) -> None:
     _runner().run(job_id)
 
 
+@app.task(name=queue.ASSIST)
+def assist(job_id: str) -> None:
+    """Share the parts of a job that another worker runs."""
+    _runner().assist(job_id)
+
+
 @worker_process_init.connect
 def _prepare_child(**_: object) -> None:
     """Load the kernels when the child starts, so that the first job does not wait for it."""
@@ -45,7 +51,12 @@ def _runner() -> Runner:
     from workers.runner import Runner
     from workers.store import Store
 
-    return Runner(settings, Catalogue(settings.catalogue_url), Store(settings.data_dir))
+    return Runner(
+        settings,
+        Catalogue(settings.catalogue_url),
+        Store(settings.data_dir),
+        call_for_help=lambda job_id, workers: queue.call_for_help(app, job_id, workers),
+    )
 
 
 def main(parent: int | None = None) -> None:

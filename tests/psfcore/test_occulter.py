@@ -27,6 +27,7 @@ from psfcore.transit.occulter import (
 )
 from psfcore.transit.transit import Frame, Place, Transit
 from tests.psfcore.small_transits import (
+    BRIGHT,
     DIFFRACTION,
     IMAGES,
     SCATTER,
@@ -125,7 +126,7 @@ EVERY = range(IMAGES)
 
 def test_without_noise_places_are_exact() -> None:
     """From an ephemeris that errs by 0.6 px; what is left is the light of the neighbours' own occulters."""
-    of = sky(brightness=200.0)
+    of = sky(brightness=BRIGHT)
     for sigma_px, tolerance_px in ((100.0, 0.02), (1.0, 0.02)):
         found = found_in(of, noise_free(of), EVERY, ephemeris_sigma_px=sigma_px)
         assert np.abs(errors(of, found, EVERY)).max() < tolerance_px
@@ -173,7 +174,7 @@ def displaced(transit: Transit, index: int, place: Place) -> Transit:
 
 
 def test_an_ephemeris_off_by_pixels_is_put_right_and_one_off_by_more_is_told() -> None:
-    of = sky(brightness=200.0)
+    of = sky(brightness=BRIGHT)
     exact = of.plan.place(5)
     near = Place(exact.x_px + 2.5, exact.y_px - 3.0, RADIUS_PX)
     found = found_in(of, displaced(noise_free(of), 5, near), [5])

@@ -1,0 +1,143 @@
+"""What a wrong dark level does to a fitted PSF: the fit repeated with an offset added to every readout.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", its last experiment. An
+offset of o DN adds o / t to a frame of exposure t, DN/s: most to the short exposures, and most of all where the
+occulter is far off the limb and holds a few tens of counts.
+
+Weights are those of diffuse scatter by distance (means over rings one pixel wide), and are compared within the
+field: farther out the formula alone speaks. Curves are light beyond a distance, of diffuse scatter as the paper has
+it, and of the total PSF.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
+from psfcore.scatter.inversion import Inversion, Progress, invert
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
+from psfcore.scatter.total_psf import TotalPsf
+from psfcore.transit.transit import Transit
+
+OFFSETS_DN = (-5.0, -3.0, 3.0, 5.0)
+_RADII = 48
+
+
+@dataclass(frozen=True, eq=False)
+class DarkOffset:
+    """The fit with one offset beside the nominal one, by distance.
+
+    weight_change_pct: of a pixel's diffuse weight, relative, at radii_px. curve_change_points, total_curve_change_points:
+    of the diffuse and of the total PSF's light beyond curve_radii_px.
+    """
+
+    offset_dn: float
+    values: dict[str, float]
+    images: int
+    converged: bool
+    weight_change_pct: Vector
+    curve_change_points: Vector
+    total_curve_change_points: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class DarkOffsetStudy:
+    """What dark offsets do to the PSF of a transit. largest_...: largest size over all distances and offsets."""
+
+    radii_px: Vector
+    curve_radii_px: Vector
+    nominal: dict[str, float]
+    offsets: tuple[DarkOffset, ...]
+
+    @property
+    def largest_weight_change_pct(self) -> float:
+        """Relative, of a pixel's diffuse weight."""
+        return max(float(np.abs(o.weight_change_pct).max()) for o in self.offsets)
+
+    @property
+    def largest_curve_change_points(self) -> float:
+        """Of the diffuse light beyond any distance."""
+        return max(float(np.abs(o.curve_change_points).max()) for o in self.offsets)
+
+    @property
+    def largest_total_curve_change_points(self) -> float:
+        """Of the total PSF's light beyond any distance."""
+        return max(float(np.abs(o.total_curve_change_points).max()) for o in self.offsets)
+
+
+def dark_offset_study(
+    transit: Transit,
+    offsets_dn: Sequence[float] = OFFSETS_DN,
+    *,
+    nominal: Inversion | None = None,
+    shape: Shape = SOFTENED_POWER_LAW,
+    threads: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> DarkOffsetStudy:
+    """Repeat the fit of a transit with each offset, started where the nominal fit ended.
+
+    nominal: the fit without an offset, where it is there already; its shape counts then. Raises DataError as
+    `inversion.invert`.
+    """
+    if nominal is None:
+        nominal = invert(transit, shape, threads=threads, progress=progress).inversion
+    looks = _Looks(transit, nominal.shape, threads)
+    before = looks.of(nominal.coordinates)
+    found = []
+    for offset_dn in offsets_dn:
+
+        def report(stage: str, step: int, steps: int, offset_dn: float = offset_dn) -> None:
+            progress(f"{offset_dn:+g} DN: {stage}", step, steps)
+
+        at = invert(
+            with_offset(transit, offset_dn),
+            nominal.shape,
+            start=nominal.coordinates,
+            threads=threads,
+            progress=report,
+        ).inversion
+        weights, diffuse, total = looks.of(at.coordinates)
+        found.append(
+            DarkOffset(
+                offset_dn=float(offset_dn),
+                values=at.values,
+                images=len(at.frames),
+                converged=at.converged,
+                weight_change_pct=100 * (weights / before[0] - 1),
+                curve_change_points=diffuse - before[1],
+                total_curve_change_points=total - before[2],
+            )
+        )
+    return DarkOffsetStudy(looks.radii_px, looks.curve_radii_px, nominal.values, tuple(found))
+
+
+def with_offset(transit: Transit, offset_dn: float) -> Transit:
+    """The transit with offset_dn added to every pixel of every readout."""
+    frames = tuple(
+        replace(frame, pixels=frame.pixels + np.float32(offset_dn / frame.exposure_s))
+        for frame in transit.frames
+    )
+    return replace(transit, frames=frames)
+
+
+class _Looks:
+    """Weights and curves of a shape by distance."""
+
+    def __init__(self, transit: Transit, shape: Shape, threads: int) -> None:
+        self._total = TotalPsf(transit.diffraction, shape, transit.shape, threads=threads)
+        farthest = min(max(transit.shape), REACH_GRID_PX // 2) - 1
+        self.radii_px = np.unique(np.geomspace(1, farthest, _RADII).round())
+        self.curve_radii_px = np.concatenate(([0.5], self.radii_px))
+
+    def of(self, coordinates: Vector) -> tuple[Vector, Vector, Vector]:
+        """Mean weight at radii_px; diffuse and total light beyond curve_radii_px, percent."""
+        scatter = self._total.shape.kernel(coordinates, REACH_GRID_PX)
+        ring, mean = radial_profile(scatter)
+        return (
+            mean[np.searchsorted(ring, self.radii_px)],
+            cumulative_curve(scatter, self.curve_radii_px),
+            cumulative_curve(self._total.kernel(coordinates), self.curve_radii_px),
+        )

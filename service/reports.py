@@ -1,0 +1,89 @@
+"""Reports on transits: ``/v1/reports``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from pydantic import BaseModel, Field
+
+from service import files
+from service.paging import Cursor, Limit, Page, page, position
+from service.problems import RESPONSES, Problem
+from service.state import Shared
+from workers.catalogue import ReportRow
+from workers.contract import Identity
+
+router = APIRouter(prefix="/v1/reports", tags=["reports"], responses=RESPONSES)
+
+
+class ReportView(BaseModel):
+    """What a study of a transit found."""
+
+    id: str
+    created_at: float
+    kind: str
+    transit_id: str
+    bytes: int
+    details: dict[str, Any] = Field(description="the sentence to read first, and the figures that matter")
+    file: str = Field(description="address of the whole report, JSON")
+    preview: str | None = Field(description="address of a picture")
+
+    @classmethod
+    def of(cls, row: ReportRow) -> ReportView:
+        """The view of a row."""
+        here = f"/v1/reports/{row.id}"
+        return cls(
+            id=row.id,
+            created_at=row.created_at,
+            kind=row.kind,
+            transit_id=row.transit_id,
+            bytes=row.bytes,
+            details=row.details,
+            file=f"{here}/file",
+            preview=f"{here}/preview" if row.preview_sha256 else None,
+        )
+
+
+@router.get("", summary="List reports")
+def list_reports(
+    request: Request,
+    state: Shared,
+    transit_id: Identity | None = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[ReportView]:
+    """Reports, newest first."""
+    rows = state.catalogue.page(ReportRow, limit=limit + 1, after=position(cursor), transit_id=transit_id)
+    return page(request, rows, limit, ReportView.of)
+
+
+@router.get("/{report_id}", summary="One report")
+def get_report(report_id: Identity, state: Shared) -> ReportView:
+    """What is known of a report."""
+    return ReportView.of(_find(state, report_id))
+
+
+@router.get("/{report_id}/file", summary="The report as JSON", response_class=Response)
+def get_report_file(report_id: Identity, request: Request, state: Shared) -> Response:
+    """Download the report; its hash is the ETag."""
+    row = _find(state, report_id)
+    return files.send(
+        request, state.store, row.file_sha256, "application/json", f"report-{report_id[:12]}.json"
+    )
+
+
+@router.get("/{report_id}/preview", summary="A picture of the report", response_class=Response)
+def get_report_preview(report_id: Identity, request: Request, state: Shared) -> Response:
+    """The report's figures as PNG."""
+    row = _find(state, report_id)
+    if row.preview_sha256 is None:
+        raise Problem(404, "no-preview", "this report has no picture")
+    return files.send(request, state.store, row.preview_sha256, "image/png", None)
+
+
+def _find(state: Shared, report_id: str) -> ReportRow:
+    row = state.catalogue.get(ReportRow, report_id)
+    if row is None:
+        raise Problem(404, "no-such-report", f"there is no report with id {report_id}")
+    return row

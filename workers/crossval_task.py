@@ -1,0 +1,185 @@
+"""The task ``cross-validate``: how well a fit is known, its folds shared by as many workers as are idle.
+
+Folds are parts in the catalogue: taken by compare-and-set under a lease, done once, kept when the job is tried again.
+The job's own worker does what nobody else takes, so that help is welcome and never needed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from psfcore.scatter.cross_validation import Bands, Draw, FoldFit, bands, draws, exact_fit, shared_fits
+from psfcore.scatter.cross_validation_plot import cross_validation_png
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.shapes import shape_named
+from psfcore.scatter.total_psf import CURVE_RADII_PX
+from psfcore.transit.transit import Transit
+from workers.catalogue import Part, ReportRow
+from workers.context import Context
+from workers.contract import ResolvedCrossValidate, psf_fit_identity
+from workers.psf_fit_task import load_transit, write_json
+from workers.settings import library_versions, software_version
+
+WAIT_S = 0.5
+MOST_HELPERS = 16
+
+
+def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Cross-validate a transit's fit; returns the id of the report."""
+    request = ResolvedCrossValidate.model_validate(parameters)
+    identity = psf_fit_identity(request)
+    if context.catalogue.get(ReportRow, identity, context.owner) is not None:
+        return identity
+    transit = load_transit(context, request)[0]
+    wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
+    if request.scheme == "shared":
+        fits = _shared(context, request, transit, wanted)
+    else:
+        fits = _exact(context, request, identity, transit, wanted)
+    _save(context, request, identity, transit, fits)
+    return identity
+
+
+def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> None:
+    """Take folds of a job that runs elsewhere, until none is left."""
+    request = ResolvedCrossValidate.model_validate(parameters)
+    identity = psf_fit_identity(request)
+    part = context.catalogue.take_part(context.owner, identity, context.settings.lease_s)
+    if part is None:
+        return
+    context.catalogue.release_part(part)  # reading a transit takes longer than a lease may last
+    transit = load_transit(context, request)[0]
+    wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
+    while (
+        part := context.catalogue.take_part(context.owner, identity, context.settings.lease_s)
+    ) is not None:
+        _one(context, request, transit, wanted, part, done=0)
+
+
+def _shared(
+    context: Context, request: ResolvedCrossValidate, transit: Transit, wanted: tuple[Draw, ...]
+) -> tuple[FoldFit, ...]:
+    solution = invert(
+        transit, shape_named(request.shape), threads=context.settings.threads, progress=context.report
+    )
+    return shared_fits(solution, wanted, progress=context.report)
+
+
+def _exact(
+    context: Context,
+    request: ResolvedCrossValidate,
+    identity: str,
+    transit: Transit,
+    wanted: tuple[Draw, ...],
+) -> tuple[FoldFit, ...]:
+    """Every fold a fit of its own, done here or by whoever helps."""
+    catalogue, owner = context.catalogue, context.owner
+    catalogue.open_parts(owner, identity, len(wanted))
+    context.call_for_help(min(MOST_HELPERS, len(wanted) - 1))
+    while True:
+        done = catalogue.part_results(owner, identity)
+        context.report("folds", len(done), len(wanted))
+        if len(done) == len(wanted):
+            return tuple(FoldFit.from_json(result) for result in done)
+        part = catalogue.take_part(owner, identity, context.settings.lease_s)
+        if part is None:
+            time.sleep(WAIT_S)  # the rest is with other workers
+            continue
+        _one(context, request, transit, wanted, part, done=len(done))
+
+
+def _one(
+    context: Context,
+    request: ResolvedCrossValidate,
+    transit: Transit,
+    wanted: tuple[Draw, ...],
+    part: Part,
+    *,
+    done: int,
+) -> None:
+    """One fold; what it raises gives the fold back."""
+    try:
+        fit = exact_fit(
+            transit,
+            request.shape,
+            wanted[part.number],
+            threads=context.settings.threads,
+            progress=_alive(context, part, done, len(wanted)),
+        )
+    except BaseException:
+        context.catalogue.release_part(part)
+        raise
+    context.catalogue.finish_part(part, fit.to_json())
+
+
+def _alive(context: Context, part: Part, done: int, folds: int) -> Callable[[str, int, int], None]:
+    """Progress of a fold: says that the part is alive, and lets the job's own report stop it."""
+    last = time.monotonic()
+
+    def report(_stage: str, _step: int, _steps: int) -> None:
+        nonlocal last
+        context.report("folds", done, folds)
+        if time.monotonic() - last > context.settings.heartbeat_s:
+            last = time.monotonic()
+            context.catalogue.part_heartbeat(part)
+
+    return report
+
+
+def _save(
+    context: Context,
+    request: ResolvedCrossValidate,
+    identity: str,
+    transit: Transit,
+    fits: tuple[FoldFit, ...],
+) -> None:
+    radii = np.array(CURVE_RADII_PX[: len(fits[0].curve_pct)])
+    found = bands(fits, radii)
+    said = {
+        "schema": "cross-validation/1",
+        "sentence": sentence(found, len(fits)),
+        "scheme": request.scheme,
+        "shape": request.shape,
+        **found.to_json(),
+        "files": {str(n): frame.file for n, frame in enumerate(transit.frames)},
+        "folds": [fit.to_json() for fit in fits],
+        "inputs_sha256": transit.sha256,
+        "provenance": {
+            "transit_sha256": request.transit_id,
+            "parameters": request.model_dump(mode="json", exclude_none=True),
+            "algorithm_version": request.algorithm_version,
+            "software_version": software_version(),
+            "libraries": library_versions(),
+            "job_id": context.job_id,
+        },
+    }
+    with context.store.temporary() as text, context.store.temporary() as picture:
+        write_json(text, said)
+        cross_validation_png(found, fits, [frame.fov for frame in transit.frames], picture)
+        file_sha256 = context.store.keep(text)
+        row = ReportRow(
+            owner=context.owner,
+            id=identity,
+            created_at=time.time(),
+            kind="cross-validation",
+            transit_id=request.transit_id,
+            file_sha256=file_sha256,
+            bytes=context.store.path(file_sha256).stat().st_size,
+            preview_sha256=context.store.keep(picture),
+            details={"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},
+        )
+    context.catalogue.add(row)
+
+
+def sentence(found: Bands, folds: int) -> str:
+    """What a person reads first."""
+    total, held_out = found.values["total"], found.held_out
+    return (
+        f"{folds} fits with images held out and drawn again: {100 * total[2]:.1f} % of the light is scattered diffusely "
+        f"(1 sigma {100 * total[1]:.1f} to {100 * total[3]:.1f} %); held-out discs are {held_out['mean_pct']:+.1f} % off "
+        f"on the mean, {held_out['rms_pct']:.1f} % rms, {held_out['largest_pct']:.1f} % at most."
+    )
