@@ -16,7 +16,7 @@ import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
-from service import cli_diffraction, cli_simulate
+from service import cli_diffraction, cli_gap, cli_simulate
 from service.client import DEFAULT_SERVER, Heliopsf, Operations, ServiceError, percent
 from workers.contract import Component, Method, ShapeName
 from workers.settings import Settings, software_version
@@ -418,7 +418,7 @@ def _progress_bar() -> Iterator[Report]:
         sys.stderr.write("\n")
 
 
-for command in (*cli_diffraction.COMMANDS, *cli_simulate.COMMANDS):
+for command in (*cli_diffraction.COMMANDS, *cli_simulate.COMMANDS, *cli_gap.COMMANDS):
     main.add_command(command)
 
 

@@ -16,7 +16,7 @@ from service.openapi import description
 
 HERE = Path(__file__).parents[2]
 # What --local and the demo need is imported by the command line alone.
-COMMAND_LINE = {"cli.py", "cli_diffraction.py", "cli_simulate.py", "local.py", "demo.py"}
+COMMAND_LINE = {"cli.py", "local.py", "demo.py"} | {path.name for path in (HERE / "service").glob("cli_*.py")}
 
 
 def imports(path: Path) -> Iterator[str]:
