@@ -7,8 +7,9 @@ Radii are the same for every PSF, as far as it reaches: each distance that a pix
 where E is a staircase and the table is exact; every whole pixel to 100; steps of 2 % from there on, and the reach.
 Between these E is taken as linear, and the tables say by how much that was off at worst where it was tried.
 
-Where the PSF was fitted, the curves of all PSFs that it might be instead (the sigma points of its covariance)
-stand beside: the error of whatever is read off the tables is its spread over them, correlations included.
+Where the PSF was fitted, what its covariance leaves open stands beside: the changes of E by one sigma along each of
+the covariance's axes, to first order as the fit's own report has it. The error of whatever is read off the tables is
+the root of the squares of the same figure read off each of these, correlations included.
 
 | symbol | name | unit |
 |---|---|---|
@@ -24,9 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.error_planes import sigma_points
+from psfcore.fourier import Convolver
 from psfcore.psf import Psf, encircled_energy, radial_profile, squared_radii
-from psfcore.scatter.samples import DIFFRACTION, SCATTER, possible_psfs
+from psfcore.scatter.samples import DIFFRACTION, SCATTER
 from psfcore.scatter.shapes import shape_named
+from psfcore.scatter.total_psf import DIFFERENCE
 
 SCHEMA = "psf-tables/1"
 TOTAL = "TOTAL"
@@ -43,7 +46,7 @@ Numbers = list[float]
 def tables_of(psf: Psf, *, threads: int = 1) -> dict[str, Any]:
     """The tables of a PSF, as JSON has them.
 
-    radii_px; encircled: E by component, TOTAL among them; encircled_of_possible: E of each sigma point by component,
+    radii_px; encircled: E by component, TOTAL among them; encircled_changes: E's changes by component,
     none where the PSF was not fitted; interpolation_error: largest error of E between radii by component; profile:
     ring radius, pixels, mean weight by component, its 1-sigma error where known, rms over its mean of TOTAL round each ring.
     """
@@ -58,7 +61,7 @@ def tables_of(psf: Psf, *, threads: int = 1) -> dict[str, Any]:
         encircled[name] = _numbers(within)
         off = np.abs(np.interp(tried, radii, within) - between)
         interpolation_error[name] = float(off.max(initial=0.0))
-    possible = _possible(psf, radii, threads)
+    changes = _changes(psf, radii, threads)
     return {
         "schema": SCHEMA,
         "name": psf.name,
@@ -72,8 +75,10 @@ def tables_of(psf: Psf, *, threads: int = 1) -> dict[str, Any]:
         "exact_to_px": EXACT_TO_PX,
         "interpolation_error": interpolation_error,
         "encircled": encircled,
-        "encircled_of_possible": {name: [_numbers(one) for one in rows[0]] for name, rows in possible.items()},
-        "profile": _profile(kernels, {name: np.std(rows[1], axis=0) for name, rows in possible.items()}),
+        "encircled_changes": {name: [_numbers(one) for one in rows[0]] for name, rows in changes.items()},
+        "profile": _profile(
+            kernels, {name: np.linalg.norm(rows[1], axis=0) for name, rows in changes.items()}
+        ),
     }
 
 
@@ -95,20 +100,30 @@ def _tried_radii(radii: Vector) -> Vector:
     return np.asarray((low[wide, None] + (high - low)[wide, None] * shares).ravel())
 
 
-def _possible(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vector], list[Vector]]]:
-    """E at the radii, and mean weights by ring, of each sigma point: of the total and of its scatter."""
+def _changes(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vector], list[Vector]]]:
+    """What the fit leaves open, along the covariance's axes: 1-sigma changes of E at the radii, and of mean weights by
+    ring, of the total and of its scatter.
+    """
     if psf.fitted is None or DIFFRACTION not in psf.components:
         return {}
-    fitted, shape = psf.fitted, shape_named(psf.fitted.shape)
-    points = sigma_points(np.array(fitted.coordinates), np.array(fitted.covariance))
-    of_total = [one.kernel for one in possible_psfs(psf, threads=threads)]
-    of_scatter = (shape.kernel(point, psf.kernel.shape[0]) for point in points)
+    shape, size = shape_named(psf.fitted.shape), psf.kernel.shape[0]
+    at = np.array(psf.fitted.coordinates)
+    axes = sigma_points(np.zeros(at.size), np.array(psf.fitted.covariance))[: at.size] / np.sqrt(at.size)
+    # Slopes need no more than single precision, which takes half the time.
+    diffract = Convolver(psf.components[DIFFRACTION], psf.kernel.shape, dtype=np.float32, threads=threads)
+    of_total, of_scatter = [], []
+    for axis in axes:
+        step = DIFFERENCE * axis / max(float(np.abs(axis).max()), 1e-300)
+        ahead, behind = shape.kernel(at + step, size), shape.kernel(at - step, size)
+        change = (ahead - behind) * (float(np.abs(axis).max()) / (2 * DIFFERENCE))
+        of_scatter.append(change)
+        of_total.append(np.asarray(diffract.apply(change), dtype=np.float64))
     return {TOTAL: _read_off(of_total, radii), SCATTER: _read_off(of_scatter, radii)}
 
 
-def _read_off(kernels: Any, radii: Vector) -> tuple[list[Vector], list[Vector]]:
-    pairs = [(encircled_energy(kernel, radii), radial_profile(kernel)[1]) for kernel in kernels]
-    return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+def _read_off(changes: list[Kernel], radii: Vector) -> tuple[list[Vector], list[Vector]]:
+    within = [encircled_energy(change, radii) for change in changes]
+    return within, [radial_profile(change)[1] for change in changes]
 
 
 def _profile(kernels: dict[str, Kernel], sigma: dict[str, Vector]) -> dict[str, Any]:

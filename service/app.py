@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from fastapi import APIRouter, FastAPI
 from pydantic import BaseModel
 
-from service import images, jobs, problems, products, psfs, reports, transits
+from service import images, jobs, problems, products, psf_queries, psfs, reports, transits
 from service.state import Shared, State
 from workers import queue
 from workers.catalogue import Catalogue
@@ -61,7 +61,7 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=lifespan,
     )
     problems.install(app)
-    for part in (images, transits, jobs, psfs, products, reports):
+    for part in (images, transits, jobs, psfs, psf_queries, products, reports):
         app.include_router(part.router)
     app.include_router(health)
     return app

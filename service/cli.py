@@ -16,7 +16,15 @@ import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
-from service import cli_diffraction, cli_gap, cli_simulate
+from service import (
+    cli_diffraction,
+    cli_effects,
+    cli_evaluate,
+    cli_flare,
+    cli_gap,
+    cli_psf_query,
+    cli_simulate,
+)
 from service.client import DEFAULT_SERVER, Heliopsf, Operations, ServiceError, percent
 from workers.contract import Component, Method, ShapeName
 from workers.settings import Settings, software_version
@@ -418,8 +426,11 @@ def _progress_bar() -> Iterator[Report]:
         sys.stderr.write("\n")
 
 
-for command in (*cli_diffraction.COMMANDS, *cli_simulate.COMMANDS, *cli_gap.COMMANDS):
-    main.add_command(command)
+for module in (cli_diffraction, cli_simulate, cli_gap, cli_evaluate, cli_flare, cli_effects):
+    for command in module.COMMANDS:
+        main.add_command(command)
+for command in cli_psf_query.COMMANDS:
+    psf.add_command(command)
 
 
 if __name__ == "__main__":

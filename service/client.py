@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -65,6 +65,17 @@ class Operations(ABC):
     @abstractmethod
     def download(self, address: str, path: str | Path) -> None:
         """Write the file at an address of the service to ``path``."""
+
+    @abstractmethod
+    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
+        """What a PSF's tables say to "curve", "profile", "encircled", "annulus" or "compare/ID".
+
+        Raises ``ServiceError`` with code "no-tables" where they have not been made.
+        """
+
+    @abstractmethod
+    def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
+        """Write the central (size, size) px of a PSF as FITS."""
 
     def deconvolve(
         self,
@@ -175,6 +186,37 @@ class Operations(ABC):
         found = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(found, report, preview)
         return found
+
+    def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
+        """Light beyond radii (px) in percent by component, with errors; without radii the whole table."""
+        return self.answer([psf_id], "curve", {} if radii is None else {"radii": list(radii)})
+
+    def psf_profile(self, psf_id: str) -> dict[str, Any]:
+        """Mean weight of a pixel by radius, by component."""
+        return self.answer([psf_id], "profile", {})
+
+    def psf_encircled(self, psf_id: str, radius: float) -> dict[str, Any]:
+        """Light within a radius (px), as a fraction of all light."""
+        return self.answer([psf_id], "encircled", {"radius": radius})
+
+    def psf_annulus(self, psf_id: str, inner: float, outer: float) -> dict[str, Any]:
+        """Light between two radii (px), as a fraction of all light."""
+        return self.answer([psf_id], "annulus", {"inner": inner, "outer": outer})
+
+    def compare_psfs(self, psf_id: str, other_id: str) -> dict[str, Any]:
+        """Differences of two PSFs' curves (points) and totals, the second less the first."""
+        return self.answer([psf_id, other_id], f"compare/{other_id}", {})
+
+    def answer(self, psf_ids: list[str], question: str, query: dict[str, Any]) -> dict[str, Any]:
+        """The answer; tables that are not there yet, as of a PSF that was uploaded, are made first."""
+        try:
+            return self.ask(psf_ids[0], question, **query)
+        except ServiceError as error:
+            if error.code != "no-tables":
+                raise
+        for psf_id in psf_ids:
+            self.wait(self.submit("psf-tables", psf_id=psf_id))
+        return self.ask(psf_ids[0], question, **query)
 
     def _fetch(self, result: dict[str, Any], output: str | Path | None, preview: str | Path | None) -> None:
         if output is not None:
@@ -319,6 +361,18 @@ class Heliopsf(Operations):
             raise self._unreachable(error) from error
         finally:
             partial.unlink(missing_ok=True)
+
+    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
+        """The service's answer to a question about a PSF."""
+        told = {
+            name: ",".join(f"{number!r}" for number in value) if isinstance(value, list) else value
+            for name, value in query.items()
+        }
+        return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=told)
+
+    def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
+        """Download the central (size, size) px of a PSF."""
+        self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output)
 
     def _upload(
         self, address: str, path: Path, query: dict[str, str | None], *, media_type: str = "application/fits"

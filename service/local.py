@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,11 +12,14 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from psfcore.errors import DataError
 from psfcore.header import FitsLimits, read_summary
 from psfcore.transit.archive import list_archive
+from service import psf_lookup
 from service.client import Operations, Progress, ServiceError, as_archive
 from service.jobs import JobView
 from service.products import ProductView
+from service.psf_cutout import cutout
 from service.psfs import PsfView
 from service.reports import ReportView
 from service.transits import TransitDetails
@@ -120,6 +124,37 @@ class LocalService(Operations):
         digest = digests[part]
         assert digest is not None
         shutil.copyfile(self._store.path(digest), path)
+
+    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
+        """The answer of the tables that are kept here."""
+        name, _, other = question.partition("/")
+        tables = [self._tables(one) for one in (psf_id, other) if one]
+        try:
+            return psf_lookup.compare(*tables) if other else psf_lookup.QUESTIONS[name](*tables, **query)
+        except DataError as error:
+            raise ServiceError(error.message, code=error.code) from error
+
+    def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
+        """Cut the middle out of a PSF that is kept here."""
+        row = self._psf(psf_id)
+        limits = FitsLimits(max_pixels=self._settings.max_pixels)
+        try:
+            Path(output).write_bytes(cutout(self._store.path(row.file_sha256), size, limits))
+        except DataError as error:
+            raise ServiceError(error.message, code=error.code) from error
+
+    def _tables(self, psf_id: str) -> dict[str, Any]:
+        digest = self._psf(psf_id).details.get("tables_sha256")
+        if digest is None:
+            raise ServiceError(f"PSF {psf_id} has no tables yet", code="no-tables")
+        tables: dict[str, Any] = json.loads(self._store.path(digest).read_bytes())
+        return tables
+
+    def _psf(self, psf_id: str) -> PsfRow:
+        row = self._catalogue.get(PsfRow, psf_id)
+        if row is None:
+            raise ServiceError(f"the catalogue holds no PSF with id {psf_id}", code="no-such-psf")
+        return row
 
     def _row(self, address: str) -> ProductRow | PsfRow | ReportRow:
         _, collection, identity = address.rsplit("/", 2)

@@ -1,8 +1,8 @@
 """Questions about a PSF, answered from its tables: looked up and interpolated, nothing computed anew.
 
 The tables are those of `psfcore.psf_tables`. E(R), the light within R, is a staircase as far as they are exact,
-and taken as linear between their radii beyond. A 1-sigma error is the spread of the same figure over the PSFs that
-a fitted PSF might be instead, so that an annulus has its own error and not those of two curves added up.
+and taken as linear between their radii beyond. A 1-sigma error is the same figure read off the changes that a fit
+leaves open, so that an annulus has its own error and not those of two curves added up.
 
 No numerics are imported: the web process answers with this, and so does the command line.
 """
@@ -17,7 +17,7 @@ from typing import Any
 from psfcore.errors import DataError
 
 SCHEMA = "psf-tables/1"
-LARGEST_COUNT = 1000
+LARGEST_COUNT = 500
 PLATE_SCALE_TOLERANCE = 0.01
 SMALLEST_WORTH_SAYING = 0.005  # points
 
@@ -34,10 +34,10 @@ def curve(tables: Tables, radii: Sequence[float] | None = None) -> dict[str, Any
     return {
         **_what(tables),
         "radii_px": list(wanted),
-        "light_beyond_pct": {name: [_beyond(e) for e in find(row)] for name, row in tables["encircled"].items()},
-        "sigma_points": _spread(
-            tables, lambda row: [_beyond(e) for e in find(row)]
-        ),
+        "light_beyond_pct": {
+            name: [_beyond(e) for e in find(row)] for name, row in tables["encircled"].items()
+        },
+        "sigma_points": _sigma(tables, lambda row: [100 * e for e in find(row)]),
         "resolution": _resolution(tables),
     }
 
@@ -54,7 +54,7 @@ def encircled(tables: Tables, radius: float) -> dict[str, Any]:
         **_what(tables),
         "radius_px": radius,
         "light_within": {name: find(row)[0] for name, row in tables["encircled"].items()},
-        "sigma": {name: s[0] for name, s in _spread(tables, find).items()},
+        "sigma": {name: s[0] for name, s in _sigma(tables, find).items()},
         "resolution": _resolution(tables),
     }
 
@@ -74,7 +74,7 @@ def annulus(tables: Tables, inner: float, outer: float) -> dict[str, Any]:
         "inner_px": inner,
         "outer_px": outer,
         "light": {name: between(row)[0] for name, row in tables["encircled"].items()},
-        "sigma": {name: s[0] for name, s in _spread(tables, between).items()},
+        "sigma": {name: s[0] for name, s in _sigma(tables, between).items()},
         "resolution": _resolution(tables),
     }
 
@@ -106,12 +106,14 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
     points = {
         name: [
             _beyond(new) - _beyond(old)
-            for old, new in zip(find[0](one["encircled"][name]), find[1](other["encircled"][name]), strict=True)
+            for old, new in zip(
+                find[0](one["encircled"][name]), find[1](other["encircled"][name]), strict=True
+            )
         ]
         for name in names
     }
-    spreads = [_spread(tables, f) for tables, f in zip((one, other), find, strict=True)]
-    known = [name for name in names if name in spreads[0] or name in spreads[1]]
+    sigmas = [_sigma(tables, f) for tables, f in zip((one, other), find, strict=True)]
+    known = [name for name in names if name in sigmas[0] or name in sigmas[1]]
     none = [0.0] * len(radii)
     return {
         "one": _what(one),
@@ -121,7 +123,7 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
         "sigma_points": {
             name: [
                 100 * math.hypot(a, b)
-                for a, b in zip(spreads[0].get(name, none), spreads[1].get(name, none), strict=True)
+                for a, b in zip(sigmas[0].get(name, none), sigmas[1].get(name, none), strict=True)
             ]
             for name in known
         },
@@ -164,12 +166,18 @@ def _finder(tables: Tables, radii: Sequence[float]) -> Callable[[Numbers], Numbe
         if not radius >= 0 or math.isinf(radius):
             raise DataError("bad-radius", f"expected radii of 0 px or more; got {radius:g}")
         if radius > reach * (1 + 1e-9):
-            raise DataError("radius-beyond-reach", f"expected radii within {reach:.1f} px, the PSF's reach; got {radius:g}")
+            raise DataError(
+                "radius-beyond-reach",
+                f"expected radii within {reach:.1f} px, the PSF's reach; got {radius:g}",
+            )
     # Stored radii are rounded: a radius such as sqrt(2) may be given with more digits, or fewer.
     places = [min(bisect_right(grid, radius * (1 + 1e-9)) - 1, len(grid) - 1) for radius in radii]
 
     def find(row: Numbers) -> Numbers:
-        return [_read(tables["exact_to_px"], grid, row, at, radius) for at, radius in zip(places, radii, strict=True)]
+        return [
+            _read(tables["exact_to_px"], grid, row, at, radius)
+            for at, radius in zip(places, radii, strict=True)
+        ]
 
     return find
 
@@ -182,21 +190,14 @@ def _read(exact_to_px: float, grid: Numbers, row: Numbers, at: int, radius: floa
     return row[at] + share * (row[at + 1] - row[at])
 
 
-def _spread(tables: Tables, of: Callable[[Numbers], Numbers]) -> dict[str, Numbers]:
-    """Standard deviation, over the PSFs that this one might be, of each figure; none where it was not fitted."""
-    out: dict[str, Numbers] = {}
-    for name, rows in tables["encircled_of_possible"].items():
-        columns = zip(*(of(row) for row in rows), strict=True)
-        out[name] = [_deviation(column) for column in columns]
-    return out
-
-
-def _deviation(values: Sequence[float]) -> float:
-    mean = math.fsum(values) / len(values)
-    return math.sqrt(math.fsum((value - mean) ** 2 for value in values) / len(values))
+def _sigma(tables: Tables, of: Callable[[Numbers], Numbers]) -> dict[str, Numbers]:
+    """1-sigma errors of figures that are linear in E, by component; none where the PSF was not fitted."""
+    return {
+        name: [math.hypot(*column) for column in zip(*(of(row) for row in rows), strict=True)]
+        for name, rows in tables["encircled_changes"].items()
+    }
 
 
 def _beyond(within: float) -> float:
     """Light beyond, percent: an array larger than the full reach holds more than all of the light."""
     return 100 * max(1 - within, 0.0)
-

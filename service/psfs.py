@@ -34,7 +34,7 @@ class PsfView(BaseModel):
     bytes: int
     details: dict[str, Any] = Field(description="shape, curve, parameters, where it came from")
     file: str = Field(description="address of the FITS file")
-    preview: str | None = Field(description="address of a picture; null for an uploaded PSF")
+    preview: str | None = Field(description="address of a picture; null for an uploaded PSF without tables")
     report: str | None = Field(description="address of the fit's report; null where nothing was fitted")
 
     @classmethod
@@ -137,7 +137,7 @@ def get_psf_preview(psf_id: Identity, request: Request, state: Shared) -> Respon
     """The PSF, its radial profile and its cumulative curve as PNG."""
     row = _find(state, psf_id)
     if row.preview_sha256 is None:
-        raise Problem(404, "no-preview", "an uploaded PSF has no picture; its file can be downloaded")
+        raise Problem(404, "no-preview", "an uploaded PSF has no picture until a job psf-tables draws it")
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
 
 

@@ -36,114 +36,20 @@ from psfcore.noise import Noise
 from psfcore.scatter.inversion import LEAST_DARK_PIXELS, Progress, dark_pixels
 from psfcore.scatter.noise_transfer import noise_covariance
 from psfcore.scatter.optics import Optics, Pixels, pick, put
-from psfcore.transit.occulter import FoundPlace, find_occulter
+from psfcore.transit.evaluated_frame import FrameEvaluation, Slice, at_centre
+from psfcore.transit.occulter import DOUBT_SIGMAS, FoundPlace, find_occulter
 from psfcore.transit.superposed import Superposed, Superposition
 from psfcore.transit.transit import Frame, Kernel, Transit
 
 Vector = NDArray[np.float64]
 Plane = NDArray[np.float64]
 
-CENTRE_PX = 2.0
+LEAST_DEPTH = 0.2  # less than the inversion's: a PSF without scatter expects far more to be missing than is
 SLICE_HALF_PX = 20
 SLICES_A_POINTING = 3
 DRAWS = 4
 UNDO_STEPS = 6
 _SCENES_KEPT = 24
-
-
-@dataclass(frozen=True, eq=False)
-class Slice:
-    """A row or a column through the middle of an occulter: offsets from its centre (px), intensities in DN/s.
-
-    dark: which of its pixels are fully dark.
-    """
-
-    offset_px: Vector
-    observed: Vector
-    simulated: Vector
-    dark: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class FrameEvaluation:
-    """One image: the light in its occulter as observed and as simulated, DN/s.
-
-    observed, simulated: of the dark pixels, in the order of `dark`. noise, centre_noise: standard errors of the mean
-    of their difference, over all of them and at the centre; nan where the centre is not among them. along_x,
-    along_y: slices, of some images.
-    """
-
-    index: int
-    file: str
-    fov: int
-    time_s: float
-    found: FoundPlace
-    dark: Pixels
-    observed: Vector
-    simulated: Vector
-    noise_dn_s: float
-    centre_noise_dn_s: float
-    along_x: Slice | None = None
-    along_y: Slice | None = None
-
-    @property
-    def observed_dn_s(self) -> float:
-        """Mean over the dark pixels."""
-        return float(self.observed.mean())
-
-    @property
-    def simulated_dn_s(self) -> float:
-        """Mean over the dark pixels."""
-        return float(self.simulated.mean())
-
-    @property
-    def error_dn_s(self) -> float:
-        """Simulated minus observed, mean over the dark pixels."""
-        return self.simulated_dn_s - self.observed_dn_s
-
-    @property
-    def pe_pct(self) -> Vector:
-        """Eq. (2), percent, a dark pixel at a time."""
-        return 100 * (self.simulated - self.observed) / self.observed_dn_s
-
-    @property
-    def residual_pct(self) -> float:
-        """Eq. (3), percent."""
-        return 100 * self.error_dn_s / self.observed_dn_s
-
-    @property
-    def noise_pct(self) -> float:
-        """Standard error of the residual."""
-        return 100 * self.noise_dn_s / self.observed_dn_s
-
-    @property
-    def at_centre(self) -> NDArray[np.bool_]:
-        """Which of the dark pixels lie within CENTRE_PX of the occulter's centre."""
-        return _at_centre(self.dark, self.found)
-
-    @property
-    def centre_dn_s(self) -> tuple[float, float]:
-        """Observed and simulated mean at the centre; nan where no dark pixel lies there."""
-        at = self.at_centre
-        if not at.any():
-            return float("nan"), float("nan")
-        return float(self.observed[at].mean()), float(self.simulated[at].mean())
-
-    @property
-    def centre_pct(self) -> float:
-        """Mean PE at the centre, percent."""
-        observed, simulated = self.centre_dn_s
-        return 100 * (simulated - observed) / self.observed_dn_s
-
-    @property
-    def centre_noise_pct(self) -> float:
-        """Standard error of the PE at the centre."""
-        return 100 * self.centre_noise_dn_s / self.observed_dn_s
-
-    def residual_against_pct(self, plane: NDArray[np.floating]) -> float:
-        """Eq. (3) with an image [y, x] in place of the observed one: one without noise, where there is one."""
-        wanted = float(np.mean(plane[self.dark], dtype=np.float64))
-        return 100 * (self.simulated_dn_s - wanted) / wanted
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +185,7 @@ class _Scenes(Sequence[NDArray[np.float32]]):
 def _reason(frame: Frame, found: FoundPlace, dark: Pixels) -> str | None:
     """Why an image takes no part, or None."""
     where = f"({frame.place.x_px:g}, {frame.place.y_px:g}) px"
-    if not found.seen:
+    if not found.within_reach or found.depth + DOUBT_SIGMAS * found.depth_sigma < LEAST_DEPTH:
         return f"expected an occulter at {where}; found none there"
     if dark[0].size < LEAST_DARK_PIXELS:
         return f"expected at least {LEAST_DARK_PIXELS} fully dark pixels; got {dark[0].size}"
@@ -287,11 +193,6 @@ def _reason(frame: Frame, found: FoundPlace, dark: Pixels) -> str | None:
     if observed <= 0:
         return f"expected some light in the occulter at {where}; got {observed:.3g} DN/s in the mean"
     return None
-
-
-def _at_centre(dark: Pixels, found: FoundPlace) -> NDArray[np.bool_]:
-    place = found.place
-    return np.asarray(np.hypot(dark[0] - place.y_px, dark[1] - place.x_px) <= CENTRE_PX)
 
 
 def _compared(
@@ -326,7 +227,7 @@ def _standard_errors(
     optics: Optics, frame: Frame, dark: Pixels, found: FoundPlace, noise: Noise
 ) -> tuple[float, float]:
     """Of the mean of s - y over the dark pixels, and over those at the centre (nan where there is none)."""
-    at = _at_centre(dark, found)
+    at = at_centre(dark, found)
     templates = [np.full(at.size, 1 / at.size), at / max(int(np.count_nonzero(at)), 1)]
     disc, centre = np.sqrt(np.diag(noise_covariance(optics, frame, dark, templates, noise)))
     return float(disc), float(centre) if at.any() else float("nan")

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.scatter.dark_offsets import DarkOffsetStudy
-from psfcore.transit.evaluation import Evaluation, FrameEvaluation, Slice
+from psfcore.transit.evaluated_frame import FrameEvaluation, Slice
+from psfcore.transit.evaluation import Evaluation
 from psfcore.transit.superposed import Superposed
 
 Vector = NDArray[np.float64]
@@ -118,7 +119,7 @@ def trends(evaluation: Evaluation) -> tuple[Trend, ...]:
                 slope_of(where, _each(frames, value), _each(frames, noise))
                 for value, noise in (("residual_pct", "noise_pct"), ("error_dn_s", "noise_dn_s"))
             )
-            found.append(Trend(fov, against, len(frames), relative, absolute))  # type: ignore[arg-type]
+            found.append(Trend(fov, against, len(frames), relative, absolute))
     return tuple(found)
 
 

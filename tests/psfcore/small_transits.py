@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.psf import cumulative_curve
+from psfcore.scatter import fit
+from psfcore.scatter.equations import free_fit
 from psfcore.scatter.fit import TransitFit, fit_transit
 from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.published import Choices, Published, crop_or_pad, invert_as_published
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from psfcore.simulate.sky import TrueSky, true_sky
@@ -24,6 +28,11 @@ Plane = NDArray[np.float64]
 IMAGES, SIZE_PX, BRIGHTNESS = 12, 128, 5.0
 BRIGHT = 200.0  # enough light that the places do not follow the ephemeris
 SCATTER = ScatterTruth(6.15, 2.53, 0.411)
+STRETCHED = ScatterTruth(6.15, 2.53, 0.411, stretch=0.15, angle_deg=-15.0)
+TRUE_VALUES = {"b_px": 6.15, "c": 2.53, "total": 0.411}
+# A hundredth of the light goes farther than 50 px.
+COMPACT = ScatterTruth(6.0, 4.0, 0.4)
+FAINT = 0.3  # times the brightness of a sky: discs of a few DN/s
 
 
 def diffraction() -> Plane:
@@ -84,9 +93,25 @@ def solved_noise_free() -> Solution:
 
 
 @cache
+def faint() -> Transit:
+    """Nine faint images through compact scatter, the known part of the PSF on an array about as large as they are."""
+    made = observed(sky(COMPACT, images=9, size_px=96, brightness=FAINT)).transit
+    return dataclasses.replace(made, diffraction=crop_or_pad(DIFFRACTION, 95))
+
+
+@cache
+def recipe(choices: Choices) -> tuple[Published, list[str]]:
+    """What the published recipe finds in the faint ones, and the stages that it told of."""
+    seen: list[str] = []
+    found = invert_as_published(faint(), choices, draws=3, progress=lambda stage, *_: seen.append(stage))
+    return found, seen
+
+
+@cache
 def fitted() -> TransitFit:
-    """The whole fit of the noisy transit."""
-    return fit_transit(observed(sky()).transit)
+    """The whole fit of the noisy transit; its free shells from 20 draws, which are quicker than 100."""
+    with patch.object(fit, "free_fit", partial(free_fit, draws=20)):
+        return fit_transit(observed(sky()).transit)
 
 
 @cache
