@@ -259,7 +259,11 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
     inversion, out = solution.inversion, []
     if not inversion.converged:
         out.append(f"the fit had not settled after {len(inversion.rounds)} rounds")
-    pointings = {frame.fov for frame in solution.transit.frames}
+    pointings = {frame.fov for frame in inversion.frames}
+    if inversion.left_out:
+        out.append(
+            f"{len(inversion.left_out)} images took no part: " + "; ".join(sorted(inversion.left_out)[:5])
+        )
     if len(pointings) < 3:
         out.append(
             f"{len(pointings)} pointing{'s' if len(pointings) > 1 else ''}: scatter over short and long distances "

@@ -47,6 +47,7 @@ LARGEST_SHIFT_PX = 5.0
 SETTLED_PX = 1e-3
 STEPS = 30
 LEAST_DEPTH = 0.5
+SCALE_SIGMA = 0.02  # images of one pointing are as bright as each other, but for a percent or two
 DOUBT_SIGMAS = 3.0
 DAMPED_FROM = 6  # steps: before a faint scene they may swing to and fro
 DECONVOLUTION_NOISE = 2.3  # how much a deconvolution adds to it, for a core weight of 0.43
@@ -248,7 +249,8 @@ def _solve(
     """Gauss-Newton on Eq. (2), the weights by what the simulation expects and not by what happened to come."""
     at = np.array([start.x_px, start.y_px, 1.0, 0.0])
     origin, radius = at.copy(), start.radius_px
-    prior = np.diag([sigma_px**-2, sigma_px**-2, 0.0, 0.0])
+    # A scale that is free is diluted by the noise of the neighbours, and what is left of their slope moves the disc.
+    prior = np.diag([sigma_px**-2, sigma_px**-2, SCALE_SIGMA**-2, 0.0])
     h = _DIFFERENCE_PX
     settled, done = False, 0
     while done < STEPS and not settled:

@@ -167,6 +167,19 @@ def test_the_ephemeris_decides_where_the_image_says_nothing() -> None:
         assert (f.sigma_x_px, f.sigma_y_px) == pytest.approx((1.0, 1.0), abs=0.02)
 
 
+def test_image_and_ephemeris_share_the_say_by_their_errors() -> None:
+    """Of the way from the ephemeris to the truth, 1 - sigma^2 is gone where the ephemeris' own error is 1."""
+    of, exact = sky(), sky().plan.place(5)
+    reported = Place(exact.x_px + 1.0, exact.y_px - 1.0, RADIUS_PX)
+    for read_noise_dn in (1e4, 3e4, 6e4):
+        transit = displaced(noise_free(of), 5, reported)
+        transit = dataclasses.replace(transit, noise=Noise(6.0, read_noise_dn))
+        found = found_in(of, transit, [5])[0]
+        gone = (reported.x_px - found.place.x_px, found.place.y_px - reported.y_px)
+        assert gone == pytest.approx((1 - found.sigma_x_px**2, 1 - found.sigma_y_px**2), abs=0.1)
+    assert max(gone) < 0.6
+
+
 def displaced(transit: Transit, index: int, place: Place) -> Transit:
     frames = list(transit.frames)
     frames[index] = dataclasses.replace(frames[index], place=place)
