@@ -118,6 +118,7 @@ def test_noise_figures_may_come_with_the_command(transit: Path, true_psf: Path, 
 # --- none: fitted, and held out ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow  # a fit and its folds; test_evaluation holds the folds themselves
 def test_without_a_psf_images_are_held_out(transit: Path, tmp_path: Path) -> None:
     result = run(
         transit,
