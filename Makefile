@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test test-full bench bench-peers lint openapi clean
+.PHONY: demo test test-full bench bench-peers blind lint openapi clean
 .DELETE_ON_ERROR:
 
 $(RUN): pyproject.toml constraints.txt
@@ -31,12 +31,18 @@ bench: $(DEV)
 	$(BIN)/python -m tests.bench
 	$(BIN)/python -m tests.bench_ring_sums --quick
 	$(BIN)/python -m tests.bench_fit
+	$(BIN)/python -m tests.bench_crossval
 
 # What others use, in an environment of its own, timed in turn with ours on the same data.
 bench-peers: $(DEV)
 	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9'
 	$(BIN)/python -m tests.bench_peers .venv-peers/bin/python
+
+# The gap diagnosis on cases whose effect it does not know: hours. Goes on where it was stopped.
+blind: $(RUN)
+	OMP_NUM_THREADS=1 $(BIN)/heliopsf gap blind --cases 204 --size 256 --images 18 -o heliopsf-blind
+	OMP_NUM_THREADS=1 $(BIN)/heliopsf gap blind --cases 12 --seed 2 --size 512 --images 30 -o heliopsf-blind-512
 
 lint: $(DEV)
 	$(BIN)/ruff check .

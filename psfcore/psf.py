@@ -120,6 +120,18 @@ def crop_centred(kernel: Kernel, shape: tuple[int, int]) -> Kernel:
     return kernel[top : top + ny, left : left + nx].copy()
 
 
+def crop_or_pad(kernel: Kernel, size: int) -> Kernel:
+    """A square kernel on (size, size), its centre at [size // 2, size // 2]; zero where it did not reach."""
+    if kernel.shape[0] >= size and kernel.shape[1] >= size:
+        return crop_centred(kernel, (size, size))
+    out = np.zeros((size, size))
+    ny, nx = (min(n, size) for n in kernel.shape)
+    part = crop_centred(kernel, (ny, nx))
+    top, left = size // 2 - ny // 2, size // 2 - nx // 2
+    out[top : top + ny, left : left + nx] = part
+    return out
+
+
 def squared_radii(shape: tuple[int, int]) -> NDArray[np.int64]:
     """r^2 [y, x] (px^2, whole numbers) from the pixel [ny // 2, nx // 2]."""
     dy = np.arange(shape[0], dtype=np.int64) - shape[0] // 2

@@ -28,8 +28,7 @@ from psfcore.deconvolve.error_planes import sigma_points
 from psfcore.fourier import Convolver
 from psfcore.psf import Psf, encircled_energy, radial_profile, squared_radii
 from psfcore.scatter.samples import DIFFRACTION, SCATTER
-from psfcore.scatter.shapes import shape_named
-from psfcore.scatter.total_psf import DIFFERENCE
+from psfcore.scatter.shapes import DIFFERENCE, shape_named
 
 SCHEMA = "psf-tables/1"
 TOTAL = "TOTAL"

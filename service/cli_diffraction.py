@@ -6,21 +6,21 @@ Everything numerical is imported by the command that needs it, so that the other
 from __future__ import annotations
 
 import dataclasses
-import json
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import click
 
-from psfcore.errors import DataError
-from psfcore.header import FitsLimits
-from workers.settings import Settings
+from service.cli_options import (
+    FILE,
+    OUTPUT,
+    PLOT,
+    check_writable,
+    limits,
+    progress_bar,
+    user_errors,
+    write_json,
+)
 
-FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-OUTPUT = click.Path(dir_okay=False, path_type=Path)
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 11.5, 20, 50, 100, 200, 500, 1000)
 
 
@@ -32,7 +32,7 @@ def show(file: Path, plot: Path | None) -> list[str]:
     from psfcore.plots import psf_png
     from psfcore.psf import cumulative_curve
 
-    psf = read_psf(file, _limits())
+    psf = read_psf(file, limits())
     if plot is not None:
         psf_png(psf, plot)
     radii = np.array([r for r in SHOWN_RADII_PX if r < psf.reach_px])
@@ -69,7 +69,7 @@ def mask_as_fits(instrument_file: Path, folder: Path) -> Path | None:
 @click.command()
 @click.option("--instrument", default="hri_euv", show_default=True, metavar="NAME|FILE")
 @click.option("--json", "json_file", type=OUTPUT, help="Write everything found")
-@click.option("--plot", type=OUTPUT, help="Write a picture (PNG)")
+@PLOT
 @click.option("--distances", help="Filter wheel to detector, mm, as 50,273,550 [default: the paper's seven]")
 @click.option(
     "--phases", default=16, show_default=True, type=click.IntRange(1, 256), help="Positions of the mesh"
@@ -90,10 +90,15 @@ def fresnel(
     from psfcore.diffraction_plots import fresnel_png
     from psfcore.instruments.model import load_instrument
 
-    with user_errors():
+    check_writable(json_file, plot)
+    with user_errors(), progress_bar() as report:
         wanted = DISTANCES_MM if distances is None else _numbers("--distances", distances)
         study = fresnel_study(
-            load_instrument(instrument), distances_mm=wanted, phases=phases, windows=windows, progress=_dots()
+            load_instrument(instrument),
+            distances_mm=wanted,
+            phases=phases,
+            windows=windows,
+            progress=lambda done, of: report("distances", done, of),
         )
         if plot is not None:
             fresnel_png(study, plot)
@@ -107,7 +112,7 @@ def fresnel(
         click.echo(
             f"{at.distance_mm:>13g}   {at.largest_points:>25.2f} points   up to {at.largest_single_points:.2f} points"
         )
-    _write_json(json_file, study.as_json())
+    write_json(json_file, study.as_json())
 
 
 @click.command()
@@ -119,7 +124,7 @@ def fresnel(
 )
 @click.option("--saturation", type=float, help="Level in the image's unit from which pixels are not trusted")
 @click.option("--json", "json_file", type=OUTPUT, help="Write what was found")
-@click.option("--plot", type=OUTPUT, help="Write a picture (PNG)")
+@PLOT
 def arms(
     image: Path,
     before: Path | None,
@@ -134,9 +139,10 @@ def arms(
     from psfcore.diffraction.arms_plot import arms_png
     from psfcore.fits_io import read_image
 
+    check_writable(json_file, plot)
     with user_errors():
-        flare = read_image(image, _limits(), saturation_dn=saturation)
-        reference = None if before is None else read_image(before, _limits()).pixels
+        flare = read_image(image, limits(), saturation_dn=saturation)
+        reference = None if before is None else read_image(before, limits()).pixels
         found = measure_arms(
             flare.pixels,
             None if centre is None else _pair("--centre", centre),
@@ -149,7 +155,7 @@ def arms(
     for angle, sigma in zip(found.angles_deg, found.angles_sigma_deg, strict=True):
         click.echo(f"arm at {angle:8.3f} +- {sigma:.3f} degrees from +x towards +y")
     click.echo(f"spacing  {found.spacing_px:8.4f} +- {found.spacing_sigma_px:.4f} px")
-    _write_json(
+    write_json(
         json_file,
         {
             "angles_deg": found.angles_deg,
@@ -169,13 +175,14 @@ def arms(
 @click.option("--pitches", default="400,635,800,1000,1270,1600,2000", show_default=True, help="um")
 @click.option("--wires", default="20,30,40,60", show_default=True, help="um")
 @click.option("--json", "json_file", type=OUTPUT, help="Write the table")
-@click.option("--plot", type=OUTPUT, help="Write a picture (PNG)")
+@PLOT
 def design(instrument: str, pitches: str, wires: str, json_file: Path | None, plot: Path | None) -> None:
     """Tabulate what the entrance mesh's pitch and wire width do to the diffracted light."""
     from psfcore.diffraction.design_plot import design_png
     from psfcore.diffraction.design_study import design_study
     from psfcore.instruments.model import load_instrument
 
+    check_writable(json_file, plot)
     with user_errors():
         study = design_study(
             load_instrument(instrument), _numbers("--pitches", pitches), _numbers("--wires", wires)
@@ -188,23 +195,10 @@ def design(instrument: str, pitches: str, wires: str, json_file: Path | None, pl
         values = (getattr(row, name) for name in names)
         texts = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in values)
         click.echo("  ".join(f"{text:>{len(name)}}" for text, name in zip(texts, names, strict=True)))
-    _write_json(json_file, dataclasses.asdict(study))
+    write_json(json_file, dataclasses.asdict(study))
 
 
 COMMANDS = (fresnel, arms, design)
-
-
-@contextmanager
-def user_errors() -> Iterator[None]:
-    """What is wrong with the user's data, in one line."""
-    try:
-        yield
-    except DataError as error:
-        raise click.ClickException(error.message) from error
-
-
-def _limits() -> FitsLimits:
-    return FitsLimits(max_pixels=Settings.model_fields["max_pixels"].default)
 
 
 def _numbers(option: str, text: str) -> tuple[float, ...]:
@@ -219,20 +213,3 @@ def _pair(option: str, text: str) -> tuple[float, float]:
     if len(numbers) != 2:
         raise click.BadParameter(f"expected x,y; got {text!r}", param_hint=option)
     return numbers[0], numbers[1]
-
-
-def _write_json(path: Path | None, content: dict[str, Any]) -> None:
-    if path is not None:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-
-
-def _dots() -> Any:
-    """Progress on a terminal: how many of how many."""
-    if not sys.stderr.isatty():
-        return None
-
-    def report(done: int, of: int) -> None:
-        sys.stderr.write(f"\r{done}/{of} " + ("\n" if done == of else ""))
-        sys.stderr.flush()
-
-    return report

@@ -6,18 +6,25 @@ Everything numerical is imported when it is called, so that other commands start
 from __future__ import annotations
 
 import hashlib
-import json
-import sys
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from psfcore.header import FitsLimits, read_summary
-from service.cli_diffraction import user_errors
-from workers.contract import Method
-from workers.settings import Settings, software_version
+from psfcore.header import read_summary
+from service.cli_options import (
+    METHODS,
+    NOISE,
+    OUTPUT_FOLDER,
+    SATURATION,
+    limits,
+    progress_bar,
+    read_settings,
+    user_errors,
+    write_json,
+)
+from workers.settings import software_version
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,7 +33,6 @@ if TYPE_CHECKING:
     from psfcore.noise import Noise
     from psfcore.psf import Psf
 
-METHODS = [get_args(kind.model_fields["name"].annotation)[0] for kind in get_args(get_args(Method)[0])]
 TABLE, SHEET = "effects.json", "contact-sheet.png"
 
 
@@ -35,15 +41,13 @@ TABLE, SHEET = "effects.json", "contact-sheet.png"
 @click.option(
     "--psf", "psf_name", default="auto", show_default=True, metavar="FILE|auto", help="auto: the instrument's"
 )
-@click.option(
-    "-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), help="Folder"
-)
+@click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder")
 @click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True)
 @click.option(
     "--steps", type=click.IntRange(1, 200), help="Steps [default: the method's; Richardson-Lucy 20]"
 )
-@click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help="DN a photon, DN rms of the readout")
-@click.option("--saturation", "saturation_dn", type=float, help="DN from which a pixel is not trusted")
+@NOISE
+@SATURATION
 @click.option(
     "--most", default=60, show_default=True, type=click.IntRange(1, 200), help="Images on the contact sheet"
 )
@@ -67,21 +71,22 @@ def effects(
     from psfcore.deconvolve.contact_sheet import contact_sheet_png, table, treat_many
 
     files = _files(images)
-    threads = threads or Settings().threads
+    threads = threads or read_settings().threads
     with user_errors():
         psf_for = _psf_chooser(psf_name, threads)
-    output.mkdir(parents=True, exist_ok=True)
-    treated, failures = treat_many(
-        files,
-        lambda name: _treat(Path(name), psf_for, method, steps, noise, saturation_dn, threads),
-        progress=_progress,
-    )
+        output.mkdir(parents=True, exist_ok=True)
+    with progress_bar() as report:
+        treated, failures = treat_many(
+            files,
+            lambda name: _treat(Path(name), psf_for, method, steps, noise, saturation_dn, threads),
+            progress=lambda done, of: report("images", done, of),
+        )
     content = table(treated, failures) | {
         "method": {"name": method, "steps": steps},
         "software_version": software_version(),
         "inputs_sha256": {row.name: _sha256(Path(row.name)) for row in treated},
     }
-    (output / TABLE).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_json(output / TABLE, content)
     contact_sheet_png(treated, failures, output / SHEET, most=most)
     click.echo("\n".join(_lines(content)))
     click.echo(f"{output / TABLE}, {output / SHEET}")
@@ -108,7 +113,7 @@ def _treat(
 
     psf = psf_for(path)
     known_noise, known_saturation = _known_figures(path)
-    image = read_image(path, _limits(), saturation_dn=saturation_dn or known_saturation)
+    image = read_image(path, limits(), saturation_dn=saturation_dn or known_saturation)
     conditions = Conditions(
         noise=Noise(*noise) if noise else known_noise, threads=threads, engine_for=_engines()
     )
@@ -128,7 +133,7 @@ def _psf_chooser(psf_name: str, threads: int) -> Callable[[Path], Psf]:
         return build_psf(load_instrument(instrument), threads=threads)
 
     def of_instrument(path: Path) -> Psf:
-        instrument = read_summary(path, _limits()).instrument
+        instrument = read_summary(path, limits()).instrument
         if instrument is None:
             raise DataError(
                 "no-psf-for-instrument",
@@ -140,7 +145,7 @@ def _psf_chooser(psf_name: str, threads: int) -> Callable[[Path], Psf]:
         return of_instrument
     if not Path(psf_name).is_file():
         raise click.BadParameter(f"expected a file, or auto; got {psf_name!r}", param_hint="--psf")
-    psf = read_psf(psf_name, _limits(), parts=False)
+    psf = read_psf(psf_name, limits(), parts=False)
     return lambda _path: psf
 
 
@@ -151,7 +156,7 @@ def _known_figures(path: Path) -> tuple[Noise | None, float | None]:
     from psfcore.instruments.gain import noise_for, saturation_for
     from psfcore.instruments.model import load_instrument
 
-    summary = read_summary(path, _limits())
+    summary = read_summary(path, limits())
     if summary.instrument is None or summary.gain_mode is None:
         return None, None
     instrument, mode = load_instrument(summary.instrument), Header({"GAINCOMB": summary.gain_mode})
@@ -202,13 +207,3 @@ def _lines(content: dict[str, Any]) -> list[str]:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _limits() -> FitsLimits:
-    return FitsLimits(max_pixels=Settings.model_fields["max_pixels"].default)
-
-
-def _progress(done: int, of: int) -> None:
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r{done}/{of} " + ("\n" if done == of else ""))
-        sys.stderr.flush()

@@ -6,19 +6,25 @@ Everything numerical is imported by the command that needs it, so that the other
 from __future__ import annotations
 
 import hashlib
-import json
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from psfcore.errors import DataError
-from psfcore.header import FitsLimits
-from service.cli_diffraction import OUTPUT, user_errors
-from workers.settings import Settings, software_version
+from service.cli_options import (
+    FOLDER,
+    NOISE,
+    OUTPUT,
+    PLOT,
+    Report,
+    check_writable,
+    limits,
+    progress_bar,
+    user_errors,
+    write_json,
+)
+from workers.settings import software_version
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,18 +32,16 @@ if TYPE_CHECKING:
 
     from psfcore.psf import Psf
     from psfcore.scatter.fold_fits import FoldKernels
-    from psfcore.scatter.inversion import Inversion
+    from psfcore.scatter.inversion import Solution
     from psfcore.transit.evaluation import Evaluation
     from psfcore.transit.transit import Transit
 
 THREADS = 2
 NO_PSF = "none"
 
-Report = Callable[[str, int, int], None]
-
 
 @click.command()
-@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("folder", type=FOLDER)
 @click.option(
     "--psf",
     "psf_file",
@@ -47,60 +51,73 @@ Report = Callable[[str, int, int], None]
     help="A PSF (FITS); none: fit the transit, and evaluate each image with a PSF fitted without it",
 )
 @click.option("--json", "json_file", type=OUTPUT, help="Write all of it, image by image")
-@click.option("--plot", type=OUTPUT, help="Write a picture (PNG)")
+@PLOT
 @click.option("--dark-offsets", is_flag=True, help="Also fit with -5, -3, +3 and +5 DN added to the images")
-@click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help="DN a photon, DN rms of the readout")
+@click.option(
+    "--shapes",
+    is_flag=True,
+    help="Also compare shapes of scatter by what each leaves, held out; with --psf none",
+)
+@NOISE
 def evaluate(
     folder: Path,
     psf_file: str,
     json_file: Path | None,
     plot: Path | None,
     dark_offsets: bool,
+    shapes: bool,
     noise: tuple[float, float] | None,
 ) -> None:
     """Compare the light that a PSF puts into the occulter of FOLDER, a transit, with what was observed there."""
     from psfcore.transit.evaluation_plot import evaluation_png
     from psfcore.transit.evaluation_report import lines, report
 
-    _check_writable(json_file, plot)
-    with user_errors(), _progress() as say:
+    check_writable(json_file, plot)
+    if shapes and psf_file != NO_PSF:
+        raise click.UsageError(f"--shapes fits every shape itself: expected --psf {NO_PSF}; got a PSF file")
+    with user_errors(), progress_bar() as say:
         psf = None if psf_file == NO_PSF else _psf(Path(psf_file))
         transit = _transit(folder, noise, fits=psf is None or dark_offsets, progress=say)
         _check_scale(transit, psf)
-        nominal = None
+        fitted, compared = None, None
         if psf is None:
-            evaluation, nominal, about = _held_out(transit, say)
+            evaluation, fitted, about = _held_out(transit, say)
         else:
             evaluation, about = _with(transit, psf, Path(psf_file), say)
         study = None
         if dark_offsets:
             from psfcore.scatter.dark_offsets import dark_offset_study
 
+            nominal = None if fitted is None else fitted.inversion
             study = dark_offset_study(transit, nominal=nominal, threads=THREADS, progress=say)
         found = report(evaluation, study)
+        if shapes and fitted is not None:
+            from psfcore.transit.evaluation_shapes import compare_shapes_by_errors
+
+            compared = compare_shapes_by_errors(fitted, progress=say)
+            found["shapes"] = compared.to_json()
     said = f"{about['sentence']}; {len(transit.frames)} images of {folder.resolve().name}"
-    try:
+    with user_errors():
         if plot is not None:
             evaluation_png(evaluation, plot, title=said, study=study)
-        if json_file is not None:
-            whole = {"psf": about, "software_version": software_version(), **found}
-            json_file.write_text(json.dumps(whole, indent=1, allow_nan=False) + "\n")
-    except OSError as error:
-        raise click.ClickException(f"cannot write the result: {error.strerror or error}") from error
+        write_json(json_file, {"psf": about, "software_version": software_version(), **found})
     click.echo(said)
     click.echo("\n".join(lines(evaluation, study)))
+    if compared is not None:
+        click.echo("\n".join(compared.lines()))
 
 
 COMMANDS = (evaluate,)
 
 
-def _held_out(transit: Transit, say: Report) -> tuple[Evaluation, Inversion, dict[str, Any]]:
+def _held_out(transit: Transit, say: Report) -> tuple[Evaluation, Solution, dict[str, Any]]:
     """Every image with the PSF of the fold that holds it out; the fit to all images; what was done."""
     from psfcore.scatter.fold_fits import fold_kernels
     from psfcore.scatter.inversion import invert
     from psfcore.transit.evaluation import evaluate as evaluated
 
-    whole = invert(transit, threads=THREADS, progress=say).inversion
+    solution = invert(transit, threads=THREADS, progress=say)
+    whole = solution.inversion
     kernels = fold_kernels(transit, whole.shape, start=whole.coordinates, threads=THREADS, progress=say)
     evaluation = evaluated(transit, kernels, threads=THREADS, progress=say)
     about = {
@@ -110,7 +127,7 @@ def _held_out(transit: Transit, say: Report) -> tuple[Evaluation, Inversion, dic
         "parameters": whole.values,
         "folds": _folds_json(transit, kernels),
     }
-    return evaluation, whole, about
+    return evaluation, solution, about
 
 
 def _folds_json(transit: Transit, kernels: FoldKernels) -> list[dict[str, Any]]:
@@ -152,7 +169,7 @@ def _psf(file: Path) -> Psf:
         raise click.BadParameter(
             f"expected a PSF file, or {NO_PSF}; there is no file {file}", param_hint="--psf"
         )
-    return read_psf(file, _limits(), parts=False)
+    return read_psf(file, limits(), parts=False)
 
 
 def _transit(folder: Path, noise: tuple[float, float] | None, *, fits: bool, progress: Report) -> Transit:
@@ -162,7 +179,7 @@ def _transit(folder: Path, noise: tuple[float, float] | None, *, fits: bool, pro
 
     return read_transit(
         folder,
-        _limits(),
+        limits(),
         progress=lambda done, of: progress("reading", done, of),
         diffraction=_built_diffraction if fits else _no_diffraction,
         noise=None if noise is None else Noise(*noise),
@@ -206,31 +223,3 @@ def _check_scale(transit: Transit, psf: Psf | None) -> None:
             f"expected images of {psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it; "
             f"got {seen:g} arcsec/px",
         )
-
-
-def _limits() -> FitsLimits:
-    return FitsLimits(max_pixels=Settings.model_fields["max_pixels"].default)
-
-
-def _check_writable(*files: Path | None) -> None:
-    """Say so before the work, not after it, where a result could not be written."""
-    for file in files:
-        if file is not None and not file.resolve().parent.is_dir():
-            raise click.ClickException(f"cannot write {file}: there is no folder {file.resolve().parent}")
-
-
-@contextmanager
-def _progress() -> Iterator[Report]:
-    """What is being done, on a terminal; nothing elsewhere."""
-    if not sys.stderr.isatty():
-        yield lambda stage, step, steps: None
-        return
-
-    def report(stage: str, step: int, steps: int) -> None:
-        sys.stderr.write(f"\r{stage:<40.40} {step}/{steps}    ")
-        sys.stderr.flush()
-
-    try:
-        yield report
-    finally:
-        sys.stderr.write("\n")

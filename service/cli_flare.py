@@ -5,15 +5,12 @@ Everything numerical is imported when it is called, so that other commands start
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from psfcore.header import FitsLimits
-from service.cli_diffraction import FILE, OUTPUT, user_errors
-from workers.settings import Settings
+from service.cli_options import FILE, NOISE, OUTPUT, PLOT, check_writable, limits, user_errors, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,10 +36,10 @@ WELL_MATCHED_PCT = 3.0
     help="Direction of the arm, degrees from +x to +y [default: the measured arm nearest to +x]",
 )
 @click.option("--range", "distances_px", nargs=2, type=float, default=(10, 80), show_default=True, help="px")
-@click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help="DN a photon, DN rms of the readout")
+@NOISE
 @click.option("--saturation", type=float, help="DN from which pixels are not trusted")
 @click.option("--json", "json_file", type=OUTPUT, help="Write profiles and figures")
-@click.option("--plot", type=OUTPUT, help="Write a picture (PNG)")
+@PLOT
 def flare(
     image: Path,
     background: Path,
@@ -60,10 +57,10 @@ def flare(
     from psfcore.fits_io import read_image, read_psf
     from psfcore.psf import check_compatible
 
+    check_writable(json_file, plot)
     with user_errors():
-        limits = FitsLimits(max_pixels=Settings.model_fields["max_pixels"].default)
-        flaring, before = (read_image(f, limits, saturation_dn=saturation) for f in (image, background))
-        psf = read_psf(psf_file, limits)
+        flaring, before = (read_image(f, limits(), saturation_dn=saturation) for f in (image, background))
+        psf = read_psf(psf_file, limits())
         check_compatible(flaring, psf)
         light, quiet, unit = _same_unit(flaring, before)
         difference = light - quiet
@@ -85,7 +82,7 @@ def flare(
     click.echo("\n".join(_lines(found)))
     if json_file is not None:
         inputs = {"image": image.name, "background": background.name, "psf": f"{psf.name} {psf.version}"}
-        json_file.write_text(json.dumps(inputs | found.as_json(), indent=1, allow_nan=False) + "\n")
+        write_json(json_file, inputs | found.as_json())
 
 
 COMMANDS = (flare,)

@@ -5,7 +5,6 @@ A file is read here and asked the same questions as the service's tables are.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,11 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psfcore.header import FitsLimits
 from service import psf_lookup
-from service.cli_diffraction import OUTPUT, user_errors
-from service.client import DEFAULT_SERVER, Heliopsf, ServiceError
-from workers.settings import Settings
+from service.cli_options import OUTPUT, check_writable, limits, user_errors, write_json
+from service.client import DEFAULT_SERVER, Heliopsf
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
@@ -48,8 +45,9 @@ def query(
     server: str | None,
 ) -> None:
     """Say how far the light of a PSF goes: by radius, in an annulus, beside another PSF."""
+    check_writable(json_file)
     answers: dict[str, Any] = {}
-    with _errors(), _asking(server, psf, compare) as ask:
+    with user_errors(), _asking(server, psf, compare) as ask:
         if radii or not (annulus or profile or compare):
             reach = ask(psf, "encircled", radius=0.0)["reach_px"]
             wanted = list(radii) or [r for r in SHOWN_RADII_PX if r <= reach]
@@ -63,8 +61,7 @@ def query(
     for name, lines in _LINES.items():
         if name in answers:
             click.echo("\n".join(lines(answers[name])))
-    if json_file is not None:
-        json_file.write_text(json.dumps(answers, indent=1, allow_nan=False) + "\n")
+    write_json(json_file, answers)
 
 
 @click.command("cutout")
@@ -74,7 +71,8 @@ def query(
 @SERVER
 def cutout(psf: str, size: int, output: Path, server: str | None) -> None:
     """Write the middle of a PSF, not renormalised. Of a file, its components too."""
-    with _errors():
+    check_writable(output)
+    with user_errors():
         if _is_id(psf):
             with Heliopsf(server) as service:
                 service.psf_cutout(psf, size, output)
@@ -92,7 +90,8 @@ def rebin(psf: str, factor: int, output: Path, server: str | None) -> None:
     """Write the PSF that an image of FACTOR x FACTOR binned pixels is seen through."""
     from psfcore.psf_sampling import rebinned
 
-    with _errors(), TemporaryDirectory(prefix="heliopsf-") as folder:
+    check_writable(output)
+    with user_errors(), TemporaryDirectory(prefix="heliopsf-") as folder:
         file = psf
         if _is_id(psf):
             file = str(Path(folder) / "psf.fits")
@@ -150,7 +149,7 @@ def _tables(file: str) -> dict[str, Any]:
 def _read(file: str) -> Psf:
     from psfcore.fits_io import read_psf
 
-    return read_psf(file, FitsLimits(max_pixels=Settings.model_fields["max_pixels"].default))
+    return read_psf(file, limits())
 
 
 def _cut(psf: Psf, size: int) -> Psf:
@@ -243,12 +242,3 @@ _LINES = {
     "profile": _profile_lines,
     "compare": _compare_lines,
 }
-
-
-@contextmanager
-def _errors() -> Iterator[None]:
-    try:
-        with user_errors():
-            yield
-    except (ServiceError, OSError) as error:
-        raise click.ClickException(str(error)) from error

@@ -5,15 +5,22 @@ Everything numerical is imported by the command that needs it, so that the other
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from psfcore.header import FitsLimits
-from service.cli_diffraction import FILE, OUTPUT, user_errors
-from workers.settings import Settings
+from service.cli_options import (
+    FILE,
+    FOLDER,
+    OUTPUT,
+    OUTPUT_FOLDER,
+    check_fresh_folder,
+    check_writable,
+    limits,
+    user_errors,
+    write_json,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,9 +38,7 @@ def simulate() -> None:
 
 
 @simulate.command()
-@click.option(
-    "-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), help="Folder to fill"
-)
+@click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder to fill")
 @click.option(
     "--size", default=512, show_default=True, type=click.IntRange(64, 4096), help="Edge of an image, px"
 )
@@ -93,7 +98,7 @@ def transit(
     from psfcore.simulate.transit import simulate as simulated
     from psfcore.simulate.transit_files import write
 
-    _check_folder(output, force)
+    check_fresh_folder(output, force=force)
     with user_errors():
         scatter = ScatterTruth(b_px, c, total, stretch, stretch_angle, dipole)
         plan = default_plan(images, size, beyond=beyond, saturation_dn=saturation, dark_offset_dn=dark_offset)
@@ -115,19 +120,16 @@ def transit(
 
 
 @simulate.command()
-@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("folder", type=FOLDER)
 @click.option("--json", "json_file", type=OUTPUT, help="Write all of it, with every image's place")
 def bound(folder: Path, json_file: Path | None) -> None:
     """Say how well photons and readout let FOLDER, a simulated transit, be analysed at best."""
     from psfcore.simulate.bound import bound_of_folder
 
+    check_writable(json_file)
     with user_errors():
         found = bound_of_folder(folder, threads=2)
-    if json_file is not None:
-        try:
-            json_file.write_text(json.dumps(found.to_json(), indent=1, allow_nan=False) + "\n")
-        except OSError as error:
-            raise click.ClickException(f"cannot write {json_file}: {error.strerror or error}") from error
+    write_json(json_file, found.to_json())
     click.echo("\n".join(_lines(found)))
 
 
@@ -152,13 +154,6 @@ def _lines(found: PhotonBound) -> list[str]:
     ]
 
 
-def _check_folder(folder: Path, force: bool) -> None:
-    if not force and folder.is_dir() and any(folder.iterdir()):
-        raise click.ClickException(f"{folder} is not empty: name another folder, or say --force")
-    if not folder.resolve().parent.is_dir():
-        raise click.ClickException(f"cannot write {folder}: there is no folder {folder.resolve().parent}")
-
-
 def _diffraction(file: Path | None, instrument: str, size: int) -> NDArray[np.float64]:
     """Weights that sum to 1 on their grid: read, or built for an instrument."""
     from psfcore.build import build_psf
@@ -166,7 +161,7 @@ def _diffraction(file: Path | None, instrument: str, size: int) -> NDArray[np.fl
     from psfcore.instruments.model import load_instrument
 
     if file is not None:
-        return read_plane(file, _limits())
+        return read_plane(file, limits())
     kernel = build_psf(load_instrument(instrument), size=size, component="DIFFRACTION", threads=2).kernel
     return kernel / kernel.sum()
 
@@ -184,14 +179,10 @@ def _scenes(files: tuple[Path, ...], plan: Plan) -> dict[int, NDArray[np.float64
         raise click.BadParameter(message, param_hint="--scene")
     scenes = {}
     for fov in plan.fovs:
-        image = read_image(files[(fov - 1) % len(files)], _limits())
+        image = read_image(files[(fov - 1) % len(files)], limits())
         rate = image.pixels
         if (image.unit or "").replace(" ", "").lower() == "dn" and image.exposure_s is not None:
             rate = rate / image.exposure_s
         mirrored = len(files) == 1 and plan.views[fov - 1] == WEST
         scenes[fov] = scene_from_image(rate[:, ::-1] if mirrored else rate, plan)
     return scenes
-
-
-def _limits() -> FitsLimits:
-    return FitsLimits(max_pixels=Settings.model_fields["max_pixels"].default)

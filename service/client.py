@@ -98,13 +98,15 @@ class Operations(ABC):
         ``effects``: where to write the picture of difference, ratio and histogram.
         ``method_parameters``: what the method takes, as ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
         """
-        given = {name: value for name, value in method_parameters.items() if value is not None}
-        wanted: dict[str, Any] = {"psf_id": psf_id, "method": {"name": method, **given}}
-        if noise is not None:
-            wanted["noise"] = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}
-        wanted |= {"saturation_dn": saturation_dn, "error_draws": error_draws}
-        wanted["effects_picture"] = effects is not None
-        job = self.submit("deconvolve", image_id=self.upload_image(image)["id"], **wanted)
+        wanted = {
+            "psf_id": psf_id,
+            "method": {"name": method, **_given(method_parameters)},
+            "saturation_dn": saturation_dn,
+            "error_draws": error_draws,
+            "effects_picture": effects is not None,
+        }
+        image_id = self.upload_image(image)["id"]
+        job = self.submit("deconvolve", image_id=image_id, **wanted, **_noise(noise))
         product = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(product, output, preview)
         if effects is not None:
@@ -155,10 +157,8 @@ class Operations(ABC):
         ``report``, ``preview``: where to write the report (JSON) and the picture. ``noise``: as for ``deconvolve``.
         ``parameters``: what the fit takes, as ``shape="stretched"``, ``as_published=True``.
         """
-        given = {name: value for name, value in parameters.items() if value is not None}
-        if noise is not None:
-            given["noise"] = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}
-        job = self.submit("psf-fit", transit_id=self.upload_transit(transit)["id"], **given)
+        transit_id = self.upload_transit(transit)["id"]
+        job = self.submit("psf-fit", transit_id=transit_id, **_given(parameters), **_noise(noise))
         psf = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(psf, output, preview)
         if report is not None:
@@ -179,12 +179,58 @@ class Operations(ABC):
 
         ``parameters``: as for ``fit_psf``, and ``scheme="exact"``, ``runs=10``.
         """
-        given = {name: value for name, value in parameters.items() if value is not None}
-        if noise is not None:
-            given["noise"] = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}
-        job = self.submit("cross-validate", transit_id=self.upload_transit(transit)["id"], **given)
+        transit_id = self.upload_transit(transit)["id"]
+        job = self.submit("cross-validate", transit_id=transit_id, **_given(parameters), **_noise(noise))
         found = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(found, report, preview)
+        return found
+
+    def evaluate(
+        self,
+        transit: str | Path,
+        report: str | Path | None = None,
+        *,
+        page: str | Path | None = None,
+        preview: str | Path | None = None,
+        progress: Progress | None = None,
+        noise: tuple[float, float] | None = None,
+        **parameters: Any,
+    ) -> dict[str, Any]:
+        """Upload a transit, have a report made on it and its PSF, and download that; its description.
+
+        ``report``, ``page``, ``preview``: where to write it as JSON, as HTML, as a picture. ``noise``: as for
+        ``deconvolve``. ``parameters``: ``psf_id`` of a PSF to judge instead of fitting one, ``seed``, ``dark_offsets``.
+        """
+        transit_id = self.upload_transit(transit)["id"]
+        job = self.submit("evaluate", transit_id=transit_id, **_given(parameters), **_noise(noise))
+        found = self.get(self.wait(job, progress=progress)["result"])
+        self._fetch(found, report, preview)
+        if page is not None:
+            self.download(found["html"], page)
+        return found
+
+    def diagnose_gap(
+        self,
+        transit: str | Path,
+        report: str | Path | None = None,
+        *,
+        page: str | Path | None = None,
+        preview: str | Path | None = None,
+        progress: Progress | None = None,
+        noise: tuple[float, float] | None = None,
+        **parameters: Any,
+    ) -> dict[str, Any]:
+        """Upload a transit, have the gap between it and its model diagnosed and download the report; its description.
+
+        ``report``, ``page``, ``preview``, ``noise``: as for ``evaluate``. ``parameters``: ``psf_id`` of a fitted PSF to
+        start from, ``seed``, ``correct``. Where there is an answer, ``details.corrected_psf_id`` names the PSF with it.
+        """
+        transit_id = self.upload_transit(transit)["id"]
+        job = self.submit("gap-diagnose", transit_id=transit_id, **_given(parameters), **_noise(noise))
+        found = self.get(self.wait(job, progress=progress)["result"])
+        self._fetch(found, report, preview)
+        if page is not None:
+            self.download(found["html"], page)
         return found
 
     def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
@@ -422,6 +468,16 @@ def as_archive(path: Path) -> Iterator[Path]:
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
         yield archive
+
+
+def _given(parameters: dict[str, Any]) -> dict[str, Any]:
+    """Of a job's parameters those that were given; the service has defaults for the others."""
+    return {name: value for name, value in parameters.items() if value is not None}
+
+
+def _noise(noise: tuple[float, float] | None) -> dict[str, Any]:
+    """A job's parameter for (DN a photon, DN rms of the readout), where they are known."""
+    return {} if noise is None else {"noise": {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}}
 
 
 def percent(value: float | None, digits: int = 1) -> str:

@@ -30,9 +30,11 @@ RESULTS = {
     "psf-fit": "/v1/psfs",
     "psf-tables": "/v1/psfs",
     "cross-validate": "/v1/reports",
+    "evaluate": "/v1/reports",
+    "gap-diagnose": "/v1/reports",
 }
 # Kinds whose steps count the whole job, so that what is left can be told from what was done.
-COUNTED_WHOLE = {"psf-build", "psf-fit", "cross-validate"}
+COUNTED_WHOLE = {"psf-build", "psf-fit", "cross-validate", "evaluate"}
 
 
 class Progress(BaseModel):
@@ -82,13 +84,15 @@ class JobView(BaseModel):
 @router.post(
     "",
     status_code=202,
-    summary="Ask for a deconvolution, a PSF build, a fit of a transit or its cross-validation",
+    summary="Ask for a deconvolution, a PSF build, a fit of a transit, its cross-validation, a report or a diagnosis",
     responses={200: {"model": JobView, "description": "An equal request was made before; this is its job."}},
 )
 def submit_job(body: JobRequest, response: Response, state: Shared) -> JobView:
     """Write the job down; it is submitted from there. An equal request gets the job that it already has."""
     try:
-        parameters, request_key = resolve(body, state.catalogue, DEFAULT_OWNER)
+        parameters, request_key = resolve(
+            body, state.catalogue, DEFAULT_OWNER, added_effects=state.settings.added_effects
+        )
     except DataError as error:
         raise Problem(STATUS_OF.get(error.code, 422), error.code, error.message) from error
     row, new = state.catalogue.submit(body.kind, parameters, request_key)

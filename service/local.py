@@ -88,7 +88,10 @@ class LocalService(Operations):
         except ValidationError as error:
             faults = (f"{'/'.join(map(str, e['loc'][1:]))}: {e['msg']}" for e in error.errors())
             raise ServiceError("; ".join(faults)) from error
-        row, _ = self._catalogue.submit(kind, *resolve(request, self._catalogue, DEFAULT_OWNER))
+        resolved = resolve(
+            request, self._catalogue, DEFAULT_OWNER, added_effects=self._settings.added_effects
+        )
+        row, _ = self._catalogue.submit(kind, *resolved)
         return JobView.of(row).model_dump(mode="json")
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
@@ -120,6 +123,7 @@ class LocalService(Operations):
             "preview": row.preview_sha256,
             "effects": row.details.get("effects_picture_sha256"),
             "report": row.details.get("report_sha256"),
+            "page": row.details.get("page_sha256"),
         }
         digest = digests[part]
         assert digest is not None
@@ -175,10 +179,10 @@ class LocalService(Operations):
 
 
 @contextmanager
-def local_service() -> Iterator[LocalService]:
-    """A local service on a folder that is gone afterwards."""
+def local_service(*, gap_effects: str = "") -> Iterator[LocalService]:
+    """A local service on a folder that is gone afterwards. gap_effects: as the setting of that name."""
     with TemporaryDirectory(prefix="heliopsf-") as folder:
-        service = LocalService(Settings.apart(Path(folder)))
+        service = LocalService(Settings.apart(Path(folder), gap_effects=gap_effects))
         try:
             yield service
         finally:

@@ -14,6 +14,8 @@ from service.state import Shared
 from workers.catalogue import ReportRow
 from workers.contract import Identity
 
+PAGE_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
 router = APIRouter(prefix="/v1/reports", tags=["reports"], responses=RESPONSES)
 
 
@@ -28,6 +30,7 @@ class ReportView(BaseModel):
     details: dict[str, Any] = Field(description="the sentence to read first, and the figures that matter")
     file: str = Field(description="address of the whole report, JSON")
     preview: str | None = Field(description="address of a picture")
+    html: str | None = Field(description="address of the report as a page to read, which needs nothing else")
 
     @classmethod
     def of(cls, row: ReportRow) -> ReportView:
@@ -42,6 +45,7 @@ class ReportView(BaseModel):
             details=row.details,
             file=f"{here}/file",
             preview=f"{here}/preview" if row.preview_sha256 else None,
+            html=f"{here}/page" if row.details.get("page_sha256") else None,
         )
 
 
@@ -80,6 +84,18 @@ def get_report_preview(report_id: Identity, request: Request, state: Shared) -> 
     if row.preview_sha256 is None:
         raise Problem(404, "no-preview", "this report has no picture")
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
+
+
+@router.get("/{report_id}/page", summary="The report as a page to read", response_class=Response)
+def get_report_page(report_id: Identity, request: Request, state: Shared) -> Response:
+    """The report as HTML with its figures inside; the browser is told to load nothing else and to run no script."""
+    digest = _find(state, report_id).details.get("page_sha256")
+    if digest is None:
+        raise Problem(404, "no-page", "this report has no page; its file and its picture are all there is")
+    answer = files.send(request, state.store, digest, "text/html; charset=utf-8", None)
+    answer.headers["Content-Security-Policy"] = PAGE_POLICY
+    answer.headers["X-Content-Type-Options"] = "nosniff"
+    return answer
 
 
 def _find(state: Shared, report_id: str) -> ReportRow:

@@ -1,10 +1,13 @@
 """How good the inversion is, on simulated transits whose truth is known: bias, errors, pulls, places, stretch.
 
     python -m tests.transit_study [--seeds 20] [--processes 2] [--published 0] [--stretch 0] [--size 512] [--images 30]
+    python -m tests.transit_study --bands | --shapes
 
 Each seed draws a power law, scenes, an ephemeris and noise of its own. Printed is what the closing table of the fit
 asks for: the total PSF's cumulative curve against truth, its rms beside the photon bound, pulls, the occulter's
-place, the curve without noise on the true scene's places, and on request the published recipe and stretches.
+place, the curve without noise on the true scene's places, and on request the published recipe and stretches. --bands: the
+bands of cross-validations against truth. --shapes: what shapes of scatter leave in held-out images, and the light that
+a free fit puts near the centre beyond the power law's; the truth is a power law.
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ from psfcore.simulate.bound import photon_bound
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from psfcore.simulate.transit import SimulatedTransit, simulate
+from psfcore.transit.evaluation_shapes import compare_shapes_by_errors
 
 BRIGHT_PHOTONS = 30.0
 
@@ -112,6 +116,39 @@ def banded(seed: int, size: int, images: int) -> dict[str, Any]:
         "sigma": ((found.curve_pct[3] - found.curve_pct[1]) / 2).tolist(),
         "held_out": found.held_out,
     }
+
+
+def shaped(seed: int, size: int, images: int) -> dict[str, Any]:
+    """One seed: shapes by their held-out errors, and the free fit beside the power law in a cross-validation."""
+    kernel, truth = diffraction(min(2 * size, REACH_GRID_PX)), drawn_truth(seed)
+    solution = invert(simulate(default_plan(images, size), truth, kernel, seed).transit)
+    found = bands(shared_fits(solution, draws(images, seed=seed)), solution.inversion.radii_px).shells
+    assert found is not None
+    return {
+        "seed": seed,
+        "near": found.near_centre,
+        "largest": found.largest,
+        "excess_pull": found.excess_pct[2] / found.excess_sigma,
+        "shapes": compare_shapes_by_errors(solution, seed=seed),
+    }
+
+
+def shapes_summary(rows: list[dict[str, Any]]) -> str:
+    """A table a seed, and the excesses."""
+    lines = []
+    for row in rows:
+        lines.append(f"seed {row['seed']}")
+        lines += row["shapes"].lines()
+        for name, excess in (("near the centre", row["near"]), ("most apart", row["largest"])):
+            lines.append(
+                f"free fit less power law, {name}: {excess.points:+.2f} +- {excess.sigma:.2f} points of all light "
+                f"within {excess.within_px:.3g} px ({excess.of_formula_pct:+.0f} % of the power law's)"
+            )
+    pulls = np.array([row["excess_pull"] for row in rows])
+    lines.append(
+        f"pulls of the excess at all distances: rms {np.sqrt((pulls**2).mean()):.2f}, at most {np.abs(pulls).max():.2f}"
+    )
+    return "\n".join(lines)
 
 
 def bands_summary(rows: list[dict[str, Any]]) -> str:
@@ -244,14 +281,19 @@ def main() -> None:
     parser.add_argument("--published", type=int, default=0, help="seeds that the published recipe gets")
     parser.add_argument("--stretch", type=int, default=0, help="seeds that a stretch is put into")
     parser.add_argument("--bands", action="store_true", help="cross-validate each seed, and nothing else")
+    parser.add_argument("--shapes", action="store_true", help="compare shapes of each seed, and nothing else")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     diffraction(min(2 * asked.size, REACH_GRID_PX))
     with ProcessPoolExecutor(asked.processes) as pool:
-        if asked.bands:
-            seeds = range(asked.first, asked.first + asked.seeds)
-            print(bands_summary(list(pool.map(banded, seeds, repeat(asked.size), repeat(asked.images)))))
-            return
+        for wanted, part, told in (
+            (asked.bands, banded, bands_summary),
+            (asked.shapes, shaped, shapes_summary),
+        ):
+            if wanted:
+                seeds = range(asked.first, asked.first + asked.seeds)
+                print(told(list(pool.map(part, seeds, repeat(asked.size), repeat(asked.images)))))
+                return
         jobs = [
             pool.submit(one, seed, asked.size, asked.images, k < asked.published, k < asked.stretch)
             for k, seed in enumerate(range(asked.first, asked.first + asked.seeds))

@@ -44,28 +44,27 @@ class Base(DeclarativeBase):
     type_annotation_map = {dict[str, Any]: JSON}  # noqa: RUF012 - SQLAlchemy's own convention
 
 
-class ImageRow(Base):
-    """An uploaded image; its id is the hash of its bytes."""
+class Uploaded:
+    """Columns of an upload; its id is the hash of its bytes."""
+
+    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    created_at: Mapped[float] = mapped_column(index=True)
+    bytes: Mapped[int] = mapped_column(BigInteger)
+    filename: Mapped[str | None]
+    summary: Mapped[dict[str, Any]]
+
+
+class ImageRow(Uploaded, Base):
+    """An uploaded image."""
 
     __tablename__ = "images"
-    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    created_at: Mapped[float] = mapped_column(index=True)
-    bytes: Mapped[int] = mapped_column(BigInteger)
-    filename: Mapped[str | None]
-    summary: Mapped[dict[str, Any]]
 
 
-class TransitRow(Base):
-    """An uploaded transit; its id is the hash of the archive's bytes."""
+class TransitRow(Uploaded, Base):
+    """An uploaded transit, as the archive that was sent."""
 
     __tablename__ = "transits"
-    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    created_at: Mapped[float] = mapped_column(index=True)
-    bytes: Mapped[int] = mapped_column(BigInteger)
-    filename: Mapped[str | None]
-    summary: Mapped[dict[str, Any]]
 
 
 class PsfRow(Base):

@@ -219,12 +219,54 @@ class PsfFit(_Parameters):
 class CrossValidate(PsfFit):
     """How well a fit is known: blocks of images held out, the others drawn again, in many runs."""
 
-    algorithm_version: ClassVar[int] = 1
+    algorithm_version: ClassVar[int] = 2
     as_published: Literal[False] = False
     scheme: Literal["shared", "exact"] = Field(
         "shared", description="folds that share every reconstruction, or fits of their own (slow, fanned out)"
     )
     runs: int = Field(10, ge=1, le=50, description="each holds every block out once; the paper has ten")
+
+
+class Evaluate(_Parameters):
+    """Report on an uploaded transit: its PSF fitted, cross-validated and judged on images held out; or one given, judged."""
+
+    algorithm_version: ClassVar[int] = 1
+    transit_id: Identity = Field(description="id that the upload of the transit answered")
+    psf_id: Identity | None = Field(
+        None, description="a PSF of the catalogue, evaluated as it is; none: the transit is fitted"
+    )
+    noise: NoiseFigures | None = Field(None, description="instead of those in transit.json")
+    saturation_dn: float | None = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="DN of one exposure; none: header's or instrument's, if known",
+    )
+    seed: int = Field(1, ge=0, lt=2**31, description="of all draws")
+    dark_offsets: bool = Field(
+        True, description="also fit with -5, -3, +3 and +5 DN added to every image; not where a PSF is given"
+    )
+
+
+class GapDiagnose(_Parameters):
+    """Diagnose the gap between an uploaded transit and the model fitted to it: is there one, where, and which effect."""
+
+    algorithm_version: ClassVar[int] = 1
+    transit_id: Identity = Field(description="id that the upload of the transit answered")
+    psf_id: Identity | None = Field(
+        None, description="a PSF of the catalogue that was fitted to a transit: the fit starts from it"
+    )
+    noise: NoiseFigures | None = Field(None, description="instead of those in transit.json")
+    saturation_dn: float | None = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="DN of one exposure; none: header's or instrument's, if known",
+    )
+    seed: int = Field(1, ge=0, lt=2**31, description="of the simulation and of the intervals")
+    correct: bool = Field(
+        True, description="where there is an answer, also add the PSF with it in the model to the catalogue"
+    )
 
 
 class PsfTables(_Parameters):
@@ -262,6 +304,20 @@ class CrossValidateRequest(_Parameters):
     parameters: CrossValidate
 
 
+class EvaluateRequest(_Parameters):
+    """A request for a report on a transit and its PSF."""
+
+    kind: Literal["evaluate"]
+    parameters: Evaluate
+
+
+class GapDiagnoseRequest(_Parameters):
+    """A request for a diagnosis of the gap."""
+
+    kind: Literal["gap-diagnose"]
+    parameters: GapDiagnose
+
+
 class PsfTablesRequest(_Parameters):
     """A request for a PSF's tables."""
 
@@ -270,7 +326,13 @@ class PsfTablesRequest(_Parameters):
 
 
 JobRequest = Annotated[
-    DeconvolveRequest | PsfBuildRequest | PsfFitRequest | PsfTablesRequest | CrossValidateRequest,
+    DeconvolveRequest
+    | PsfBuildRequest
+    | PsfFitRequest
+    | PsfTablesRequest
+    | CrossValidateRequest
+    | EvaluateRequest
+    | GapDiagnoseRequest,
     Field(discriminator="kind"),
 ]
 
@@ -279,6 +341,19 @@ class ResolvedPsfFit(PsfFit):
     """A fit as the worker gets it: with the recipe of the diffraction, where the transit brings none."""
 
     diffraction_recipe: PsfBuild | None = None
+
+
+class ResolvedEvaluate(Evaluate):
+    """An evaluation as the worker gets it: with the recipe of the diffraction, where a fit needs one."""
+
+    diffraction_recipe: PsfBuild | None = None
+
+
+class ResolvedGapDiagnose(GapDiagnose):
+    """A diagnosis as the worker gets it: with the diffraction's recipe, and the effects that the operator adds."""
+
+    diffraction_recipe: PsfBuild | None = None
+    added_effects: tuple[str, ...] = ()
 
 
 class ResolvedDeconvolve(_Parameters):
@@ -359,3 +434,34 @@ def psf_fit_identity(request: ResolvedPsfFit | ResolvedCrossValidate) -> str:
             "algorithm_version": request.algorithm_version,
         }
     )
+
+
+def evaluate_identity(request: ResolvedEvaluate) -> str:
+    """Identity of a report: the transit's bytes, the PSF's identity or the diffraction's, parameters, version."""
+    recipe = request.diffraction_recipe
+    return canonical_hash(
+        {
+            "kind": "evaluate",
+            "request": request.model_dump(mode="json", exclude={"diffraction_recipe"}),
+            "diffraction": None if recipe is None else psf_identity(recipe),
+            "algorithm_version": request.algorithm_version,
+        }
+    )
+
+
+def gap_identity(request: ResolvedGapDiagnose) -> str:
+    """Identity of a diagnosis: the transit's bytes, the PSF's and the diffraction's identity, parameters, version."""
+    recipe = request.diffraction_recipe
+    return canonical_hash(
+        {
+            "kind": "gap-diagnose",
+            "request": request.model_dump(mode="json", exclude={"diffraction_recipe"}),
+            "diffraction": None if recipe is None else psf_identity(recipe),
+            "algorithm_version": request.algorithm_version,
+        }
+    )
+
+
+def corrected_psf_identity(diagnosis: str) -> str:
+    """Identity of the PSF with the answer of a diagnosis in the model."""
+    return canonical_hash({"kind": "gap-corrected-psf", "diagnosis": diagnosis})

@@ -12,9 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.scatter.cross_validation import Bands, Draw, FoldFit, bands, draws, exact_fit, shared_fits
+from psfcore.scatter.cross_validation import (
+    NEAR_CENTRE_PX,
+    PARTING_SIGMAS,
+    Bands,
+    Draw,
+    FoldFit,
+    bands,
+    draws,
+    exact_fit,
+    shared_fits,
+)
 from psfcore.scatter.cross_validation_plot import cross_validation_png
-from psfcore.scatter.inversion import invert
+from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
 from psfcore.transit.transit import Transit
@@ -36,10 +46,11 @@ def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
         return identity
     transit = load_transit(context, request)[0]
     wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
+    solution = _solution(context, request, transit)
     if request.scheme == "shared":
-        fits = _shared(context, request, transit, wanted)
+        fits = shared_fits(solution, wanted, progress=context.report)
     else:
-        fits = _exact(context, request, identity, transit, wanted)
+        fits = _exact(context, identity, solution, wanted)
     _save(context, request, identity, transit, fits)
     return identity
 
@@ -51,30 +62,25 @@ def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> 
     part = context.catalogue.take_part(context.owner, identity, context.settings.lease_s)
     if part is None:
         return
-    context.catalogue.release_part(part)  # reading a transit takes longer than a lease may last
+    context.catalogue.release_part(part)  # reading and fitting a transit takes longer than a lease may last
     transit = load_transit(context, request)[0]
     wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
+    solution = _solution(context, request, transit)
     while (
         part := context.catalogue.take_part(context.owner, identity, context.settings.lease_s)
     ) is not None:
-        _one(context, request, transit, wanted, part, done=0)
+        _one(context, solution, wanted, part, done=0)
 
 
-def _shared(
-    context: Context, request: ResolvedCrossValidate, transit: Transit, wanted: tuple[Draw, ...]
-) -> tuple[FoldFit, ...]:
-    solution = invert(
+def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit) -> Solution:
+    """The fit of all images, which every fold begins from: each worker makes its own, for its scenes are large."""
+    return invert(
         transit, shape_named(request.shape), threads=context.settings.threads, progress=context.report
     )
-    return shared_fits(solution, wanted, progress=context.report)
 
 
 def _exact(
-    context: Context,
-    request: ResolvedCrossValidate,
-    identity: str,
-    transit: Transit,
-    wanted: tuple[Draw, ...],
+    context: Context, identity: str, solution: Solution, wanted: tuple[Draw, ...]
 ) -> tuple[FoldFit, ...]:
     """Every fold a fit of its own, done here or by whoever helps."""
     catalogue, owner = context.catalogue, context.owner
@@ -89,27 +95,13 @@ def _exact(
         if part is None:
             time.sleep(WAIT_S)  # the rest is with other workers
             continue
-        _one(context, request, transit, wanted, part, done=len(done))
+        _one(context, solution, wanted, part, done=len(done))
 
 
-def _one(
-    context: Context,
-    request: ResolvedCrossValidate,
-    transit: Transit,
-    wanted: tuple[Draw, ...],
-    part: Part,
-    *,
-    done: int,
-) -> None:
+def _one(context: Context, solution: Solution, wanted: tuple[Draw, ...], part: Part, *, done: int) -> None:
     """One fold; what it raises gives the fold back."""
     try:
-        fit = exact_fit(
-            transit,
-            request.shape,
-            wanted[part.number],
-            threads=context.settings.threads,
-            progress=_alive(context, part, done, len(wanted)),
-        )
+        fit = exact_fit(solution, wanted[part.number], progress=_alive(context, part, done, len(wanted)))
     except BaseException:
         context.catalogue.release_part(part)
         raise
@@ -140,7 +132,7 @@ def _save(
     radii = np.array(CURVE_RADII_PX[: len(fits[0].curve_pct)])
     found = bands(fits, radii)
     said = {
-        "schema": "cross-validation/1",
+        "schema": "cross-validation/2",
         "sentence": sentence(found, len(fits)),
         "scheme": request.scheme,
         "shape": request.shape,
@@ -181,5 +173,22 @@ def sentence(found: Bands, folds: int) -> str:
     return (
         f"{folds} fits with images held out and drawn again: {100 * total[2]:.1f} % of the light is scattered diffusely "
         f"(1 sigma {100 * total[1]:.1f} to {100 * total[3]:.1f} %); held-out discs are {held_out['mean_pct']:+.1f} % off "
-        f"on the mean, {held_out['rms_pct']:.1f} % rms, {held_out['largest_pct']:.1f} % at most."
+        f"on the mean, {held_out['rms_pct']:.1f} % rms, {held_out['largest_pct']:.1f} % at most{_freely(found)}."
+    )
+
+
+def _freely(found: Bands) -> str:
+    """How a fit without a formula compares."""
+    if found.shells is None:
+        return ""
+    near, largest = found.shells.near_centre, found.shells.largest
+    said = (
+        f"; without a formula {near.points:+.1f} ± {near.sigma:.1f} % of the light more is within "
+        f"{NEAR_CENTRE_PX:g} px"
+    )
+    if not largest.parts:
+        return f"{said}, and at no distance do the two part by more than {PARTING_SIGMAS:g} errors"
+    return (
+        f"{said}; the two part most within {largest.within_px:.3g} px, by {largest.points:+.1f} ± "
+        f"{largest.sigma:.1f} % of the light"
     )

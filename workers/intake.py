@@ -17,6 +17,10 @@ from workers.contract import (
     CrossValidate,
     CrossValidateRequest,
     DeconvolveRequest,
+    Evaluate,
+    EvaluateRequest,
+    GapDiagnose,
+    GapDiagnoseRequest,
     JobRequest,
     PsfBuild,
     PsfBuildRequest,
@@ -25,7 +29,11 @@ from workers.contract import (
     PsfTablesRequest,
     ResolvedCrossValidate,
     ResolvedDeconvolve,
+    ResolvedEvaluate,
+    ResolvedGapDiagnose,
     ResolvedPsfFit,
+    evaluate_identity,
+    gap_identity,
     instrument_text,
     product_identity,
     psf_fit_identity,
@@ -104,10 +112,12 @@ def uploaded_psf_row(
     )
 
 
-def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict[str, Any], str]:
+def resolve(
+    request: JobRequest, catalogue: Catalogue, owner: str, *, added_effects: tuple[str, ...] = ()
+) -> tuple[dict[str, Any], str]:
     """Parameters with nothing left open, and the identity of what the job makes.
 
-    Raises ``DataError`` with code ``no-such-image``, ``no-such-psf``, ``no-psf-for-instrument``,
+    added_effects: modules of effects that the operator adds to a diagnosis. Raises ``DataError`` with code ``no-such-image``, ``no-such-psf``, ``no-psf-for-instrument``,
     ``unknown-instrument`` or ``bad-instrument-file``.
     """
     match request:
@@ -117,17 +127,20 @@ def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict
                 raise DataError("no-such-image", f"no image was uploaded with id {build.mask_id}")
             return build.model_dump(mode="json"), psf_identity(build)
         case PsfFitRequest(parameters=fit) | CrossValidateRequest(parameters=fit):
-            row = catalogue.get(TransitRow, fit.transit_id, owner)
-            if row is None:
-                raise DataError("no-such-transit", f"no transit was uploaded with id {fit.transit_id}")
+            row = _transit(catalogue, fit.transit_id, owner)
             kind = ResolvedCrossValidate if isinstance(fit, CrossValidate) else ResolvedPsfFit
             resolved_fit = kind(
                 diffraction_recipe=_diffraction_of(row.summary, fit), **fit.model_dump(mode="json")
             )
             return resolved_fit.model_dump(mode="json"), psf_fit_identity(resolved_fit)
+        case EvaluateRequest(parameters=judged):
+            resolved_report = _evaluation(catalogue, judged, owner)
+            return resolved_report.model_dump(mode="json"), evaluate_identity(resolved_report)
+        case GapDiagnoseRequest(parameters=diagnosis):
+            resolved_gap = _diagnosis(catalogue, diagnosis, owner, added_effects)
+            return resolved_gap.model_dump(mode="json"), gap_identity(resolved_gap)
         case PsfTablesRequest(parameters=asked):
-            if catalogue.get(PsfRow, asked.psf_id, owner) is None:
-                raise DataError("no-such-psf", f"the catalogue holds no PSF with id {asked.psf_id}")
+            _check_psf(catalogue, asked.psf_id, owner)
             return asked.model_dump(mode="json"), psf_tables_identity(asked)
         case DeconvolveRequest(parameters=wanted):
             image = catalogue.get(ImageRow, wanted.image_id, owner)
@@ -146,13 +159,56 @@ def resolve(request: JobRequest, catalogue: Catalogue, owner: str) -> tuple[dict
             return resolved.model_dump(mode="json"), product_identity(resolved)
 
 
-def _diffraction_of(summary: dict[str, Any], fit: PsfFit) -> PsfBuild | None:
-    """How the known part of a transit's PSF is made; None where the transit brings it."""
-    if fit.noise is None and summary["noise"] is None:
+def _transit(catalogue: Catalogue, transit_id: str, owner: str) -> TransitRow:
+    row = catalogue.get(TransitRow, transit_id, owner)
+    if row is None:
+        raise DataError("no-such-transit", f"no transit was uploaded with id {transit_id}")
+    return row
+
+
+def _check_psf(catalogue: Catalogue, psf_id: str, owner: str) -> None:
+    if catalogue.get(PsfRow, psf_id, owner) is None:
+        raise DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+
+
+def _evaluation(catalogue: Catalogue, asked: Evaluate, owner: str) -> ResolvedEvaluate:
+    """A report with nothing left open; where a PSF is given there is nothing to fit, and no diffraction is asked for."""
+    summary = _transit(catalogue, asked.transit_id, owner).summary
+    if asked.psf_id is None:
+        recipe, given = _diffraction_of(summary, asked), asked.model_dump(mode="json")
+    else:
+        _check_psf(catalogue, asked.psf_id, owner)
+        _check_noise(summary, asked)
+        # Equal requests share a report, and what is not done makes none of its own.
+        recipe, given = None, asked.model_dump(mode="json") | {"dark_offsets": False}
+    return ResolvedEvaluate(diffraction_recipe=recipe, **given)
+
+
+def _diagnosis(
+    catalogue: Catalogue, asked: GapDiagnose, owner: str, added_effects: tuple[str, ...]
+) -> ResolvedGapDiagnose:
+    """A diagnosis with nothing left open."""
+    summary = _transit(catalogue, asked.transit_id, owner).summary
+    if asked.psf_id is not None:
+        _check_psf(catalogue, asked.psf_id, owner)
+    return ResolvedGapDiagnose(
+        diffraction_recipe=_diffraction_of(summary, asked),
+        added_effects=added_effects,
+        **asked.model_dump(mode="json"),
+    )
+
+
+def _check_noise(summary: dict[str, Any], asked: PsfFit | Evaluate | GapDiagnose) -> None:
+    if asked.noise is None and summary["noise"] is None:
         raise DataError(
             "no-noise-figures",
             "expected noise figures in transit.json or in the request (photon_gain_dn, read_noise_dn); got neither",
         )
+
+
+def _diffraction_of(summary: dict[str, Any], fit: PsfFit | Evaluate | GapDiagnose) -> PsfBuild | None:
+    """How the known part of a transit's PSF is made; None where the transit brings it."""
+    _check_noise(summary, fit)
     if summary["known_psf"] is not None:
         return None
     if summary["instrument"] not in instrument_names():

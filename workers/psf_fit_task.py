@@ -18,7 +18,13 @@ from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 from workers.catalogue import PsfRow, TransitRow
 from workers.context import Context
-from workers.contract import ResolvedCrossValidate, ResolvedPsfFit, psf_fit_identity
+from workers.contract import (
+    ResolvedCrossValidate,
+    ResolvedEvaluate,
+    ResolvedGapDiagnose,
+    ResolvedPsfFit,
+    psf_fit_identity,
+)
 from workers.psf_task import built_psf, psf_row
 from workers.settings import library_versions, software_version
 
@@ -43,9 +49,15 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def load_transit(
-    context: Context, request: ResolvedPsfFit | ResolvedCrossValidate
+    context: Context,
+    request: ResolvedPsfFit | ResolvedCrossValidate | ResolvedEvaluate | ResolvedGapDiagnose,
+    *,
+    diffraction: Kernel | None = None,
 ) -> tuple[Transit, Prepared]:
-    """The transit of a request, unpacked, read and prepared."""
+    """The transit of a request, unpacked, read and prepared.
+
+    diffraction: where the transit brings none; none: built as the request says.
+    """
     upload = context.catalogue.get(TransitRow, request.transit_id, context.owner)
     if upload is None:
         raise DataError("no-such-transit", f"no transit was uploaded with id {request.transit_id}")
@@ -57,13 +69,18 @@ def load_transit(
             folder,
             context.limits,
             progress=lambda done, of: context.report("reading", done, of),
-            diffraction=lambda _instrument, _shape: _built_diffraction(context, request),
+            diffraction=lambda _instrument, _shape: (
+                _built_diffraction(context, request) if diffraction is None else diffraction
+            ),
             noise=None if request.noise is None else Noise(**request.noise.model_dump()),
             saturation_dn=request.saturation_dn,
         )
 
 
-def _built_diffraction(context: Context, request: ResolvedPsfFit | ResolvedCrossValidate) -> Kernel:
+def _built_diffraction(
+    context: Context,
+    request: ResolvedPsfFit | ResolvedCrossValidate | ResolvedEvaluate | ResolvedGapDiagnose,
+) -> Kernel:
     """The diffraction of the transit's instrument, built now or before; cut to nothing, it sums to 1 on 2048 px."""
     if request.diffraction_recipe is None:
         raise DataError("no-known-psf", "expected known_psf in transit.json; got none")

@@ -40,10 +40,20 @@ class Settings(BaseSettings):
     resubmit_s: float = Field(30.0, gt=0, description="first wait before a queued job is submitted again")
     max_attempts: int = Field(3, ge=1, description="starts after which a job is an error")
 
+    gap_effects: str = Field(
+        "",
+        description="modules of effects that a gap's diagnosis tries too, separated by commas; their code is run",
+    )
+
     @classmethod
-    def apart(cls, data_dir: Path) -> Settings:
+    def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
         """Defaults on a folder, whatever the environment says: for work beside any service."""
-        return cls(_env_prefix="HELIOPSF_APART_", data_dir=data_dir)
+        return cls(_env_prefix="HELIOPSF_APART_", data_dir=data_dir, gap_effects=gap_effects)
+
+    @property
+    def added_effects(self) -> tuple[str, ...]:
+        """The modules, or files, of effects that a diagnosis tries beside the library's."""
+        return tuple(name.strip() for name in self.gap_effects.split(",") if name.strip())
 
     @property
     def embedded(self) -> bool:

@@ -8,6 +8,8 @@ from typing import Any
 from workers.context import Context
 from workers.crossval_task import assist_cross_validation, cross_validate
 from workers.deconvolve_task import deconvolve
+from workers.evaluate_task import evaluate
+from workers.gap_task import gap_diagnose
 from workers.psf_fit_task import psf_fit
 from workers.psf_tables_task import psf_tables
 from workers.psf_task import psf_build
@@ -20,6 +22,8 @@ TASKS: dict[str, Task] = {
     "psf-tables": psf_tables,
     "cross-validate": cross_validate,
     "deconvolve": deconvolve,
+    "evaluate": evaluate,
+    "gap-diagnose": gap_diagnose,
 }
 # What other workers do of a job that calls for help.
 ASSISTANTS: dict[str, Callable[[Context, Mapping[str, Any]], None]] = {

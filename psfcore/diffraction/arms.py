@@ -442,6 +442,7 @@ def _first_fit(
     state = _State(figures, np.ones(arm.size), source)
     for _ in range(2):  # all orders, then those that show
         orders = _select(difference, usable, sigma, grid, figures, arm, k)
+        _check_enough(orders.arm, figures.size - 1)  # near a corner arms may leave the image at once
         state, error = _alternate(orders, grid, state)
         shows = state.amplitude > _PEAK_SIGMA * error
         arm, k = orders.arm[shows], orders.k[shows]

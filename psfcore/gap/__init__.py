@@ -1,1 +1,18 @@
-"""The gap between the fitted model and the images: where it lies, which effect causes it, how far it shrinks."""
+"""The gap between the fitted model and the images: where it lies, which effect causes it, how far it shrinks.
+
+An effect is declared once (`effect.Effect`). One of your own is a Python file that defines EFFECTS, as this one does:
+
+    import numpy as np
+    from psfcore.gap.effect import Change, Effect, EffectParameter
+
+    def glow(view):
+        x, _ = view.places
+        plane = np.exp(-(((x - 0.5) / 0.15) ** 2)).astype(np.float32)
+        return [Change(lambda n, images: plane, lit=False)]
+
+    EFFECTS = (Effect("edge_glow", "detector", (EffectParameter("height", "DN/s", 5.0),),
+        "A lamp beside the detector lights its right edge.", "a dark exposure", ("detector_x",), glow),)
+
+`heliopsf gap TRANSIT --local --effects FILE.py` tries it beside the library; a service tries those of the modules that
+its operator names in HELIOPSF_GAP_EFFECTS.
+"""

@@ -1,13 +1,9 @@
-"""An effect that the model leaves out: declared once, used to explain a gap.
+"""An effect that the model leaves out: declared once, used to explain a gap and to correct for it.
 
-An effect changes the images, or it changes the PSF; either way only to first order and by a few numbers. An image
-error e is seen in the discs through the whole estimate, for the scene is reconstructed from the image that it is in:
-
-    r_D = D [e - H (1 - D) H^-1 e]                          Eq. (1)
-    r_D = D [dH (1 - D) x - H (1 - D) G dH (1 - D) x]        Eq. (2)
-
-Eq. (1) for a change of the image, Eq. (2) for a change dH of the PSF. A global gain error is invisible in Eq. (1).
-In the lit part only what differs between images of one pointing is seen: an image error as it stands.
+An effect is a change of the images, to first order and by a few numbers: e(n) for one unit of a parameter, in image n,
+DN/s. What changes the optics changes the images by dH x, H the PSF and x the scene as it is lit. The discs show a
+change through the whole estimate (`cells`), for the scene is reconstructed from the image that it is in. In the lit
+part only what differs between images of one pointing is seen, as it stands.
 """
 
 from __future__ import annotations
@@ -21,22 +17,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.scatter.inversion import Solution
-from psfcore.scatter.optics import Blur, Lanes, pick, put
+from psfcore.scatter.optics import Blur, Lanes, put
 from psfcore.transit.occulter import coverage, disc_distance, neighbours_of
 
 Field = NDArray[np.float32]
 Vector = NDArray[np.float64]
 Stage = Literal["scene", "optics", "detector"]
 DISC_MARGIN_PX = 2.0
-UNDO_STEPS = 1  # beyond the first: a template needs a percent
+KEPT_FIELDS = 4
 
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """A number of an effect: its name and unit."""
+    """A number of an effect: its name, its unit, and how large it may well be: one sigma, for a first judgement."""
 
     name: str
     unit: str
+    likely: float
+
+
+class _Fields(Sequence[Field]):
+    """Fields of all images, worked out where asked for; the last few are kept."""
+
+    def __init__(self, count: int, field: Callable[[int], Field]) -> None:
+        self._count, self._field = count, field
+        self._kept: dict[int, Field] = {}
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        if index not in self._kept:
+            if len(self._kept) >= KEPT_FIELDS:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[index] = self._field(index)
+        return self._kept[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,27 +64,37 @@ class View:
     solution: Solution
 
     @cached_property
-    def expected(self) -> list[Field]:
+    def expected(self) -> Sequence[Field]:
         """Every image as the model sees it [y, x], DN/s."""
         optics = self.solution.optics
-        return [optics.field(optics.see(self.lit_scene(n))) for n in range(len(self.solution.transit.frames))]
+        return _Fields(
+            len(self.solution.transit.frames), lambda n: optics.field(optics.see(self.lit_scene(n)))
+        )
+
+    def behind(self, n: int) -> Field | None:
+        """The scene that the occulter of image n hides, as neighbours in time show it; none where none does."""
+        solution = self.solution
+        places = [found.place for found in solution.sky.found]
+        chosen = neighbours_of(n, solution.transit.frames, places, solution.transit.noise)
+        if not chosen:
+            return None
+        return np.asarray(
+            np.mean([solution.optics.field(solution.sky.scenes[k]) for k in chosen], axis=0), dtype=np.float32
+        )
 
     @cached_property
-    def unocculted(self) -> list[Field]:
+    def unocculted(self) -> Sequence[Field]:
         """Every image as observed, with the light put back that its occulter hides [y, x], DN/s."""
+        return _Fields(len(self.solution.transit.frames), self._put_back)
+
+    def _put_back(self, n: int) -> Field:
         solution = self.solution
-        transit, optics = solution.transit, solution.optics
-        places = [found.place for found in solution.sky.found]
-        out = []
-        for n, frame in enumerate(transit.frames):
-            seen = frame.pixels
-            chosen = neighbours_of(n, transit.frames, places, transit.noise)
-            if chosen:
-                behind = np.mean([optics.field(solution.sky.scenes[k]) for k in chosen], axis=0)
-                hidden = (behind * coverage(transit.shape, places[n])).astype(np.float32)
-                seen = seen + optics.field(optics.see(optics.lanes(hidden)))
-            out.append(seen)
-        return out
+        optics, seen = solution.optics, solution.transit.frames[n].pixels
+        behind = self.behind(n)
+        if behind is None:
+            return seen
+        hidden = behind * coverage(solution.transit.shape, solution.sky.found[n].place)
+        return seen + optics.field(optics.see(optics.lanes(hidden.astype(np.float32))))
 
     @cached_property
     def lit(self) -> list[Field]:
@@ -78,10 +103,13 @@ class View:
         The same array for all of a pointing, so that a template made of it differs between them by what is meant.
         """
         fov = [frame.fov for frame in self.solution.transit.frames]
-        mean = {
-            one: np.mean([u for u, f in zip(self.unocculted, fov, strict=True) if f == one], axis=0)
-            for one in set(fov)
-        }
+        mean: dict[int, Field] = {}
+        for one in sorted(set(fov)):
+            images = [n for n, f in enumerate(fov) if f == one]
+            total = np.zeros(self.solution.transit.shape)
+            for n in images:
+                total += self.unocculted[n]
+            mean[one] = (total / len(images)).astype(np.float32)
         return [mean[f] for f in fov]
 
     @cached_property
@@ -102,18 +130,31 @@ class View:
         away = disc_distance(solution.transit.shape, place) > place.radius_px + DISC_MARGIN_PX
         return solution.optics.field(solution.sky.scenes[n]), away
 
-    def lit_scene(self, n: int) -> Lanes:
-        """The scene of frame n as the other images of its pointing show it, its occulter dark; engine's order.
+    def pointing_scene(self, n: int) -> Field:
+        """The scene of frame n's pointing as all its images show it, each without its own disc [y, x], DN/s."""
+        total, count = self._scene_sums[self.solution.transit.frames[n].fov]
+        own, _ = self._own(n)
+        return np.asarray(np.where(count > 0, total / np.maximum(count, 1), own), dtype=np.float32)
 
-        A template made of the frame's own scene would hold the noise that its residual holds, and fit it.
+    @cached_property
+    def scenes(self) -> Sequence[Field]:
+        """The scene of every image as the others of its pointing show it, nothing hidden [y, x], DN/s.
+
+        A template made of the image's own scene would hold the noise that its residual holds, and fit it.
         """
-        solution = self.solution
+        return _Fields(len(self.solution.transit.frames), self._scene)
+
+    def _scene(self, n: int) -> Field:
         own, away = self._own(n)
-        total, count = self._scene_sums[solution.transit.frames[n].fov]
+        total, count = self._scene_sums[self.solution.transit.frames[n].fov]
         others = count - away
         mean = np.where(others > 0, (total - own * away) / np.maximum(others, 1), own)
-        lit = solution.optics.lanes(mean.astype(np.float32))
-        put(lit, solution.sky.dark[n], 0.0)
+        return np.asarray(mean, dtype=np.float32)
+
+    def lit_scene(self, n: int) -> Lanes:
+        """One of `scenes` with the dark pixels of the occulter dark, in the engine's order."""
+        lit = self.solution.optics.lanes(self.scenes[n])
+        put(lit, self.solution.sky.dark[n], 0.0)
         return lit
 
     @cached_property
@@ -128,43 +169,34 @@ class View:
         """Of frame n."""
         return self.solution.transit.frames[n].exposure_s
 
-    def in_disc(self, n: int, error: Field) -> Vector:
-        """Eq. (1): what an image error leaves in the dark pixels of frame n."""
-        optics, dark = self.solution.optics, self.solution.sky.dark[n]
-        lanes = optics.lanes(np.ascontiguousarray(error, dtype=np.float32))
-        scene = optics.undo(lanes, optics.undo_once(lanes), steps=UNDO_STEPS)
-        put(scene, dark, 0.0)
-        return pick(lanes, dark) - pick(optics.see(scene), dark)
-
-    def by_psf(self, n: int, slope: Blur, weight: Field | None = None) -> Vector:
-        """Eq. (2): what a change of the PSF, times a weight of where the light is from, does to the dark pixels."""
-        optics, dark = self.solution.optics, self.solution.sky.dark[n]
+    def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
+        """dH x of frame n, the scene times a weight of where its light is from [y, x], DN/s."""
         lit = self.lit_scene(n)
         if weight is not None:
-            lit *= optics.lanes(weight)
-        changed = slope.see(lit)
-        scene = optics.undo_once(changed)
-        put(scene, dark, 0.0)
-        return pick(changed, dark) - pick(optics.see(scene), dark)
+            lit *= slope.lanes(weight)
+        return slope.field(slope.see(lit))
 
 
 @dataclass(frozen=True, eq=False)
-class Template:
-    """What one unit of one parameter does to a frame.
+class Change:
+    """What one unit of one parameter does: change(n, images) to image n [y, x] in DN/s.
 
-    disc(n): the change of the dark pixels of frame n. image(n): the change of the image [y, x] in DN/s, for the lit
-    part; none where nothing there differs between images of a pointing.
+    images: all images as they should be, or, for the lit part, their pointings' means. lit: whether it differs
+    between images of one pointing, so that the lit part shows it.
     """
 
-    disc: Callable[[int], Vector]
-    image: Callable[[int], Field] | None = None
+    change: Callable[[int, Sequence[Field]], Field]
+    lit: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Effect:
     """One effect: its physical cause, what would settle it, and the axes along which it shows.
 
-    trials: how many places were looked at for the best, about, which its p-value pays for. templates(view): one a parameter; none where these data cannot show it, for the reason that `why_not` gives.
+    changes(view): one a parameter. why_not(view): why these data cannot show it, or None. trials: how many places
+    were looked at for the best, about, which its gain pays for. named: whether it may be an answer; if not, it is a
+    probe: a form that gaps of unknown cause have, which says that the cause is not in the library. held(view): of an
+    effect that searches for a place, the same with that place held.
     """
 
     name: str
@@ -173,19 +205,8 @@ class Effect:
     cause: str
     settled_by: str
     axes: tuple[str, ...]
-    templates: Callable[[View], Sequence[Template]]
+    changes: Callable[[View], Sequence[Change]]
     why_not: Callable[[View], str | None] = lambda view: None
     trials: int = 1
-
-
-def image_template(
-    view: View, error: Callable[[int, list[Field]], Field], *, static: bool = False
-) -> Template:
-    """A template from an image error, a function of a frame's index and of all images as they should be.
-
-    static: the same in all images of a pointing, so that only discs show it.
-    """
-    return Template(
-        disc=lambda n: view.in_disc(n, error(n, view.expected)),
-        image=None if static else lambda n: error(n, view.lit),
-    )
+    named: bool = True
+    held: Callable[[View], Effect] | None = None

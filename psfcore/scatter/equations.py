@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear
+from threadpoolctl import threadpool_limits
 
 from psfcore.errors import DataError
 
@@ -226,10 +227,12 @@ def _drawn(lines: Lines, counts: Vector, rng: np.random.Generator, draws: int, s
     matrix = (lines.ring_sums - lines.unscattered[:, None] * counts) / lines.scale[:, None]
     target = (lines.observed - lines.unscattered) / lines.scale
     fits, cost = [], []
-    for _ in range(draws):
-        chosen = draw(lines, rng)
-        fit, misfit = solve(matrix[chosen], target[chosen])
-        fits.append(fit)
-        cost.append(misfit / chosen.size)
+    # So small are these factorisations that threads cost more than they bring, and most where the cores are busy.
+    with threadpool_limits(limits=1, user_api="blas"):
+        for _ in range(draws):
+            chosen = draw(lines, rng)
+            fit, misfit = solve(matrix[chosen], target[chosen])
+            fits.append(fit)
+            cost.append(misfit / chosen.size)
     best = np.argsort(cost, kind="stable")[: max(1, draws * KEPT_DRAWS // DRAWS)]
     return Drawn(np.array(fits)[best], np.array(cost)[best])

@@ -19,11 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.fourier import Convolver
-from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, cumulative_curve, encircled_energy
+from psfcore.psf import (
+    REACH_GRID_PX,
+    FittedShape,
+    Psf,
+    crop_or_pad,
+    cumulative_curve,
+    encircled_energy,
+)
+from psfcore.scatter.cross_validation import ONE_SIGMA, TWO_SIGMA
 from psfcore.scatter.equations import Drawn, Lines, free_fit
 from psfcore.scatter.inversion import Inversion, Progress, Solution, invert
 from psfcore.scatter.optics import Blur, pick
-from psfcore.scatter.published import AS_PUBLISHED, MENDED_ALONE, Published, crop_or_pad, invert_as_published
+from psfcore.scatter.published import AS_PUBLISHED, MENDED_ALONE, Published, invert_as_published
 from psfcore.scatter.ring_sums import segment_sums
 from psfcore.scatter.segments import Segments, shells_as_published
 from psfcore.scatter.shape_comparison import ComparedShape, compare_shapes
@@ -40,7 +48,6 @@ RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
 ALONE_DRAWS = 30  # of each bias mended alone: differences between recipes that share their draws
 WORST_CHI2 = 1.5  # a pixel; that of 10,000 pixels is known to 0.014
 OPEN_POINTS = 3.0  # an error of the curve from which a radius is said to be open
-ONE_SIGMA, TWO_SIGMA = (15.87, 84.13), (2.275, 97.725)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,9 +219,7 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
     diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float32, threads=threads)
     total_slopes, diffuse_slopes = [], []
     for k in range(at.size):
-        step = np.zeros_like(at)
-        step[k] = 1e-3
-        slope = (shape.kernel(at + step, REACH_GRID_PX) - shape.kernel(at - step, REACH_GRID_PX)) / 2e-3
+        slope = shape.slope(at, k, REACH_GRID_PX)
         diffuse_slopes.append(-100 * encircled_energy(slope, radii))
         total_slopes.append(-100 * encircled_energy(np.asarray(diffract.apply(slope), np.float64), radii))
 
@@ -234,8 +239,9 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> FreeShell
     for step, n in enumerate(solution.part):
         progress("free shells", step, len(solution.part))
         frame, dark = solution.transit.frames[n], solution.sky.dark[n]
-        diffracted = diffract.see(solution.lit(n))
-        expected = pick(solution.optics.see(solution.lit(n)), dark)
+        lit = solution.lit(n)
+        diffracted = diffract.see(lit)
+        expected = pick(solution.optics.see(lit), dark)
         distance = disc_distance(solution.transit.shape, solution.sky.found[n].place)[dark]
         parts.append(
             Lines(

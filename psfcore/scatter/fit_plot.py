@@ -27,7 +27,6 @@ _DIFFUSE, _TOTAL, _FREE, _PUBLISHED = "#c77f00", "#111111", "#1f6fb4", "#b3261e"
 _POINTINGS = ("#1b4f8a", "#c2402f", "#2b8a6e", "#7b3fa0", "#8a6d00", "#5b5b5b")
 _ESTIMATOR_STYLES = {"image_mean": "o", "image_median": "s", "shell": "^"}
 _NEAREST_PX, _FARTHEST_PX = 0.5, REACH_GRID_PX / 2
-_STEP = 1e-3  # of a coordinate, for central differences
 _MANY_IMAGES = 60  # from which on points are drawn smaller
 _TITLE_LETTERS = 175
 
@@ -102,19 +101,14 @@ def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
     """Distance (px), mean weight over rings and the standard error of its logarithm, to first order."""
     shape, at = fit.inversion.shape, fit.inversion.coordinates
 
-    def rings(coordinates: Vector) -> tuple[Vector, Vector]:
-        radius, mean = radial_profile(shape.kernel(coordinates, REACH_GRID_PX))
+    def rings(kernel: Vector) -> tuple[Vector, Vector]:
+        radius, mean = radial_profile(kernel)
         shown = (radius >= 1) & (radius <= _FARTHEST_PX)
         return radius[shown], mean[shown]
 
-    radius, weight = rings(at)
-    slopes = []
-    for k in range(at.size):
-        step = np.zeros_like(at)
-        step[k] = _STEP
-        ahead, behind = (rings(at + side * step)[1] for side in (1, -1))
-        slopes.append((ahead - behind) / (2 * _STEP * weight))
-    s = np.stack(slopes, axis=1)
+    radius, weight = rings(shape.kernel(at, REACH_GRID_PX))
+    slopes = (rings(shape.slope(at, k, REACH_GRID_PX))[1] for k in range(at.size))
+    s = np.stack([slope / weight for slope in slopes], axis=1)
     variance = np.einsum("rk,kl,rl->r", s, fit.covariance, s)
     return radius, weight, np.sqrt(np.maximum(variance, 0.0))
 

@@ -31,6 +31,7 @@ radius; the scene is reconstructed linearly. No shells are needed where the scat
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -155,15 +156,26 @@ class Sky:
         self.found: list[FoundPlace] = []
         self.dark: list[Pixels] = []
 
-    def find(self, optics: Optics, psf_kernel: Kernel) -> None:
+    def copy(self) -> Sky:
+        """One more, to go on from here with: no array is copied, and none is ever written to."""
+        other = copy(self)
+        other.scenes, other.found, other.dark = list(self.scenes), list(self.found), list(self.dark)
+        return other
+
+    def find(
+        self,
+        optics: Optics,
+        psf_kernel: Kernel,
+        progress: Progress = lambda stage, step, steps: None,
+    ) -> None:
         """Step (e): where every occulter is, and which pixels are fully dark."""
         frames = self.transit.frames
         scenes = _Fields(self.scenes, optics)
         places = [f.place for f in self.found] or [frame.place for frame in frames]
-        self.found = [
-            find_occulter(n, frames, scenes, places, psf_kernel, self.transit.noise)
-            for n in range(len(frames))
-        ]
+        self.found = []
+        for n in range(len(frames)):
+            progress("finding occulters", n, len(frames))
+            self.found.append(find_occulter(n, frames, scenes, places, psf_kernel, self.transit.noise))
         self.dark = [dark_pixels(frame, found) for frame, found in zip(frames, self.found, strict=True)]
 
     def left_out(self) -> dict[str, str]:
@@ -249,14 +261,13 @@ class _Measured:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """An inversion and what it was made with, for questions that come after it.
+class Reconstruction:
+    """A transit behind one PSF: its scenes, where its discs are dark, and what the PSF leaves unexplained there.
 
-    optics: the total PSF at the solution. sky: scenes and dark pixels of all frames. part: indices of the frames
-    that took part, in the order of inversion.frames.
+    optics: the total PSF. sky: scenes and dark pixels of all frames. part: indices of the frames that took part in
+    the fit of the PSF.
     """
 
-    inversion: Inversion
     transit: Transit
     total: TotalPsf
     optics: Optics
@@ -282,6 +293,26 @@ class Solution:
     def answer(self, n: int, slope: Blur) -> Vector:
         """How the expected dark pixels of frame n change with a change of the PSF, Eq. (4)."""
         return _answer(self.optics, slope, self.lit(n), self.sky.dark[n])
+
+
+@dataclass(frozen=True, eq=False)
+class Solution(Reconstruction):
+    """An inversion and what it was made with, for questions that come after it; part is in the order of its frames."""
+
+    inversion: Inversion
+
+
+@dataclass(frozen=True, eq=False)
+class Refit(Reconstruction):
+    """The fit of some of a transit's frames, without its errors. left_out: frames that could not take part, and why.
+
+    Scenes of frames that did not take part are still those of the fit before.
+    """
+
+    coordinates: Vector
+    rounds: tuple[Round, ...]
+    converged: bool
+    left_out: dict[str, str]
 
 
 def invert(
@@ -315,6 +346,39 @@ def invert(
     sky.find(Optics(kernel, transit.shape, threads=threads), kernel)
     at = solver.solve(at, solver.taking_part(), CONVERGED_POINTS)
     return solver.solution(at)
+
+
+def refit(
+    solution: Solution,
+    counts: Sequence[int],
+    start: Vector,
+    *,
+    progress: Progress = lambda stage, step, steps: None,
+) -> Refit:
+    """The same fit with other counts, as `invert` has them, where one with all frames is there to begin from.
+
+    start: coordinates near to the result, such as one step from the solution. Scenes are iterated on from those of
+    the solution, and every occulter is looked for again with the PSF at the start. Raises DataError as `invert`.
+    """
+    total, threads = solution.total, solution.threads
+    sky = solution.sky.copy()
+    kernel = total.kernel(start)
+    sky.find(Optics(kernel, solution.transit.shape, threads=threads), kernel, progress)
+    solver = _Solver(sky, total, counts, threads, progress)
+    frames = solver.taking_part()
+    at = solver.solve(start, frames, CONVERGED_POINTS)
+    return Refit(
+        transit=solution.transit,
+        total=total,
+        optics=Optics(total.kernel(at), solution.transit.shape, threads=threads),
+        sky=sky,
+        part=tuple(frames),
+        threads=threads,
+        coordinates=at,
+        rounds=tuple(solver.rounds),
+        converged=solver.converged,
+        left_out=sky.left_out(),
+    )
 
 
 class _Solver:

@@ -22,8 +22,8 @@ from psfcore.engine import Engine
 from psfcore.errors import DataError
 from psfcore.fourier import Convolver
 from psfcore.image import Image
-from psfcore.psf import REACH_GRID_PX, Psf, crop_centred, cumulative_curve, squared_radii
-from psfcore.scatter.equations import LIT, Drawn, Lines, free_fit, power_law_fit
+from psfcore.psf import CENTRE_TOLERANCE, REACH_GRID_PX, Psf, crop_or_pad, cumulative_curve, squared_radii
+from psfcore.scatter.equations import LIT, Drawn, Lines, PowerLawDrawn, free_fit, power_law_fit
 from psfcore.scatter.ring_sums import segment_sums
 from psfcore.scatter.segments import Segments, shells_as_published
 from psfcore.scatter.total_psf import CURVE_RADII_PX
@@ -85,7 +85,8 @@ class PublishedRound:
 class Published:
     """What the published recipe finds.
 
-    a, b_px, c: the power law of the last round, with the spread of its draws. total: scattered light on the array
+    a, b_px, c: the power law of the last round, with the spread of its draws, none where fewer than two draws were
+    kept. total: scattered light on the array
     it was counted on, a grid of grid_px. free: draws of the last free fit, on `segments`. curve_pct at radii_px: of
     the final total PSF, scatter convolved with diffraction.
     """
@@ -93,7 +94,7 @@ class Published:
     a: float
     b_px: float
     c: float
-    spread: dict[str, float]
+    spread: dict[str, float] | None
     total: float
     grid_px: int
     free: Drawn
@@ -118,7 +119,8 @@ def invert_as_published(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Published:
-    """Steps (a) to (j). Raises DataError "no-lines" where no pixel is occulted, "no-scatter" where none is found."""
+    """Steps (a) to (j). Raises DataError "no-lines" where no pixel is occulted, "no-scatter" where what is found is
+    no scatter: more than all light, or a PSF that is not brightest at its centre."""
     recipe = _Recipe(transit, choices, seed, draws, threads, progress)
     return recipe.run()
 
@@ -163,19 +165,23 @@ class _Recipe:
                 )
                 law, name = fitted.law, "softened power law"
                 scatter = _power_law_kernel(law, self.grid)
-            if not scatter[self.grid // 2, self.grid // 2] > 0:
-                raise DataError("no-scatter", f"round {n + 1}: expected less than all light to be scattered")
+            centre = float(scatter[self.grid // 2, self.grid // 2])
+            if not centre > 0:
+                raise DataError(
+                    "no-scatter",
+                    f"round {n + 1}: expected {name} that scatter less than all light; got {100 * (1 - centre):.3g} %",
+                )
             kernel = np.maximum(self.to_total.apply(crop_or_pad(scatter, self.psf_size)), 0.0)
+            _check_brightest_at_centre(kernel, f"round {n + 1}: {name}")
             curve = cumulative_curve(kernel, self.radii)
             rounds.append(PublishedRound(name, tuple(float(c) for c in curve)))
         assert free is not None
-        centre = scatter[self.grid // 2, self.grid // 2]
         return Published(
             a=float(law[0]),
             b_px=float(law[1]),
             c=float(law[2]),
-            spread=dict(zip(("a", "b_px", "c"), fitted.fits.std(axis=0, ddof=1).tolist(), strict=True)),
-            total=float(1 - centre),
+            spread=_spread(fitted),
+            total=1 - centre,
             grid_px=self.grid,
             free=free,
             segments=self.segments,
@@ -269,16 +275,24 @@ class _Recipe:
         return np.asarray(kernel)
 
 
-def crop_or_pad(kernel: Kernel, size: int) -> Kernel:
-    """A square kernel on (size, size), its centre at [size // 2, size // 2]; zero where it did not reach."""
-    if kernel.shape[0] >= size and kernel.shape[1] >= size:
-        return crop_centred(kernel, (size, size))
-    out = np.zeros((size, size))
-    ny, nx = (min(n, size) for n in kernel.shape)
-    part = crop_centred(kernel, (ny, nx))
-    top, left = size // 2 - ny // 2, size // 2 - nx // 2
-    out[top : top + ny, left : left + nx] = part
-    return out
+def _check_brightest_at_centre(kernel: Kernel, found: str) -> None:
+    """A PSF that is fainter at its centre than beside it is no smear of a point: no image can be freed of it."""
+    middle = (kernel.shape[0] // 2, kernel.shape[1] // 2)
+    if kernel[middle] < kernel.max() * (1 - CENTRE_TOLERANCE):
+        y, x = np.unravel_index(int(kernel.argmax()), kernel.shape)
+        distance = np.hypot(y - middle[0], x - middle[1])
+        raise DataError(
+            "no-scatter",
+            f"{found}: expected a PSF that is brightest at its centre; got {kernel[middle]:.3g} of the light there "
+            f"and {kernel.max():.3g} in a pixel {distance:.3g} px from it",
+        )
+
+
+def _spread(fitted: PowerLawDrawn) -> dict[str, float] | None:
+    """Standard deviations of a, b and c over the draws; none of fewer than two."""
+    if len(fitted.fits) < 2:
+        return None
+    return dict(zip(("a", "b_px", "c"), fitted.fits.std(axis=0, ddof=1).tolist(), strict=True))
 
 
 def _power_law_kernel(law: Vector, size: int) -> Kernel:

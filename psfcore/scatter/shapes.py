@@ -42,6 +42,7 @@ Values = Mapping[str, float]
 Kernel = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
+DIFFERENCE = 1e-3  # of a coordinate, for central differences
 HALO_B_PX = 120.0
 KNEE_PX = 100.0
 CORE_PX = 1.5
@@ -121,6 +122,13 @@ class Shape:
         scaled[middle, middle] = 1 - values["total"]
         first = middle - size // 2
         return np.ascontiguousarray(scaled[first : first + size, first : first + size])
+
+    def slope(self, coordinates: Vector, k: int, size: int) -> Kernel:
+        """d kernel / d coordinate k, [y, x] on (size, size), by central differences."""
+        step = np.zeros_like(coordinates)
+        step[k] = DIFFERENCE
+        ahead, behind = (self.kernel(coordinates + side * step, size) for side in (1, -1))
+        return np.asarray((ahead - behind) / (2 * DIFFERENCE))
 
 
 B = Parameter("b_px", "px", 6.0, "log", 0.5, "radius within which the power law is softened")

@@ -14,7 +14,6 @@ from psfcore.psf import REACH_GRID_PX, encircled_energy
 from psfcore.scatter.shapes import Shape, Vector
 
 Kernel = NDArray[np.float64]
-DIFFERENCE = 1e-3  # of a coordinate, for central differences
 CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 
 
@@ -36,12 +35,8 @@ class TotalPsf:
         return np.asarray(self._convolver.apply(self.shape.kernel(coordinates, self.size)), dtype=np.float64)
 
     def slope(self, coordinates: Vector, k: int) -> Kernel:
-        """d kernel / d coordinate k, [y, x], by central differences."""
-        step = np.zeros_like(coordinates)
-        step[k] = DIFFERENCE
-        ahead = self.shape.kernel(coordinates + step, self.size)
-        behind = self.shape.kernel(coordinates - step, self.size)
-        slope = self._convolver.apply((ahead - behind) / (2 * DIFFERENCE))
+        """d kernel / d coordinate k, [y, x]."""
+        slope = self._convolver.apply(self.shape.slope(coordinates, k, self.size))
         return np.asarray(slope, dtype=np.float64)
 
     def slopes(self, coordinates: Vector) -> list[Kernel]:

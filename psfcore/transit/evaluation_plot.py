@@ -42,7 +42,7 @@ def evaluation_png(
         layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, hspace=0.03, wspace=0.03),
     )
     # The layout makes room for one title: its first line is empty, and the name stands there in bold.
-    words = "\n".join(textwrap.wrap(_sentence(evaluation), _TITLE_LETTERS))
+    words = "\n".join(textwrap.wrap(sentence(evaluation), _TITLE_LETTERS))
     figure.suptitle(f"\n{words}", fontsize=11, color=INK, x=0.012, ha="left", linespacing=1.5)
     figure.text(0.012, 0.992, title, fontsize=14, color=INK, weight="bold", va="top")
     bands: Any = figure.subfigures(rows, 1)
@@ -51,33 +51,39 @@ def evaluation_png(
         return list(bands[row].subplots(1, count))
 
     *slices, by_centre = panels(0, 4)
-    for axes, frame in zip(slices, _shown(evaluation), strict=False):
-        _draw_slices(axes, frame)
-    for axes in slices[len(_shown(evaluation)) :]:
+    shown = shown_slices(evaluation, _SLICES)
+    for axes, frame in zip(slices, shown, strict=False):
+        draw_slices(axes, frame)
+    for axes in slices[len(shown) :]:
         axes.set_visible(False)
-    _draw_centres(by_centre, evaluation.frames)
+    draw_centres(by_centre, evaluation.frames)
     maps = panels(1, 4)
-    _draw_maps(bands[1], maps, evaluation.superposed)
+    draw_maps(bands[1], maps, evaluation.superposed)
     lines = panels(2, 4)
-    _draw_residuals(lines[0], evaluation.frames, _minutes(evaluation.frames), "Time (min)", "by time")
+    draw_residuals(lines[0], evaluation.frames, minutes_of(evaluation.frames), "Time (min)", "by time")
     for axes, along in zip(lines[1:3], ("x", "y"), strict=True):
         where = np.array([getattr(f.found.place, f"{along}_px") for f in evaluation.frames])
-        _draw_residuals(axes, evaluation.frames, where, f"Detector {along} (px)", f"by detector {along}")
-    _draw_absolute(lines[3], evaluation.frames)
+        draw_residuals(axes, evaluation.frames, where, f"Detector {along} (px)", f"by detector {along}")
+    draw_absolute(lines[3], evaluation.frames)
     charts = [*slices, by_centre, *lines]
     if study is not None:
         offsets = panels(3, 2)
-        _draw_offsets(offsets, study)
+        draw_offsets(offsets, study)
         charts += offsets
+    tidy(charts)
+    FigureCanvasAgg(figure).print_png(str(path))
+
+
+def tidy(charts: Sequence[Any]) -> None:
+    """A light grid behind what is drawn, and no frame above it and to the right."""
     for axes in charts:
         axes.set_axisbelow(True)
         axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    FigureCanvasAgg(figure).print_png(str(path))
 
 
-def _sentence(evaluation: Evaluation) -> str:
+def sentence(evaluation: Evaluation) -> str:
     whole, maps = summaries(evaluation)[-1], evaluation.superposed
     return (
         f"{whole.images} images: simulated minus observed light in the occulter {whole.mean_pct:+.2f} % in the mean, "
@@ -87,15 +93,15 @@ def _sentence(evaluation: Evaluation) -> str:
     )
 
 
-def _shown(evaluation: Evaluation) -> list[FrameEvaluation]:
-    """One image a pointing, the middle one of those whose slices were kept; at most _SLICES."""
+def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
+    """One image a pointing, the middle one of those whose slices were kept; at most so many."""
     kept = [f for f in evaluation.frames if f.along_x is not None]
     fovs = sorted({f.fov for f in kept})
     by_fov = [[f for f in kept if f.fov == fov] for fov in fovs]
-    return [frames[len(frames) // 2] for frames in by_fov][:_SLICES]
+    return [frames[len(frames) // 2] for frames in by_fov][:most]
 
 
-def _draw_slices(axes: Any, frame: FrameEvaluation) -> None:
+def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
     """Observed and simulated along x, and along y where there is room: its points are hollow."""
     assert frame.along_x is not None and frame.along_y is not None
     dark = frame.along_x.dark
@@ -139,9 +145,9 @@ def _draw_slice(axes: Any, along: Slice, name: str, marker: str, face: str, dash
     )
 
 
-def _draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
+def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     """Light at the centre by time, observed and simulated."""
-    minutes = _minutes(frames)
+    minutes = minutes_of(frames)
     observed, simulated = np.array([f.centre_dn_s for f in frames]).T
     error = np.array([f.centre_noise_dn_s for f in frames])
     axes.errorbar(minutes, observed, error, label="observed", **_points(_OBSERVED, _size(frames)))
@@ -153,7 +159,7 @@ def _draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     axes.legend(fontsize=9, loc="upper left", frameon=False)
 
 
-def _draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
+def draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
     """MPE and its noise on one scale, MAPE and what noise alone gives on another."""
     mpe_top = max(maps.mpe_largest_pct, 1e-3)
     mape_top = max(float(np.nanmax([maps.mape_pct, maps.noise_mape_pct])), 1e-3)
@@ -178,22 +184,22 @@ def _draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
         band.colorbar(drawn, ax=axes, label="% of the disc's mean", shrink=0.8)
 
 
-def _draw_residuals(
+def draw_residuals(
     axes: Any, frames: Sequence[FrameEvaluation], where: Vector, label: str, title: str
 ) -> None:
     """Residuals with their noise, coloured by pointing."""
     values = np.array([f.residual_pct for f in frames])
     noise = np.array([f.noise_pct for f in frames])
-    _draw_errors(axes, frames, where, values, noise)
+    draw_errors(axes, frames, where, values, noise)
     axes.set(xlabel=label, ylabel="Simulated - observed (% of observed)", title=f"Residual {title}")
 
 
-def _draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
+def draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     """Absolute errors by detector x: of bright discs and faint ones, so that the scale is linear only about 0."""
     values = np.array([f.error_dn_s for f in frames])
     noise = np.array([f.noise_dn_s for f in frames])
     where = np.array([f.found.place.x_px for f in frames])
-    _draw_errors(axes, frames, where, values, noise)
+    draw_errors(axes, frames, where, values, noise)
     span = np.abs(values) + noise
     linear = 10.0 ** np.ceil(np.log10(max(float(np.median(span)), 1e-6)))  # so that a label stands at its end
     top = 4 * max(float(span.max()), linear)
@@ -206,16 +212,18 @@ def _draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     )
 
 
-def _draw_errors(
+def draw_errors(
     axes: Any, frames: Sequence[FrameEvaluation], where: Vector, values: Vector, noise: Vector
 ) -> None:
+    """Errors of images with their noise, coloured by pointing; nan where an image has none."""
     fovs = np.array([f.fov for f in frames])
     axes.axhline(0, color="#555555", linewidth=1.0)
     for n, fov in enumerate(sorted(set(fovs.tolist()))):
         here = fovs == fov
         style = _points(_POINTINGS[n % len(_POINTINGS)], _size(frames))
         axes.errorbar(where[here], values[here], noise[here], label=f"{fov}", **style)
-    top = 1.12 * float((np.abs(values) + noise).max(initial=1e-3))
+    span = np.abs(values) + noise
+    top = 1.12 * float(span[np.isfinite(span)].max(initial=1e-3))
     axes.set_ylim(-top, 1.35 * top)
     axes.legend(
         title="pointing",
@@ -229,7 +237,7 @@ def _draw_errors(
     )
 
 
-def _draw_offsets(panels: Sequence[Any], study: DarkOffsetStudy) -> None:
+def draw_offsets(panels: Sequence[Any], study: DarkOffsetStudy) -> None:
     """What offsets do to the weights, relative, and to the light beyond a distance, points."""
     weights, curve = panels
     for axes in panels:
@@ -254,7 +262,8 @@ def _draw_offsets(panels: Sequence[Any], study: DarkOffsetStudy) -> None:
         axes.legend(fontsize=9, frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
 
 
-def _minutes(frames: Sequence[FrameEvaluation]) -> Vector:
+def minutes_of(frames: Sequence[FrameEvaluation]) -> Vector:
+    """When each image was taken, minutes from the first of the transit."""
     return np.array([f.time_s for f in frames]) / 60
 
 

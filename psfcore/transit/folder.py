@@ -26,7 +26,7 @@ from psfcore.noise import Noise
 from psfcore.psf import CENTRE_TOLERANCE, plate_scale_arcsec
 from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest, read_manifest
 from psfcore.transit.prepare import Exposure, Prepared, exposure_of, prepare
-from psfcore.transit.transit import Kernel, Place, Transit
+from psfcore.transit.transit import Kernel, Place, Transit, check_reaches_in
 
 KNOWN_PSF_SUM_TOLERANCE = 1e-3
 SMALLEST_KNOWN_PSF_PX = 16
@@ -173,12 +173,7 @@ def _check_frames(images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]
         if image.r > largest:
             message = f"expected an occulter's radius r of at most {largest:g} px in {nx} x {ny} px"
             raise DataError("occulter-too-large", f"{label}: {message}; got {image.r:g}")
-        out_x = max(-0.5 - image.x, image.x - (nx - 0.5))
-        out_y = max(-0.5 - image.y, image.y - (ny - 0.5))
-        if max(out_x, out_y) > image.r:
-            message = f"expected an occulter that reaches into the {nx} x {ny} px"
-            got = f"x = {image.x:g}, y = {image.y:g}, r = {image.r:g}"
-            raise DataError("occulter-outside", f"{label}: {message}; got {got}")
+        check_reaches_in(Place(image.x, image.y, image.r), header.shape, label)
 
 
 def _times_s(headers: Sequence[HeaderSummary]) -> list[float]:

@@ -32,6 +32,7 @@ from scipy.ndimage import gaussian_filter
 
 from psfcore.fourier import Convolver
 from psfcore.noise import Noise
+from psfcore.normal_equations import scaled_inverse
 from psfcore.transit.transit import Frame, Place
 
 Plane = NDArray[np.float64]
@@ -59,6 +60,7 @@ _DIFFERENCE_PX = 0.05
 class FoundPlace:
     """An occulter's place with its error (px, each axis), and how it was found.
 
+    The patch's share of the errors is larger by sqrt(chi2_per_pixel) where that is above 1.
     neighbours: how many frames showed the scene behind it; 0: the disc's own surroundings stood in. depth: how much
     of the light that a disc would hide is missing, 1 for an occulter and 0 for none, with its error.
     """
@@ -83,13 +85,16 @@ class FoundPlace:
 
 def coverage(shape: tuple[int, int], place: Place) -> Plane:
     """Share of each pixel [y, x] that a disc covers, 0 to 1: chords exact in x, a mean of strips in y."""
-    strip = (np.arange(shape[0] * _STRIPS) + 0.5) / _STRIPS - 0.5
+    rows, columns = patch_window(shape, place, 1.0)  # elsewhere nothing is covered
+    strip = (np.arange(rows.start * _STRIPS, rows.stop * _STRIPS) + 0.5) / _STRIPS - 0.5
     half = np.sqrt(np.maximum(place.radius_px**2 - (strip - place.y_px) ** 2, 0.0))
-    left = np.arange(shape[1])[None, :] - 0.5
+    left = np.arange(columns.start, columns.stop)[None, :] - 0.5
     low = np.maximum(left, (place.x_px - half)[:, None])
     high = np.minimum(left + 1, (place.x_px + half)[:, None])
     chord = np.maximum(high - low, 0.0)
-    return np.asarray(chord.reshape(shape[0], _STRIPS, shape[1]).mean(axis=1))
+    out = np.zeros(shape)
+    out[rows, columns] = chord.reshape(-1, _STRIPS, chord.shape[1]).mean(axis=1)
+    return out
 
 
 def fully_dark(shape: tuple[int, int], place: Place, margin_px: float = 0.0) -> NDArray[np.bool_]:
@@ -110,7 +115,7 @@ def patch_window(shape: tuple[int, int], place: Place, margin_px: float = PATCH_
     """Rows and columns of the square round a disc, cut to the frame."""
     reach = place.radius_px + margin_px
     bounds = [
-        slice(max(0, round(centre - reach)), min(size, round(centre + reach) + 1))
+        slice(min(max(0, round(centre - reach)), size), min(max(0, round(centre + reach) + 1), size))
         for centre, size in ((place.y_px, shape[0]), (place.x_px, shape[1]))
     ]
     return bounds[0], bounds[1]
@@ -187,7 +192,7 @@ def find_occulter(
     place = Place(
         float(solved.at[0] + window[1].start), float(solved.at[1] + window[0].start), start.radius_px
     )
-    sigma = np.sqrt(np.diag(_inverse(solved.normal)))
+    sigma = np.sqrt(np.diag(scaled_inverse(solved.normal)))
     return FoundPlace(
         place=place,
         sigma_x_px=float(sigma[0]),
@@ -230,6 +235,8 @@ class _SimulatedDisc:
 
 @dataclass(frozen=True)
 class _Solved:
+    """Eq. (2) at its least: normal is the inverse covariance of x, y, scale and level."""
+
     at: NDArray[np.float64]
     normal: NDArray[np.float64]
     chi2: float
@@ -266,8 +273,10 @@ def _solve(
             ]
         ).reshape(4, -1)
         weighted = slopes * weight.ravel()
-        normal = weighted @ slopes.T + prior
-        step = np.linalg.lstsq(normal, weighted @ misfit.ravel() + prior @ (origin - at), rcond=None)[0]
+        normal = weighted @ slopes.T
+        step = np.linalg.lstsq(normal + prior, weighted @ misfit.ravel() + prior @ (origin - at), rcond=None)[
+            0
+        ]
         step[:2] = np.clip(step[:2], -1.0, 1.0) * (0.5 if done >= DAMPED_FROM else 1.0)
         at = at + step
         at[:2] = np.clip(at[:2], origin[:2] - LARGEST_SHIFT_PX, origin[:2] + LARGEST_SHIFT_PX)
@@ -279,23 +288,21 @@ def _solve(
     # What is missing beside what a disc hides, the scale free with it: both dim the patch as a whole.
     templates = np.array([-hidden, disc.seen]).reshape(2, -1)
     normal_2 = (templates * weight.ravel()) @ templates.T
-    inverse = _inverse(normal_2)
+    inverse = scaled_inverse(normal_2)
     more = inverse @ (templates * weight.ravel()) @ misfit.ravel()
+    chi2 = float(np.sum(weight * misfit**2))
+    # Where the simulation does not describe the patch, as where the disc's surroundings stand in for the scene, the
+    # patch says less of the place than its noise would allow; what the ephemeris says stays.
+    excess = max(chi2 / observed.size, 1.0)
     return _Solved(
         at=at,
-        normal=normal,
-        chi2=float(np.sum(weight * misfit**2)),
+        normal=normal / excess + prior,
+        chi2=chi2,
         steps_done=done,
         settled=settled,
         depth=float(1 + more[0]),
         depth_sigma=float(np.sqrt(inverse[0, 0])),
     )
-
-
-def _inverse(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse, or the pseudo-inverse where a combination is open: scale and level before an even scene."""
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.asarray(np.linalg.pinv(normal / np.outer(size, size), hermitian=True) / np.outer(size, size))
 
 
 def _ring_mean(frame: Frame, place: Place, window: Window) -> float:

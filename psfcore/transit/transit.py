@@ -30,13 +30,26 @@ class Place:
     radius_px: float
 
 
+def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
+    """Raise DataError "occulter-outside" where the square round a disc lies off the (ny, nx) px; label comes first."""
+    ny, nx = shape
+    out_x = max(-0.5 - place.x_px, place.x_px - (nx - 0.5))
+    out_y = max(-0.5 - place.y_px, place.y_px - (ny - 0.5))
+    if not max(out_x, out_y) <= place.radius_px:
+        got = f"x = {place.x_px:g}, y = {place.y_px:g}, r = {place.radius_px:g}"
+        raise DataError(
+            "occulter-outside",
+            f"{label}: expected an occulter that reaches into the {nx} x {ny} px; got {got}",
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One image of a transit: pixels [y, x] in DN/s (float32, finite), and where the ephemeris puts the occulter.
 
     fov: the pointing. time_s: since the first frame's start. filled: pixels [y, x] whose value was taken from
     another frame (saturated) or from neighbours (not finite); none of them may lie in the occulter's analysis.
-    Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure".
+    Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure", "occulter-outside".
     """
 
     file: str
@@ -60,6 +73,7 @@ class Frame:
             raise DataError(
                 "frame-exposure", f"{self.file}: expected an exposure > 0 s; got {self.exposure_s}"
             )
+        check_reaches_in(self.place, self.pixels.shape, self.file)
 
 
 @dataclass(frozen=True, eq=False)

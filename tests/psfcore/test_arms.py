@@ -143,6 +143,9 @@ def test_what_cannot_be_measured_is_refused() -> None:
         ("too-few-peaks", {"image": with_spot, "saturated": with_spot > 1e4}),
         ("arms-bad-input", {"image": image, "reference": image[:100]}),
         ("arms-bad-input", {"image": image, "centre_xy": (1e4, 3.0)}),
+        # Every direction scores alike: the arms that are taken leave the image at once.
+        ("too-few-peaks", {"image": image, "reference": image, "centre_xy": (1.0, 1.0)}),
+        ("too-few-peaks", {"image": image, "reference": image, "centre_xy": (SIZE - 1.0, SIZE - 1.0)}),
     ]
     for code, arguments in cases:
         with pytest.raises(DataError, match=r"expected .*;") as caught:

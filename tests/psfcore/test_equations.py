@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from psfcore.errors import DataError
 from psfcore.psf import squared_radii
+from psfcore.scatter import equations
 from psfcore.scatter.equations import (
     LIT,
     LIT_LINES,
@@ -49,6 +52,23 @@ def some(of: Lines, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Lines:
         of.scale[chosen],
         of.stratum[chosen],
     )
+
+
+def test_small_systems_are_solved_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many threads are given: for so small factorisations they wait for each other, and longest on busy cores."""
+    seen = []
+
+    def counted(*arguments: object, **options: object) -> object:
+        seen.extend(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        return lsq_linear(*arguments, **options)
+
+    monkeypatch.setattr(equations, "lsq_linear", counted)
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+        free_fit(lines(), COUNTS, seed=1, draws=2)
+        after = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+    assert seen and set(seen) == {1}
+    assert before == after and set(before) == {2}
 
 
 # --- draws ------------------------------------------------------------------------------------------------

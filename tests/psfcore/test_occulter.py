@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.simulate.disc import covered_share
 from psfcore.simulate.plan import Shot, default_plan
@@ -197,6 +198,13 @@ def test_an_ephemeris_off_by_pixels_is_put_right_and_one_off_by_more_is_told() -
     assert not lost.seen
 
 
+@pytest.mark.parametrize(("x_px", "y_px"), [(-12.0, 60.0), (60.0, SIZE_PX + 11.0), (np.nan, 60.0)])
+def test_a_disc_off_the_frame_is_refused_by_name(x_px: float, y_px: float) -> None:
+    with pytest.raises(DataError, match=r"005\.fits: expected an occulter .*; got x = ") as caught:
+        displaced(noise_free(sky()), 5, Place(x_px, y_px, RADIUS_PX))
+    assert caught.value.code == "occulter-outside"
+
+
 def test_an_image_without_an_occulter_is_told() -> None:
     of = sky()
     pixels = [frame.pixels for frame in noise_free(of).frames]
@@ -272,6 +280,23 @@ def test_without_neighbours_an_even_sun_gives_the_place_to_a_tenth_of_a_pixel() 
         assert [f.neighbours for f in found] == [0, 0, 0]
         assert np.abs(errors(of, found, range(3))).max() < 0.1
         assert all(f.seen for f in found)
+
+
+def test_without_neighbours_an_uneven_sun_leaves_the_place_unsure() -> None:
+    """A ring's mean is no scene: what it leaves unexplained widens the errors, up to the ephemeris' own."""
+    of = sky()
+    shown = observed(of).transit
+    alone = dataclasses.replace(
+        shown, frames=tuple(dataclasses.replace(f, fov=n) for n, f in enumerate(shown.frames, start=1))
+    )
+    on_disc = range(4, 8)
+    with_neighbours = found_in(of, shown, on_disc)
+    for sigma_px in (1.0, 0.1):
+        found = found_in(of, alone, on_disc, ephemeris_sigma_px=sigma_px)
+        assert all(f.neighbours == 0 and f.chi2_per_pixel > 50 for f in found)
+        for one, other in zip(found, with_neighbours, strict=True):
+            assert 5 * other.sigma_x_px < one.sigma_x_px < sigma_px
+            assert 5 * other.sigma_y_px < one.sigma_y_px < sigma_px
 
 
 def test_a_disc_that_touches_the_edge_is_found() -> None:

@@ -10,6 +10,7 @@ from psfcore.image import Image
 from psfcore.psf import (
     check_compatible,
     crop_centred,
+    crop_or_pad,
     cumulative_curve,
     encircled_energy,
     radial_profile,
@@ -111,3 +112,16 @@ def test_plate_scales_must_agree_to_a_percent_where_known(
             check_compatible(image, psf)
         assert caught.value.code == "plate-scale-mismatch"
         assert "0.492" in caught.value.message
+
+
+@pytest.mark.parametrize("size", [31, 64, 65, 20])
+def test_a_kernel_is_cut_or_padded_about_its_centre(size: int) -> None:
+    kernel = np.arange(31 * 31, dtype=np.float64).reshape(31, 31)
+    out = crop_or_pad(kernel, size)
+    assert out.shape == (size, size)
+    assert out[size // 2, size // 2] == kernel[15, 15]
+    least = min(size, 31)
+    np.testing.assert_array_equal(crop_centred(out, (least, least)), crop_centred(kernel, (least, least)))
+    if size > 31:
+        assert out.sum() == kernel.sum()
+    assert crop_or_pad(kernel[:, :20], 40)[20, 20] == kernel[15, 10]

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.psf import REACH_GRID_PX, crop_centred, cumulative_curve
+from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter import published
 from psfcore.scatter.equations import LIT, Drawn, Lines
 from psfcore.scatter.published import (
@@ -23,7 +23,6 @@ from psfcore.scatter.published import (
     SHRUNK_PX,
     Choices,
     Published,
-    crop_or_pad,
     invert_as_published,
 )
 from psfcore.simulate.scatter_truth import ScatterTruth
@@ -152,20 +151,28 @@ def test_filled_pixels_make_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(fewer) == len(whole) - 3
 
 
+def test_one_draw_has_no_spread() -> None:
+    """Of two draws one is kept."""
+    for draws in (1, 2):
+        of = invert_as_published(faint(), draws=draws)
+        assert of.free.fits.shape[0] == 1
+        assert of.spread is None
+        assert np.isfinite(of.curve_pct).all()
+
+
+def test_shells_that_outshine_the_centre_are_no_scatter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Less than all light in the four pixels next to the centre, and yet each brighter than it."""
+    nearest = np.zeros(50)
+    nearest[0] = 0.22
+    monkeypatch.setattr(published, "free_fit", lambda *_, **__: Drawn(nearest[None], np.zeros(1)))
+    with pytest.raises(
+        DataError, match=r"round 1: free shells: expected a PSF .* centre; got .* 1 px"
+    ) as caught:
+        invert_as_published(faint(), draws=1)
+    assert caught.value.code == "no-scatter"
+
+
 def test_without_an_occulted_pixel_there_are_no_lines() -> None:
     frames = [dataclasses.replace(f, place=Place(50.0, 50.0, 0.9)) for f in faint().frames]
     with pytest.raises(DataError, match="no-lines"):
         invert_as_published(dataclasses.replace(faint(), frames=tuple(frames)), draws=1)
-
-
-@pytest.mark.parametrize("size", [31, 64, 65, 20])
-def test_a_kernel_is_cut_or_padded_about_its_centre(size: int) -> None:
-    kernel = np.arange(31 * 31, dtype=np.float64).reshape(31, 31)
-    out = crop_or_pad(kernel, size)
-    assert out.shape == (size, size)
-    assert out[size // 2, size // 2] == kernel[15, 15]
-    least = min(size, 31)
-    np.testing.assert_array_equal(crop_centred(out, (least, least)), crop_centred(kernel, (least, least)))
-    if size > 31:
-        assert out.sum() == kernel.sum()
-    assert crop_or_pad(kernel[:, :20], 40)[20, 20] == kernel[15, 10]

@@ -53,6 +53,22 @@ def test_light_off_the_centre_is_the_total(shape: Shape) -> None:
     assert kernel.min() >= 0
 
 
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=name_of)
+def test_slopes_are_those_of_the_kernel(shape: Shape) -> None:
+    """Each against two wider differences of its own coordinate, extrapolated to no width."""
+    at = shape.coordinates(LAW | MORE)
+    for k in range(at.size):
+        axis = np.eye(at.size)[k]
+        wide, wider = (
+            (shape.kernel(at + h * axis, 64) - shape.kernel(at - h * axis, 64)) / (2 * h)
+            for h in (4e-3, 8e-3)
+        )
+        expected = (4 * wide - wider) / 3
+        largest = np.abs(expected).max()
+        assert largest > 1e-5
+        np.testing.assert_allclose(shape.slope(at, k, 64), expected, atol=1e-5 * largest)
+
+
 @pytest.mark.parametrize("shape", OTHERS, ids=name_of)
 def test_nothing_added_is_the_softened_power_law(shape: Shape) -> None:
     assert all(p.start == 0 for p in shape.parameters[3:])

@@ -212,3 +212,26 @@ def test_discs_that_are_not_there_are_refused(transit: Path, true_psf: Path, tmp
 def test_output_that_cannot_be_written_is_said_first(transit: Path, tmp_path: Path) -> None:
     refused(run(transit, "--json", tmp_path / "no/such/r.json"), "there is no folder")
     refused(run(transit, "--plot", tmp_path / "no/such/r.png"), "there is no folder")
+
+
+# --- shapes -----------------------------------------------------------------------------------------------
+
+
+def test_shapes_are_compared_where_asked(transit: Path, tmp_path: Path) -> None:
+    result = run(transit, "--shapes", "--json", tmp_path / "r.json")
+    assert result.exit_code == 0, result.output
+    shapes = json.loads((tmp_path / "r.json").read_text())["shapes"]
+    assert [shape["name"] for shape in shapes["shapes"]] == [
+        "softened-power-law",
+        "stretched-along-x",
+        "stretched",
+        "free-shells",
+    ]
+    assert shapes["images"] == IMAGES
+    assert (
+        "held-out errors of shapes" in result.output and "less those of softened-power-law" in result.output
+    )
+
+
+def test_shapes_need_fits_of_their_own(transit: Path, true_psf: Path) -> None:
+    refused(run(transit, "--psf", true_psf, "--shapes"), "--shapes", "expected --psf none")

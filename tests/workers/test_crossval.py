@@ -78,16 +78,29 @@ def test_the_report_says_what_was_done(reports: dict[str, Any]) -> None:
         assert len(report["totals"]) == 6 and report["inputs_sha256"]
 
 
+def test_both_schemes_compare_with_a_fit_without_a_formula(reports: dict[str, Any]) -> None:
+    for report in reports.values():
+        shells = report["shells"]
+        beyond = shells["diffuse_light_beyond_inner_edge_pct"]
+        assert set(beyond) == {"free", "formula"} == set(shells["weight"])
+        assert len(beyond["free"]["median"]) == len(shells["edges_px"]) - 1
+        near = shells["excess_near_centre"]
+        assert abs(near["points"]) < 3 * near["sigma"]  # the truth is a power law
+        assert f"{near['points']:+.1f} ± {near['sigma']:.1f}" in report["sentence"]
+        json.dumps(report["folds"][0]["shells"], allow_nan=False)
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Folds that cost nothing: this is about who does them."""
 
-    def fold(transit: Any, shape: str, draw: Any, **_: Any) -> crossval_task.FoldFit:
+    def fold(solution: Any, draw: Any, **_: Any) -> crossval_task.FoldFit:
         curve = tuple(50.0 - k for k in range(7))
         held_out = dict.fromkeys(draw.held_out, 1.0)
         return crossval_task.FoldFit(draw.run, draw.fold, (1.0,), {"total": 0.4}, curve, held_out)
 
     monkeypatch.setattr(crossval_task, "exact_fit", fold)
+    monkeypatch.setattr(crossval_task, "_solution", lambda *_: None)
 
 
 def submit(service: LocalService, transit: Path, seed: int) -> str:
@@ -105,12 +118,12 @@ def test_a_worker_killed_half_way_loses_no_fold_and_counts_none_twice(
     class Killed(BaseException):
         """What stops a process without its doing anything more."""
 
-    def counted(transit: Any, shape: str, draw: Any, **options: Any) -> Any:
+    def counted(solution: Any, draw: Any, **options: Any) -> Any:
         if len(done) == 4:
             done.append((-1, -1))
             raise Killed
         done.append((draw.run, draw.fold))
-        return cheap(transit, shape, draw, **options)
+        return cheap(solution, draw, **options)
 
     monkeypatch.setattr(crossval_task, "exact_fit", counted)
     # A killed process gives nothing back: the fold stays taken until its lease is over.
@@ -137,11 +150,11 @@ def test_another_worker_shares_the_folds(
     by_thread: dict[str, list[tuple[int, int]]] = {}
     helping = threading.Event()
 
-    def slow(transit: Any, shape: str, draw: Any, **options: Any) -> Any:
+    def slow(solution: Any, draw: Any, **options: Any) -> Any:
         by_thread.setdefault(threading.current_thread().name, []).append((draw.run, draw.fold))
         helping.wait(10)
         threading.Event().wait(0.05)
-        return cheap(transit, shape, draw, **options)
+        return cheap(solution, draw, **options)
 
     monkeypatch.setattr(crossval_task, "exact_fit", slow)
     helpers: list[threading.Thread] = []

@@ -1,0 +1,191 @@
+"""A blind set on disk: its folders, its seals, and the making of all its cases.
+
+DIR/set.json                  how the set was made: seed, sizes, number of cases
+DIR/cases/NNNN/transit/       what a diagnosis gets
+DIR/cases/NNNN/report.json    what it said (gap/1); run.json: time, memory; failure.json in place of a report
+DIR/truth/NNNN.json           salt and truth
+DIR/seals.jsonl               {"case", "sha256"}, a line a case
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.blind.cases import draw_case
+from psfcore.blind.making import make, seal_of, sealed, write_transit
+from psfcore.errors import DataError
+
+Plane = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SetPlan:
+    """How a set is made. first: the number of its first case; only, clean_only: as draw_case has them."""
+
+    cases: int
+    seed: int
+    size_px: int = 256
+    images: int = 18
+    first: int = 0
+    only: tuple[str, ...] = ()
+    clean_only: bool = False
+    built_diffraction: bool = True
+
+    @property
+    def numbers(self) -> range:
+        """The cases' numbers."""
+        return range(self.first, self.first + self.cases)
+
+
+@dataclass(frozen=True)
+class BlindSet:
+    """A folder that holds a set."""
+
+    folder: Path
+
+    def case_folder(self, number: int) -> Path:
+        """Of one case: its transit, then its report."""
+        return self.folder / "cases" / f"{number:04d}"
+
+    def transit(self, number: int) -> Path:
+        """What a diagnosis gets."""
+        return self.case_folder(number) / "transit"
+
+    def report(self, number: int) -> Path:
+        """What it said."""
+        return self.case_folder(number) / "report.json"
+
+    def truth_file(self, number: int) -> Path:
+        """Salt and truth."""
+        return self.folder / "truth" / f"{number:04d}.json"
+
+    @property
+    def seals_file(self) -> Path:
+        """The seals of all cases."""
+        return self.folder / "seals.jsonl"
+
+    def seals(self) -> dict[int, str]:
+        """SHA-256 by case. Raises DataError "bad-seals"."""
+        if not self.seals_file.is_file():
+            return {}
+        found: dict[int, str] = {}
+        for line in self.seals_file.read_text("utf-8").splitlines():
+            try:
+                entry = json.loads(line)
+                number, seal = int(entry["case"]), str(entry["sha256"])
+            except (ValueError, KeyError, TypeError) as error:
+                message = f"expected a case and its sha256 a line; got {line!r:.60}"
+                raise DataError("bad-seals", message) from error
+            if found.setdefault(number, seal) != seal:
+                raise DataError("bad-seals", f"expected one seal a case; got two for case {number:04d}")
+        return found
+
+    def truth(self, number: int) -> dict[str, Any]:
+        """A case's truth, after its seal was checked. Raises DataError "broken-seal"."""
+        seal = self.seals().get(number)
+        try:
+            kept = json.loads(self.truth_file(number).read_text("utf-8"))
+            salt, truth = str(kept["salt"]), dict(kept["truth"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                "broken-seal", f"case {number:04d}: expected salt and truth; got {error!s:.100}"
+            ) from error
+        if seal is None or seal_of(salt, truth) != seal:
+            message = (
+                f"case {number:04d}: expected a truth that hashes to {seal}; it was changed, or never sealed"
+            )
+            raise DataError("broken-seal", message)
+        return truth
+
+    def is_made(self, number: int) -> bool:
+        """Whether a case was made and sealed; its transit may have been deleted after the report."""
+        return self.truth_file(number).is_file() and number in self.seals()
+
+
+def make_set(
+    folder: Path,
+    plan: SetPlan,
+    *,
+    scenes: Sequence[Plane] = (),
+    processes: int = 1,
+    progress: Progress = lambda line: None,
+) -> BlindSet:
+    """Make and seal all cases of a set that are not there yet.
+
+    scenes: images [y, x] in DN/s to take scenes from. Raises DataError "other-set" where the folder holds a set made
+    otherwise, and what making a case raises.
+    """
+    made = BlindSet(folder)
+    _remember(made, plan)
+    (folder / "truth").mkdir(parents=True, exist_ok=True)
+    sealed_before = made.seals()
+    missing = [n for n in plan.numbers if not (n in sealed_before and made.truth_file(n).is_file())]
+    for number in missing:
+        shutil.rmtree(made.case_folder(number), ignore_errors=True)  # half made
+    for done, (number, seal, seconds) in enumerate(_made(made, plan, missing, scenes, processes), 1):
+        with made.seals_file.open("a", encoding="utf-8") as seals:
+            seals.write(json.dumps({"case": number, "sha256": seal}) + "\n")
+        progress(f"made case {number:04d} in {seconds:.1f} s ({done} of {len(missing)})")
+    return made
+
+
+def _remember(made: BlindSet, plan: SetPlan) -> None:
+    """Write how the set is made, or see that it is the same."""
+    about = json.loads(json.dumps(asdict(plan)))
+    file = made.folder / "set.json"
+    if file.is_file():
+        before = json.loads(file.read_text("utf-8"))
+        same = {key: value for key, value in before.items() if key != "cases"}
+        if same != {key: value for key, value in about.items() if key != "cases"}:
+            raise DataError(
+                "other-set", f"expected a folder for {about}; {made.folder} holds a set made with {before}"
+            )
+    made.folder.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(about, indent=1) + "\n", "utf-8")
+
+
+def _made(
+    made: BlindSet, plan: SetPlan, numbers: Sequence[int], scenes: Sequence[Plane], processes: int
+) -> Iterator[tuple[int, str, float]]:
+    """Case, seal and seconds of each, as they come."""
+    if processes <= 1 or len(numbers) <= 1:
+        yield from (_make_one(made, plan, number, scenes) for number in numbers)
+        return
+    # Fork would carry this process's threads' locks along.
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        waiting = [pool.submit(_make_one, made, plan, number, scenes) for number in numbers]
+        for future in as_completed(waiting):
+            yield future.result()
+
+
+def _make_one(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane]) -> tuple[int, str, float]:
+    started = time.perf_counter()
+    case = draw_case(
+        plan.seed,
+        number,
+        plan.size_px,
+        plan.images,
+        only=plan.only,
+        clean_only=plan.clean_only,
+        built_diffraction=plan.built_diffraction,
+    )
+    result = make(case, scenes)
+    write_transit(result, case.plan, made.transit(number))
+    seal, kept = sealed(result.truth)
+    unfinished = made.truth_file(number).with_suffix(".part")
+    unfinished.write_text(json.dumps(kept, allow_nan=False), "utf-8")
+    os.replace(unfinished, made.truth_file(number))
+    return number, seal, time.perf_counter() - started

@@ -1,0 +1,207 @@
+"""Which case is which: drawn from a seed and a number, the same for the same two, in shares that come out even.
+
+Of every 24 cases in a row 8 are clean, 10 carry one known effect, 2 carry two, 4 carry one that nobody's library has.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from psfcore.blind.effect import Effect
+from psfcore.blind.effects import KNOWN, UNKNOWN, effect_named
+from psfcore.blind.fine_optics import FINE, INSTRUMENT, SYNTHETIC, Glass
+from psfcore.blind.scene_effects import patches
+from psfcore.errors import DataError
+from psfcore.noise import Noise
+from psfcore.simulate.plan import WEST, Plan, Shot, default_plan
+from psfcore.simulate.pointings import drawn_scene, scene_from_image
+from psfcore.simulate.scatter_truth import ScatterTruth
+
+Plane = NDArray[np.float64]
+CLEAN, SINGLE, PAIR, FOREIGN = "clean", "single", "pair", "unknown"
+KINDS = (CLEAN, SINGLE, PAIR, FOREIGN)
+_BLOCK = (CLEAN,) * 8 + (SINGLE,) * 10 + (PAIR,) * 2 + (FOREIGN,) * 4
+_TARGET_PCT = (0.5, 10.0)
+_BUILT_SHARE = 0.5  # of cases whose diffraction is the instrument's
+_SATURATING_SHARE = 0.25
+_KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case before it is made. target_pct: what each of its effects is meant to leave in the discs after a refit.
+
+    effects: at their nominal strengths. headroom: saturation level over the brightest pixel, None for none.
+    """
+
+    number: int
+    seed: int
+    kind: str
+    plan: Plan
+    law: ScatterTruth
+    glass: Glass
+    effects: tuple[Effect, ...]
+    target_pct: tuple[float, ...]
+    headroom: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """What the truth says of how it was drawn."""
+        return {
+            "number": self.number,
+            "seed": self.seed,
+            "kind": self.kind,
+            "glass": dataclasses.asdict(self.glass),
+            "target_pct": list(self.target_pct),
+        }
+
+
+def draw_case(
+    seed: int,
+    number: int,
+    size_px: int,
+    images: int,
+    *,
+    only: Sequence[str] = (),
+    clean_only: bool = False,
+    built_diffraction: bool = True,
+) -> Case:
+    """Case `number` (from 0) of a set. only: single effects of these names in turn, no others.
+
+    built_diffraction: half of the cases have the instrument's diffraction; else all have a synthetic one.
+    Raises DataError "unknown-effect", "bad-plan".
+    """
+    kind, names = _what(seed, number, only, clean_only)
+    rng = np.random.default_rng([seed, number, _TRUTH_STREAM])
+    plan = _plan(size_px, images, rng)
+    law = ScatterTruth(rng.uniform(3, 9), rng.uniform(2.3, 2.8), rng.uniform(0.25, 0.5))
+    glass = _glass(size_px, rng, built_diffraction)
+    headroom = float(rng.uniform(1.2, 2.0)) if rng.random() < _SATURATING_SHARE else None
+    own = np.random.default_rng([seed, number, _EFFECT_STREAM])
+    effects = tuple(effect_named(name).drawn(effect_named(name).nominal, plan, own) for name in names)
+    low, high = (float(np.log(pct)) for pct in _TARGET_PCT)
+    targets = np.exp(own.uniform(low, high, len(names)))
+    own_seed = int(own.integers(2**31))
+    return Case(number, own_seed, kind, plan, law, glass, effects, tuple(float(t) for t in targets), headroom)
+
+
+def _what(seed: int, number: int, only: Sequence[str], clean_only: bool) -> tuple[str, tuple[str, ...]]:
+    """Kind and names of a case."""
+    if clean_only:
+        return CLEAN, ()
+    if only:
+        name = only[number % len(only)]
+        effect_named(name)
+        return (SINGLE if name in KNOWN else FOREIGN), (name,)
+    block, place = divmod(number, len(_BLOCK))
+    kinds = _kinds(seed, block)
+    kind = kinds[place]
+    count = block * _BLOCK.count(kind) + kinds[:place].count(kind)  # how many of its kind came before
+    if kind == SINGLE:
+        return kind, (_in_turn(seed, count, KNOWN, 0),)
+    if kind == FOREIGN:
+        return kind, (_in_turn(seed, count, UNKNOWN, 1),)
+    if kind == PAIR:
+        rng = np.random.default_rng([seed, count, _KIND_STREAM, 2])
+        first, second = rng.choice(len(KNOWN), size=2, replace=False)
+        return kind, (KNOWN[first], KNOWN[second])
+    return CLEAN, ()
+
+
+def _kinds(seed: int, block: int) -> list[str]:
+    order = np.random.default_rng([seed, block, _KIND_STREAM]).permutation(len(_BLOCK))
+    return [_BLOCK[n] for n in order]
+
+
+def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
+    """Each name once, in a random order, before any comes again."""
+    turn, place = divmod(count, len(names))
+    order = np.random.default_rng([seed, turn, _KIND_STREAM, 3 + stream]).permutation(len(names))
+    return names[order[place]]
+
+
+def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
+    """The usual transit, upright or upside down, its tracks moved a little, dimmer or brighter."""
+    plan = default_plan(
+        images,
+        size_px,
+        radius_px=float(rng.uniform(10.3, 11.2)),
+        brightness=float(np.exp(rng.uniform(np.log(0.5), np.log(1.5)))),
+        noise=Noise(float(rng.uniform(4.5, 7.5)), float(rng.uniform(1.5, 3.0))),
+        ephemeris_error_px=float(rng.uniform(0.3, 0.7)),
+        oversampling=FINE,
+    )
+    upside_down = bool(rng.random() < 0.5)
+    moves = rng.uniform(-0.06, 0.06, (len(plan.views), 2)) * size_px
+    low = plan.radius_px + 6
+    shots = []
+    for shot in plan.shots:
+        x, y = np.clip(
+            (shot.x_px + moves[shot.fov - 1, 0], shot.y_px + moves[shot.fov - 1, 1]), low, size_px - 1 - low
+        )
+        y = size_px - 1 - y if upside_down else y
+        shots.append(Shot(shot.fov, float(x), float(y), shot.exposure_s, shot.gain_mode, shot.time_s))
+    return dataclasses.replace(plan, shots=tuple(shots))
+
+
+def _glass(size_px: int, rng: np.random.Generator, built: bool) -> Glass:
+    kind = INSTRUMENT if built and rng.random() < _BUILT_SHARE else SYNTHETIC
+    return Glass(
+        kind,
+        size_px,
+        core_px=float(rng.uniform(0.08, 0.2)),
+        wing_px=float(rng.uniform(1.0, 3.0)),
+        wing_share=float(rng.uniform(0.05, 0.15)),
+        arm_share=float(rng.uniform(0.05, 0.2)),
+        pitch_px=float(rng.uniform(5.0, 6.5)),
+    )
+
+
+def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
+    """Fine scenes [y, x], DN/s, by pointing: drawn, or cut out of images [y, x] in DN/s, and given other statistics.
+
+    images: taken in turn; the west limb's is mirrored where there is one alone. Raises DataError "bad-scene".
+    """
+    scenes = {}
+    for fov in case.plan.fovs:
+        if images:
+            given = images[(case.number + fov - 1) % len(images)]
+            mirrored = len(images) == 1 and case.plan.views[fov - 1] == WEST
+            scene = scene_from_image(given[:, ::-1] if mirrored else given, case.plan)
+            scenes[fov] = _calm(scene)
+        else:
+            scenes[fov] = _with_own_statistics(drawn_scene(case.plan, fov, case.seed), case, fov)
+        if scenes[fov].max() <= 0:
+            raise DataError("bad-scene", f"expected a scene with light for pointing {fov}; got none")
+    return scenes
+
+
+def _calm(scene: Plane) -> Plane:
+    """An image has its telescope's noise in it: smoothed by less than a detector pixel."""
+    return np.asarray(gaussian_filter(scene, 0.5 * FINE))
+
+
+def _with_own_statistics(scene: Plane, case: Case, fov: int) -> Plane:
+    """Broad and fine modulation, compact brightenings whose light follows a power law, and a floor."""
+    rng = np.random.default_rng([case.seed, fov, 4])
+    n = scene.shape[0]
+    seed = int(rng.integers(2**31))
+    broad, fine = patches(n, seed, float(rng.uniform(0.1, 0.4))), patches(n, seed + 1, 0.015)
+    lit = scene * np.exp(rng.uniform(0.1, 0.5) * broad + rng.uniform(0.0, 0.35) * fine)
+    points = np.zeros_like(lit)
+    count = int(rng.integers(5, 60))
+    rows, columns = rng.integers(0, n, (2, count))
+    light = rng.pareto(1.7, count) * rng.uniform(0.3, 1.5) * lit[rows, columns]
+    np.add.at(points, (rows, columns), np.minimum(light, 40 * lit.mean()))
+    width = rng.uniform(0.8, 2.0) * FINE
+    lit += 2 * np.pi * width**2 * gaussian_filter(points, width)
+    return np.asarray(lit + rng.uniform(0, 3))
+
+
+__all__ = ["CLEAN", "FOREIGN", "KINDS", "PAIR", "SINGLE", "Case", "case_scenes", "draw_case"]

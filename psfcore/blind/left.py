@@ -1,0 +1,176 @@
+"""What an effect leaves in the discs: without noise, seen through the estimator, before and after the PSF is fitted anew.
+
+    e_i = mean of the fully dark pixels of D [y_i - H (1 - D) x_i], in percent of their mean of y_i     Eq. (1)
+    left = rms over images of e_i with the effect minus e_i without                                      Eq. (2)
+    after a fit, to first order:  r - A (A^T W A)^-1 A^T W r                                             Eq. (3)
+
+Eq. (3) is quick and sets an effect's strength; what a case's truth says of it is measured with a whole inversion.
+H is the true PSF on detector pixels. A is how the dark pixels answer to the scatter's three parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.noise import Noise
+from psfcore.scatter.inversion import DARK_MARGIN_PX, invert
+from psfcore.scatter.optics import Blur, Lanes, Optics, Pixels, pick, put
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from psfcore.scatter.total_psf import TotalPsf
+from psfcore.simulate.scatter_truth import ScatterTruth
+from psfcore.transit.occulter import fully_dark
+from psfcore.transit.transit import Frame, Transit
+
+Plane = NDArray[np.floating]
+Kernel = NDArray[np.float64]
+Vector = NDArray[np.float64]
+_WARM_STEPS = 3
+_LEAST_LEVEL = 0.2
+
+
+@dataclass(frozen=True)
+class _Discs:
+    """One image without the effect: its dark pixels, scene, residual, answers (parameters, pixels) and weights."""
+
+    dark: Pixels
+    scene: Lanes
+    residual: Vector
+    answers: NDArray[np.float64]
+    weight: Vector
+
+
+@dataclass(frozen=True)
+class Left:
+    """Percent, rms over images: what an effect leaves, and what the sampling leaves without one."""
+
+    before_refit_pct: float
+    after_refit_pct: float
+    clean_before_refit_pct: float
+    clean_after_refit_pct: float
+
+
+class LinearEstimator:
+    """Eq. (1) to (3) about images without effect. frames: these, nearly noise-free, with the exact places."""
+
+    def __init__(self, frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> None:
+        shape = (frames[0].pixels.shape[0], frames[0].pixels.shape[1])
+        total = TotalPsf(diffraction, SOFTENED_POWER_LAW, shape)
+        at = true_coordinates(law)
+        self._optics = Optics(total.kernel(at), shape)
+        self._slopes = [Blur(slope, shape) for slope in total.slopes(at)]
+        self._noise, self._frames = noise, frames
+        self._discs = [self._look(frame) for frame in frames]
+
+    def left(self, images: Mapping[int, Plane]) -> Left:
+        """What changed images [y, x], DN/s, leave; the fit takes the images that are given."""
+        residuals = {n: self._residual(n, pixels) for n, pixels in images.items()}
+        changes = {n: residuals[n][0] - self._discs[n].residual for n in images}
+        clean = {n: self._discs[n].residual for n in images}
+        return Left(
+            before_refit_pct=self._rms(changes),
+            after_refit_pct=self._rms(self._refitted(changes)),
+            clean_before_refit_pct=self._rms(clean),
+            clean_after_refit_pct=self._rms(self._refitted(clean)),
+        )
+
+    def clean_left_pct(self) -> dict[int, float]:
+        """Eq. (1) of every image without effect, the PSF fitted anew; percent."""
+        fitted = self._refitted({n: disc.residual for n, disc in enumerate(self._discs)})
+        return {n: self._percent(n, residual) for n, residual in fitted.items()}
+
+    def _look(self, frame: Frame) -> _Discs:
+        shape = (frame.pixels.shape[0], frame.pixels.shape[1])
+        rows, columns = np.nonzero(fully_dark(shape, frame.place, DARK_MARGIN_PX))
+        dark = (rows, columns)
+        observed = self._optics.lanes(frame.pixels)
+        scene = self._optics.undo(observed)
+        lit = _blanked(scene, dark)
+        expected = pick(self._optics.see(lit), dark)
+        level = np.maximum(expected, _LEAST_LEVEL * expected.mean())
+        return _Discs(
+            dark=dark,
+            scene=scene,
+            residual=pick(observed, dark) - expected,
+            answers=np.array([self._answer(blur, lit, dark) for blur in self._slopes]),
+            weight=1 / self._noise.variance(level, frame.exposure_s),
+        )
+
+    def _answer(self, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
+        """A column of A: the PSF's change seen, and the change of the scene that it brings, seen."""
+        changed = slope.see(lit)
+        scene = _blanked(self._optics.undo_once(changed), dark)
+        return pick(changed, dark) - pick(self._optics.see(scene), dark)
+
+    def _residual(self, n: int, pixels: Plane) -> tuple[Vector, Vector]:
+        disc = self._discs[n]
+        observed = self._optics.lanes(pixels)
+        scene = self._optics.undo(observed, disc.scene, steps=_WARM_STEPS)
+        expected = pick(self._optics.see(_blanked(scene, disc.dark)), disc.dark)
+        return pick(observed, disc.dark) - expected, expected
+
+    def _refitted(self, residuals: Mapping[int, Vector]) -> dict[int, Vector]:
+        """Eq. (3)."""
+        weighted = {n: self._discs[n].answers * self._discs[n].weight for n in residuals}
+        normal = sum(weighted[n] @ self._discs[n].answers.T for n in residuals)
+        score = sum(weighted[n] @ residuals[n] for n in residuals)
+        step = np.linalg.lstsq(np.asarray(normal), np.asarray(score), rcond=1e-12)[0]
+        return {n: residual - self._discs[n].answers.T @ step for n, residual in residuals.items()}
+
+    def _percent(self, n: int, residual: Vector) -> float:
+        disc = self._discs[n]
+        observed = float(pick(self._optics.lanes(self._frames[n].pixels), disc.dark).mean())
+        return -100 * float(residual.mean()) / observed  # simulated minus observed
+
+    def _rms(self, residuals: Mapping[int, Vector]) -> float:
+        return float(np.sqrt(np.mean([self._percent(n, r) ** 2 for n, r in residuals.items()])))
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A whole inversion of nearly noise-free images: e_i of Eq. (1) in percent and its noise, by image, and the values."""
+
+    residual_pct: dict[int, float]
+    noise_pct: dict[int, float]
+    values: dict[str, float]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; images by their number."""
+        return {
+            "residual_pct": {str(n): value for n, value in self.residual_pct.items()},
+            "noise_pct": {str(n): value for n, value in self.noise_pct.items()},
+            "values": self.values,
+        }
+
+
+def refitted(frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> Refitted:
+    """The PSF fitted anew, from the truth on. Raises what psfcore.scatter.inversion.invert raises."""
+    transit = Transit(frames=tuple(frames), diffraction=diffraction, noise=noise)
+    inversion = invert(transit, start=true_coordinates(law)).inversion
+    number = {frame.file: n for n, frame in enumerate(frames)}
+    return Refitted(
+        residual_pct={number[fit.file]: fit.residual_pct for fit in inversion.frames},
+        noise_pct={number[fit.file]: 100 * fit.noise / fit.observed for fit in inversion.frames},
+        values=inversion.values,
+    )
+
+
+def rms_difference(with_effect: Mapping[int, float], without: Mapping[int, float]) -> float:
+    """Eq. (2) over the images that both have; percent."""
+    both = sorted(set(with_effect) & set(without))
+    return float(np.sqrt(np.mean([(with_effect[n] - without[n]) ** 2 for n in both]))) if both else 0.0
+
+
+def true_coordinates(law: ScatterTruth) -> Vector:
+    """The true power law in the coordinates of the fit."""
+    return SOFTENED_POWER_LAW.coordinates({"b_px": law.b_px, "c": law.c, "total": law.total})
+
+
+def _blanked(scene: Lanes, dark: Pixels) -> Lanes:
+    lit = scene.copy()
+    put(lit, dark, 0.0)
+    return lit

@@ -1,0 +1,148 @@
+"""What the discs say: means over cells of radius and azimuth, and how each answers to any change of its image.
+
+With y an image, D its fully dark pixels, H the PSF, G the inverse on the periodic plane and x = (2 - G H) G y the
+scene, the light left unexplained in the disc is r = D [y - H (1 - D) x]. A cell's mean of r is a linear function of
+the whole image, and its weights are found once by going backwards:
+
+    a . r = q . y,   q = a - (2 - G^T H^T) G^T (1 - D) H^T a        Eq. (1)
+
+so that an effect's change e of the image moves the cell by q . e: a sum over pixels, whatever the effect. A global gain
+error has q . e = 0, nearly. The noise of two cells, the disc's own and that of the scene which scatters into it:
+
+    cov(a_1 . r, a_2 . r) = sum over all pixels of q_1 q_2 var(y)    Eq. (2)
+
+| symbol | name | unit |
+|---|---|---|
+| a | weights of a cell: one over its number of pixels | - |
+| q | sensitivity | - |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.scatter.inversion import Solution
+from psfcore.scatter.optics import Optics, Pixels, put
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Planes = NDArray[np.float32]
+
+RINGS = (
+    (0.0, 0.38, 1),
+    (0.38, 0.7, 4),
+    (0.7, 1.0, 8),
+)  # from, to (of the outermost dark pixel's radius), sectors
+LEAST_PIXELS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The cells of one disc: weights (cells, dark pixels), mean radius over the disc's, and azimuth (rad)."""
+
+    weights: Matrix
+    pixels: Vector
+    radius: Vector
+    azimuth: Vector
+
+
+def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
+    """Cells of the dark pixels round a disc's centre; those of fewer than LEAST_PIXELS pixels are left out."""
+    rows, columns = dark
+    dx, dy = columns - x_px, rows - y_px
+    r = np.hypot(dx, dy)
+    share = r / max(float(r.max()), 1e-9)
+    angle = np.arctan2(dy, dx)
+    members: list[NDArray[np.bool_]] = []
+    for low, high, sectors in RINGS:
+        ring = (share >= low) & ((share < high) | (high >= 1.0))
+        sector = np.floor((angle + np.pi / sectors) / (2 * np.pi / sectors)).astype(int) % sectors
+        members.extend(ring & (sector == k) for k in range(sectors))
+    kept = [m for m in members if m.sum() >= LEAST_PIXELS]
+    weights = np.array([m / m.sum() for m in kept])
+    centre = np.exp(1j * angle)
+    return Cells(
+        weights=weights,
+        pixels=np.array([float(m.sum()) for m in kept]),
+        radius=weights @ share,
+        azimuth=np.angle(weights @ (centre * share)),
+    )
+
+
+def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
+    """Eq. (1): how each cell's mean answers to every pixel of the image, (cells, ny, nx)."""
+    out = []
+    for weight in weights:
+        cell = np.zeros(optics.engine.lanes_shape, np.float32)
+        put(cell, dark, weight)
+        scattered = optics.see_back(cell)
+        put(scattered, dark, 0.0)
+        once = optics.undo_once(scattered, adjoint=True)
+        cell -= 2 * once
+        cell += optics.undo_once(optics.see_back(once), adjoint=True)
+        out.append(optics.field(cell))
+    return np.array(out)
+
+
+@dataclass(frozen=True, eq=False)
+class DiscCells:
+    """The cells of frame `index` (a position among all frames): residuals (observed minus expected) and what moves them.
+
+    residual, expected: (cells,) in DN/s. covariance: Eq. (2). answers: (columns, cells), DN/s for one unit.
+    pixels, radius, azimuth: of `Cells`. observed: the disc's mean.
+    """
+
+    index: int
+    residual: Vector
+    expected: Vector
+    covariance: Matrix
+    answers: Matrix
+    pixels: Vector
+    radius: Vector
+    azimuth: Vector
+
+    @property
+    def share(self) -> Vector:
+        """Each cell's share of the disc's pixels."""
+        return np.asarray(self.pixels / self.pixels.sum())
+
+    @property
+    def observed(self) -> float:
+        """The disc's mean, DN/s."""
+        return float(self.share @ (self.expected + self.residual))
+
+    @property
+    def mean_expected(self) -> float:
+        """What it should be, DN/s."""
+        return float(self.share @ self.expected)
+
+    @property
+    def mean_noise(self) -> float:
+        """Noise of the disc's mean, DN/s."""
+        return float(np.sqrt(self.share @ self.covariance @ self.share))
+
+
+def disc_cells(solution: Solution, n: int) -> tuple[DiscCells, Planes]:
+    """The cells of frame n, with no column of answers yet, and their sensitivities."""
+    place = solution.sky.found[n].place
+    dark = solution.sky.dark[n]
+    cells = cells_of(dark, place.x_px, place.y_px)
+    residual, expected = solution.residual(n)
+    planes = sensitivities(solution.optics, dark, cells.weights)
+    frame = solution.transit.frames[n]
+    variance = solution.transit.noise.variance(frame.pixels.astype(np.float64), frame.exposure_s)
+    flat = planes.reshape(planes.shape[0], -1)
+    covariance = (flat * variance.ravel().astype(np.float32)) @ flat.T
+    return DiscCells(
+        index=n,
+        residual=cells.weights @ residual,
+        expected=cells.weights @ expected,
+        covariance=np.asarray(covariance, dtype=np.float64),
+        answers=np.zeros((0, cells.pixels.size)),
+        pixels=cells.pixels,
+        radius=cells.radius,
+        azimuth=cells.azimuth,
+    ), planes

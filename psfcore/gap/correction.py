@@ -1,0 +1,110 @@
+"""The model with an effect added: the images as they would be without it, and the PSF fitted anew.
+
+Images minus the effect's change, worked out from the scene and the PSF as they are; a new fit; the change worked out
+again from that, and what is left of the effect fitted beside the PSF. Two or three rounds settle it, as a Gauss-Newton
+step does, and what was a first-order change is one no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.gap.effect import Effect, View
+from psfcore.gap.evidence import Evidence, gather
+from psfcore.gap.judge import Tried, fitted
+from psfcore.gap.linear_model import LinearModel
+from psfcore.scatter.inversion import Progress, Solution, invert
+from psfcore.transit.transit import Transit
+
+Vector = NDArray[np.float64]
+
+ROUNDS = 3
+SETTLED = 0.3  # of a parameter's error
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A fit with an effect added. values: its parameters, all rounds together, with errors. model: about that fit."""
+
+    effects: tuple[Effect, ...]
+    solution: Solution
+    evidence: Evidence
+    model: LinearModel
+    values: dict[str, tuple[float, float, str]]
+    rounds: int
+
+    @property
+    def covariance(self) -> Vector:
+        """Of the PSF's coordinates, the effects' parameters free beside them: (coordinates, coordinates)."""
+        columns = tuple(c for effect in self.effects for c in self.evidence.columns[effect.name])
+        base = len(self.evidence.base)
+        return self.model.fit(columns).covariance[:base, :base]
+
+
+def corrected(transit: Transit, view: View, effects: Sequence[Effect], theta: Vector) -> Transit:
+    """The images of a transit less what the effects with these parameters did to them."""
+    changes = [change for effect in effects for change in effect.changes(view)]
+    frames = []
+    for n, frame in enumerate(transit.frames):
+        error = np.zeros(transit.shape)
+        for value, change in zip(theta, changes, strict=True):
+            error += value * change.change(n, view.expected)
+        frames.append(replace(frame, pixels=(frame.pixels - error).astype(np.float32)))
+    return replace(transit, frames=tuple(frames))
+
+
+def add_to_model(
+    solution: Solution,
+    effects: Sequence[Effect],
+    found: Tried,
+    model: LinearModel,
+    *,
+    progress: Progress = lambda stage, step, steps: None,
+) -> Corrected:
+    """Fit PSF and effects together, starting from the linear fit `found`. Raises what `invert` raises."""
+    transit = solution.transit
+    # A form with a place of its own keeps the place that was found: it is looked for once.
+    view = View(solution)
+    held = [hold(effect, view) for effect in effects]
+    values = {name: value for name, (value, _, _) in found.values.items()}
+    theta = np.array(list(values.values()))
+    current, rounds = solution, 0
+    for _ in range(ROUNDS):
+        rounds += 1
+        clean = corrected(transit, View(current), held, theta)
+        current = invert(
+            clean,
+            solution.inversion.shape,
+            start=current.inversion.coordinates,
+            threads=solution.threads,
+            progress=progress,
+        )
+        evidence = gather(current, held, progress=progress)
+        again = replace(model, evidence=evidence)
+        left = fitted(again, evidence.effects)
+        steps = np.array([value for value, _, _ in left.values.values()])
+        sigma = np.array([s for _, s, _ in left.values.values()])
+        theta = theta + steps
+        if float(np.abs(steps / np.maximum(sigma, 1e-300)).max()) < SETTLED:
+            break
+    units = [unit for _, _, unit in found.values.values()]
+    return Corrected(
+        effects=tuple(held),
+        solution=current,
+        evidence=evidence,
+        model=again,
+        values={
+            name: (float(value), float(s), unit)
+            for name, value, s, unit in zip(values, theta, sigma, units, strict=True)
+        },
+        rounds=rounds,
+    )
+
+
+def hold(effect: Effect, view: View) -> Effect:
+    """The effect with whatever it searches for, as a place, held as these images give it."""
+    return effect if effect.held is None else effect.held(view)

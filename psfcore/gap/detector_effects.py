@@ -1,0 +1,126 @@
+"""Effects of the detector and its electronics: changes of the image as it is read out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+
+FAINT_DN = 60.0
+
+
+def flat(view: View) -> Field:
+    """One on every pixel."""
+    return np.ones(view.solution.transit.shape, np.float32)
+
+
+def fixed(plane: Field) -> Change:
+    """The same plane in every image."""
+    return Change(lambda n, images: plane, lit=False)
+
+
+def times_image(pattern: Field) -> Change:
+    """Every image times one pattern."""
+    return Change(lambda n, images: np.asarray(images[n] * pattern), lit=False)
+
+
+def _dark_offset(view: View) -> Sequence[Change]:
+    one = flat(view)
+    return [Change(lambda n, images: one / np.float32(view.exposure_s(n)))]
+
+
+def _gradient(view: View) -> Sequence[Change]:
+    x, y = view.places
+    return [fixed(plane) for plane in (flat(view), x, y)]
+
+
+def _gain_mismatch(view: View) -> Sequence[Change]:
+    def change(n: int, images: Sequence[Field]) -> Field:
+        combined = (view.solution.transit.frames[n].gain_mode or "").lower() == "combined"
+        return np.asarray(images[n] * np.float32(combined))
+
+    return [Change(change)]
+
+
+def _one_gain_mode(view: View) -> str | None:
+    modes = sorted({frame.gain_mode or "unknown" for frame in view.solution.transit.frames})
+    return None if len(modes) > 1 else f"all images have one gain mode ({modes[0]})"
+
+
+def _nonlinearity(view: View) -> Sequence[Change]:
+    def change(n: int, images: Sequence[Field]) -> Field:
+        counts = np.maximum(images[n] * np.float32(view.exposure_s(n)), 0)
+        return np.asarray(-images[n] * np.exp(-counts / np.float32(FAINT_DN)))
+
+    return [Change(change)]
+
+
+def _flat_field(view: View) -> Sequence[Change]:
+    x, y = view.places
+    twelfth = np.float32(1 / 12)
+    return [times_image(np.asarray(p)) for p in (x, y, x * x - twelfth, x * y, y * y - twelfth)]
+
+
+def _column_smear(view: View) -> Sequence[Change]:
+    def change(n: int, images: Sequence[Field]) -> Field:
+        return np.broadcast_to(images[n].mean(axis=0, dtype=np.float32), images[n].shape)
+
+    return [Change(change, lit=False)]
+
+
+def _persistence(view: View) -> Sequence[Change]:
+    def change(n: int, images: Sequence[Field]) -> Field:
+        if n == 0:
+            return np.zeros(view.solution.transit.shape, np.float32)
+        return images[n - 1] * np.float32(view.exposure_s(n - 1) / view.exposure_s(n))
+
+    return [Change(change)]
+
+
+def _filled(view: View) -> Sequence[Change]:
+    frames = view.solution.transit.frames
+
+    def change(n: int, images: Sequence[Field]) -> Field:
+        filled = frames[n].filled
+        if filled is None:
+            return np.zeros(view.solution.transit.shape, np.float32)
+        return np.asarray(images[n] * filled)
+
+    return [Change(change)]
+
+
+def _nothing_filled(view: View) -> str | None:
+    filled = any(f.filled is not None and f.filled.any() for f in view.solution.transit.frames)
+    return None if filled else "no pixel was filled in"
+
+
+def _p(name: str, unit: str, likely: float) -> EffectParameter:
+    return EffectParameter(name, unit, likely)
+
+
+EFFECTS: tuple[Effect, ...] = (
+    Effect("dark_offset", "detector", (_p("offset", "DN", 2.0),),
+           "The dark level taken off every readout is wrong.",
+           "a dark exposure, or a ladder of exposures at one pointing", ("exposure", "intensity"), _dark_offset),
+    Effect("intensity_gradient", "detector",
+           (_p("level", "DN/s", 2.0), _p("slope_x", "DN/s/field", 2.0), _p("slope_y", "DN/s/field", 2.0)),
+           "A light leak lays a faint plane over every image.", "an exposure with the door shut",
+           ("detector_x", "detector_y"), _gradient),
+    Effect("gain_mismatch", "detector", (_p("excess", "", 0.05),), "Combined and high-only images differ in gain.",
+           "the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
+    Effect("nonlinearity", "detector", (_p("loss", "", 0.05),), "Faint signals are read out too low.",
+           "a ladder of exposures at one pointing", ("intensity",), _nonlinearity),
+    Effect("flat_field_residual", "detector",
+           tuple(_p(name, unit, 0.05) for name, unit in
+                 (("x", "/field"), ("y", "/field"), ("xx", "/field2"), ("xy", "/field2"), ("yy", "/field2"))),
+           "The detector's sensitivity is not quite flattened.", "the same scene displaced on the detector",
+           ("detector_x", "detector_y"), _flat_field),
+    Effect("column_smear", "detector", (_p("share", "", 0.01),), "Charge is smeared along columns while they are read.",
+           "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
+    Effect("persistence", "detector", (_p("share", "", 0.01),), "A share of the image before is left in the next.",
+           "a dark exposure after a bright one", ("time", "pointing"), _persistence),
+    Effect("saturation_fill", "detector", (_p("excess", "", 0.1),), "What was filled in for saturated pixels is wrong.",
+           "a shorter exposure of the same time", ("pointing", "intensity"), _filled, _nothing_filled),
+)  # fmt: skip

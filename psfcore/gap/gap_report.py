@@ -1,0 +1,220 @@
+"""The gap report: schema gap/1, and the sentence that a person reads first."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.gap.closure import Interval
+from psfcore.gap.correction import Corrected
+from psfcore.gap.diagnose import Diagnosis
+from psfcore.gap.effect import Effect
+from psfcore.gap.judge import Tried
+from psfcore.gap.probes import PROBES
+from psfcore.scatter.inversion import Inversion
+
+SCHEMA = "gap/1"
+PROBE_NAMES = {probe.name for probe in PROBES}
+AXIS_WORDS = {
+    "detector_x": "along detector x",
+    "detector_y": "along detector y",
+    "time": "in time",
+    "pointing": "from pointing to pointing",
+    "intensity": "with the intensity",
+    "exposure": "with the exposure",
+    "gain_mode": "with the gain mode",
+    "radius_in_disc": "with the radius in the disc",
+    "azimuth_in_disc": "with the azimuth in the disc",
+    "scattering_distance": "with the distance that light scatters from",
+}
+
+
+def gap_report(found: Diagnosis) -> dict[str, Any]:
+    """The report of a diagnosis, schema gap/1."""
+    judged = found.judgement
+    refits = {" + ".join(e.name for e in c.effects): c for c in found.corrected}
+    return {
+        "schema": SCHEMA,
+        "sentence": sentence(found),
+        "gap": {
+            "before_refit_pct": found.before_refit.to_json(),
+            "rms_pct": found.rms.to_json(),
+            "after_pct": found.after.to_json(),
+            "noise_pct": found.noise_pct,
+            "p_value": judged.p_value,
+        },
+        "where": [axis.to_json() for axis in found.where],
+        "verdict": judged.verdict,
+        "answer": list(judged.answer),
+        "effects": [_effect(found, tried, refits.get(tried.label)) for tried in judged.tried],
+        "ties": [list(judged.answer)] if judged.verdict == "tie" else [],
+        "would_separate": would_separate(found),
+        "untestable": [
+            {"name": name, "why": why}
+            for name, why in found.evidence.untestable.items()
+            if name not in PROBE_NAMES
+        ],
+        "looks_like": [
+            {"form": _by_name(found, probe.names[0]).cause, "score": probe.score, "p_value": probe.p_value}
+            for probe in judged.probes[:3]
+        ]
+        if judged.verdict in ("unknown", "inconclusive")
+        else [],
+        "cautions": list(found.cautions),
+        "expected": {
+            "residual_pct": found.expected.residual_pct,
+            "disc_chi2_a_cell": found.expected.disc_scale,
+            "lit_chi2_a_block": found.expected.lit_scale,
+        },
+        "psf": {
+            "shape": found.solution.inversion.shape.name,
+            "refitted": _values(found.solution.inversion, found.model.base.covariance),
+            "with_answer": _values(found.corrected[0].solution.inversion, found.corrected[0].covariance)
+            if found.corrected
+            else None,
+        },
+        "shape": list(found.solution.transit.shape),
+        "images": _images(found),
+        "inputs_sha256": found.solution.transit.sha256,
+    }
+
+
+def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, Any]:
+    """A shape's parameters; errors are those of the fit that the effects are judged by, floor included."""
+    values, sigma = inversion.values, np.sqrt(np.diag(covariance))
+    return {
+        p.name: {
+            "value": values[p.name],
+            "sigma": float(abs(p.slope(float(at))) * s),
+            "unit": p.unit,
+        }
+        for p, at, s in zip(inversion.shape.parameters, inversion.coordinates, sigma, strict=True)
+    }
+
+
+def _by_name(found: Diagnosis, name: str) -> Effect:
+    return next(effect for effect in found.evidence.effects if effect.name == name)
+
+
+def _effect(found: Diagnosis, tried: Tried, refit: Corrected | None) -> dict[str, Any]:
+    shrinking = found.shrinking[tried.label]
+    values = tried.values if refit is None else refit.values
+    return {
+        "name": tried.label,
+        "parameters": {
+            name: {"value": value, "sigma": sigma, "unit": unit}
+            for name, (value, sigma, unit) in values.items()
+        },
+        "p_value": tried.p_value,
+        "delta_chi2": tried.gain,
+        "score": tried.score,
+        "delta_chi2_held_out": shrinking.held_out_fall,
+        "closure": _interval(shrinking.closure),
+        "closure_by_pointing": _interval(shrinking.closure_by_pointing),
+        "refitted": refit is not None,
+        "cause": " ".join(_by_name(found, name).cause for name in tried.names),
+    }
+
+
+def _interval(interval: Interval | None) -> dict[str, Any] | None:
+    return None if interval is None else interval.to_json()
+
+
+def _images(found: Diagnosis) -> list[dict[str, Any]]:
+    """Every image's disc: where, how bright, what was left, held out, before and after."""
+    before, after = found.residual, found.residual_after
+    at_before = {} if before is None else dict(zip(before.images, before.residual_pct, strict=True))
+    noise = {} if before is None else dict(zip(before.images, before.noise_pct, strict=True))
+    at_after = {} if after is None else dict(zip(after.images, after.residual_pct, strict=True))
+    noise_after = {} if after is None else dict(zip(after.images, after.noise_pct, strict=True))
+    out = []
+    for disc in found.evidence.discs:
+        taken = found.evidence.taken[disc.index]
+        out.append(
+            {
+                "file": taken.file,
+                "fov": taken.fov,
+                "x_px": taken.x_px,
+                "y_px": taken.y_px,
+                "time_s": taken.time_s,
+                "exposure_s": taken.exposure_s,
+                "gain_mode": taken.gain_mode,
+                "observed_dn_s": disc.observed,
+                "residual_pct": _number(at_before.get(disc.index)),
+                "noise_pct": _number(noise.get(disc.index)),
+                "residual_after_pct": _number(at_after.get(disc.index)),
+                "noise_after_pct": _number(noise_after.get(disc.index)),
+            }
+        )
+    return out
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def would_separate(found: Diagnosis) -> str:
+    """What observation would tell tied effects apart, or settle an answer."""
+    if found.judgement.verdict != "tie":
+        return ""
+    said = [_by_name(found, name).settled_by for name in found.judgement.answer]
+    return "; ".join(dict.fromkeys(said))
+
+
+def sentence(found: Diagnosis) -> str:
+    """What a person reads first."""
+    judged = found.judgement
+    left = f"{found.rms.value:.1f} % ({found.rms.low:.1f} to {found.rms.high:.1f})"
+    if judged.verdict == "none":
+        return (
+            f"No gap beyond noise and the fit's own error: held-out residuals of {left} beyond a noise of "
+            f"{found.noise_pct:.1f} %, p = {judged.p_value:.2g}."
+        )
+    strongest = found.where[0]
+    pointings = " and ".join(str(p) for p in strongest.at.get("pointings", []))
+    lead = f"A residual of {left} {AXIS_WORDS[strongest.name]}, most in pointings {pointings}"
+    best = judged.best
+    if judged.verdict == "unknown" or best is None:
+        like = _by_name(found, judged.probes[0].names[0]).cause if judged.probes else ""
+        close = f"; it looks most like {like}" if like and judged.probes[0].score > 0 else ""
+        return f"{lead}: no effect of the library explains it{close}."
+    if judged.verdict == "tie":
+        among = " or ".join(words(name) for name in judged.answer)
+        return f"{lead}: {among}, which these data cannot tell apart; {would_separate(found)} would."
+    if judged.verdict == "inconclusive":
+        return (
+            f"{lead} is likely (p = {judged.p_value:.2g}), but what causes it depends on what is taken for granted; "
+            f"best so far: {words(best.label)}."
+        )
+    return f"{lead}; {_explained(found, best)}{_excluded(found, best)}."
+
+
+def _explained(found: Diagnosis, best: Tried) -> str:
+    values = found.corrected[0].values if found.corrected else best.values
+    numbers = ", ".join(
+        f"{words(name)} {value:.3g} ± {sigma:.2g} {unit}".strip()
+        for name, (value, sigma, unit) in values.items()
+    )
+    return (
+        f"{words(best.label)} explains it ({numbers}); held-out gap {found.rms.value:.1f} -> "
+        f"{found.after.value:.1f} %, noise {found.noise_pct:.1f} %"
+    )
+
+
+def _excluded(found: Diagnosis, best: Tried) -> str:
+    """The next best effect, and by how many sigmas it is worse."""
+    others = [t for t in found.judgement.tried if not set(t.names) & set(best.names)]
+    if not others:
+        return ""
+    next_best = max(others, key=lambda t: t.score)
+    sigmas = max(best.score - next_best.score, 0.0) ** 0.5
+    shrunk = found.shrinking[next_best.label].closure
+    closes = "" if shrunk is None else f" closes {100 * max(shrunk.value, 0.0):.0f} % and"
+    return f"; {words(next_best.label)}{closes} is excluded at {sigmas:.1f} sigma"
+
+
+def words(name: str) -> str:
+    """A name as a person writes it."""
+    return name.replace("_", " ")

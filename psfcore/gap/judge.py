@@ -1,0 +1,206 @@
+"""The verdict: is there a gap, and which effect causes it.
+
+Gains of effects are compared after what their parameters, and a search over many places, gain from noise:
+
+    score = gain - PENALTY parameters - 2 ln trials                         Eq. (1)
+
+There is a gap where patterns that any gap makes (`patterns`), all cells, the lit blocks or an effect's gain are less
+likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be told from it.
+Pairs are searched exhaustively where no single effect is enough: where what it leaves is less likely than ENOUGH, its
+own forward change taken to be right to TEMPLATE_ERROR. Closing much of a gap identifies nothing, for a wrong effect does
+that too: where no effect and no pair is enough, or where a probe, a form of unknown cause, does clearly better, the
+verdict is unknown. It is repeated with half and twice the floor; where it flips, the answer holds both, or is inconclusive.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence import Evidence
+from psfcore.gap.linear_model import LinearModel, Step
+from psfcore.gap.patterns import patterns
+
+Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
+
+FLOOR = 0.003
+FLOORS = (0.5, 2.0)  # the verdict is repeated with
+ALARM = 0.005
+ENOUGH = 1e-3
+PENALTY = 2.0
+TIE = 9.0
+CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
+TEMPLATE_ERROR = 0.05
+LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
+TESTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """One effect, or two, fitted beside the PSF: values and errors by "effect.parameter", its gain, what is left.
+
+    p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show; none where it was
+    not worth asking.
+    """
+
+    names: tuple[str, ...]
+    named: bool
+    values: dict[str, tuple[float, float, str]]
+    gain: float
+    score: float
+    p_value: float
+    step: Step
+    left_p_value: float | None = None
+
+    @property
+    def label(self) -> str:
+        """The names as a report has them."""
+        return " + ".join(self.names)
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """A verdict under one floor. tried: named effects, best first, the answer's pair before them. probes: best first."""
+
+    verdict: Verdict
+    answer: tuple[str, ...]
+    p_value: float
+    tried: tuple[Tried, ...]
+    probes: tuple[Tried, ...]
+    best: Tried | None
+
+
+def judge(model: LinearModel) -> Judgement:
+    """The verdict under the model's floor, and twice with others."""
+    found = _judge(model)
+    if found.verdict == "none":
+        return found
+    others = [_judge(replace(model, floor=model.floor * factor)) for factor in FLOORS]
+    if any(other.verdict == "none" for other in others):
+        return replace(found, verdict="inconclusive")
+    if any((other.verdict == "unknown") != (found.verdict == "unknown") for other in others):
+        return replace(found, verdict="inconclusive")
+    pairs = {
+        found.verdict == "attributed" and len(found.answer) == 2,
+        *(len(o.answer) == 2 and o.verdict == "attributed" for o in others),
+    }
+    answers = {name for one in (found, *others) for name in one.answer}
+    if len(pairs) > 1 or answers == set(found.answer):
+        return found
+    return replace(found, verdict="tie", answer=tuple(sorted(answers)))
+
+
+def _judge(model: LinearModel) -> Judgement:
+    evidence = model.evidence
+    every = [fitted(model, (effect,)) for effect in evidence.effects]
+    named = sorted((t for t in every if t.named), key=lambda t: -t.score)
+    probes = tuple(sorted((t for t in every if not t.named), key=lambda t: -t.score))
+    p_gap = _p_of_gap(model, named)
+    if p_gap > ALARM or not named:
+        return Judgement("none", (), p_gap, tuple(named), probes, named[0] if named else None)
+    best = named[0] = _with_left(model, named[0])
+    enough = _is_enough(best)
+    pair = None if enough else _best_pair(model, best)
+    winner = pair or best
+    if (not enough and pair is None) or best.p_value * len(named) > ALARM:
+        return Judgement("unknown", (), p_gap, tuple(named), probes, best)
+    if probes and probes[0].score > winner.score + CLEAR:
+        return Judgement("unknown", (), p_gap, tuple(named), probes, winner)
+    if pair is not None:
+        return Judgement("attributed", tuple(sorted(pair.names)), p_gap, (pair, *named), probes, pair)
+    rivals = [t.names[0] for t in named[1:] if best.score - t.score < TIE]
+    if rivals:
+        return Judgement("tie", tuple(sorted({*best.names, *rivals})), p_gap, tuple(named), probes, best)
+    return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
+
+
+def _is_enough(tried: Tried) -> bool:
+    assert tried.left_p_value is not None
+    return tried.left_p_value >= ENOUGH
+
+
+def _best_pair(model: LinearModel, best: Tried) -> Tried | None:
+    """The pair of effects that explains most, if it is clearly better than one and leaves nothing."""
+    effects = [effect for effect in model.evidence.effects if effect.named]
+    pairs = sorted(
+        (fitted(model, pair) for pair in itertools.combinations(effects, 2)), key=lambda t: -t.score
+    )
+    if not pairs or pairs[0].score < best.score + CLEAR:
+        return None
+    pair = _with_left(model, pairs[0])
+    return pair if _is_enough(pair) else None
+
+
+def fitted(model: LinearModel, effects: Sequence[Effect]) -> Tried:
+    """The PSF's parameters with these effects."""
+    evidence = model.evidence
+    columns = tuple(c for effect in effects for c in evidence.columns[effect.name])
+    step = model.fit(columns)
+    gain = max(step.fall - model.base.fall, 0.0)
+    trials = math.prod(effect.trials for effect in effects)
+    sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
+    values = {}
+    k = len(evidence.base)
+    for effect in effects:
+        for parameter in effect.parameters[: len(evidence.columns[effect.name])]:
+            label = parameter.name if len(effects) == 1 else f"{effect.name}.{parameter.name}"
+            values[label] = (float(step.values[k]), float(sigma[k]), parameter.unit)
+            k += 1
+    return Tried(
+        names=tuple(effect.name for effect in effects),
+        named=all(effect.named for effect in effects),
+        values=values,
+        gain=gain,
+        score=gain - PENALTY * len(columns) - 2 * math.log(trials),
+        p_value=min(1.0, trials * float(chi2_distribution.sf(gain, len(columns)))),
+        step=step,
+    )
+
+
+def _p_of_gap(model: LinearModel, named: Sequence[Tried]) -> float:
+    """The least of the p-values of patterns, cells, lit blocks and single effects, times how many they are."""
+    effects = min((t.p_value for t in named), default=1.0) * max(len(named), 1)
+    return float(min(1.0, TESTS * min(*_p_of_left(model, model.base, model.base), effects)))
+
+
+def _with_left(model: LinearModel, tried: Tried) -> Tried:
+    """With the p-value of what is left, the effect's own change unsure by TEMPLATE_ERROR."""
+    return replace(tried, left_p_value=min(1.0, 3 * min(_p_of_left(model, tried.step, model.base))))
+
+
+def _p_of_left(model: LinearModel, step: Step, base: Step) -> tuple[float, float, float]:
+    """p-values of what a step leaves: along patterns, in all cells, in the lit blocks."""
+    evidence = model.evidence
+    unsure = np.array(step.values) * TEMPLATE_ERROR
+    unsure[: len(base.columns)] = 0.0
+    here = list(step.columns)
+    # An unsure template adds a covariance along its own answer: taken off along that direction, disc by disc.
+    shrink = []
+    for disc, left in zip(model.discs, model.left(step), strict=True):
+        answer = disc.answers[here].T @ unsure
+        length = float(answer @ answer)
+        shrink.append(left - answer * float(answer @ left) / (1 + length))
+    freedom = max(sum(left.size for left in shrink) - len(here), 1)
+    cells = sum(float(left @ left) for left in shrink)
+    gain, directions = model.gain_of_patterns(step, patterns(evidence), shrink)
+    lit = model.whole_lit
+    theta = unsure / TEMPLATE_ERROR
+    moved = float(theta @ lit.normal[np.ix_(here, here)] @ theta) / model.lit_scale * TEMPLATE_ERROR**2
+    of_lit = max(model.left_lit(step) - moved, 0.0) / (1 + LIT_WIDTH)
+    return (
+        float(chi2_distribution.sf(gain, directions)),
+        float(chi2_distribution.sf(cells, freedom)),
+        float(chi2_distribution.sf(of_lit, lit.freedom)),
+    )
+
+
+def model_of(evidence: Evidence, *, disc_scale: float = 1.0, lit_scale: float = 1.0) -> LinearModel:
+    """The linear model with the floor that verdicts start from."""
+    return LinearModel(evidence, FLOOR, disc_scale, lit_scale)

@@ -1,0 +1,164 @@
+"""The model about its solution: linear in the PSF's coordinates and in every effect's parameters.
+
+    chi2(theta) = sum over discs of (r - J theta)^T C^-1 (r - J theta) + chi2 of the lit blocks        Eq. (1)
+    C = noise of the cells + f^2 m m^T                                                                  Eq. (2)
+
+m being what is expected in a disc's cells: a floor, the share f, common to a disc, for what nobody has thought of. An
+effect is tried beside the PSF's own coordinates, which are refitted with it: what they absorb is not its. Its gain is
+what chi2 falls by then.
+
+| symbol | name | unit |
+|---|---|---|
+| r, J, C | residual, answers, covariance of `cells.DiscCells` | DN/s |
+| f | floor | - |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.gap.cells import DiscCells
+from psfcore.gap.evidence import Evidence
+from psfcore.gap.lit_blocks import LitEquations
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+WEAKEST = 1e-9  # of a normal matrix scaled to a unit diagonal
+
+
+@dataclass(frozen=True, eq=False)
+class Whitened:
+    """One disc with unit noise: residual (cells,), answers (columns, cells); and the whitening itself."""
+
+    index: int
+    residual: Vector
+    answers: Matrix
+    white: Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A fit of some columns: values, covariance, and how far chi2 fell by all of them together."""
+
+    columns: tuple[int, ...]
+    values: Vector
+    covariance: Matrix
+    fall: float
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """Eq. (1) on some evidence. floor: f of Eq. (2). disc_scale, lit_scale: by what factor chi2 of discs and of lit
+    blocks exceeds its degrees of freedom where there is no gap."""
+
+    evidence: Evidence
+    floor: float
+    disc_scale: float = 1.0
+    lit_scale: float = 1.0
+
+    @cached_property
+    def discs(self) -> tuple[Whitened, ...]:
+        """Every disc with unit noise."""
+        return tuple(self._whitened(disc) for disc in self.evidence.discs)
+
+    def _whitened(self, disc: DiscCells) -> Whitened:
+        covariance = disc.covariance * self.disc_scale + self.floor**2 * np.outer(
+            disc.expected, disc.expected
+        )
+        values, vectors = np.linalg.eigh(covariance)
+        white = (vectors / np.sqrt(np.maximum(values, values[-1] * 1e-12))) @ vectors.T
+        return Whitened(disc.index, white @ disc.residual, disc.answers @ white, white)
+
+    def equations(self, images: Sequence[int] | None = None) -> tuple[Matrix, Vector]:
+        """Normal matrix and score of all columns from some images (none: all)."""
+        size = self.evidence.size
+        normal, score = np.zeros((size, size)), np.zeros(size)
+        for disc in self.discs:
+            if images is None or disc.index in images:
+                normal += disc.answers @ disc.answers.T
+                score += disc.answers @ disc.residual
+        lit = self.lit(images)
+        return normal + lit.normal / self.lit_scale, score + lit.score / self.lit_scale
+
+    def lit(self, images: Sequence[int] | None = None) -> LitEquations:
+        """The lit blocks' equations of all columns."""
+        return self.evidence.lit.equations(range(self.evidence.size), images)
+
+    @cached_property
+    def whole(self) -> tuple[Matrix, Vector]:
+        """`equations` of all images."""
+        return self.equations()
+
+    @cached_property
+    def whole_lit(self) -> LitEquations:
+        """`lit` of all images."""
+        return self.lit()
+
+    def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
+        """The PSF's coordinates and these columns, from some equations (none: of all images)."""
+        here = [*self.evidence.base, *columns]
+        normal, score = self.whole if equations is None else equations
+        normal, score = normal[np.ix_(here, here)], score[here]
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        covariance = np.linalg.pinv(normal / np.outer(size, size), rcond=WEAKEST, hermitian=True)
+        covariance = covariance / np.outer(size, size)
+        values = covariance @ score
+        return Step(tuple(here), values, covariance, float(score @ values))
+
+    @cached_property
+    def base(self) -> Step:
+        """The PSF's coordinates alone."""
+        return self.fit(())
+
+    def gain(self, columns: Sequence[int]) -> float:
+        """What chi2 falls by with these columns, beyond the PSF's coordinates."""
+        return max(self.fit(columns).fall - self.base.fall, 0.0)
+
+    def left(self, step: Step) -> tuple[Vector, ...]:
+        """The whitened residuals of every disc after a step."""
+        return tuple(d.residual - d.answers[list(step.columns)].T @ step.values for d in self.discs)
+
+    def left_lit(self, step: Step) -> float:
+        """chi2 of the lit blocks after a step, over lit_scale."""
+        here, lit = list(step.columns), self.whole_lit
+        theta = step.values
+        fall = 2 * theta @ lit.score[here] - theta @ lit.normal[np.ix_(here, here)] @ theta
+        return float(lit.chi2 - fall) / self.lit_scale
+
+    def gain_of_patterns(
+        self, step: Step, patterns: Sequence[Matrix], left: Sequence[Vector]
+    ) -> tuple[float, int]:
+        """How far chi2 of the discs falls further by patterns of the cells, and how many of them count.
+
+        patterns: for each disc (patterns, cells) in DN/s. left: whitened residuals after the step, whose own columns
+        are refitted with the patterns.
+        """
+        here = list(step.columns)
+        design = np.concatenate(
+            [
+                np.vstack([disc.answers[here], pattern @ disc.white])
+                for disc, pattern in zip(self.discs, patterns, strict=True)
+            ],
+            axis=1,
+        )
+        residual = np.concatenate(left)
+        first = len(here)
+        basis = _orthonormal(design[:first])
+        rest = design[first:] - (design[first:] @ basis.T) @ basis
+        size = np.linalg.norm(design[first:], axis=1)
+        rest = _orthonormal(rest / np.maximum(size, 1e-300)[:, None], 1e-4)
+        return float(np.sum((rest @ residual) ** 2)), rest.shape[0]
+
+
+def _orthonormal(rows: Matrix, least: float = 1e-7) -> Matrix:
+    """An orthonormal basis of the span of some rows."""
+    if rows.shape[0] == 0:
+        return rows
+    _, sizes, basis = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(basis[sizes > least * max(float(sizes[0]), 1e-300)])

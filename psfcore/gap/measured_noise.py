@@ -1,0 +1,102 @@
+"""The noise that the images themselves show, beside what they are said to have.
+
+Two images of one pointing that follow each other show one scene. Of their difference d the mixed second difference
+
+    h = (d_00 - d_01 - d_10 + d_11) / 2          Eq. (1)
+
+holds nothing smooth, and where the noise of pixels is independent it has the variance of d. In blocks this gives the
+variance against the level; the line through it is g D + r^2 (`psfcore.noise`, Eq. (1)).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.noise import Noise
+from psfcore.transit.transit import Frame, Transit
+
+Vector = NDArray[np.float64]
+
+BLOCK = 16  # of h, which has half the pixels along each axis
+FREE_OF_DISC_PX = 20.0
+NORMAL_MAD = 1.4826
+LEAST_BLOCKS = 20
+ROUNDS = 5
+TRUSTED = 0.15  # a ratio of variances nearer to 1 than this is left alone
+
+
+@dataclass(frozen=True)
+class MeasuredNoise:
+    """noise: as fitted. ratio: measured variance over the stated one, the median of all blocks."""
+
+    noise: Noise
+    ratio: float
+    blocks: int
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the stated figures may stand."""
+        return abs(self.ratio - 1) <= TRUSTED
+
+
+def measured_noise(transit: Transit) -> MeasuredNoise | None:
+    """The noise of a transit's images; none where too few of them show one scene."""
+    levels, variances = [], []
+    frames = transit.frames
+    for one, other in itertools.pairwise(frames):
+        if (one.fov, one.gain_mode, one.exposure_s) == (other.fov, other.gain_mode, other.exposure_s):
+            level, variance = _blocks(one, other)
+            levels.append(level)
+            variances.append(variance)
+    if not levels or sum(level.size for level in levels) < LEAST_BLOCKS:
+        return None
+    level, variance = np.concatenate(levels), np.concatenate(variances)
+    stated = transit.noise.photon_gain_dn * np.maximum(level, 0) + transit.noise.read_noise_dn**2
+    ratio = float(np.median(variance / stated))
+    gain, readout = _line(level, variance)
+    if gain <= 0 and readout <= 0:
+        return None
+    return MeasuredNoise(Noise(max(gain, 0.0), math.sqrt(max(readout, 0.0))), ratio, level.size)
+
+
+def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
+    """Level (DN) and variance (DN^2) of an exposure in blocks away from both discs."""
+    a, b = (frame.pixels.astype(np.float64) * frame.exposure_s for frame in (one, other))
+    difference = a - b * (a.mean() / b.mean())
+    ny, nx = (n // 2 * 2 for n in difference.shape)
+    quads = difference[:ny, :nx].reshape(ny // 2, 2, nx // 2, 2)
+    h = (quads[:, 0, :, 0] - quads[:, 0, :, 1] - quads[:, 1, :, 0] + quads[:, 1, :, 1]) / 2  # Eq. (1)
+    level = ((a + b) / 2)[:ny, :nx].reshape(ny // 2, 2, nx // 2, 2).mean(axis=(1, 3))
+    rows, columns = (n // BLOCK for n in h.shape)
+    h, level = (p[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK) for p in (h, level))
+    spread = NORMAL_MAD * np.median(np.abs(h), axis=(1, 3))
+    y = (np.arange(rows) * 2 + 1) * BLOCK
+    x = (np.arange(columns) * 2 + 1) * BLOCK
+    away = np.ones((rows, columns), dtype=bool)
+    for frame in (one, other):
+        reach = frame.place.radius_px + FREE_OF_DISC_PX
+        away &= np.maximum(np.abs(y[:, None] - frame.place.y_px), np.abs(x - frame.place.x_px)) > reach
+        if frame.filled is not None:
+            filled = frame.filled[: rows * 2 * BLOCK, : columns * 2 * BLOCK]
+            away &= ~filled.reshape(rows, 2 * BLOCK, columns, 2 * BLOCK).any(axis=(1, 3))
+    return level.mean(axis=(1, 3))[away], (spread**2 / 2)[away]
+
+
+def _line(level: Vector, variance: Vector) -> tuple[float, float]:
+    """Slope and intercept of variance against level, each block weighted by what its own variance is known to."""
+    expected = np.full(level.shape, float(np.median(variance)))
+    slope = intercept = 0.0
+    for _ in range(ROUNDS):
+        weight = 1 / np.maximum(expected, 1e-12) ** 2
+        mean_x, mean_y = (float((weight * v).sum() / weight.sum()) for v in (level, variance))
+        spread = float((weight * (level - mean_x) ** 2).sum())
+        slope = float((weight * (level - mean_x) * variance).sum()) / spread if spread > 0 else 0.0
+        slope = max(slope, 0.0)
+        intercept = max(mean_y - slope * mean_x, 0.0)
+        expected = np.maximum(slope * level + intercept, 0.1 * float(np.median(variance)))
+    return slope, intercept

@@ -1,0 +1,153 @@
+"""Where a form with a place of its own fits best: looked at over a coarse grid, all places at a time.
+
+A form f at place or displacement d changes the mean of disc n by
+
+    T_n(d) = sum over pixels of q_n(x) f_n(x - d)          Eq. (1)
+
+q_n being the disc's sensitivity (`cells`): a correlation. Of what the PSF's own parameters leave, a place explains
+
+    gain(d) = (sum r T)^2 / sum T^2     where the sum r T has the form's sign        Eq. (2)
+
+r and T over their noise, the PSF's part taken out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from psfcore.fourier import linear_convolve
+from psfcore.gap.cells import sensitivities
+from psfcore.gap.effect import View
+
+Plane = NDArray[np.float64]
+
+STEP_PX = 8
+FINE_PX = 2
+COARSE_BLUR_PX = 8.0
+BLURS_PX = (2.0, 4.0, 8.0, 16.0)
+NEAREST_PX = 40.0
+FLOOR = 0.003
+SEEN = 1e-4  # of the best seen place's sum T^2: a place that the discs see less of is not looked at
+
+
+class PlaceSearch:
+    """The discs' sensitivities on a grid of STEP_PX, for any number of searches."""
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        solution = view.solution
+        self._planes, self._fine = {}, {}
+        for n in solution.part:
+            dark = solution.sky.dark[n]
+            (plane,) = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
+            self._planes[n] = _binned(plane, STEP_PX) * STEP_PX**2
+            self._fine[n] = _binned(plane, FINE_PX) * FINE_PX**2
+        frames = solution.inversion.frames
+        self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
+        self._absorbed = np.linalg.qr(np.array([f.answer for f in frames]) / self._sigma[:, None])[0]
+        residual = np.array([f.observed - f.expected for f in frames]) / self._sigma
+        self._residual = self._left(residual)
+
+    def copy(self) -> tuple[float, int, int]:
+        """Blur (px) and displacement (whole pixels x, y) of a copy of each image that explains most of the residuals.
+
+        Not nearer than NEAREST_PX, where a copy would be the disc's own surroundings. The place is looked for on a
+        coarse grid with a middling blur, then round it on a fine one with several.
+        """
+        dx, dy = self._coarse_displacement(COARSE_BLUR_PX)
+        best = (-1.0, COARSE_BLUR_PX, dx, dy)
+        for blur_px in BLURS_PX:
+            gain, at_x, at_y = self._fine_displacement(blur_px, dx, dy)
+            best = max(best, (gain, blur_px, at_x, at_y))
+        return best[1:]
+
+    def _coarse_displacement(self, blur_px: float) -> tuple[int, int]:
+        rows, columns = (2 * n - 1 for n in next(iter(self._planes.values())).shape)
+
+        def answer(n: int, q: Plane) -> Plane:
+            copy = _binned(gaussian_filter(self._view.expected[n], blur_px), STEP_PX)
+            return linear_convolve(q, copy[::-1, ::-1], (rows, columns))
+
+        dy, dx = (_displacements(n) for n in (rows, columns))
+        gain = self._gains(answer, 1.0)
+        gain[np.hypot(dy[:, None], dx[None, :]) < NEAREST_PX] = -1.0
+        at = int(np.argmax(gain))
+        return int(dx[at % columns]), int(dy[at // columns])
+
+    def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:
+        """The best gain within one coarse step of a displacement, on a grid of FINE_PX."""
+        reach = STEP_PX // FINE_PX
+        steps = np.arange(-reach, reach + 1)
+
+        def answer(n: int, _: Plane) -> Plane:
+            copy = _binned(gaussian_filter(self._view.expected[n], blur_px), FINE_PX)
+            q = self._fine[n]
+            out = np.zeros((steps.size, steps.size))
+            for j, k in np.ndindex(out.shape):
+                moved = displaced(copy, dx // FINE_PX + int(steps[k]), dy // FINE_PX + int(steps[j]))
+                out[j, k] = float(np.vdot(q, moved))
+            return out
+
+        gain = self._gains(answer, 1.0)
+        row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        return float(gain.max()), dx + int(steps[column]) * FINE_PX, dy + int(steps[row]) * FINE_PX
+
+    def place(self, width_px: float, *, of_image: bool, sign: float) -> tuple[float, float]:
+        """Pixel (x, y) where a Gaussian patch of light (of_image: of the image itself) explains most.
+
+        sign: +1 for more light, -1 for less.
+        """
+
+        def answer(n: int, q: Plane) -> Plane:
+            seen = q * _binned(self._view.expected[n], STEP_PX) if of_image else q
+            return np.asarray(gaussian_filter(seen, width_px / STEP_PX, mode="constant"))
+
+        gain = self._gains(answer, sign)
+        row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        return (float(column) + 0.5) * STEP_PX - 0.5, (float(row) + 0.5) * STEP_PX - 0.5
+
+    def _gains(self, answer: Callable[[int, Plane], Plane], sign: float) -> Plane:
+        """Eq. (2) at every place."""
+        answers = np.array(
+            [answer(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
+        )
+        flat = self._left(answers.reshape(self._sigma.size, -1))
+        size = (flat**2).sum(axis=0)
+        along = sign * (self._residual @ flat)
+        seen = size > SEEN * size.max()
+        gain = np.where(seen & (along > 0), along**2 / np.where(seen, size, 1.0), 0.0)
+        return np.asarray(gain.reshape(answers.shape[1:]))
+
+    def _left(self, of_discs: Plane) -> Plane:
+        """What the PSF's parameters leave."""
+        return np.asarray(of_discs - self._absorbed @ (self._absorbed.T @ of_discs))
+
+
+def _displacements(count: int) -> NDArray[np.intp]:
+    """Displacement (px) at each index of a full correlation of two lines of (count + 1) / 2."""
+    line = (count + 1) // 2
+    zero = line - 1 - (2 * (line // 2) - count // 2)
+    return (np.arange(count) - zero) * STEP_PX
+
+
+def displaced(plane: Any, dx: int, dy: int) -> Any:
+    """A plane [y, x] moved by whole pixels, dark where nothing moved in."""
+    out = np.zeros_like(plane)
+    ny, nx = plane.shape
+    to_y, to_x = slice(max(dy, 0), min(ny + dy, ny)), slice(max(dx, 0), min(nx + dx, nx))
+    from_y, from_x = slice(max(-dy, 0), min(ny - dy, ny)), slice(max(-dx, 0), min(nx - dx, nx))
+    if to_y.start < to_y.stop and to_x.start < to_x.stop:
+        out[to_y, to_x] = plane[from_y, from_x]
+    return out
+
+
+def _binned(plane: NDArray[np.floating], step: int) -> Plane:
+    """Means over squares of `step` px; the far edges' rest is dropped."""
+    rows, columns = (n // step for n in plane.shape)
+    cut = plane[: rows * step, : columns * step].astype(np.float64)
+    return np.asarray(cut.reshape(rows, step, columns, step).mean(axis=(1, 3)))

@@ -1,0 +1,159 @@
+"""The linear algebra of the gap: cells, lit blocks, gains, shares, searches, each against something plainly right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from psfcore.gap.cells import cells_of, disc_cells, sensitivities
+from psfcore.gap.closure import HeldOut, closure, gap
+from psfcore.gap.detector_effects import EFFECTS
+from psfcore.gap.effect import View
+from psfcore.gap.evidence import Evidence, gather
+from psfcore.gap.linear_model import LinearModel
+from psfcore.gap.search import PlaceSearch, displaced
+from psfcore.gap.where import _shapley
+from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.optics import pick, put
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
+from psfcore.transit.transit import Transit
+from tests.transit_files import TRUTH, diffraction
+
+FEW = tuple(effect for effect in EFFECTS if effect.name in ("dark_offset", "column_smear"))
+
+
+@pytest.fixture(scope="module")
+def clean() -> Transit:
+    plan = default_plan(9, 160, oversampling=1, brightness=4.0)
+    return simulate(plan, TRUTH, diffraction(), seed=5).transit
+
+
+@pytest.fixture(scope="module")
+def solution(clean: Transit) -> Solution:
+    return invert(clean)
+
+
+@pytest.fixture(scope="module")
+def evidence(solution: Solution) -> Evidence:
+    return gather(solution, FEW)
+
+
+def left_in_disc(solution: Solution, n: int, image: np.ndarray) -> np.ndarray:
+    """r of Eq. (1) of cells, forwards."""
+    optics, dark = solution.optics, solution.sky.dark[n]
+    lanes = optics.lanes(np.ascontiguousarray(image, dtype=np.float32))
+    scene = optics.undo(lanes, optics.undo_once(lanes), steps=1)
+    put(scene, dark, 0.0)
+    return pick(lanes, dark) - pick(optics.see(scene), dark)
+
+
+def test_cells_share_out_all_dark_pixels(solution: Solution) -> None:
+    n = solution.part[3]
+    place = solution.sky.found[n].place
+    cells = cells_of(solution.sky.dark[n], place.x_px, place.y_px)
+    assert cells.pixels.sum() == solution.sky.dark[n][0].size
+    assert np.allclose(cells.weights.sum(axis=1), 1.0)
+    assert cells.pixels.size == 13 and cells.radius.max() < 1.0
+
+
+def test_a_sensitivity_is_the_whole_estimate_backwards(solution: Solution) -> None:
+    n = solution.part[3]
+    place = solution.sky.found[n].place
+    cells = cells_of(solution.sky.dark[n], place.x_px, place.y_px)
+    planes = sensitivities(solution.optics, solution.sky.dark[n], cells.weights)
+    image = np.random.default_rng(1).normal(size=solution.transit.shape).astype(np.float32)
+    forwards = cells.weights @ left_in_disc(solution, n, image)
+    backwards = np.einsum("cyx,yx->c", planes, image)
+    assert backwards == pytest.approx(forwards, abs=1e-4)
+
+
+def test_an_added_error_moves_the_residual_as_its_sensitivity_says(solution: Solution) -> None:
+    n = solution.part[3]
+    found, planes = disc_cells(solution, n)
+    error = np.full(solution.transit.shape, 5.0, np.float32)
+    place = solution.sky.found[n].place
+    weights = cells_of(solution.sky.dark[n], place.x_px, place.y_px).weights
+    optics, dark = solution.optics, solution.sky.dark[n]
+    lanes = optics.lanes(solution.transit.frames[n].pixels + error)
+    scene = optics.undo(lanes, steps=8)
+    put(scene, dark, 0.0)
+    after = weights @ (pick(lanes, dark) - pick(optics.see(scene), dark))
+    expected = np.einsum("cyx,yx->c", planes, error)
+    assert np.abs(expected).max() > 0.5
+    assert after - found.residual == pytest.approx(expected, abs=0.05 * float(np.abs(expected).max()))
+
+
+def test_a_global_gain_cannot_be_seen_in_a_disc(solution: Solution) -> None:
+    view = View(solution)
+    n = solution.part[2]
+    found, planes = disc_cells(solution, n)
+    moved = np.einsum("cyx,yx->c", planes, view.expected[n])
+    assert np.abs(moved).max() < 0.01 * float(found.expected.mean())
+
+
+def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> None:
+    bare = replace(evidence, lit=replace(evidence.lit, part=np.zeros(len(evidence.taken), dtype=bool)))
+    model = LinearModel(bare, 0.003)
+    columns = evidence.columns["dark_offset"]
+
+    def chi2(here: list[int]) -> float:
+        design, target = [], []
+        for disc in evidence.discs:
+            covariance = disc.covariance + 0.003**2 * np.outer(disc.expected, disc.expected)
+            white = np.linalg.inv(np.linalg.cholesky(covariance))
+            design.append(white @ disc.answers[here].T)
+            target.append(white @ disc.residual)
+        a, b = np.vstack(design), np.concatenate(target)
+        solved = np.linalg.lstsq(a, b, rcond=None)[0]
+        return float(np.sum((b - a @ solved) ** 2))
+
+    base = list(evidence.base)
+    assert model.gain(columns) == pytest.approx(chi2(base) - chi2([*base, *columns]), rel=1e-4, abs=1e-6)
+
+
+def test_lit_blocks_give_back_what_was_added_and_do_not_mind_brightness(solution: Solution) -> None:
+    evidence = gather(solution, FEW)
+    (column,) = evidence.columns["dark_offset"]
+    lit = evidence.lit
+    before = lit.equations([column])
+    rng = np.random.default_rng(2)
+    waver = 1 + 0.004 * rng.standard_normal(len(evidence.taken))
+    added = replace(lit, levels=lit.levels * waver[:, None] + 1.5 * lit.errors[column])
+    after = added.equations([column])
+    found, was = (float(e.score[0] / e.normal[0, 0]) for e in (after, before))
+    assert found - was == pytest.approx(1.5, abs=0.15)
+
+
+def test_shares_are_averages_over_orders() -> None:
+    worth = {(): 0.0, ("a",): 1.0, ("b",): 2.0, ("a", "b"): 2.5}
+    shares = _shapley(["a", "b"], worth)
+    assert shares == pytest.approx({"a": 0.75, "b": 1.75})  # (1 + 0.5) / 2 and (2 + 1.5) / 2
+
+
+def test_a_copy_and_a_patch_are_found_where_they_are(clean: Transit) -> None:
+    dx, dy = 66, -30
+    frames = tuple(
+        replace(f, pixels=f.pixels + 0.05 * displaced(gaussian_filter(f.pixels, 4.0), dx, dy))
+        for f in clean.frames
+    )
+    blur, x, y = PlaceSearch(View(invert(replace(clean, frames=frames)))).copy()
+    assert (x, y) == pytest.approx((dx, dy), abs=6) and blur in (2.0, 4.0, 8.0)
+
+
+def test_closure_and_gap_by_hand() -> None:
+    rng = np.random.default_rng(1)
+    ones = np.ones(4)
+
+    def held_out(chi2: list[float], residual: list[float]) -> HeldOut:
+        return HeldOut((0, 1, 2, 3), np.array(chi2), 10 * ones, 0 * ones, 0 * ones, np.array(residual), ones)
+
+    before, after = held_out([110.0] * 4, [5.0] * 4), held_out([20.0] * 4, [1.0] * 4)
+    found = closure(before, after, rng)
+    assert found is not None and found.value == pytest.approx(0.9)  # 1 - 10 / 100
+    assert gap(before, rng).value == pytest.approx(np.sqrt(24.0))
+    assert gap(after, rng).value == 0.0
+    assert closure(held_out([9.0] * 4, [0.0] * 4), after, rng) is None

@@ -1,0 +1,168 @@
+"""The task ``gap-diagnose``: an uploaded transit in, a report on its gap out, and the PSF with the answer in the model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from psfcore.errors import DataError
+from psfcore.fits_io import read_psf, write_psf
+from psfcore.gap.added_effects import Added, added_effects, library_with
+from psfcore.gap.corrected_psf import corrected_psf
+from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
+from psfcore.gap.gap_page import gap_page
+from psfcore.gap.gap_plot import gap_png
+from psfcore.gap.gap_report import gap_report
+from psfcore.plots import psf_png
+from psfcore.psf import Psf
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from workers.catalogue import PsfRow, ReportRow
+from workers.context import Context
+from workers.contract import ResolvedGapDiagnose, corrected_psf_identity, gap_identity
+from workers.psf_fit_task import load_transit, write_json
+from workers.psf_task import psf_row
+from workers.settings import library_versions, software_version
+
+KIND = "gap"
+
+
+def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Diagnose the gap of a transit; returns the report's id."""
+    request = ResolvedGapDiagnose.model_validate(parameters)
+    identity = gap_identity(request)
+    if context.catalogue.get(ReportRow, identity, context.owner) is not None:
+        return identity
+    _check_effects(context, request)
+    added = added_effects(request.added_effects)
+    parent = _parent(context, request)
+    shape, start = (SOFTENED_POWER_LAW, None) if parent is None else start_of(parent)
+    transit, _ = load_transit(context, request)
+    found = diagnose(
+        transit,
+        library=library_with(added),
+        shape=shape,
+        start=start,
+        seed=request.seed,
+        threads=context.settings.threads,
+        progress=context.report,
+    )
+    provenance = _provenance(context, request, identity, parent, added)
+    corrected = (
+        _save_psf(context, identity, found, provenance) if request.correct and found.corrected else None
+    )
+    _save(context, request, identity, found, provenance, corrected)
+    return identity
+
+
+def _check_effects(context: Context, request: ResolvedGapDiagnose) -> None:
+    """The worker runs code that its own operator names, never what a job says."""
+    if request.added_effects != context.settings.added_effects:
+        raise DataError(
+            "effects-changed",
+            f"expected the effects that the job was taken with ({', '.join(request.added_effects) or 'none'}); this worker "
+            f"adds {', '.join(context.settings.added_effects) or 'none'}: submit the job again",
+        )
+
+
+def _parent(context: Context, request: ResolvedGapDiagnose) -> Psf | None:
+    """The PSF that the fit starts from, where one is named."""
+    if request.psf_id is None:
+        return None
+    row = context.catalogue.get(PsfRow, request.psf_id, context.owner)
+    if row is None:
+        raise DataError("no-such-psf", f"the catalogue holds no PSF with id {request.psf_id}")
+    return read_psf(context.store.path(row.file_sha256), context.limits)
+
+
+def _provenance(
+    context: Context,
+    request: ResolvedGapDiagnose,
+    identity: str,
+    parent: Psf | None,
+    added: tuple[Added, ...],
+) -> dict[str, Any]:
+    started = (
+        None if parent is None else {"name": parent.name, "version": parent.version, "id": request.psf_id}
+    )
+    return {
+        "report_id": identity,
+        "transit_sha256": request.transit_id,
+        "started_from_psf": started,
+        "seed": request.seed,
+        "added_effects": {one.source: one.sha256 for one in added},
+        "parameters": request.model_dump(mode="json", exclude_none=True),
+        "algorithm_version": request.algorithm_version,
+        "software_version": software_version(),
+        "libraries": library_versions(),
+        "job_id": context.job_id,
+    }
+
+
+def _save_psf(context: Context, report_id: str, found: Diagnosis, provenance: dict[str, Any]) -> str:
+    """The PSF with the answer in the model, its tables and picture; its row a new draft. Returns its id."""
+    identity = corrected_psf_identity(report_id)
+    parents = {"transit": provenance["transit_sha256"], "report": report_id}
+    if provenance["started_from_psf"] is not None:
+        parents["psf"] = provenance["started_from_psf"]["id"]
+    psf = corrected_psf(
+        found,
+        name=f"{found.solution.transit.instrument or 'transit'}-gap-corrected",
+        version=f"0.1.0+{identity[:8]}",
+        provenance={"psf_id": identity, "parents": parents, **provenance},
+    )
+    with context.store.temporary() as file, context.store.temporary() as picture:
+        write_psf(file, psf)
+        psf_png(psf, picture)
+        row = psf_row(
+            psf,
+            identity,
+            context.owner,
+            origin="fitted",
+            file_sha256=context.store.keep(file),
+            store=context.store,
+            preview_sha256=context.store.keep(picture),
+            details={"transit_id": parents["transit"], "parents": parents},
+            threads=context.settings.threads,
+        )
+    context.catalogue.add(row)
+    return identity
+
+
+def _save(
+    context: Context,
+    request: ResolvedGapDiagnose,
+    identity: str,
+    found: Diagnosis,
+    provenance: dict[str, Any],
+    corrected: str | None,
+) -> None:
+    """JSON, page and picture into the store, the row into the catalogue."""
+    said = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected}}
+    with (
+        context.store.temporary() as text,
+        context.store.temporary() as page,
+        context.store.temporary() as picture,
+    ):
+        write_json(text, said)
+        page.write_text(gap_page(found, said).html(), "utf-8")
+        picture.write_bytes(gap_png(found, said))
+        file_sha256 = context.store.keep(text)
+        row = ReportRow(
+            owner=context.owner,
+            id=identity,
+            created_at=time.time(),
+            kind=KIND,
+            transit_id=request.transit_id,
+            file_sha256=file_sha256,
+            bytes=context.store.path(file_sha256).stat().st_size,
+            preview_sha256=context.store.keep(picture),
+            details={
+                **{name: said[name] for name in ("sentence", "verdict", "answer", "gap", "cautions")},
+                "strongest_axis": said["where"][0]["axis"],
+                "psf_id": request.psf_id,
+                "corrected_psf_id": corrected,
+                "page_sha256": context.store.keep(page),
+            },
+        )
+    context.catalogue.add(row)
