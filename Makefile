@@ -22,10 +22,10 @@ demo: $(RUN)
 	$(BIN)/heliopsf demo $(if $(IMAGE),--image "$(IMAGE)")
 
 test: $(DEV)
-	$(BIN)/python -m pytest -m "not slow" tests
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile tests
 
 test-full: $(DEV)
-	$(BIN)/python -m pytest tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile tests
 
 bench: $(DEV)
 	$(BIN)/python -m tests.bench

@@ -117,10 +117,13 @@ def _guarded(effect: Effect, source: str) -> Effect:
         if len(made) != wanted or not all(isinstance(change, Change) for change in made):
             kinds = ", ".join(sorted({type(change).__name__ for change in made}))
             raise _bad(
-                source, f"{effect.name}: expected {wanted} of Change, one a parameter; got {len(made)} of {kinds}"
+                source,
+                f"{effect.name}: expected {wanted} of Change, one a parameter; got {len(made)} of {kinds}",
             )
         shape = view.solution.transit.shape
-        return [replace(change, change=_checked(change.change, shape, effect.name, source)) for change in made]
+        return [
+            replace(change, change=_checked(change.change, shape, effect.name, source)) for change in made
+        ]
 
     def why_not(view: View) -> str | None:
         with _theirs(source):

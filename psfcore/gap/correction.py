@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from psfcore.gap.effect import Effect, View
 from psfcore.gap.evidence import Evidence, gather
-from psfcore.gap.judge import Tried, fitted
+from psfcore.gap.judge import Tried, fitted, label_of
 from psfcore.gap.linear_model import LinearModel
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.transit.transit import Transit
@@ -36,6 +36,11 @@ class Corrected:
     model: LinearModel
     values: dict[str, tuple[float, float, str]]
     rounds: int
+
+    @property
+    def label(self) -> str:
+        """The effects' names as a report has them."""
+        return label_of([effect.name for effect in self.effects])
 
     @property
     def covariance(self) -> Vector:

@@ -26,6 +26,7 @@ from psfcore.gap.where import Axis, where
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named
+from psfcore.transit.blocks import Fold
 from psfcore.transit.transit import Transit
 
 MOST_REFITS = 3
@@ -136,12 +137,11 @@ def diagnose_solution(
         disc_scale=float(np.clip(expected.disc_scale, SMALLEST_SCALE, LARGEST_SCALE)),
         lit_scale=float(np.clip(expected.lit_scale, SMALLEST_SCALE, LARGEST_SCALE)),
     )
-    found = judge(model)
+    refits = _Refits(solution, model, progress)
+    found = judge(model, refits.model) if refit else judge(model)
+    fits = refits.of(found) if refit else ()
     rng = np.random.default_rng(seed)
-    shrinking, before, after = _shrinking(model, found, rng)
-    fits = _refits(solution, model, found, progress) if refit else ()
-    if fits and len(fits[0].effects) == len(found.answer):
-        after = hold_out(fits[0].model, _columns(fits[0].evidence, found.answer), time_blocks(model)) or after
+    shrinking, before, after = _shrinking(model, found, fits, rng)
     favoured = [axis for effect in evidence.effects if effect.name in found.answer for axis in effect.axes]
     nothing = Interval(0.0, 0.0, 0.0)
     rms = gap(before, rng) if before is not None else nothing
@@ -163,64 +163,95 @@ def diagnose_solution(
         corrected=fits,
         residual=before,
         residual_after=after if gone else None,
-        cautions=_cautions(solution, noise, evidence),
-    )
-
-
-def _columns(evidence: Evidence, names: Sequence[str]) -> tuple[int, ...]:
-    return tuple(
-        c for effect in evidence.effects if effect.name in names for c in evidence.columns[effect.name]
+        cautions=(*_cautions(solution, noise, evidence), *refits.failures),
     )
 
 
 def _shrinking(
-    model: LinearModel, found: Judgement, rng: np.random.Generator
+    model: LinearModel, found: Judgement, fits: Sequence[Corrected], rng: np.random.Generator
 ) -> tuple[dict[str, Shrinking], HeldOut | None, HeldOut | None]:
-    """Closure of every effect tried; residuals held out without an effect, and with the best."""
+    """Closure of every effect tried; residuals held out without an effect, and with the best.
+
+    Of effects that were added to the model for real, by that model.
+    """
     schemes = (time_blocks(model), pointings(model))
     before = [hold_out(model, (), scheme) for scheme in schemes]
+    real = {fit.label: fit.model for fit in fits}
     out: dict[str, Shrinking] = {}
     best: HeldOut | None = None
     base = len(model.evidence.base)
     for tried in found.tried:
         after = [hold_out(model, tried.step.columns[base:], scheme) for scheme in schemes]
+        if tried.label in real:
+            after = [
+                _better_known(_held_out_by(real[tried.label], scheme), linear)
+                for scheme, linear in zip(schemes, after, strict=True)
+            ]
         if found.best is not None and tried.label == found.best.label:
             best = after[0]
         closures = [
             closure(b, a, rng) if found.verdict != "none" and b is not None and a is not None else None
             for b, a in zip(before, after, strict=True)
         ]
-        both = before[0] is not None and after[0] is not None
-        out[tried.label] = Shrinking(
-            closures[0],
-            closures[1],
-            fall(before[0], after[0]) if both and before[0] is not None and after[0] is not None else None,
-        )
+        falls = fall(before[0], after[0]) if before[0] is not None and after[0] is not None else None
+        out[tried.label] = Shrinking(closures[0], closures[1], falls)
     return out, before[0], best
 
 
-def _refits(
-    solution: Solution, model: LinearModel, found: Judgement, progress: Progress
-) -> tuple[Corrected, ...]:
-    """Real refits of the answer; with a tie, of each of its effects, the best first."""
-    if found.verdict not in ("attributed", "tie") or found.best is None:
-        return ()
-    chosen: list[Tried] = [found.best]
-    if found.verdict == "tie":
-        chosen += [
-            t for t in found.tried if len(t.names) == 1 and t.names[0] in found.answer and t is not found.best
-        ]
-    effects = {effect.name: effect for effect in model.evidence.effects}
-    out = []
-    for tried in chosen[:MOST_REFITS]:
+def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
+    """By a model with effects in it, all of which are fitted."""
+    return hold_out(model, range(len(model.evidence.base), model.evidence.size), scheme)
 
-        def say(stage: str, step: int, steps: int, label: str = tried.label) -> None:
-            progress(f"adding {label}: {stage}", step, steps)
 
-        out.append(
-            add_to_model(solution, [effects[name] for name in tried.names], tried, model, progress=say)
-        )
-    return tuple(out)
+def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
+    """The real refit's, unless an image took no part in that."""
+    same = real is not None and linear is not None and real.images == linear.images
+    return real if same else linear
+
+
+class _Refits:
+    """Real refits of effects, each made once."""
+
+    def __init__(self, solution: Solution, model: LinearModel, progress: Progress) -> None:
+        self._solution, self._model, self._progress = solution, model, progress
+        self._made: dict[str, Corrected | None] = {}
+        self.failures: list[str] = []
+
+    def model(self, tried: Tried) -> LinearModel | None:
+        """The model about the refit with an effect, or a pair; none where there is no fit with it."""
+        made = self._fit(tried)
+        return None if made is None else made.model
+
+    def of(self, found: Judgement) -> tuple[Corrected, ...]:
+        """Of the answer; with a tie, of each of its effects, the best first."""
+        if found.verdict not in ("attributed", "tie") or found.best is None:
+            return ()
+        chosen: list[Tried] = [found.best]
+        if found.verdict == "tie":
+            chosen += [
+                t
+                for t in found.tried
+                if len(t.names) == 1 and t.names[0] in found.answer and t is not found.best
+            ]
+        fits = (self._fit(tried) for tried in chosen[:MOST_REFITS])
+        return tuple(fit for fit in fits if fit is not None)
+
+    def _fit(self, tried: Tried) -> Corrected | None:
+        if tried.label in self._made:
+            return self._made[tried.label]
+
+        def say(stage: str, step: int, steps: int) -> None:
+            self._progress(f"adding {tried.label}: {stage}", step, steps)
+
+        effects = {effect.name: effect for effect in self._model.evidence.effects}
+        chosen = [effects[name] for name in tried.names]
+        made: Corrected | None = None
+        try:
+            made = add_to_model(self._solution, chosen, tried, self._model, progress=say)
+        except DataError as error:  # images less an effect that is not there may have no fit
+            self.failures.append(f"No fit with {tried.label} in the model: {error}")
+        self._made[tried.label] = made
+        return made
 
 
 def _before_refit(model: LinearModel, found: Judgement, rng: np.random.Generator) -> Interval | None:

@@ -29,7 +29,7 @@ KEPT_FIELDS = 4
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """A number of an effect: its name, its unit, and how large it may well be: one sigma, for a first judgement."""
+    """A number of an effect: its name, its unit, and how large it may well be; ten times that is hardly believed."""
 
     name: str
     unit: str

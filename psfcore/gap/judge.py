@@ -6,21 +6,25 @@ Gains of effects are compared after what their parameters, and a search over man
 
 There is a gap where patterns that any gap makes (`patterns`), all cells, the lit blocks or an effect's gain are less
 likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be told from it.
-Pairs are searched exhaustively where no single effect is enough: where what it leaves is less likely than ENOUGH, its
-own forward change taken to be right to TEMPLATE_ERROR. Closing much of a gap identifies nothing, for a wrong effect does
-that too: where no effect and no pair is enough, or where a probe, a form of unknown cause, does clearly better, the
-verdict is unknown. It is repeated with half and twice the floor; where it flips, the answer holds both, or is inconclusive.
+An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
+TEMPLATE_ERROR, or where that is less than LEFT_SHARE of a gap that no rival closes half as well: an effect whose form is
+not quite the sky's. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
+model for real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
+Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
+where a probe, a form of unknown cause, does clearly better, the verdict is unknown. It is repeated with half and twice
+the floor; where it flips, the answer holds both, or is inconclusive.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from psfcore.gap.effect import Effect
@@ -28,6 +32,7 @@ from psfcore.gap.evidence import Evidence
 from psfcore.gap.linear_model import LinearModel, Step
 from psfcore.gap.patterns import patterns
 
+Vector = NDArray[np.float64]
 Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 
 FLOOR = 0.003
@@ -36,6 +41,9 @@ ALARM = 0.005
 ENOUGH = 1e-3
 PENALTY = 2.0
 TIE = 9.0
+TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less would tell two apart
+LEFT_SHARE = 0.15
+FAR_BEHIND = 0.5
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
@@ -46,8 +54,8 @@ TESTS = 4
 class Tried:
     """One effect, or two, fitted beside the PSF: values and errors by "effect.parameter", its gain, what is left.
 
-    p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show; none where it was
-    not worth asking.
+    p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show, and left_share:
+    the largest share of what they showed before; none where it was not worth asking.
     """
 
     names: tuple[str, ...]
@@ -58,11 +66,17 @@ class Tried:
     p_value: float
     step: Step
     left_p_value: float | None = None
+    left_share: float | None = None
 
     @property
     def label(self) -> str:
         """The names as a report has them."""
-        return " + ".join(self.names)
+        return label_of(self.names)
+
+
+def label_of(names: Sequence[str]) -> str:
+    """Names of effects as a report has them."""
+    return " + ".join(names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +91,23 @@ class Judgement:
     best: Tried | None
 
 
-def judge(model: LinearModel) -> Judgement:
-    """The verdict under the model's floor, and twice with others."""
-    found = _judge(model)
+# The model about a real refit with an effect in it, its columns beside the PSF's; none where there is no such fit.
+Refit = Callable[[Tried], LinearModel | None]
+
+
+def judge(model: LinearModel, refit: Refit = lambda tried: None) -> Judgement:
+    """The verdict under the model's floor, and twice with others. refit: asked at most once for an effect or a pair."""
+    asked: dict[str, LinearModel | None] = {}
+
+    def once(tried: Tried) -> LinearModel | None:
+        if tried.label not in asked:
+            asked[tried.label] = refit(tried)
+        return asked[tried.label]
+
+    found = _judge(model, once)
     if found.verdict == "none":
         return found
-    others = [_judge(replace(model, floor=model.floor * factor)) for factor in FLOORS]
+    others = [_judge(replace(model, floor=model.floor * factor), once) for factor in FLOORS]
     if any(other.verdict == "none" for other in others):
         return replace(found, verdict="inconclusive")
     if any((other.verdict == "unknown") != (found.verdict == "unknown") for other in others):
@@ -97,7 +122,7 @@ def judge(model: LinearModel) -> Judgement:
     return replace(found, verdict="tie", answer=tuple(sorted(answers)))
 
 
-def _judge(model: LinearModel) -> Judgement:
+def _judge(model: LinearModel, refit: Refit) -> Judgement:
     evidence = model.evidence
     every = [fitted(model, (effect,)) for effect in evidence.effects]
     named = sorted((t for t in every if t.named), key=lambda t: -t.score)
@@ -105,9 +130,10 @@ def _judge(model: LinearModel) -> Judgement:
     p_gap = _p_of_gap(model, named)
     if p_gap > ALARM or not named:
         return Judgement("none", (), p_gap, tuple(named), probes, named[0] if named else None)
-    best = named[0] = _with_left(model, named[0])
-    enough = _is_enough(best)
-    pair = None if enough else _best_pair(model, best)
+    best = named[0] = _with_left(model, named[0], refit)
+    rivals = max((t.score for t in (*named[1:], *probes)), default=0.0)
+    enough = _is_enough(best, rivals)
+    pair = None if enough else _best_pair(model, best, refit)
     winner = pair or best
     if (not enough and pair is None) or best.p_value * len(named) > ALARM:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
@@ -115,18 +141,20 @@ def _judge(model: LinearModel) -> Judgement:
         return Judgement("unknown", (), p_gap, tuple(named), probes, winner)
     if pair is not None:
         return Judgement("attributed", tuple(sorted(pair.names)), p_gap, (pair, *named), probes, pair)
-    rivals = [t.names[0] for t in named[1:] if best.score - t.score < TIE]
-    if rivals:
-        return Judgement("tie", tuple(sorted({*best.names, *rivals})), p_gap, tuple(named), probes, best)
+    alike = max(TIE, TIE_SHARE * best.gain)
+    tied = [t.names[0] for t in named[1:] if best.score - t.score < alike]
+    if tied:
+        return Judgement("tie", tuple(sorted({*best.names, *tied})), p_gap, tuple(named), probes, best)
     return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
 
 
-def _is_enough(tried: Tried) -> bool:
-    assert tried.left_p_value is not None
-    return tried.left_p_value >= ENOUGH
+def _is_enough(tried: Tried, rival_score: float) -> bool:
+    assert tried.left_p_value is not None and tried.left_share is not None
+    nearly = tried.left_share < LEFT_SHARE and rival_score < FAR_BEHIND * tried.score
+    return tried.left_p_value >= ENOUGH or nearly
 
 
-def _best_pair(model: LinearModel, best: Tried) -> Tried | None:
+def _best_pair(model: LinearModel, best: Tried, refit: Refit) -> Tried | None:
     """The pair of effects that explains most, if it is clearly better than one and leaves nothing."""
     effects = [effect for effect in model.evidence.effects if effect.named]
     pairs = sorted(
@@ -134,8 +162,8 @@ def _best_pair(model: LinearModel, best: Tried) -> Tried | None:
     )
     if not pairs or pairs[0].score < best.score + CLEAR:
         return None
-    pair = _with_left(model, pairs[0])
-    return pair if _is_enough(pair) else None
+    pair = _with_left(model, pairs[0], refit)
+    return pair if _is_enough(pair, best.score) else None
 
 
 def fitted(model: LinearModel, effects: Sequence[Effect]) -> Tried:
@@ -167,19 +195,60 @@ def fitted(model: LinearModel, effects: Sequence[Effect]) -> Tried:
 def _p_of_gap(model: LinearModel, named: Sequence[Tried]) -> float:
     """The least of the p-values of patterns, cells, lit blocks and single effects, times how many they are."""
     effects = min((t.p_value for t in named), default=1.0) * max(len(named), 1)
-    return float(min(1.0, TESTS * min(*_p_of_left(model, model.base, model.base), effects)))
+    return float(
+        min(1.0, TESTS * min(*_left(model, model.base, np.zeros(len(model.base.columns))).p_values, effects))
+    )
 
 
-def _with_left(model: LinearModel, tried: Tried) -> Tried:
-    """With the p-value of what is left, the effect's own change unsure by TEMPLATE_ERROR."""
-    return replace(tried, left_p_value=min(1.0, 3 * min(_p_of_left(model, tried.step, model.base))))
+@dataclass(frozen=True)
+class _Left:
+    """What a step leaves, and of how many degrees of freedom: along patterns, in all cells, in the lit blocks."""
+
+    gains: tuple[float, float, float]
+    freedom: tuple[int, int, int]
+
+    @property
+    def p_values(self) -> tuple[float, ...]:
+        """Of each of the three."""
+        return tuple(
+            float(chi2_distribution.sf(gain, k)) for gain, k in zip(self.gains, self.freedom, strict=True)
+        )
+
+    @property
+    def p_value(self) -> float:
+        """The least of them, counted for how many they are."""
+        return min(1.0, len(self.gains) * min(self.p_values))
+
+    def share_of(self, before: _Left) -> float:
+        """The largest share of the excess that is left, of those that are not likely anyway."""
+        shares = [
+            max(gain - k, 0.0) / max(gain_before - k_before, 1e-9)
+            for gain, k, p, gain_before, k_before in zip(
+                self.gains, self.freedom, self.p_values, before.gains, before.freedom, strict=True
+            )
+            if p < ENOUGH
+        ]
+        return max(shares, default=0.0)
 
 
-def _p_of_left(model: LinearModel, step: Step, base: Step) -> tuple[float, float, float]:
-    """p-values of what a step leaves: along patterns, in all cells, in the lit blocks."""
+def _with_left(model: LinearModel, tried: Tried, refit: Refit) -> Tried:
+    """With what is left: in the linear model, and where that is too much, after a real refit."""
+    unsure = np.array(tried.step.values) * TEMPLATE_ERROR
+    unsure[: len(model.base.columns)] = 0.0
+    left = _left(model, tried.step, unsure)
+    if left.p_value < ENOUGH:
+        again = refit(tried)
+        if again is not None and again.evidence.size == unsure.size:
+            again = replace(again, floor=model.floor)
+            step = again.fit(range(len(again.evidence.base), again.evidence.size))
+            left = max(left, _left(again, step, unsure), key=lambda one: one.p_value)
+    before = _left(model, model.base, np.zeros(len(model.base.columns)))
+    return replace(tried, left_p_value=left.p_value, left_share=left.share_of(before))
+
+
+def _left(model: LinearModel, step: Step, unsure: Vector) -> _Left:
+    """What a step leaves, its columns' own answers unsure by so much."""
     evidence = model.evidence
-    unsure = np.array(step.values) * TEMPLATE_ERROR
-    unsure[: len(base.columns)] = 0.0
     here = list(step.columns)
     # An unsure template adds a covariance along its own answer: taken off along that direction, disc by disc.
     shrink = []
@@ -191,14 +260,9 @@ def _p_of_left(model: LinearModel, step: Step, base: Step) -> tuple[float, float
     cells = sum(float(left @ left) for left in shrink)
     gain, directions = model.gain_of_patterns(step, patterns(evidence), shrink)
     lit = model.whole_lit
-    theta = unsure / TEMPLATE_ERROR
-    moved = float(theta @ lit.normal[np.ix_(here, here)] @ theta) / model.lit_scale * TEMPLATE_ERROR**2
+    moved = float(unsure @ lit.normal[np.ix_(here, here)] @ unsure) / model.lit_scale
     of_lit = max(model.left_lit(step) - moved, 0.0) / (1 + LIT_WIDTH)
-    return (
-        float(chi2_distribution.sf(gain, directions)),
-        float(chi2_distribution.sf(cells, freedom)),
-        float(chi2_distribution.sf(of_lit, lit.freedom)),
-    )
+    return _Left((gain, cells, of_lit), (directions, freedom, lit.freedom))
 
 
 def model_of(evidence: Evidence, *, disc_scale: float = 1.0, lit_scale: float = 1.0) -> LinearModel:

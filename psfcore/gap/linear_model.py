@@ -4,8 +4,8 @@
     C = noise of the cells + f^2 m m^T                                                                  Eq. (2)
 
 m being what is expected in a disc's cells: a floor, the share f, common to a disc, for what nobody has thought of. An
-effect is tried beside the PSF's own coordinates, which are refitted with it: what they absorb is not its. Its gain is
-what chi2 falls by then.
+effect is tried beside the PSF's own coordinates, which are refitted with it: what they absorb is not its. Its parameters have a
+prior of UNLIKELY times what is likely: a flat field of 500 % explains nothing. Its gain is what chi2 and prior fall by.
 
 | symbol | name | unit |
 |---|---|---|
@@ -29,6 +29,7 @@ from psfcore.gap.lit_blocks import LitEquations
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
+UNLIKELY = 10.0
 WEAKEST = 1e-9  # of a normal matrix scaled to a unit diagonal
 
 
@@ -104,12 +105,21 @@ class LinearModel:
         """The PSF's coordinates and these columns, from some equations (none: of all images)."""
         here = [*self.evidence.base, *columns]
         normal, score = self.whole if equations is None else equations
-        normal, score = normal[np.ix_(here, here)], score[here]
+        normal, score = normal[np.ix_(here, here)] + np.diag(self._prior[here]), score[here]
         size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         covariance = np.linalg.pinv(normal / np.outer(size, size), rcond=WEAKEST, hermitian=True)
         covariance = covariance / np.outer(size, size)
         values = covariance @ score
         return Step(tuple(here), values, covariance, float(score @ values))
+
+    @cached_property
+    def _prior(self) -> Vector:
+        """Of each column, over its variance: 0 of the PSF's coordinates."""
+        out = np.zeros(self.evidence.size)
+        for effect in self.evidence.effects:
+            for column, parameter in zip(self.evidence.columns[effect.name], effect.parameters, strict=False):
+                out[column] = (UNLIKELY * parameter.likely) ** -2
+        return out
 
     @cached_property
     def base(self) -> Step:

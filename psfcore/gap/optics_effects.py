@@ -148,8 +148,8 @@ EFFECTS: tuple[Effect, ...] = (
            not_a_power_law),
     Effect("core_blur", "optics", (_p("variance", "px2", 0.5),), "Jitter or defocus widens the core.",
            "a sharp limb, or a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur),
-    Effect("mesh_rotation", "optics", (_p("angle", "deg", 1.0),), "The meshes are turned against the detector.",
+    Effect("mesh_rotation", "optics", (_p("angle", "deg", 2.0),), "The meshes are turned against the detector.",
            "the arms of a flare", ("azimuth_in_disc", "detector_x", "detector_y"), _rotation),
-    Effect("mesh_pitch", "optics", (_p("stretch", "%", 2.0),), "The meshes' pitch is not the drawing's.",
+    Effect("mesh_pitch", "optics", (_p("stretch", "%", 3.0),), "The meshes' pitch is not the drawing's.",
            "the arms of a flare", ("radius_in_disc", "azimuth_in_disc"), _pitch),
 )  # fmt: skip

@@ -6,6 +6,7 @@ cause is not in the library, and what it looks like.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -130,7 +131,7 @@ def _lit_occulter(view: View) -> Sequence[Change]:
 
 
 def _p(*names: str) -> tuple[EffectParameter, ...]:
-    return tuple(EffectParameter(name, "", 1.0) for name in names)
+    return tuple(EffectParameter(name, "", math.inf) for name in names)
 
 
 def _probe(name, stage, parameters, form, axes, changes, why_not=lambda view: None, trials=1):  # type: ignore[no-untyped-def]

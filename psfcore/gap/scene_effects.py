@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.fourier import Convolver
@@ -14,22 +15,52 @@ from psfcore.transit.transit import Place
 
 MOTION_PX = 1.0
 STRUCTURE_PX = 16.0
+COARSE_PX = 4
 
 
 def _beyond_field(view: View) -> Sequence[Change]:
-    """The field's mirror image beyond its edges, seen through the PSF."""
+    """The field's mirror image beyond each of its edges, seen through the PSF.
+
+    What gets in from there is smooth but for the outermost pixels: worked out on coarse pixels.
+    """
     solution = view.solution
-    ny, nx = solution.transit.shape
-    kernel = solution.total.kernel(solution.inversion.coordinates)
+    ny, nx = (-(-n // COARSE_PX) for n in solution.transit.shape)
     pad_y, pad_x = ny // 2, nx // 2
+    kernel = _coarse_kernel(solution.total.kernel(solution.inversion.coordinates))
     through = Convolver(kernel, (ny + 2 * pad_y, nx + 2 * pad_x), dtype=np.float32, threads=solution.threads)
+    y, x = np.indices((ny + 2 * pad_y, nx + 2 * pad_x))
+    low_y, high_y, low_x, high_x = y < pad_y, y >= pad_y + ny, x < pad_x, x >= pad_x + nx
+    # A corner belongs to the side: the sides share all that is beyond the field.
+    sides = (low_x, high_x, low_y & ~low_x & ~high_x, high_y & ~low_x & ~high_x)
 
-    def change(n: int, _: Sequence[Field]) -> Field:
-        wide = np.pad(view.scenes[n], ((pad_y, pad_y), (pad_x, pad_x)), mode="symmetric")
-        wide[pad_y:-pad_y, pad_x:-pad_x] = 0
-        return np.asarray(through.apply(wide)[pad_y:-pad_y, pad_x:-pad_x], dtype=np.float32)
+    def change(n: int, side: NDArray[np.bool_]) -> Field:
+        scene = _coarse(view.scenes[n])
+        wide = np.pad(scene, ((pad_y, pad_y), (pad_x, pad_x)), mode="symmetric") * side
+        seen = through.apply(wide.astype(np.float32))[pad_y : pad_y + ny, pad_x : pad_x + nx]
+        fine = np.repeat(np.repeat(seen, COARSE_PX, axis=0), COARSE_PX, axis=1)
+        rows, columns = solution.transit.shape
+        return np.asarray(fine[:rows, :columns], dtype=np.float32)
 
-    return [Change(change, lit=False)]
+    return [Change(lambda n, _, side=side: change(n, side), lit=False) for side in sides]  # type: ignore[misc]
+
+
+def _coarse(plane: Field) -> Field:
+    """Means of squares of COARSE_PX; the last ones are made whole with their own edge."""
+    ny, nx = plane.shape
+    whole = np.pad(plane, ((0, -ny % COARSE_PX), (0, -nx % COARSE_PX)), mode="edge")
+    rows, columns = (n // COARSE_PX for n in whole.shape)
+    return np.asarray(whole.reshape(rows, COARSE_PX, columns, COARSE_PX).mean(axis=(1, 3)))
+
+
+def _coarse_kernel(kernel: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Light by displacement in coarse pixels, the middle of the kernel in the middle of one: sums of squares."""
+    middle = kernel.shape[0] // 2
+    reach = (middle + COARSE_PX // 2) // COARSE_PX
+    at = (np.arange(kernel.shape[0]) - middle + COARSE_PX // 2) // COARSE_PX + reach
+    out = np.zeros((2 * reach + 1,) * 2)
+    keep = at <= 2 * reach
+    np.add.at(out, np.ix_(at[keep], at[keep]), kernel[np.ix_(keep, keep)])
+    return out
 
 
 def _motion(view: View) -> Sequence[Change]:
@@ -81,7 +112,8 @@ def _p(name: str, unit: str, likely: float) -> EffectParameter:
 EFFECTS: tuple[Effect, ...] = (
     Effect("occulter_motion", "scene", (_p("amount", "", 2.0),), "The occulter moves during an exposure.",
            "shorter exposures", ("radius_in_disc", "azimuth_in_disc"), _motion),
-    Effect("out_of_field_light", "scene", (_p("share", "", 0.5),), "The Sun goes on beyond the field and scatters in.",
+    Effect("out_of_field_light", "scene", tuple(_p(side, "", 0.5) for side in ("left", "right", "bottom", "top")),
+           "The Sun goes on beyond the field and scatters in.",
            "full-Sun images of the same time", ("scattering_distance", "pointing", "intensity"), _beyond_field),
     Effect("scene_evolution", "scene", (_p("drift", "/h", 0.2),), "The Sun changes while the occulter crosses a pointing.",
            "images closer in time", ("time", "pointing"), _evolution),

@@ -61,7 +61,7 @@ def where(model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] 
         for chosen in itertools.combinations(names, size)
     }
     shares = _shapley(names, subset)
-    total = max(subset[tuple(names)], 1e-300)
+    total = max(sum(max(share, 0.0) for share in shares.values()), 1e-300)
     draws = _drawn(model, designs, rng)
     out = []
     for name in names:

@@ -59,6 +59,7 @@ def test_shapes_do_not_differ_where_the_truth_is_isotropic() -> None:
             assert sigma < shape.figures[name][1]  # paired: better known than the figures themselves
 
 
+@pytest.mark.slow
 def test_a_stretch_that_is_there_is_seen_in_held_out_errors() -> None:
     shapes = {shape.name: shape for shape in compared_stretched().shapes}
     value, sigma = shapes["stretched"].minus_first["mpe_rms_pct"]

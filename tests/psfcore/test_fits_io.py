@@ -393,7 +393,7 @@ def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path) -> None:
 def test_planes_come_back_and_the_product_is_still_one_map(
     tmp_path: Path, limits: FitsLimits, real: Find
 ) -> None:
-    image = read_image(real(FSI), limits)
+    image = read_image(real(AIA), limits)
     shape = image.pixels.shape
     rng = np.random.default_rng(1)
     error = rng.random(shape)

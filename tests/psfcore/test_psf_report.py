@@ -68,6 +68,7 @@ def given() -> PsfReport:
     return make_report(transit, untouched(transit), psf=psf)
 
 
+@pytest.mark.slow
 def test_the_parameters_are_the_truth_within_their_errors() -> None:
     for name, parameter in whole_json()["fit"]["parameters"].items():
         assert abs(parameter["value"] - TRUE_VALUES[name]) < 4 * parameter["sigma"], name
@@ -165,6 +166,7 @@ def test_a_psf_that_was_fitted_to_these_images_is_no_test_of_itself() -> None:
     assert report.fitted_to_these and "no test of it" in report.sentence
 
 
+@pytest.mark.slow
 def test_too_few_images_to_hold_some_out_are_judged_with_their_own_fit_and_it_says_so() -> None:
     transit = observed(sky()).transit
     few = dataclasses.replace(transit, frames=transit.frames[:4] + transit.frames[6:7])

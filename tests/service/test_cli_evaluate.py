@@ -217,6 +217,7 @@ def test_output_that_cannot_be_written_is_said_first(transit: Path, tmp_path: Pa
 # --- shapes -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_shapes_are_compared_where_asked(transit: Path, tmp_path: Path) -> None:
     result = run(transit, "--shapes", "--json", tmp_path / "r.json")
     assert result.exit_code == 0, result.output
