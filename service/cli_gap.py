@@ -40,7 +40,8 @@ class _DiagnosisByDefault(click.Group):
 
 
 @click.group(
-    cls=_DiagnosisByDefault, help="Diagnose a transit (heliopsf gap TRANSIT ...), or judge the diagnosis."
+    cls=_DiagnosisByDefault,
+    help="Diagnose a transit (heliopsf gap TRANSIT ...; its options: heliopsf gap diagnose -h), or judge the diagnosis.",
 )
 def gap() -> None:
     """The gap between a fitted model and the images."""

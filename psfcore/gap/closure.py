@@ -26,6 +26,7 @@ Vector = NDArray[np.float64]
 DRAWS = 1000
 SHOWN = 3.0  # sigmas of chi2 by which the discs must show a gap, for them to be judged alone
 INTERVAL = (5.0, 95.0)
+HIDDEN_SIGMA = 1.645  # 95 % of a normal distribution lies below
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,20 @@ class HeldOut:
     lit_expected: Vector
     residual_pct: Vector
     noise_pct: Vector
+
+    def of(self, images: Sequence[int]) -> HeldOut:
+        """Some of the images."""
+        at = {image: k for k, image in enumerate(self.images)}
+        here = [at[image] for image in images]
+        return HeldOut(
+            tuple(images),
+            self.chi2[here],
+            self.expected[here],
+            self.lit_chi2[here],
+            self.lit_expected[here],
+            self.residual_pct[here],
+            self.noise_pct[here],
+        )
 
 
 def time_blocks(model: LinearModel) -> tuple[Fold, ...]:
@@ -114,8 +129,20 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
     return HeldOut(tuple(images), chi2, expected, lit_chi2, lit_expected, residual, noise_pct)
 
 
+def _in_both(before: HeldOut, after: HeldOut) -> tuple[HeldOut, HeldOut] | None:
+    """The images that both hold out: with more to fit, folds with few images drop out. None where there are none."""
+    common = sorted(set(before.images) & set(after.images))
+    if not common:
+        return None
+    return before.of(common), after.of(common)
+
+
 def closure(before: HeldOut, after: HeldOut, rng: np.random.Generator) -> Interval | None:
     """Eq. (1) with its interval; none where there is nothing to close."""
+    both = _in_both(before, after)
+    if both is None:
+        return None
+    before, after = both
     excess = before.chi2 - before.expected
     left = after.chi2 - before.expected
     if excess.sum() < SHOWN * math.sqrt(2 * float(before.expected.sum())):
@@ -134,14 +161,19 @@ def closure(before: HeldOut, after: HeldOut, rng: np.random.Generator) -> Interv
 
 
 def fall(before: HeldOut, after: HeldOut) -> float:
-    """How far chi2 of discs and lit blocks falls, held out."""
+    """How far chi2 of discs and lit blocks falls, held out, in the images that both hold out."""
+    both = _in_both(before, after)
+    if both is None:
+        return 0.0
+    before, after = both
     return float((before.chi2 - after.chi2 + before.lit_chi2 - after.lit_chi2).sum())
 
 
 def gap(held_out: HeldOut, rng: np.random.Generator) -> Interval:
-    """Eq. (3) with its interval."""
+    """Eq. (3) with its interval, whose upper end is not below what noise alone would hide."""
     squares = held_out.residual_pct**2 - held_out.noise_pct**2
     chosen = rng.integers(0, squares.size, (DRAWS, squares.size))
     drawn = np.sqrt(np.maximum(squares[chosen].mean(axis=1), 0.0))
     low, high = np.percentile(drawn, INTERVAL)
-    return Interval(math.sqrt(max(float(squares.mean()), 0.0)), float(low), float(high))
+    hidden = math.sqrt(HIDDEN_SIGMA * math.sqrt(2 * float(np.mean(held_out.noise_pct**4)) / squares.size))
+    return Interval(math.sqrt(max(float(squares.mean()), 0.0)), float(low), max(float(high), hidden))

@@ -74,7 +74,7 @@ def add_to_model(
     transit = solution.transit
     # A form with a place of its own keeps the place that was found: it is looked for once.
     view = View(solution)
-    held = [hold(effect, view) for effect in effects]
+    held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
     values = {name: value for name, (value, _, _) in found.values.items()}
     theta = np.array(list(values.values()))
     current, rounds = solution, 0
@@ -88,9 +88,9 @@ def add_to_model(
             threads=solution.threads,
             progress=progress,
         )
-        evidence = gather(current, held, progress=progress)
+        evidence = _with_noise_of(model.evidence, gather(current, held, progress=progress))
         again = replace(model, evidence=evidence)
-        left = fitted(again, evidence.effects)
+        left = fitted(again, evidence.effects, any_sign=True)
         steps = np.array([value for value, _, _ in left.values.values()])
         sigma = np.array([s for _, s, _ in left.values.values()])
         theta = theta + steps
@@ -113,3 +113,28 @@ def add_to_model(
 def hold(effect: Effect, view: View) -> Effect:
     """The effect with whatever it searches for, as a place, held as these images give it."""
     return effect if effect.held is None else effect.held(view)
+
+
+def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
+    """The evidence after an effect was taken out, with the noise of before: the light that is gone left its noise."""
+    covariance = {disc.index: disc.covariance for disc in before.discs}
+    discs = tuple(
+        replace(disc, covariance=covariance[disc.index])
+        if disc.index in covariance and covariance[disc.index].shape == disc.covariance.shape
+        else disc
+        for disc in after.discs
+    )
+    return replace(after, discs=discs, lit=replace(after.lit, variance=before.lit.variance))
+
+
+def _acting(effect: Effect, found: Tried, effects: int) -> Effect:
+    """The effect with those of its parameters alone that take part in a fit."""
+    labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
+    part = [k for k, label in enumerate(labels) if label in found.values]
+    if len(part) == len(labels):
+        return effect
+    return replace(
+        effect,
+        parameters=tuple(effect.parameters[k] for k in part),
+        changes=lambda view: [effect.changes(view)[k] for k in part],
+    )

@@ -96,8 +96,8 @@ def _nothing_filled(view: View) -> str | None:
     return None if filled else "no pixel was filled in"
 
 
-def _p(name: str, unit: str, likely: float) -> EffectParameter:
-    return EffectParameter(name, unit, likely)
+def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
+    return EffectParameter(name, unit, likely, positive)
 
 
 EFFECTS: tuple[Effect, ...] = (
@@ -117,9 +117,9 @@ EFFECTS: tuple[Effect, ...] = (
                  (("x", "/field"), ("y", "/field"), ("xx", "/field2"), ("xy", "/field2"), ("yy", "/field2"))),
            "The detector's sensitivity is not quite flattened.", "the same scene displaced on the detector",
            ("detector_x", "detector_y"), _flat_field),
-    Effect("column_smear", "detector", (_p("share", "", 0.01),), "Charge is smeared along columns while they are read.",
+    Effect("column_smear", "detector", (_p("share", "", 0.01, True),), "Charge is smeared along columns while they are read.",
            "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
-    Effect("persistence", "detector", (_p("share", "", 0.01),), "A share of the image before is left in the next.",
+    Effect("persistence", "detector", (_p("share", "", 0.01, True),), "A share of the image before is left in the next.",
            "a dark exposure after a bright one", ("time", "pointing"), _persistence),
     Effect("saturation_fill", "detector", (_p("excess", "", 0.1),), "What was filled in for saturated pixels is wrong.",
            "a shorter exposure of the same time", ("pointing", "intensity"), _filled, _nothing_filled),

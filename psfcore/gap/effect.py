@@ -29,11 +29,15 @@ KEPT_FIELDS = 4
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """A number of an effect: its name, its unit, and how large it may well be; ten times that is hardly believed."""
+    """A number of an effect: its name, its unit, and how large it may well be; ten times that is hardly believed.
+
+    positive: whether it can be nothing else, as a share of light.
+    """
 
     name: str
     unit: str
     likely: float
+    positive: bool = False
 
 
 class _Fields(Sequence[Field]):

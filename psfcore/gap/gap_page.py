@@ -24,6 +24,7 @@ from psfcore.gap.gap_plot import (
 )
 from psfcore.gap.gap_report import AXIS_WORDS, words
 from psfcore.gap.judge import ALARM, ENOUGH, FLOOR, TIE
+from psfcore.gap.where import DRAWS
 from psfcore.page import DASH, Bullets, Details, Figure, Page, Part, Section, Table, Value, Values, with_error
 from psfcore.scatter.inversion import Inversion
 
@@ -57,7 +58,7 @@ def gap_page(found: Diagnosis, report: Report) -> Page:
         Section("What was found", _found(found, report)),
         Section("Where the gap lies", _where(found, report)),
         Section("Which effect", _which(found, report)),
-        Section("The PSF, before and with the answer", _psf(found)),
+        Section("The PSF, before and with the answer" if found.corrected else "The PSF", _psf(found)),
         Section("What weakens this", _doubts(report)),
         Section("Every image, and what it was made of", _made_of(found, report)),
     ]
@@ -116,6 +117,11 @@ def _found(found: Diagnosis, report: Report) -> list[Part]:
     elif report["verdict"] == "attributed":
         settled = [e.settled_by for e in found.effects if e.settled_by]
         parts.append(f"What would settle it beyond doubt: {'; '.join(dict.fromkeys(settled))}.")
+    if report["verdict"] == "tie" and found.corrected:
+        parts.append(
+            f"Below, “with the answer” is with the best of those that are tied: {_best_words(found)}. With another the PSF and what is left "
+            "would be others."
+        )
     if report["looks_like"]:
         parts += _looks_like(report)
     if found.residual is None:
@@ -123,6 +129,11 @@ def _found(found: Diagnosis, report: Report) -> list[Part]:
     else:
         parts.append(_map_figure(report))
     return parts
+
+
+def _best_words(found: Diagnosis) -> str:
+    """The effects of the first real refit."""
+    return " + ".join(words(effect.name) for effect in found.corrected[0].effects)
 
 
 def _answer_meaning(report: Report) -> str:
@@ -155,7 +166,8 @@ def _map_figure(report: Report) -> Figure:
     after = has_after(report)
     caption = (
         "Every disc at its place on the detector, its colour the residual of its mean: simulated minus observed, over the "
-        "observed mean, by a fit that this image and its neighbours took no part in. Symbols tell the pointings apart."
+        "observed mean, by a fit that this image and its neighbours took no part in. Symbols tell the pointings apart; how well each is "
+        "known shows in the next figure."
     )
     if after:
         caption += " Left: the fitted model; right: with the answer's effects in it, on the same scale."
@@ -188,7 +200,8 @@ def _where(found: Diagnosis, report: Report) -> list[Part]:
         Figure(
             where_png(report),
             "How much of what all axes explain together goes with each: its share, averaged over all orders in which axes can be "
-            "taken, for they go together in a transit. Beside it how likely chance alone would do as well, counted for the number of axes.",
+            "taken, for they go together in a transit. Beside it how likely chance alone would do as well, counted for the number of axes; "
+            f"{DRAWS} draws cannot tell less than {len(report['where']) / (DRAWS + 1):.2g} in the discs.",
             "Bars of the share of the gap that goes with each axis",
         )
     )
@@ -230,24 +243,37 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
         parts.append(
             "Without a gap no effect is needed. All were tried; none of them gains what noise would not."
         )
+    elif report["verdict"] == "unknown":
+        parts.append(
+            "None of them is the answer, nor are two together: what the best leaves still shows, or a form of a cause outside the library "
+            "does clearly better."
+        )
+    elif report["verdict"] == "inconclusive":
+        parts.append(
+            "Which of them it is, or whether it is any, changes with what is taken for granted, here the share of a disc's light that "
+            "nobody has thought of."
+        )
     elif report["ties"]:
         tied = " or ".join(words(name) for name in report["ties"][0])
         parts.append(
             f"Tied: {tied}. Their scores lie within {TIE:g} of one another, or change places with what is taken for granted."
         )
-    parts.append(
-        Figure(
-            effects_png(report),
-            f"Effects of the library, best first (at most {MOST_EFFECTS}): the share of the gap that each closes on images held out, with its "
-            "90 % interval; bars and intervals that leave the chart are cut, with an arrow. Blue: the answer, or what is tied. A wrong effect may close much of a gap too, so that the score decides: by how much chi2 falls, "
-            f"less what its parameters and a search for its place gain from noise; what lies within {TIE:g} of the best is tied with it.",
-            "Bars of held-out closure by effect",
-        )
-    )
+    if report["verdict"] != "none":
+        parts.append(_effects_figure(report))
     parts.append(_effects_table(report))
     if found.corrected:
         parts += _slices(found)
     return parts
+
+
+def _effects_figure(report: Report) -> Figure:
+    return Figure(
+        effects_png(report),
+        f"Effects of the library, best first (at most {MOST_EFFECTS}): the share of the gap that each closes on images held out, with its "
+        "90 % interval; bars and intervals that leave the chart are cut, with an arrow. Blue: the answer, or what is tied. A wrong effect may close much of a gap too, so that the score decides: by how much chi2 falls, "
+        f"less what its parameters and a search for its place gain from noise; what lies within {TIE:g} of the best is tied with it.",
+        "Bars of held-out closure by effect",
+    )
 
 
 def _effects_table(report: Report) -> Table:
@@ -322,10 +348,7 @@ def _psf(found: Diagnosis) -> list[Part]:
     if not found.corrected:
         parts.append("No effect was added to the model, so that there is no corrected PSF.")
     elif found.judgement.verdict == "tie":
-        first = " + ".join(words(e.name) for e in found.corrected[0].effects)
-        parts.append(
-            f"Of the effects that are tied, this is with the best: {first}. With another the PSF would be another."
-        )
+        parts.append(f"With the best of the effects that are tied: {_best_words(found)}.")
     return parts
 
 
@@ -391,10 +414,9 @@ def _made_of(found: Diagnosis, report: Report) -> list[Part]:
                 meaning="of a disc's light, common to its cells; the verdict is repeated at half and twice",
             ),
             Value("an effect is enough where what it leaves is as likely as", f"{ENOUGH:g}"),
-            Value(
-                "rounds of the real refit",
-                str(found.corrected[0].rounds) if found.corrected else DASH,
-                meaning=f"at most {ROUNDS}",
+            *(
+                Value("rounds of the real refit", str(one.rounds), meaning=f"at most {ROUNDS}")
+                for one in found.corrected[:1]
             ),
         ]
     )

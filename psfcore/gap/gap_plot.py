@@ -296,13 +296,14 @@ def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
     n = largest_residual(found)
     solution = found.solution
     frame, place = solution.transit.frames[n], solution.sky.found[n].place
-    middle, centre = round(place.y_px), place.x_px
+    rows, columns = solution.sky.dark[n]
+    # Of a disc at the field's edge the centre may lie beyond it: the middle of what is dark does not.
+    middle, centre = int(np.median(rows)), place.x_px
     band = slice(max(middle - SLICE_ROWS, 0), middle + SLICE_ROWS + 1)
     first, last = max(int(centre) - _SLICE_PX, 0), min(int(centre) + _SLICE_PX + 1, frame.pixels.shape[1])
     x = np.arange(first, last) - centre
     seen = frame.pixels[band, first:last].astype(np.float64)
     noise = np.sqrt(solution.transit.noise.variance(seen, frame.exposure_s).sum(axis=0)) / seen.shape[0]
-    rows, columns = solution.sky.dark[n]
     inside = columns[rows == middle] - centre
     simulated = [(_BEFORE, simulated_of(found, n))]
     if found.corrected:

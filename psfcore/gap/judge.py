@@ -44,6 +44,7 @@ TIE = 9.0
 TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less would tell two apart
 LEFT_SHARE = 0.15
 FAR_BEHIND = 0.5
+NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits anything a little
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
@@ -137,15 +138,23 @@ def _judge(model: LinearModel, refit: Refit) -> Judgement:
     winner = pair or best
     if (not enough and pair is None) or best.p_value * len(named) > ALARM:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
-    if probes and probes[0].score > winner.score + CLEAR:
+    if probes and probes[0].score > winner.score + (CLEAR if pair is None else -CLEAR):
         return Judgement("unknown", (), p_gap, tuple(named), probes, winner)
     if pair is not None:
         return Judgement("attributed", tuple(sorted(pair.names)), p_gap, (pair, *named), probes, pair)
-    alike = max(TIE, TIE_SHARE * best.gain)
+    alike = max(
+        TIE, TIE_SHARE * best.gain, (1 - NEAR_BEHIND) * best.score if _searched(best, evidence) else 0.0
+    )
     tied = [t.names[0] for t in named[1:] if best.score - t.score < alike]
     if tied:
         return Judgement("tie", tuple(sorted({*best.names, *tied})), p_gap, tuple(named), probes, best)
+    if probes and _searched(best, evidence) and best.score - probes[0].score < alike:
+        return Judgement("unknown", (), p_gap, tuple(named), probes, best)
     return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
+
+
+def _searched(tried: Tried, evidence: Evidence) -> bool:
+    return any(effect.trials > 1 for effect in evidence.effects if effect.name in tried.names)
 
 
 def _is_enough(tried: Tried, rival_score: float) -> bool:
@@ -166,28 +175,42 @@ def _best_pair(model: LinearModel, best: Tried, refit: Refit) -> Tried | None:
     return pair if _is_enough(pair, best.score) else None
 
 
-def fitted(model: LinearModel, effects: Sequence[Effect]) -> Tried:
-    """The PSF's parameters with these effects."""
-    evidence = model.evidence
-    columns = tuple(c for effect in effects for c in evidence.columns[effect.name])
-    step = model.fit(columns)
+def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> Tried:
+    """The PSF's parameters with these effects.
+
+    A parameter that can be positive alone and would not be is left out, unless any_sign: a step may have either.
+    """
+    columns = {
+        column: (effect, parameter)
+        for effect in effects
+        for column, parameter in zip(model.evidence.columns[effect.name], effect.parameters, strict=True)
+    }
+    step = model.fit(tuple(columns))
+    base = len(model.evidence.base)
+    while not any_sign:
+        below = {
+            column: float(value)
+            for column, value in zip(step.columns[base:], step.values[base:], strict=True)
+            if columns[column][1].positive and value <= 0
+        }
+        if not below:
+            break
+        del columns[min(below, key=lambda column: below[column])]
+        step = model.fit(tuple(columns))
     gain = max(step.fall - model.base.fall, 0.0)
     trials = math.prod(effect.trials for effect in effects)
     sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
     values = {}
-    k = len(evidence.base)
-    for effect in effects:
-        for parameter in effect.parameters[: len(evidence.columns[effect.name])]:
-            label = parameter.name if len(effects) == 1 else f"{effect.name}.{parameter.name}"
-            values[label] = (float(step.values[k]), float(sigma[k]), parameter.unit)
-            k += 1
+    for k, (effect, parameter) in enumerate(columns.values(), base):
+        label = parameter.name if len(effects) == 1 else f"{effect.name}.{parameter.name}"
+        values[label] = (float(step.values[k]), float(sigma[k]), parameter.unit)
     return Tried(
         names=tuple(effect.name for effect in effects),
         named=all(effect.named for effect in effects),
         values=values,
         gain=gain,
         score=gain - PENALTY * len(columns) - 2 * math.log(trials),
-        p_value=min(1.0, trials * float(chi2_distribution.sf(gain, len(columns)))),
+        p_value=min(1.0, trials * float(chi2_distribution.sf(gain, len(columns)))) if columns else 1.0,
         step=step,
     )
 

@@ -128,12 +128,12 @@ def _pitch(view: View) -> Sequence[Change]:
     return _mesh(view, (scaled(1 + PITCH_SHARE) - scaled(1 - PITCH_SHARE)) / (2 * PITCH_SHARE * 100))
 
 
-def _p(name: str, unit: str, likely: float) -> EffectParameter:
-    return EffectParameter(name, unit, likely)
+def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
+    return EffectParameter(name, unit, likely, positive)
 
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect("ghost", "optics", (_p("share", "", 0.02),), "A reflection lays a displaced, defocused copy over the image.",
+    Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection lays a displaced, defocused copy over the image.",
            "a bright source moved across the field", ("detector_x", "detector_y", "intensity"), _ghost,
            trials=GHOST_TRIALS, held=_held_ghost),
     Effect("anisotropic_scatter", "optics", (_p("p", "", 0.1), _p("q", "", 0.1)),
@@ -143,10 +143,10 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("field_dependent_scatter", "optics", (_p("x", "/field", 0.1), _p("y", "/field", 0.1)),
            "The amount of scatter changes across the detector.", "a transit of another part of the detector",
            ("detector_x", "detector_y"), _field_dependent, not_a_power_law),
-    Effect("wide_halo", "optics", (_p("share", "", 0.1),), "A second, wide component of scatter.",
+    Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "A second, wide component of scatter.",
            "an eclipse or a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,
            not_a_power_law),
-    Effect("core_blur", "optics", (_p("variance", "px2", 0.5),), "Jitter or defocus widens the core.",
+    Effect("core_blur", "optics", (_p("variance", "px2", 0.5, True),), "Jitter or defocus widens the core.",
            "a sharp limb, or a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur),
     Effect("mesh_rotation", "optics", (_p("angle", "deg", 2.0),), "The meshes are turned against the detector.",
            "the arms of a flare", ("azimuth_in_disc", "detector_x", "detector_y"), _rotation),

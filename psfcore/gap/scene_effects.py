@@ -105,14 +105,14 @@ def _evolution(view: View) -> Sequence[Change]:
     return [Change(change)]
 
 
-def _p(name: str, unit: str, likely: float) -> EffectParameter:
-    return EffectParameter(name, unit, likely)
+def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
+    return EffectParameter(name, unit, likely, positive)
 
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect("occulter_motion", "scene", (_p("amount", "", 2.0),), "The occulter moves during an exposure.",
+    Effect("occulter_motion", "scene", (_p("amount", "", 2.0, True),), "The occulter moves during an exposure.",
            "shorter exposures", ("radius_in_disc", "azimuth_in_disc"), _motion),
-    Effect("out_of_field_light", "scene", tuple(_p(side, "", 0.5) for side in ("left", "right", "bottom", "top")),
+    Effect("out_of_field_light", "scene", tuple(_p(side, "", 0.5, True) for side in ("left", "right", "bottom", "top")),
            "The Sun goes on beyond the field and scatters in.",
            "full-Sun images of the same time", ("scattering_distance", "pointing", "intensity"), _beyond_field),
     Effect("scene_evolution", "scene", (_p("drift", "/h", 0.2),), "The Sun changes while the occulter crosses a pointing.",

@@ -27,6 +27,7 @@ Vector = NDArray[np.float64]
 
 DRAWS = 999
 AS_GOOD = 0.6  # of the best axis' own fall: an axis that explains so much may be the strongest
+SIGNIFICANT = 0.05  # an axis that chance explains does not come before one that it does not
 SUSPECT = 2  # pointings that are named
 
 
@@ -46,7 +47,7 @@ class Axis:
 
 
 def where(model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = ()) -> tuple[Axis, ...]:
-    """All axes, the strongest first.
+    """All axes, the strongest first: of those that chance does not explain, the one with the largest share.
 
     favoured: axes of the effect that was found; of axes that explain about as much, they come first, for the effect was
     found by more than its place on the track.
@@ -75,7 +76,11 @@ def where(model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] 
     return tuple(
         sorted(
             out,
-            key=lambda a: (not (a.name in favoured and a.alone >= AS_GOOD * best), -a.share),
+            key=lambda a: (
+                not (a.name in favoured and a.alone >= AS_GOOD * best),
+                a.p_value > SIGNIFICANT,
+                -a.share,
+            ),
         )
     )
 

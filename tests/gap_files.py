@@ -1,0 +1,90 @@
+"""A small transit with a gap, as files; and the patches with which a job diagnoses it in seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psfcore.gap import added_effects, gap_plot
+from psfcore.gap.corrected_psf import corrected_psf
+from psfcore.gap.diagnose import Diagnosis
+from psfcore.psf import Psf, crop_centred
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
+from psfcore.simulate.transit_files import write
+from tests.psfcore.small_gaps import FEW, QUICK
+from tests.transit_files import TRUTH, diffraction
+from workers import gap_task
+
+SIZE_PX = 96
+GLOW_DN_S = 25.0
+
+
+def glow() -> NDArray[np.float64]:
+    """Light at the right edge [y, x], 1 there: nobody's effect but that of who wrote EDGE_GLOW."""
+    x = (np.arange(SIZE_PX) + 0.5) / SIZE_PX - 0.5
+    return np.asarray(np.exp(-(((x - 0.5) / 0.15) ** 2)) * np.ones((SIZE_PX, 1)))
+
+
+EDGE_GLOW = """
+import numpy as np
+from psfcore.gap.effect import Change, Effect, EffectParameter
+
+def glow(view):
+    x, _ = view.places
+    plane = np.exp(-(((x - 0.5) / 0.15) ** 2)).astype(np.float32)
+    return [Change(lambda n, images: plane, lit=False)]
+
+EFFECTS = (Effect("edge_glow", "detector", (EffectParameter("height", "DN/s", 5.0),),
+    "A lamp beside the detector lights its right edge.", "a dark exposure", ("detector_x",), glow),)
+"""
+
+
+def write_gap(folder: Path, *, offset_dn: float = 0.0, light_dn_s: float = 0.0) -> Path:
+    """Twelve images of SIZE_PX px, with a dark level that is wrong or with light at their right edge."""
+    plan = default_plan(12, SIZE_PX, oversampling=1, brightness=8.0)
+    made = simulate(plan, TRUTH, diffraction(), seed=8)
+    frames = tuple(
+        replace(f, pixels=(f.pixels + offset_dn / f.exposure_s + light_dn_s * glow()).astype(np.float32))
+        for f in made.transit.frames
+    )
+    write(replace(made, transit=replace(made.transit, frames=frames)), folder)
+    return folder
+
+
+@contextmanager
+def quick_diagnosis() -> Iterator[None]:
+    """A library of a few effects, and fewer draws."""
+    with ExitStack() as stack:
+        stack.enter_context(patch.object(added_effects, "LIBRARY", FEW))
+        stack.enter_context(QUICK)
+        yield
+
+
+def answer_at_once(monkeypatch: pytest.MonkeyPatch, found: Diagnosis) -> list[dict[str, Any]]:
+    """Let jobs answer a diagnosis that was made before, with small pictures and PSFs; what they ask for is listed."""
+    asked: list[dict[str, Any]] = []
+
+    def diagnose(transit: object, **how: Any) -> Diagnosis:
+        asked.append(how)
+        return found
+
+    monkeypatch.setattr(gap_task, "diagnose", diagnose)
+    monkeypatch.setattr(gap_task, "corrected_psf", _small_psf)
+    monkeypatch.setattr(gap_plot, "PLOT_DPI", 40)
+    return asked
+
+
+def _small_psf(*given: Any, **named: Any) -> Psf:
+    """The corrected PSF's middle, which is quicker to write down."""
+    psf = corrected_psf(*given, **named)
+    parts = {name: crop_centred(part, (257, 257)) for name, part in psf.components.items()}
+    return replace(psf, kernel=crop_centred(psf.kernel, (257, 257)), components=parts)
