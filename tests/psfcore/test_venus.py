@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.venus import table
+from tests.venus_gap import explained, read
 
 
 def test_scatter_leaves_the_disc_of_venus(shared: Path) -> None:
@@ -19,3 +20,19 @@ def test_scatter_leaves_the_disc_of_venus(shared: Path) -> None:
     # The peer's own deconvolution of the XRT image takes as much out as five percent of scatter would.
     peer_core, _ = rows["XRT", "the peer's deconvolution"]
     assert rows["XRT", "scatter of 10 %"][0] < peer_core < rows["XRT", "as observed"][0]
+
+
+def test_the_gap_of_a_psf_without_long_range_scatter_is_a_level_and_what_goes_with_the_ring(
+    shared: Path,
+) -> None:
+    core, terms = read(shared)
+    level = explained(core, terms, ["level"])
+    both = explained(core, terms, ["level", "ring"])
+    weight, sigma = both.weights["ring"]
+    assert weight > 4 * sigma and both.held_out_rms < level.held_out_rms
+    # A constant and a share of the full disk, whose light hardly changes, cannot be told apart.
+    other = explained(core, terms, ["full disk", "ring"])
+    assert abs(other.bic - both.bic) < 6
+    # Two ways of taking images differ by more than their light does: no scatter does that.
+    weight, sigma = explained(core, terms, ["level", "ring", "kind of image"]).weights["kind of image"]
+    assert weight > 3 * sigma and weight / core.mean() > 0.15
