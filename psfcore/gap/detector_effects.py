@@ -71,12 +71,14 @@ def _column_smear(view: View) -> Sequence[Change]:
 
 
 def _persistence(view: View) -> Sequence[Change]:
-    def change(n: int, images: Sequence[Field]) -> Field:
-        if n == 0:
-            return np.zeros(view.solution.transit.shape, np.float32)
-        return images[n - 1] * np.float32(view.exposure_s(n - 1) / view.exposure_s(n))
+    """Shares of the image before and of the one before that, whatever they showed: traps empty slowly."""
 
-    return [Change(change)]
+    def before(n: int, images: Sequence[Field], back: int) -> Field:
+        if n < back:
+            return np.zeros(view.solution.transit.shape, np.float32)
+        return images[n - back] * np.float32(view.exposure_s(n - back) / view.exposure_s(n))
+
+    return [Change(lambda n, images, back=back: before(n, images, back)) for back in (1, 2)]  # type: ignore[misc]
 
 
 def _filled(view: View) -> Sequence[Change]:
@@ -119,7 +121,8 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _flat_field),
     Effect("column_smear", "detector", (_p("share", "", 0.01, True),), "Charge is smeared along columns while they are read.",
            "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
-    Effect("persistence", "detector", (_p("share", "", 0.01, True),), "A share of the image before is left in the next.",
+    Effect("persistence", "detector", (_p("share", "", 0.01, True), _p("share_of_second", "", 0.01, True)),
+           "Shares of the two images before are left in the next.",
            "a dark exposure after a bright one", ("time", "pointing"), _persistence),
     Effect("saturation_fill", "detector", (_p("excess", "", 0.1),), "What was filled in for saturated pixels is wrong.",
            "a shorter exposure of the same time", ("pointing", "intensity"), _filled, _nothing_filled),

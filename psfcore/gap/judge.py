@@ -7,11 +7,12 @@ Gains of effects are compared after what their parameters, and a search over man
 There is a gap where patterns that any gap makes (`patterns`), all cells, the lit blocks or an effect's gain are less
 likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be told from it.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
-TEMPLATE_ERROR, or where that is less than LEFT_SHARE of a gap that no rival closes half as well: an effect whose form is
-not quite the sky's. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
+TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
+sky's. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
 model for real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
 Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
-where a probe, a form of unknown cause, does clearly better, the verdict is unknown. It is repeated with half and twice
+where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better,
+inconclusive. It is repeated with half and twice
 the floor; where it flips, the answer holds both, or is inconclusive.
 """
 
@@ -43,7 +44,7 @@ PENALTY = 2.0
 TIE = 9.0
 TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less would tell two apart
 LEFT_SHARE = 0.15
-FAR_BEHIND = 0.5
+BEHIND = 0.85  # of the best score: what a rival may reach at most
 NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits anything a little
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
@@ -106,10 +107,10 @@ def judge(model: LinearModel, refit: Refit = lambda tried: None) -> Judgement:
         return asked[tried.label]
 
     found = _judge(model, once)
-    if found.verdict == "none":
+    if found.verdict in ("none", "inconclusive"):
         return found
     others = [_judge(replace(model, floor=model.floor * factor), once) for factor in FLOORS]
-    if any(other.verdict == "none" for other in others):
+    if any(other.verdict in ("none", "inconclusive") for other in others):
         return replace(found, verdict="inconclusive")
     if any((other.verdict == "unknown") != (found.verdict == "unknown") for other in others):
         return replace(found, verdict="inconclusive")
@@ -140,6 +141,8 @@ def _judge(model: LinearModel, refit: Refit) -> Judgement:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
     if probes and probes[0].score > winner.score + (CLEAR if pair is None else -CLEAR):
         return Judgement("unknown", (), p_gap, tuple(named), probes, winner)
+    if pair is None and probes and probes[0].score > best.score:
+        return Judgement("inconclusive", (), p_gap, tuple(named), probes, best)
     if pair is not None:
         return Judgement("attributed", tuple(sorted(pair.names)), p_gap, (pair, *named), probes, pair)
     alike = max(
@@ -159,7 +162,7 @@ def _searched(tried: Tried, evidence: Evidence) -> bool:
 
 def _is_enough(tried: Tried, rival_score: float) -> bool:
     assert tried.left_p_value is not None and tried.left_share is not None
-    nearly = tried.left_share < LEFT_SHARE and rival_score < FAR_BEHIND * tried.score
+    nearly = tried.left_share < LEFT_SHARE and rival_score < BEHIND * tried.score
     return tried.left_p_value >= ENOUGH or nearly
 
 
@@ -172,7 +175,8 @@ def _best_pair(model: LinearModel, best: Tried, refit: Refit) -> Tried | None:
     if not pairs or pairs[0].score < best.score + CLEAR:
         return None
     pair = _with_left(model, pairs[0], refit)
-    return pair if _is_enough(pair, best.score) else None
+    # Two forms that are not quite right fit too much: of a pair nothing may be left.
+    return pair if (pair.left_p_value or 0.0) >= ENOUGH else None
 
 
 def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> Tried:
