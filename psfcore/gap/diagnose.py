@@ -18,7 +18,7 @@ from psfcore.gap.correction import Corrected, add_to_model
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.expected_gap import ExpectedGap, expected_gap
-from psfcore.gap.judge import FLOOR, Judgement, Tried, judge
+from psfcore.gap.judge import FLOOR, LEAST_IMAGES, Judgement, Tried, judge
 from psfcore.gap.library import LIBRARY
 from psfcore.gap.linear_model import LinearModel
 from psfcore.gap.measured_noise import MeasuredNoise, measured_noise
@@ -30,7 +30,6 @@ from psfcore.transit.blocks import Fold
 from psfcore.transit.transit import Transit
 
 MOST_REFITS = 3
-LEAST_FOR_CLAIMS = 6  # images: with fewer nothing can be held out
 SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 
 
@@ -292,7 +291,7 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
             + "; ".join(f"{k}: {v}" for k, v in list(left_out.items())[:3])
         )
     images = len(evidence.discs)
-    if images < LEAST_FOR_CLAIMS:
+    if images < LEAST_IMAGES:
         out.append(
             f"With {images} images nothing can be held out: closure and the gap held out are not given."
         )

@@ -251,7 +251,7 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
     elif report["verdict"] == "inconclusive":
         parts.append(
             "Which of them it is, or whether it is any, changes with what is taken for granted, here the share of a disc's light that "
-            "nobody has thought of."
+            "nobody has thought of; or a form of unknown cause does as well; or there are too few images to say."
         )
     elif report["ties"]:
         tied = " or ".join(words(name) for name in report["ties"][0])

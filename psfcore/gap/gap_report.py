@@ -11,7 +11,7 @@ from psfcore.gap.closure import Interval
 from psfcore.gap.correction import Corrected
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.effect import Effect
-from psfcore.gap.judge import Tried
+from psfcore.gap.judge import ALARM, LEAST_IMAGES, Tried
 from psfcore.gap.probes import PROBES
 from psfcore.scatter.inversion import Inversion
 
@@ -166,7 +166,18 @@ def would_separate(found: Diagnosis) -> str:
 def sentence(found: Diagnosis) -> str:
     """What a person reads first."""
     judged = found.judgement
+    images = len(found.evidence.discs)
+    if judged.verdict == "inconclusive" and judged.p_value > ALARM:
+        return (
+            f"No gap shows in these {images} images, and they could hide one: nothing can be held out of fewer than "
+            f"{LEAST_IMAGES}, and p = {judged.p_value:.2g} with so few excludes little."
+        )
     left = f"{found.rms.value:.1f} % ({found.rms.low:.1f} to {found.rms.high:.1f})"
+    if judged.verdict == "none" and found.residual is None:
+        return (
+            f"No gap shows in these {images} images (p = {judged.p_value:.2g}); they are too few to hold any out, so that how "
+            "large a gap could hide in them is not known."
+        )
     if judged.verdict == "none":
         return (
             f"No gap beyond noise and the fit's own error: held-out residuals of {left} beyond a noise of "
@@ -185,8 +196,8 @@ def sentence(found: Diagnosis) -> str:
         return f"{lead}: {among}, which these data cannot tell apart; {would_separate(found)} would."
     if judged.verdict == "inconclusive":
         return (
-            f"{lead} is likely (p = {judged.p_value:.2g}), but what causes it depends on what is taken for granted; "
-            f"best so far: {words(best.label)}."
+            f"{lead} is likely (p = {judged.p_value:.2g}), but what causes it depends on what is taken for granted, or is "
+            f"met as well by a form of unknown cause; best so far: {words(best.label)}."
         )
     return f"{lead}; {_explained(found, best)}{_excluded(found, best)}."
 

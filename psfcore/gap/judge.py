@@ -12,7 +12,7 @@ sky's. The linear model is good for a small gap alone: the best effect that is n
 model for real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
 Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
 where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better,
-inconclusive. It is repeated with half and twice
+or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
 the floor; where it flips, the answer holds both, or is inconclusive.
 """
 
@@ -39,6 +39,7 @@ Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 FLOOR = 0.003
 FLOORS = (0.5, 2.0)  # the verdict is repeated with
 ALARM = 0.005
+CONFIDENT = 1e-3  # of an effect that is named, counted for how many were tried
 ENOUGH = 1e-3
 PENALTY = 2.0
 TIE = 9.0
@@ -50,6 +51,7 @@ CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effec
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
 TESTS = 4
+LEAST_IMAGES = 6  # with fewer nothing can be held out, and that nothing shows says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +109,8 @@ def judge(model: LinearModel, refit: Refit = lambda tried: None) -> Judgement:
         return asked[tried.label]
 
     found = _judge(model, once)
+    if found.verdict == "none" and len(model.evidence.discs) < LEAST_IMAGES:
+        return replace(found, verdict="inconclusive")
     if found.verdict in ("none", "inconclusive"):
         return found
     others = [_judge(replace(model, floor=model.floor * factor), once) for factor in FLOORS]
@@ -141,7 +145,7 @@ def _judge(model: LinearModel, refit: Refit) -> Judgement:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
     if probes and probes[0].score > winner.score + (CLEAR if pair is None else -CLEAR):
         return Judgement("unknown", (), p_gap, tuple(named), probes, winner)
-    if pair is None and probes and probes[0].score > best.score:
+    if pair is None and (best.p_value * len(named) > CONFIDENT or (probes and probes[0].score > best.score)):
         return Judgement("inconclusive", (), p_gap, tuple(named), probes, best)
     if pair is not None:
         return Judgement("attributed", tuple(sorted(pair.names)), p_gap, (pair, *named), probes, pair)
@@ -187,7 +191,8 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
     columns = {
         column: (effect, parameter)
         for effect in effects
-        for column, parameter in zip(model.evidence.columns[effect.name], effect.parameters, strict=True)
+        # A probe may have fewer changes than parameters: one for each pointing that there is.
+        for column, parameter in zip(model.evidence.columns[effect.name], effect.parameters, strict=False)
     }
     step = model.fit(tuple(columns))
     base = len(model.evidence.base)
@@ -263,7 +268,7 @@ def _with_left(model: LinearModel, tried: Tried, refit: Refit) -> Tried:
     unsure = np.array(tried.step.values) * TEMPLATE_ERROR
     unsure[: len(model.base.columns)] = 0.0
     left = _left(model, tried.step, unsure)
-    if left.p_value < ENOUGH:
+    if left.p_value < ENOUGH and tried.values:
         again = refit(tried)
         if again is not None and again.evidence.size == unsure.size:
             again = replace(again, floor=model.floor)

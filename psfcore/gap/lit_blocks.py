@@ -6,13 +6,14 @@ The light that the occulter hides is put back. In block b of image n
 
 mu_b, the scene, is free in every block, and g_n, the brightness of an image, in every image: the Sun and the shutter
 are not steady to a percent. g_n has a prior, of the width that images of one pointing, gain mode and exposure show among
-themselves, so that a difference between modes can be told from it.
+themselves, so that a difference between modes can be told from it. A bright block that differs between images far more
+than the others do is the Sun's own, a brightening that flickers: its variance is what it shows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,6 +33,7 @@ WIDEST_GAIN = 0.05
 LEAST_GAIN = 1e-5
 FLOOR = 5e-4
 LEAST_IMAGES = 3
+RESTLESS = 4.0  # times the median block's chi2 a degree of freedom
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,28 @@ class LitBlocks:
     fov: NDArray[np.int64]
     kind: NDArray[np.int64]
     part: NDArray[np.bool_]
+
+    def with_restless_blocks(self) -> LitBlocks:
+        """The same with the variance of restless blocks raised to what they show."""
+        variance = self.variance.copy()
+        gains = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
+        steady = self.levels / (1 + gains[:, None])
+        for fov in np.unique(self.fov):
+            here = np.flatnonzero((self.fov == fov) & self.part)
+            weight = np.where(self.free[here], 1 / self._variance(here), 0.0)
+            images = (weight > 0).sum(axis=0)
+            used = images >= LEAST_IMAGES
+            if not used.any():
+                continue
+            mean = (steady[here] * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+            spread = (weight * (steady[here] - mean) ** 2).sum(axis=0) / np.maximum(images - 1, 1)
+            usual = max(float(np.median(spread[used])), 1.0)
+            # What the detector does to faint signals shows in faint blocks: those are left alone.
+            bright = used & (mean > float(np.median(mean[used])))
+            factor = np.where(bright & (spread > RESTLESS * usual), spread / usual, 1.0)
+            # The floor is part of what a block is weighed by: it is raised with the rest.
+            variance[here] = factor * self._variance(here) - (FLOOR * self.levels[here]) ** 2
+        return replace(self, variance=variance)
 
     @cached_property
     def gain_width(self) -> float:
@@ -187,7 +211,7 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
     kinds = [(f.fov, f.gain_mode, f.exposure_s) for f in transit.frames]
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     shape = np.shape(levels)
-    return LitBlocks(
+    lit = LitBlocks(
         levels=np.array(levels),
         variance=np.array(variance),
         free=np.array(free),
@@ -197,3 +221,4 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
         kind=np.array([number[kind] for kind in kinds]),
         part=np.ones(len(transit.frames), dtype=bool),
     )
+    return lit.with_restless_blocks()
