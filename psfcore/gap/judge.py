@@ -291,7 +291,7 @@ def _left(model: LinearModel, step: Step, unsure: Vector) -> _Left:
     freedom = max(sum(left.size for left in shrink) - len(here), 1)
     cells = sum(float(left @ left) for left in shrink)
     gain, directions = model.gain_of_patterns(step, patterns(evidence), shrink)
-    lit = model.whole_lit
+    lit = model.whole_steady_lit
     moved = float(unsure @ lit.normal[np.ix_(here, here)] @ unsure) / model.lit_scale
     of_lit = max(model.left_lit(step) - moved, 0.0) / (1 + LIT_WIDTH)
     return _Left((gain, cells, of_lit), (directions, freedom, lit.freedom))

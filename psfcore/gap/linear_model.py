@@ -101,6 +101,12 @@ class LinearModel:
         """`lit` of all images."""
         return self.lit()
 
+    @cached_property
+    def whole_steady_lit(self) -> LitEquations:
+        """`whole_lit` with restless blocks weighed by what they show: what is left is judged by these."""
+        steady = self.evidence.lit.with_restless_blocks()
+        return steady.equations(range(self.evidence.size))
+
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
         """The PSF's coordinates and these columns, from some equations (none: of all images)."""
         here = [*self.evidence.base, *columns]
@@ -135,8 +141,8 @@ class LinearModel:
         return tuple(d.residual - d.answers[list(step.columns)].T @ step.values for d in self.discs)
 
     def left_lit(self, step: Step) -> float:
-        """chi2 of the lit blocks after a step, over lit_scale."""
-        here, lit = list(step.columns), self.whole_lit
+        """chi2 of the lit blocks after a step, over lit_scale, restless blocks weighed by what they show."""
+        here, lit = list(step.columns), self.whole_steady_lit
         theta = step.values
         fall = 2 * theta @ lit.score[here] - theta @ lit.normal[np.ix_(here, here)] @ theta
         return float(lit.chi2 - fall) / self.lit_scale

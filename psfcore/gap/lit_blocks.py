@@ -7,7 +7,7 @@ The light that the occulter hides is put back. In block b of image n
 mu_b, the scene, is free in every block, and g_n, the brightness of an image, in every image: the Sun and the shutter
 are not steady to a percent. g_n has a prior, of the width that images of one pointing, gain mode and exposure show among
 themselves, so that a difference between modes can be told from it. A bright block that differs between images far more
-than the others do is the Sun's own, a brightening that flickers: its variance is what it shows.
+than the others do is the Sun's own, a brightening that flickers: where it is asked what is left, its variance is what it shows.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
     kinds = [(f.fov, f.gain_mode, f.exposure_s) for f in transit.frames]
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     shape = np.shape(levels)
-    lit = LitBlocks(
+    return LitBlocks(
         levels=np.array(levels),
         variance=np.array(variance),
         free=np.array(free),
@@ -221,4 +221,3 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
         kind=np.array([number[kind] for kind in kinds]),
         part=np.ones(len(transit.frames), dtype=bool),
     )
-    return lit.with_restless_blocks()

@@ -13,7 +13,7 @@ from psfcore.gap.closure import HeldOut, closure, gap
 from psfcore.gap.detector_effects import EFFECTS
 from psfcore.gap.effect import View
 from psfcore.gap.evidence import Evidence, gather
-from psfcore.gap.linear_model import LinearModel
+from psfcore.gap.linear_model import UNLIKELY, LinearModel
 from psfcore.gap.search import PlaceSearch, displaced
 from psfcore.gap.where import _shapley
 from psfcore.scatter.inversion import Solution, invert
@@ -107,7 +107,10 @@ def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> 
             white = np.linalg.inv(np.linalg.cholesky(covariance))
             design.append(white @ disc.answers[here].T)
             target.append(white @ disc.residual)
-        a, b = np.vstack(design), np.concatenate(target)
+        # The prior of the effect's parameter is a measurement of 0.
+        likely = next(e for e in evidence.effects if e.name == "dark_offset").parameters[0].likely
+        prior = [[1 / (UNLIKELY * likely) if c in columns else 0.0 for c in here]]
+        a, b = np.vstack([*design, prior]), np.concatenate([*target, [0.0]])
         solved = np.linalg.lstsq(a, b, rcond=None)[0]
         return float(np.sum((b - a @ solved) ** 2))
 
