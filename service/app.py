@@ -5,36 +5,28 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fastapi import APIRouter, FastAPI
-from pydantic import BaseModel
+from fastapi import FastAPI
 
-from service import images, jobs, problems, products, psf_queries, psfs, reports, transits
-from service.state import Shared, State
+from service import (
+    health,
+    images,
+    jobs,
+    metrics,
+    observation,
+    problems,
+    products,
+    psf_queries,
+    psfs,
+    reports,
+    transits,
+    uws,
+)
+from service.state import State
 from workers import queue
 from workers.catalogue import Catalogue
 from workers.reconciler import Reconciler
 from workers.settings import Settings, software_version
 from workers.store import Store
-
-health = APIRouter(tags=["operation"])
-
-
-class Health(BaseModel):
-    """The process answers, and so does its database."""
-
-    status: str
-    version: str
-
-
-@health.get("/healthz", summary="Is the service up?", responses=problems.RESPONSES)
-def healthz(state: Shared) -> Health:
-    """200 where the process, its reconciler and its database are up; 503 where one is not."""
-    state.catalogue.ping()
-    if not state.reconciler.alive:
-        raise problems.Problem(
-            503, "reconciler-stopped", "queued jobs are not submitted; restart the service"
-        )
-    return Health(status="ok", version=software_version())
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -61,7 +53,7 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=lifespan,
     )
     problems.install(app)
-    for part in (images, transits, jobs, psfs, psf_queries, products, reports):
+    app.state.requests = observation.install(app)
+    for part in (images, transits, jobs, psfs, psf_queries, products, reports, uws, health, metrics):
         app.include_router(part.router)
-    app.include_router(health)
     return app

@@ -12,6 +12,7 @@ import click
 
 from service import (
     cli_diffraction,
+    cli_doctor,
     cli_effects,
     cli_evaluate,
     cli_flare,
@@ -346,7 +347,16 @@ def _mask_beside(instrument: str) -> Iterator[Path | None]:
         yield cli_diffraction.mask_as_fits(Path(instrument), Path(folder))
 
 
-for module in (cli_diffraction, cli_simulate, cli_gap, cli_evaluate, cli_report, cli_flare, cli_effects):
+for module in (
+    cli_diffraction,
+    cli_simulate,
+    cli_gap,
+    cli_evaluate,
+    cli_report,
+    cli_flare,
+    cli_effects,
+    cli_doctor,
+):
     for command in module.COMMANDS:
         main.add_command(command)
 for command in cli_psf_query.COMMANDS:

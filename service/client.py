@@ -272,7 +272,9 @@ class Operations(ABC):
 
     @staticmethod
     def _ended(job: dict[str, Any]) -> dict[str, Any]:
-        """The job, where it is completed; else what it died of."""
+        """The job, where it is completed; else what it died of, or that nobody started it."""
+        if job["phase"] == "PENDING":
+            raise ServiceError(f"job {job['id']} was set up and not started", code="pending")
         if job["phase"] == "ERROR":
             raise ServiceError(job["error"]["message"], code=job["error"]["code"])
         if job["phase"] == "ABORTED":

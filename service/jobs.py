@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from typing import Annotated, Any
 
@@ -16,6 +17,7 @@ from workers.catalogue import DEFAULT_OWNER, JobRow
 from workers.contract import JobError, JobRequest, Phase
 from workers.intake import resolve
 
+log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 STATUS_OF = {
@@ -58,7 +60,9 @@ class JobView(BaseModel):
     attempt: int
     cancel_requested: bool
     progress: Progress
-    parameters: dict[str, Any] = Field(description="with every default and the PSF filled in")
+    parameters: dict[str, Any] = Field(
+        description="with every default and the PSF filled in; of a PENDING job as given"
+    )
     result: str | None = Field(description="address of what the job made")
     error: JobError | None
 
@@ -74,7 +78,7 @@ class JobView(BaseModel):
             ended_at=row.ended_at,
             attempt=row.attempt,
             cancel_requested=row.cancel_requested,
-            progress=Progress(stage=row.stage, step=row.step, steps=row.steps, time_left_s=_time_left_s(row)),
+            progress=Progress(stage=row.stage, step=row.step, steps=row.steps, time_left_s=time_left_s(row)),
             parameters=row.parameters,
             result=f"{RESULTS[row.kind]}/{row.result_id}" if row.result_id else None,
             error=JobError.model_validate(row.error) if row.error else None,
@@ -97,6 +101,7 @@ def submit_job(body: JobRequest, response: Response, state: Shared) -> JobView:
         raise Problem(STATUS_OF.get(error.code, 422), error.code, error.message) from error
     row, new = state.catalogue.submit(body.kind, parameters, request_key)
     if new:
+        log.info("job %s: %s, asked for", row.id, body.kind, extra={"fields": {"job": row.id}})
         state.reconciler.wake()
     response.status_code = 202 if new else 200
     response.headers["Location"] = f"/v1/jobs/{row.id}"
@@ -126,7 +131,7 @@ def cancel_job(job_id: JobId, state: Shared) -> JobView:
     return JobView.of(_find(state, job_id))
 
 
-def _time_left_s(row: JobRow) -> float | None:
+def time_left_s(row: JobRow) -> float | None:
     """What a running job will take, if it goes on as it went."""
     if row.kind not in COUNTED_WHOLE or row.phase != Phase.EXECUTING or not row.step or not row.started_at:
         return None

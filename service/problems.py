@@ -14,6 +14,8 @@ from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
+from workers import logs
+
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
 
@@ -92,4 +94,8 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     def _ours(_request: Request, _error: Exception) -> JSONResponse:
         # Starlette logs the traceback and passes the error on to the server after this answer.
-        return answer(500, "internal-error", "the service failed; the error is in its log")
+        problem = answer(500, "internal-error", "the service failed; the error is in its log")
+        problem.headers["X-Request-ID"] = logs.about().get(
+            "request", ""
+        )  # this answer goes past what sets it
+        return problem

@@ -11,25 +11,41 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import ceil
 from pathlib import Path
+from types import FrameType
 
 import uvicorn
+from fastapi import FastAPI
 
 from service.app import create_app
+from workers import logs
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
-STOP_WITHIN_S = 20.0
 
 
 def serve(settings: Settings, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Serve until interrupted. Port 0 takes a free one; ``announce`` is told the address."""
+    """Serve until interrupted. Port 0 takes a free one; ``announce`` is told the address.
+
+    Told to stop (SIGTERM, Control-C), it takes no more connections, lets requests at work go on for ``stop_s``,
+    and then stops the embedded worker, which takes ``gone_s`` at most.
+    """
+    logs.configure(settings)
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
         host_name = f"[{host}]" if ":" in host else host
         address = f"http://{host_name}:{listener.getsockname()[1]}"
-        server = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning"))
+        server = _Server(
+            uvicorn.Config(
+                create_app(settings),
+                log_config=None,
+                log_level="warning",
+                access_log=False,
+                timeout_graceful_shutdown=ceil(settings.stop_s),
+            )
+        )
         # The server passes a signal on once it has shut down; as exceptions they let the worker be stopped too.
         signal.signal(signal.SIGTERM, _raise_exit)
         with embedded_worker(settings):
@@ -38,6 +54,16 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
                 server.run(sockets=[listener])
             except KeyboardInterrupt:
                 log.info("interrupted")
+
+
+class _Server(uvicorn.Server):
+    """Tells the application that it is to stop, so that requests which wait for a job are answered at once."""
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """As the server does on a signal, once the application knows."""
+        assert isinstance(self.config.app, FastAPI)
+        self.config.app.state.stopping = True
+        super().handle_exit(sig, frame)
 
 
 def _raise_exit(_signal: int, _frame: object) -> None:
@@ -74,7 +100,7 @@ def _keep_worker(settings: Settings, stopping: threading.Event) -> None:
         while worker.poll() is None and not stopping.wait(0.5):
             pass
         if stopping.is_set():
-            _stop(worker)
+            _stop(worker, settings.gone_s + 3.0)
         else:
             log.error("the worker ended with code %s; starting it again", worker.returncode)
             stopping.wait(1.0)
@@ -88,8 +114,8 @@ def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
             [sys.executable, "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
             env=os.environ | environment(settings),
             stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
+            stdout=subprocess.DEVNULL,  # what Celery says beside the logs
+            stderr=output,
             # Control-C goes to this process alone, which then stops the worker in order.
             start_new_session=True,
         )
@@ -102,11 +128,11 @@ def environment(settings: Settings) -> dict[str, str]:
     return {f"HELIOPSF_{name.upper()}": str(value) for name, value in set_here.items()}
 
 
-def _stop(worker: subprocess.Popen[bytes]) -> None:
+def _stop(worker: subprocess.Popen[bytes], within_s: float) -> None:
     worker.send_signal(signal.SIGTERM)
     try:
-        worker.wait(STOP_WITHIN_S)
+        worker.wait(within_s)
     except subprocess.TimeoutExpired:
-        # Its job is queued again by the next server: nothing is lost by not waiting longer.
+        # It ends itself before; its job is queued again by the next server, so nothing is lost here either.
         os.killpg(worker.pid, signal.SIGKILL)
         worker.wait()

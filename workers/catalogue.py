@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -22,10 +22,15 @@ from sqlalchemy import (
     Select,
     String,
     and_,
+    case,
     create_engine,
+    delete,
     event,
+    func,
+    inspect,
     or_,
     select,
+    text,
     tuple_,
     update,
 )
@@ -33,7 +38,7 @@ from sqlalchemy.engine import CursorResult
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sessionmaker
 
-from workers.contract import LIVE, Fault, JobError, Phase
+from workers.contract import LIVE, Fault, JobError, Phase, canonical_hash
 
 DEFAULT_OWNER = "local"
 
@@ -50,7 +55,7 @@ class Uploaded:
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     created_at: Mapped[float] = mapped_column(index=True)
-    bytes: Mapped[int] = mapped_column(BigInteger)
+    bytes: Mapped[int] = mapped_column(BigInteger, index=True)
     filename: Mapped[str | None]
     summary: Mapped[dict[str, Any]]
 
@@ -84,6 +89,8 @@ class PsfRow(Base):
     preview_sha256: Mapped[str | None] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
+    __table_args__ = (Index("psfs_bytes", "origin", "bytes"),)
+
 
 class ProductRow(Base):
     """A deconvolved image; its id is the identity of the request that made it."""
@@ -97,7 +104,7 @@ class ProductRow(Base):
     psf_id: Mapped[str] = mapped_column(String(64), index=True)
     psf_version: Mapped[str]
     file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int] = mapped_column(BigInteger)
+    bytes: Mapped[int] = mapped_column(BigInteger, index=True)
     preview_sha256: Mapped[str] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
@@ -139,7 +146,19 @@ class JobRow(Base):
             postgresql_where=phase.in_(sorted(LIVE)),
         ),
         Index("jobs_by_phase", "phase", "heartbeat_at", "submitted_at"),
+        # All that tally() asks for, so that it never reads the rows themselves.
+        Index("jobs_tallied", "kind", "phase", "attempt", "started_at", "ended_at"),
     )
+
+
+class TermsRow(Base):
+    """What a UWS client said of a job beside its parameters. A job without such a row has no name and no limits."""
+
+    __tablename__ = "job_terms"
+    job_id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    run_id: Mapped[str | None] = mapped_column(default=None)
+    execution_duration_s: Mapped[int] = mapped_column(default=0)  # 0: as long as it takes
+    destruction_at: Mapped[float | None] = mapped_column(default=None, index=True)
 
 
 class ReportRow(Base):
@@ -152,7 +171,7 @@ class ReportRow(Base):
     kind: Mapped[str]
     transit_id: Mapped[str] = mapped_column(String(64), index=True)
     file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int] = mapped_column(BigInteger)
+    bytes: Mapped[int] = mapped_column(BigInteger, index=True)
     preview_sha256: Mapped[str | None] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
@@ -170,6 +189,48 @@ class PartRow(Base):
     token: Mapped[str | None] = mapped_column(String(32))
     heartbeat_at: Mapped[float | None]
     result: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+
+
+class WorkerRow(Base):
+    """A worker process that is there, at work or not; it says so again and again, and takes its leave."""
+
+    __tablename__ = "workers"
+    name: Mapped[str] = mapped_column(String(128), primary_key=True)  # host:process, as in a job's row
+    started_at: Mapped[float]
+    heartbeat_at: Mapped[float]
+    version: Mapped[str] = mapped_column(String(64))
+
+
+@dataclass(frozen=True)
+class JobTally:
+    """Jobs of one kind in one phase, counted."""
+
+    kind: str
+    phase: str
+    jobs: int
+    attempts: int
+    retries: int
+    run_s: float  # of those that ended: from the last start to the end
+
+
+@dataclass(frozen=True)
+class FileTally:
+    """Files of one kind, counted: what came from users, and what jobs made."""
+
+    kind: str
+    origin: str  # uploaded | built
+    files: int
+    bytes: int
+
+
+@dataclass(frozen=True)
+class SchemaFaults:
+    """What the database lacks of what this version works with."""
+
+    tables: tuple[str, ...]
+    columns: tuple[str, ...]
+    indexes: tuple[str, ...]
+    empty: bool  # there is none of our tables
 
 
 @dataclass(frozen=True)
@@ -190,6 +251,17 @@ class Lease:
     token: str
 
 
+@dataclass(frozen=True)
+class JobLine:
+    """A job as a list shows it."""
+
+    id: str
+    phase: str
+    owner: str
+    created_at: float
+    run_id: str | None
+
+
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow)
 AnyRow = TypeVar("AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow)
 
@@ -197,7 +269,9 @@ AnyRow = TypeVar("AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, 
 def open_engine(url: str) -> Engine:
     """An engine with the settings each database needs for many small concurrent writers."""
     if not url.startswith("sqlite"):
-        return create_engine(url, pool_pre_ping=True, json_serializer=_strict_json)
+        # Without a limit, a database that is cut off would hold whoever asks for minutes.
+        patience = {"connect_timeout": 5} if url.startswith("postgresql") else {}
+        return create_engine(url, pool_pre_ping=True, connect_args=patience, json_serializer=_strict_json)
     engine = create_engine(url, connect_args={"timeout": 30}, json_serializer=_strict_json)
 
     @event.listens_for(engine, "connect")
@@ -234,8 +308,11 @@ class Catalogue:
         )
 
     def create_tables(self) -> None:
-        """Make the tables that are not there yet."""
+        """Make the tables that are not there yet, and the indexes that an older version's tables lack."""
         Base.metadata.create_all(self._engine)
+        for table in Base.metadata.sorted_tables:
+            for index in table.indexes:
+                index.create(self._engine, checkfirst=True)
 
     def close(self) -> None:
         """Close all connections."""
@@ -335,6 +412,10 @@ class Catalogue:
         """Note that the broker has been given the job's id."""
         self._set([JobRow.id == job_id], submitted_at=time.time(), submissions=JobRow.submissions + 1)
 
+    def forget_submission(self, job_id: str) -> None:
+        """Note that a queued job's message was taken from the broker, but not the job."""
+        self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
+
     def claim(self, job_id: str, worker: str) -> Lease | None:
         """QUEUED -> EXECUTING, for exactly one of those that try; None for all others."""
         lease = Lease(job_id, uuid.uuid4().hex)
@@ -399,10 +480,20 @@ class Catalogue:
         )
 
     def cancel(self, job_id: str) -> None:
-        """QUEUED -> ABORTED at once; an executing job is asked to stop; an ended one stays as it is."""
-        queued = [JobRow.id == job_id, JobRow.phase == Phase.QUEUED]
-        if not self._set(queued, phase=Phase.ABORTED, ended_at=time.time(), cancel_requested=True):
+        """PENDING, QUEUED -> ABORTED at once; an executing job is asked to stop; an ended one stays as it is."""
+        waiting = [JobRow.id == job_id, JobRow.phase.in_((Phase.PENDING, Phase.QUEUED))]
+        if not self._set(waiting, phase=Phase.ABORTED, ended_at=time.time(), cancel_requested=True):
             self._set([JobRow.id == job_id, JobRow.phase == Phase.EXECUTING], cancel_requested=True)
+
+    def hand_back(self, lease: Lease) -> bool:
+        """EXECUTING -> QUEUED under the lease: the worker stops, the job is not to blame, the attempt not counted."""
+        return self._set(
+            [*_held(lease), JobRow.cancel_requested.is_(False)],
+            phase=Phase.QUEUED,
+            attempt=JobRow.attempt - 1,
+            submitted_at=None,
+            lease=None,
+        )
 
     def give_up_silent(self, lease_s: float, max_attempts: int) -> list[str]:
         """Take back jobs whose worker fell silent; returns the ids of those queued again.
@@ -450,6 +541,121 @@ class Catalogue:
             if row.submitted_at is None
             or row.submitted_at < now - resubmit_s * 2 ** min(row.submissions - 1, 8)
         ]
+
+    # Jobs that are set up before they start, and the terms they run on -------------------------------
+
+    def draft(
+        self,
+        kind: str,
+        given: dict[str, Any],
+        *,
+        run_id: str | None = None,
+        execution_duration_s: int = 0,
+        destruction_at: float | None = None,
+        owner: str = DEFAULT_OWNER,
+    ) -> JobRow:
+        """A new PENDING job with the parameters that were given so far. It shares nothing with equal requests."""
+        row = JobRow(
+            id=uuid.uuid4().hex,
+            owner=owner,
+            kind=kind,
+            parameters=given,
+            request_key="",
+            phase=Phase.PENDING,
+            created_at=time.time(),
+        )
+        terms = TermsRow(
+            job_id=row.id,
+            run_id=run_id,
+            execution_duration_s=execution_duration_s,
+            destruction_at=destruction_at,
+        )
+        with self._session.begin() as session:
+            session.add_all((row, terms))
+        return row
+
+    def amend(self, job_id: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> bool:
+        """Change what was given for a PENDING job; False, and nothing changed, in any other phase."""
+        with self._session.begin() as session:
+            row = session.get(JobRow, job_id, with_for_update=True)
+            if row is None or row.phase != Phase.PENDING:
+                return False
+            row.parameters = change(dict(row.parameters))
+            return True
+
+    def start(self, job_id: str, given: dict[str, Any], parameters: dict[str, Any], request_key: str) -> bool:
+        """PENDING -> QUEUED with the parameters that ``given`` was resolved to.
+
+        False where the job is not PENDING, or what was given for it has changed since. Where an equal request has a
+        live job already this one runs under a key of its own, and finds what that job made.
+        """
+        for key in (request_key, canonical_hash({"request_key": request_key, "job": job_id})):
+            try:
+                with self._session.begin() as session:
+                    row = session.get(JobRow, job_id, with_for_update=True)
+                    if row is None or row.phase != Phase.PENDING or row.parameters != given:
+                        return False
+                    row.phase, row.parameters, row.request_key = Phase.QUEUED, parameters, key
+                return True
+            except IntegrityError:
+                continue
+        raise RuntimeError(f"job {job_id} has an equal under a key of its own")
+
+    def destroy(self, job_id: str) -> bool:
+        """Remove the job in whatever phase; a worker that has it loses its lease and stops. What it made stays."""
+        with self._session.begin() as session:
+            session.execute(delete(TermsRow).where(TermsRow.job_id == job_id))
+            result = session.execute(delete(JobRow).where(JobRow.id == job_id))
+            assert isinstance(result, CursorResult)
+            return bool(result.rowcount)
+
+    def terms(self, job_id: str) -> TermsRow:
+        """The terms of a job."""
+        with self._reading() as session:
+            return session.get(TermsRow, job_id) or TermsRow(job_id=job_id, execution_duration_s=0)
+
+    def set_terms(self, job_id: str, **values: Any) -> None:
+        """Change terms of a job."""
+        with self._session.begin() as session:
+            # The lock on the job's row orders changes, and a job that is gone gets no terms.
+            if session.get(JobRow, job_id, with_for_update=True) is not None:
+                session.merge(TermsRow(job_id=job_id, **values))
+
+    def end_by_terms(self) -> list[str]:
+        """Ask jobs that execute longer than their terms allow to stop; destroy those that are due, and return their ids."""
+        now = time.time()
+        too_long = select(JobRow.id).join(TermsRow, TermsRow.job_id == JobRow.id)
+        too_long = too_long.where(
+            JobRow.phase == Phase.EXECUTING,
+            JobRow.cancel_requested.is_(False),
+            TermsRow.execution_duration_s > 0,
+            JobRow.started_at + TermsRow.execution_duration_s < now,
+        )
+        with self._reading() as session:
+            stopped = list(session.scalars(too_long))
+            due = list(session.scalars(select(TermsRow.job_id).where(TermsRow.destruction_at < now)))
+        for job_id in stopped:
+            self.cancel(job_id)
+        return [job_id for job_id in due if self.destroy(job_id)]
+
+    def job_lines(
+        self,
+        *,
+        phases: Sequence[str] = (),
+        from_time: float | None = None,
+        last: int | None = None,
+        owner: str = DEFAULT_OWNER,
+    ) -> list[JobLine]:
+        """All jobs of an owner, newest first; of some phases, created at ``from_time`` or later, the ``last`` ones."""
+        query = select(JobRow.id, JobRow.phase, JobRow.owner, JobRow.created_at, TermsRow.run_id)
+        query = query.outerjoin(TermsRow, TermsRow.job_id == JobRow.id).where(JobRow.owner == owner)
+        if phases:
+            query = query.where(JobRow.phase.in_(phases))
+        if from_time is not None:
+            query = query.where(JobRow.created_at >= from_time)
+        query = query.order_by(JobRow.created_at.desc(), JobRow.id.desc()).limit(last)
+        with self._reading() as session:
+            return [JobLine(*line) for line in session.execute(query)]
 
     # Parts of jobs ----------------------------------------------------------------------------------
 
@@ -501,6 +707,107 @@ class Catalogue:
         )
         with self._reading() as session:
             return [dict(result) for result in session.scalars(query.order_by(PartRow.number)) if result]
+
+    # Operation --------------------------------------------------------------------------------------
+
+    def announce(self, worker: str, started_at: float, version: str) -> None:
+        """Say that a worker process is there; those that have been silent for an hour are forgotten."""
+        now = time.time()
+        with self._session.begin() as session:
+            session.execute(delete(WorkerRow).where(WorkerRow.heartbeat_at < now - 3600.0))
+            session.merge(WorkerRow(name=worker, started_at=started_at, heartbeat_at=now, version=version))
+
+    def take_leave(self, worker: str) -> None:
+        """Say that a worker process ends."""
+        with self._session.begin() as session:
+            session.execute(delete(WorkerRow).where(WorkerRow.name == worker))
+
+    def workers(self, lease_s: float) -> Sequence[WorkerRow]:
+        """Worker processes that were heard of within ``lease_s``."""
+        query = select(WorkerRow).where(WorkerRow.heartbeat_at >= time.time() - lease_s)
+        with self._reading() as session:
+            return session.scalars(query.order_by(WorkerRow.name)).all()
+
+    def tally(self) -> list[JobTally]:
+        """Jobs by kind and phase."""
+        query = select(
+            JobRow.kind,
+            JobRow.phase,
+            func.count(),
+            func.sum(JobRow.attempt),
+            func.sum(case((JobRow.attempt > 1, JobRow.attempt - 1), else_=0)),
+            func.sum(func.coalesce(JobRow.ended_at - JobRow.started_at, 0.0)),
+        ).group_by(JobRow.kind, JobRow.phase)
+        with self._reading() as session:
+            return [
+                JobTally(kind, phase, int(jobs), int(attempts), int(retries), float(run_s))
+                for kind, phase, jobs, attempts, retries, run_s in session.execute(query)
+            ]
+
+    def tally_files(self) -> list[FileTally]:
+        """Files and their bytes, by what they are."""
+        found = []
+        with self._reading() as session:
+            for kind, upload in (("image", ImageRow), ("transit", TransitRow)):
+                files, size = session.execute(
+                    select(func.count(), func.coalesce(func.sum(upload.bytes), 0)).select_from(upload)
+                ).one()
+                found.append(FileTally(kind, "uploaded", int(files), int(size)))
+            query = select(PsfRow.origin, func.count(), func.sum(PsfRow.bytes)).group_by(PsfRow.origin)
+            for origin, files, size in session.execute(query):
+                found.append(FileTally("psf", origin, int(files), int(size)))
+            for kind, made in (("product", ProductRow), ("report", ReportRow)):
+                files, size = session.execute(
+                    select(func.count(), func.coalesce(func.sum(made.bytes), 0)).select_from(made)
+                ).one()
+                found.append(FileTally(kind, "built", int(files), int(size)))
+        return found
+
+    def oldest_queued_at(self) -> float | None:
+        """When the job was asked for that has waited longest; None where none waits."""
+        with self._reading() as session:
+            return session.scalar(select(func.min(JobRow.created_at)).where(JobRow.phase == Phase.QUEUED))
+
+    def count_silent(self, lease_s: float) -> int:
+        """Jobs at work whose worker has been silent for longer than the lease."""
+        silent = (JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < time.time() - lease_s)
+        with self._reading() as session:
+            return session.scalar(select(func.count()).select_from(JobRow).where(*silent)) or 0
+
+    def count_unsubmitted(self, older_than_s: float) -> int:
+        """Queued jobs that nobody gave to the broker in that time."""
+        left = (
+            JobRow.phase == Phase.QUEUED,
+            JobRow.submitted_at.is_(None),
+            JobRow.created_at < time.time() - older_than_s,
+        )
+        with self._reading() as session:
+            return session.scalar(select(func.count()).select_from(JobRow).where(*left)) or 0
+
+    def clock(self) -> float:
+        """The database's own time, in seconds since 1970."""
+        sqlite = self._engine.dialect.name == "sqlite"
+        now = (
+            "(julianday('now') - 2440587.5) * 86400.0" if sqlite else "extract(epoch from clock_timestamp())"
+        )
+        with self._reading() as session:
+            return float(session.scalar(text(f"SELECT {now}")))
+
+    def schema_faults(self) -> SchemaFaults:
+        """What the database lacks; nothing is made."""
+        found = inspect(self._engine)
+        there = set(found.get_table_names())
+        tables, columns, indexes = [], [], []
+        for table in Base.metadata.sorted_tables:
+            if table.name not in there:
+                tables.append(table.name)
+                continue
+            has = {column["name"] for column in found.get_columns(table.name)}
+            columns += [f"{table.name}.{column.name}" for column in table.columns if column.name not in has]
+            known = {index["name"] for index in found.get_indexes(table.name)}
+            indexes += [str(index.name) for index in table.indexes if index.name not in known]
+        ours = len(Base.metadata.sorted_tables)
+        return SchemaFaults(tuple(tables), tuple(columns), tuple(sorted(indexes)), len(tables) == ours)
 
     def _set_part(self, conditions: Sequence[Any], **values: Any) -> bool:
         with self._session.begin() as session:

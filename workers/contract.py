@@ -19,8 +19,13 @@ Identity = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256,
 
 
 class Phase(StrEnum):
-    """Phases of a job, by their IVOA UWS names."""
+    """Phases of a job, by their IVOA UWS names.
 
+    A job that is asked for over ``/v1/jobs`` starts QUEUED; a UWS client's is PENDING, and may be changed, until it
+    is told to run.
+    """
+
+    PENDING = "PENDING"
     QUEUED = "QUEUED"
     EXECUTING = "EXECUTING"
     COMPLETED = "COMPLETED"

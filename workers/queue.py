@@ -11,6 +11,7 @@ import logging
 from typing import Any
 
 from celery import Celery
+from kombu import Connection
 from kombu.exceptions import KombuError, OperationalError
 from redis.exceptions import RedisError
 
@@ -18,6 +19,8 @@ from workers.settings import Settings
 
 RUN_JOB = "heliopsf.run_job"
 ASSIST = "heliopsf.assist"
+QUEUE = "heliopsf"
+AWAY = (OperationalError, KombuError, RedisError, OSError)
 log = logging.getLogger(__name__)
 
 
@@ -32,7 +35,7 @@ def make_app(settings: Settings) -> Celery:
         # does not survive the loss of its broker (kombu 5.7).
         task_acks_late=False,
         worker_prefetch_multiplier=1,
-        task_default_queue="heliopsf",
+        task_default_queue=QUEUE,
         broker_connection_retry_on_startup=True,
         worker_hijack_root_logger=False,
         worker_send_task_events=False,
@@ -45,7 +48,7 @@ def submit(app: Celery, job_id: str) -> bool:
     """Give the job's id to the broker; False where the broker is away (the reconciler tries again)."""
     try:
         app.send_task(RUN_JOB, args=[job_id], retry=False)
-    except (OperationalError, KombuError, RedisError, OSError) as error:
+    except AWAY as error:
         log.warning("broker away, job %s stays queued: %s", job_id, error)
         return False
     return True
@@ -56,8 +59,18 @@ def call_for_help(app: Celery, job_id: str, workers: int) -> None:
     try:
         for _ in range(workers):
             app.send_task(ASSIST, args=[job_id], retry=False)
-    except (OperationalError, KombuError, RedisError, OSError) as error:
+    except AWAY as error:
         log.warning("broker away, job %s goes on alone: %s", job_id, error)
+
+
+def check(settings: Settings) -> None:
+    """Raise where the broker, which is not the embedded one, does not answer within seconds.
+
+    What is raised is one of ``AWAY``, or what its transport makes of a URL that is none.
+    """
+    options = {"socket_connect_timeout": 2, "socket_timeout": 2}
+    with Connection(settings.broker_url, transport_options=options, connect_timeout=2) as connection:
+        connection.ensure_connection(max_retries=1, interval_start=0, timeout=3)
 
 
 def _transport_options(settings: Settings) -> dict[str, Any]:

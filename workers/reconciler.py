@@ -19,6 +19,8 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
     """One pass; returns how many jobs were submitted. Any number of processes may do this at once."""
     for job_id in catalogue.give_up_silent(settings.lease_s, settings.max_attempts):
         log.warning("job %s: its worker fell silent; queued again", job_id)
+    for job_id in catalogue.end_by_terms():
+        log.info("job %s: its time had come; destroyed", job_id)
     submitted = 0
     for job_id in catalogue.unsubmitted(settings.resubmit_s):
         if not queue.submit(app, job_id):

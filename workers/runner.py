@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import logging
 import os
 import socket
@@ -13,11 +14,12 @@ from dataclasses import dataclass, field
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 
 from psfcore.errors import DataError
-from workers import tasks
+from workers import logs, tasks
 from workers.catalogue import Catalogue, JobRow, Lease
 from workers.context import Context
 from workers.contract import Fault, JobError, Phase
 from workers.settings import Settings
+from workers.stopping import Stopping
 from workers.store import Store
 
 log = logging.getLogger(__name__)
@@ -25,6 +27,11 @@ log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
 REPORT_EVERY_S = 0.3
+
+
+def worker_name() -> str:
+    """This process, as jobs and the list of workers name it."""
+    return f"{socket.gethostname()}:{os.getpid()}"
 
 
 class Cancelled(Exception):
@@ -38,15 +45,20 @@ class _Work:
     catalogue: Catalogue
     lease: Lease
     heartbeat_s: float
+    stopping: Stopping
     also_report: Progress | None
     stopped: threading.Event = field(default_factory=threading.Event)
     ended: threading.Event = field(default_factory=threading.Event)
     last_report: float = 0.0
 
     def beat(self) -> None:
-        """Heartbeat until the work ends; notes a cancellation."""
+        """Heartbeat until the work ends; notes a cancellation, and hands the job back where the worker must go."""
         while not self.ended.wait(self.heartbeat_s):
             try:
+                if self.stopping.due and self.catalogue.hand_back(self.lease):
+                    log.warning("job %s: handed back, this worker stops", self.lease.job_id)
+                    self.stopped.set()
+                    return
                 alive = self.catalogue.heartbeat(self.lease)
             except SQLAlchemyError as error:
                 # If it lasts, the lease runs out and the job is given to another; nothing to do here.
@@ -82,37 +94,52 @@ class Runner:
         catalogue: Catalogue,
         store: Store,
         call_for_help: Callable[[str, int], None] = lambda job_id, workers: None,
+        stopping: Stopping | None = None,
     ) -> None:
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help = call_for_help
+        self._stopping = stopping or Stopping()
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
         """Run the job if it is queued; else do nothing (it was redelivered, cancelled or taken)."""
-        lease = self._catalogue.claim(job_id, worker=f"{socket.gethostname()}:{os.getpid()}")
+        if self._stopping.asked:
+            self._catalogue.forget_submission(job_id)
+            log.info("job %s: left queued, this worker stops", job_id)
+            return
+        lease = self._catalogue.claim(job_id, worker=worker_name())
         if lease is None:
             log.info("job %s: not queued, nothing to do", job_id)
             return
         job = self._catalogue.job(job_id)
-        assert job is not None
-        work = _Work(self._catalogue, lease, self._settings.heartbeat_s, on_progress)
-        heart = threading.Thread(target=work.beat, name=f"heartbeat {job_id}", daemon=True)
-        heart.start()
-        try:
-            self._attempt(job, lease, work)
-        finally:
-            work.ended.set()
-            heart.join()
+        if job is None:
+            log.info("job %s: destroyed, nothing to do", job_id)
+            return
+        with logs.bound(job=job.id, owner=job.owner):
+            log.info("job %s: %s starts, attempt %d", job.id, job.kind, job.attempt)
+            work = _Work(self._catalogue, lease, self._settings.heartbeat_s, self._stopping, on_progress)
+            beat = contextvars.copy_context().run
+            heart = threading.Thread(target=beat, args=(work.beat,), name=f"heartbeat {job_id}", daemon=True)
+            heart.start()
+            try:
+                self._attempt(job, lease, work)
+            finally:
+                work.ended.set()
+                heart.join()
 
     def assist(self, job_id: str) -> None:
         """Share the parts of a job that is executing elsewhere, until none is left or it ends."""
         job = self._catalogue.job(job_id)
-        if job is None or job.phase != Phase.EXECUTING or job.kind not in tasks.ASSISTANTS:
+        if self._stopping.asked or job is None or job.phase != Phase.EXECUTING:
+            return
+        if job.kind not in tasks.ASSISTANTS:
             return
 
         looked_at = time.monotonic()
 
         def report(_stage: str, _step: int, _steps: int) -> None:
             nonlocal looked_at
+            if self._stopping.due:
+                raise Cancelled(job_id)
             if time.monotonic() - looked_at < REPORT_EVERY_S:
                 return
             looked_at = time.monotonic()
@@ -128,13 +155,14 @@ class Runner:
             job_id=job.id,
             report=report,
         )
-        try:
-            tasks.ASSISTANTS[job.kind](context, job.parameters)
-        except Cancelled:
-            log.info("job %s: no more help wanted", job_id)
-        except Exception:
-            # The job's own worker meets the same trouble and says so; its error is the one that counts.
-            log.exception("job %s: help failed", job_id)
+        with logs.bound(job=job.id, owner=job.owner):
+            try:
+                tasks.ASSISTANTS[job.kind](context, job.parameters)
+            except Cancelled:
+                log.info("job %s: no more help from here", job_id)
+            except Exception:
+                # The job's own worker meets the same trouble and says so; its error is the one that counts.
+                log.exception("job %s: help failed", job_id)
 
     def _attempt(self, job: JobRow, lease: Lease, work: _Work) -> None:
         context = Context(
@@ -163,8 +191,9 @@ class Runner:
             )
             self._fail(lease, Fault.INTERNAL, "internal-error", message)
         else:
-            self._persist(lambda: self._catalogue.complete(lease, result_id))
-            log.info("job %s: %s, result %s", job.id, Phase.COMPLETED, result_id)
+            completed = self._persist(lambda: self._catalogue.complete(lease, result_id))
+            said = f"{Phase.COMPLETED}, result {result_id}" if completed else "done, but the lease was lost"
+            log.info("job %s: %s", job.id, said)
 
     def _retry(self, job: JobRow, lease: Lease, error: Exception) -> None:
         log.warning("job %s: passing failure in attempt %d: %s", job.id, job.attempt, error)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from importlib.metadata import version
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -39,6 +40,24 @@ class Settings(BaseSettings):
     reconcile_s: float = Field(2.0, gt=0, description="how often the job table is compared with the broker")
     resubmit_s: float = Field(30.0, gt=0, description="first wait before a queued job is submitted again")
     max_attempts: int = Field(3, ge=1, description="starts after which a job is an error")
+    stop_s: float = Field(
+        15.0,
+        ge=0,
+        description="how long requests and jobs may go on after SIGTERM; then jobs are handed back",
+    )
+    log_format: Literal["text", "json"] | None = Field(
+        None, description="form of the logs on standard error; none means text on a terminal, else json"
+    )
+
+    uws_max_wait_s: float = Field(
+        50.0, ge=0, le=3600, description="longest that a UWS client is kept waiting"
+    )
+    uws_max_execution_s: int = Field(
+        604_800, ge=0, lt=2**31, description="longest that a UWS client's job may execute; 0 means no limit"
+    )
+    uws_max_keep_s: int = Field(
+        2_592_000, ge=1, lt=2**31, description="longest that a UWS client may have a job kept"
+    )
 
     gap_effects: str = Field(
         "",
@@ -72,6 +91,19 @@ class Settings(BaseSettings):
     def threads(self) -> int:
         """Threads of one worker process: cores / worker processes, so that workers share the machine."""
         return self.worker_threads or max(1, cores() // self.worker_processes)
+
+    @property
+    def gone_s(self) -> float:
+        """Time after SIGTERM at which a worker is gone, whatever its job does.
+
+        It looks at each heartbeat whether its job is to be handed back; then Celery has some seconds to end in order.
+        """
+        return self.stop_s + self.heartbeat_s + 6.0
+
+    @property
+    def presence_s(self) -> float:
+        """How often a worker says that it is there, at work or not: often enough for its lease."""
+        return max(self.heartbeat_s, self.lease_s / 3)
 
     @property
     def max_upload_bytes(self) -> int:

@@ -1,10 +1,14 @@
 """The worker process: ``celery -A workers.worker`` or ``heliopsf worker``.
 
 Nothing numerical is loaded before the fork: each child loads it for itself, with its share of the threads.
+
+Told to stop (SIGTERM, or once Control-C), it takes no more jobs. The one at work may go on for ``stop_s``; then it
+is handed back, queued as if it had not been started. After ``gone_s`` the worker is gone, whatever its job does.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
@@ -12,16 +16,21 @@ import time
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from celery.signals import worker_process_init
+from celery.signals import setup_logging, worker_init, worker_process_init, worker_shutting_down
 
-from workers import queue
-from workers.settings import Settings
+from workers import logs, queue
+from workers.settings import Settings, software_version
+from workers.stopping import Stopping
 
 if TYPE_CHECKING:
+    from workers.catalogue import Catalogue
     from workers.runner import Runner
 
+log = logging.getLogger(__name__)
 settings = Settings()
 app = queue.make_app(settings)
+LOOK_EVERY_S = 0.5
+stopping = Stopping()  # made before the fork: the children see what is asked of their parent
 
 
 @app.task(name=queue.RUN_JOB)
@@ -36,10 +45,59 @@ def assist(job_id: str) -> None:
     _runner().assist(job_id)
 
 
+@setup_logging.connect
+def _logs(**_: object) -> None:
+    """Celery leaves logging to us where this is connected."""
+    logs.configure(settings)
+
+
+@worker_init.connect
+def _watch(**_: object) -> None:
+    threading.Thread(target=_end_at_the_latest, name="end at the latest", daemon=True).start()
+
+
+@worker_shutting_down.connect
+def _stop(**_: object) -> None:
+    stopping.ask(settings.stop_s)
+
+
+def _end_at_the_latest() -> None:
+    while not stopping.asked:
+        time.sleep(LOOK_EVERY_S)
+    time.sleep(settings.gone_s)
+    log.warning("not ended in order %g s after the signal: ending now", settings.gone_s)
+    # The kernel ends the children with their parent (Celery asks for that where it can be had).
+    os._exit(0)
+
+
 @worker_process_init.connect
 def _prepare_child(**_: object) -> None:
     """Load the kernels when the child starts, so that the first job does not wait for it."""
     _runner()
+    threading.Thread(target=_be_present, name="presence", daemon=True).start()
+
+
+def _be_present() -> None:
+    """Say again and again that this child is there, at work or not; once it is to stop, that it is not."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from workers.runner import worker_name
+
+    started_at = time.time()
+    while True:
+        leaving = stopping.asked
+        try:
+            if leaving:
+                _catalogue().take_leave(worker_name())
+            else:
+                _catalogue().announce(worker_name(), started_at, software_version())
+        except SQLAlchemyError as error:
+            log.warning("presence not written: %s", str(error).splitlines()[0])
+        if leaving:
+            return
+        again = time.monotonic() + settings.presence_s
+        while time.monotonic() < again and not stopping.asked:
+            time.sleep(LOOK_EVERY_S)
 
 
 @lru_cache(maxsize=1)
@@ -47,25 +105,33 @@ def _runner() -> Runner:
     # Before numba is imported: the omp layer kills forked children.
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
-    from workers.catalogue import Catalogue
     from workers.runner import Runner
     from workers.store import Store
 
     return Runner(
         settings,
-        Catalogue(settings.catalogue_url),
+        _catalogue(),
         Store(settings.data_dir),
         call_for_help=lambda job_id, workers: queue.call_for_help(app, job_id, workers),
+        stopping=stopping,
     )
+
+
+@lru_cache(maxsize=1)
+def _catalogue() -> Catalogue:
+    from workers.catalogue import Catalogue
+
+    return Catalogue(settings.catalogue_url)
 
 
 def main(parent: int | None = None) -> None:
     """Run a worker in this process until it is told to stop, or until the process ``parent`` is gone."""
+    logs.configure(settings)  # before Celery has anything to say
     if parent is not None:
         threading.Thread(target=_stop_with, args=(parent,), daemon=True).start()
     pool = ["--pool", "prefork", "--concurrency", str(settings.worker_processes)]
     quiet = ["--without-gossip", "--without-mingle", "--without-heartbeat"]
-    app.worker_main(["worker", "--loglevel", "INFO", *pool, *quiet])
+    app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])
 
 
 def _stop_with(parent: int) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from psfcore.gap.closure import Interval
 from psfcore.gap.correction import Corrected
@@ -186,6 +187,11 @@ def sentence(found: Diagnosis) -> str:
     strongest = found.where[0]
     pointings = " and ".join(str(p) for p in strongest.at.get("pointings", []))
     lead = f"A residual of {left} {AXIS_WORDS[strongest.name]}, most in pointings {pointings}"
+    if found.rms.value < found.noise_pct and _lit_alone(found):
+        lead = (
+            f"The lit parts of neighbouring images differ {AXIS_WORDS[strongest.name]}, which the discs hide "
+            f"(a residual of {left} there)"
+        )
     best = judged.best
     if judged.verdict == "unknown" or best is None:
         like = _by_name(found, judged.probes[0].names[0]).cause if judged.probes else ""
@@ -200,6 +206,16 @@ def sentence(found: Diagnosis) -> str:
             f"met as well by a form of unknown cause; best so far: {words(best.label)}."
         )
     return f"{lead}; {_explained(found, best)}{_excluded(found, best)}."
+
+
+def _lit_alone(found: Diagnosis) -> bool:
+    """Whether the lit blocks show a gap that the discs' cells do not."""
+    model = found.model
+    left = model.left(model.base)
+    cells = sum(float(one @ one) for one in left)
+    freedom = sum(one.size for one in left)
+    lit = model.whole_steady_lit
+    return bool(chi2.sf(cells, freedom) > ALARM > chi2.sf(model.left_lit(model.base), lit.freedom))
 
 
 def _explained(found: Diagnosis, best: Tried) -> str:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from service.local import LocalService
+from tests.whole.stack import Missing, postgres_database
+from workers.catalogue import Catalogue
 from workers.settings import Settings
 
 
@@ -21,3 +24,22 @@ def local(settings: Settings) -> Iterator[LocalService]:
     service = LocalService(settings)
     yield service
     service.close()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalogue]:
+    if request.param == "sqlite":
+        catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
+        catalogue.create_tables()
+        yield catalogue
+        catalogue.close()
+        return
+    with ExitStack() as resources:
+        try:
+            url = resources.enter_context(postgres_database())
+        except Missing as missing:
+            pytest.skip(str(missing))
+        catalogue = Catalogue(Settings(database_url=url).catalogue_url)
+        catalogue.create_tables()
+        yield catalogue
+        catalogue.close()

@@ -3,38 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from pathlib import Path
 
-import pytest
-
-from tests.whole.stack import Missing, postgres_database
 from workers.catalogue import Catalogue, JobRow, Lease, ProductRow
 from workers.contract import Fault, JobError, Phase
-from workers.settings import Settings
 
 BROKEN = JobError(fault=Fault.INTERNAL, code="broken", message="broken")
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalogue]:
-    if request.param == "sqlite":
-        catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
-        catalogue.create_tables()
-        yield catalogue
-        catalogue.close()
-        return
-    with ExitStack() as resources:
-        try:
-            url = resources.enter_context(postgres_database())
-        except Missing as missing:
-            pytest.skip(str(missing))
-        catalogue = Catalogue(Settings(database_url=url).catalogue_url)
-        catalogue.create_tables()
-        yield catalogue
-        catalogue.close()
 
 
 def submitted(catalogue: Catalogue, key: str = "k") -> JobRow:

@@ -1,0 +1,111 @@
+"""Metrics for Prometheus: ``/metrics``.
+
+What concerns all processes (jobs, files, workers) is asked of the database at each scrape, by queries that read
+indexes alone; what concerns this process (its requests) is counted in it. What the database says is gauges: a job that is
+destroyed takes its numbers along.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from fastapi import APIRouter, Request, Response
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Metric, generate_latest
+from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.registry import Collector
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.jobs import RESULTS
+from service.state import Shared, State
+from workers import checks, queue
+from workers.catalogue import JobTally
+from workers.contract import Phase
+from workers.settings import software_version
+
+router = APIRouter(tags=["operation"])
+
+
+@router.get(
+    "/metrics",
+    summary="Numbers for Prometheus",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+def metrics(request: Request, state: Shared) -> Response:
+    """Jobs, files and workers of the whole service; requests of this process."""
+    shared = CollectorRegistry()
+    shared.register(_Catalogued(state))
+    text = generate_latest(shared) + generate_latest(request.app.state.requests.registry)
+    return Response(text, headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+
+class _Catalogued(Collector):
+    def __init__(self, state: State) -> None:
+        self._state = state
+
+    def describe(self) -> list[Metric]:
+        """Nothing: what would be asked for here is asked for at the scrape itself."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """All that the database and the storage say; where the database is away, that alone."""
+        yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
+        room = GaugeMetricFamily("heliopsf_storage_free_bytes", "Room left where the files are")
+        room.add_metric([], checks.free_bytes(self._state.settings.data_dir))
+        yield room
+        up = GaugeMetricFamily("heliopsf_database_up", "1 where the database answers")
+        try:
+            found = [*self._jobs(), *self._waiting(), *self._files()]
+        except SQLAlchemyError:
+            up.add_metric([], 0)
+            yield up
+            return
+        up.add_metric([], 1)
+        yield up
+        yield from found
+
+    def _jobs(self) -> Iterator[Metric]:
+        tallies = {(tally.kind, tally.phase): tally for tally in self._state.catalogue.tally()}
+        kinds = sorted({*RESULTS, *(kind for kind, _ in tallies)})
+        jobs = GaugeMetricFamily("heliopsf_jobs", "Jobs", labels=["kind", "phase"])
+        attempts = GaugeMetricFamily("heliopsf_job_attempts", "Starts of jobs", labels=["kind"])
+        retries = GaugeMetricFamily("heliopsf_job_retries", "Starts of jobs after the first", labels=["kind"])
+        seconds = GaugeMetricFamily(
+            "heliopsf_job_run_seconds",
+            "Time that all jobs counted as COMPLETED took, from the last start",
+            labels=["kind"],
+        )
+        for kind in kinds:
+            of_kind = {
+                phase: tallies.get((kind, phase), JobTally(kind, phase, 0, 0, 0, 0.0)) for phase in Phase
+            }
+            for phase, tally in of_kind.items():
+                jobs.add_metric([kind, phase], tally.jobs)
+            attempts.add_metric([kind], sum(tally.attempts for tally in of_kind.values()))
+            retries.add_metric([kind], sum(tally.retries for tally in of_kind.values()))
+            seconds.add_metric([kind], of_kind[Phase.COMPLETED].run_s)
+        yield from (jobs, attempts, retries, seconds)
+
+    def _waiting(self) -> Iterator[Metric]:
+        catalogue, lease_s = self._state.catalogue, self._state.settings.lease_s
+        oldest = catalogue.oldest_queued_at()
+        age = GaugeMetricFamily(
+            "heliopsf_oldest_queued_seconds", "Age of the job that has waited longest", labels=["queue"]
+        )
+        age.add_metric([queue.QUEUE], 0.0 if oldest is None else max(0.0, time.time() - oldest))
+        yield age
+        silent = GaugeMetricFamily("heliopsf_jobs_silent", "Jobs whose worker has been silent for its lease")
+        silent.add_metric([], catalogue.count_silent(lease_s))
+        yield silent
+        workers = GaugeMetricFamily("heliopsf_workers", "Worker processes that are there")
+        workers.add_metric([], len(catalogue.workers(lease_s)))
+        yield workers
+
+    def _files(self) -> Iterator[Metric]:
+        files = GaugeMetricFamily("heliopsf_files", "Files kept", labels=["kind", "origin"])
+        size = GaugeMetricFamily("heliopsf_file_bytes", "Bytes of files kept", labels=["kind", "origin"])
+        for tally in self._state.catalogue.tally_files():
+            files.add_metric([tally.kind, tally.origin], tally.files)
+            size.add_metric([tally.kind, tally.origin], tally.bytes)
+        yield from (files, size)

@@ -1,0 +1,106 @@
+"""What is known of each request: its id, a line in the log, and its place in the metrics."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from fastapi import FastAPI
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from workers import logs
+
+log = logging.getLogger(__name__)
+REQUEST_ID = "X-Request-ID"
+# Anything else that a client may send as a method is one label, and so is every path that is nowhere.
+METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+NOWHERE = "none"
+ROUTINE = {"/healthz", "/readyz", "/metrics"}
+BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 120.0)
+
+
+class RequestMetrics:
+    """Requests of this process by route, method and status; the database knows nothing of these."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self._answered = Counter(
+            "heliopsf_http_requests",
+            "Requests answered by this process",
+            ["route", "method", "status"],
+            registry=self.registry,
+        )
+        self._seconds = Histogram(
+            "heliopsf_http_request_seconds",
+            "Time from a request's header to the end of its answer",
+            ["route", "method"],
+            buckets=BUCKETS_S,
+            registry=self.registry,
+        )
+        self._received = Counter(
+            "heliopsf_http_received_bytes",
+            "Bytes of request bodies taken in by this process",
+            ["route"],
+            registry=self.registry,
+        )
+
+    def count(self, route: str, method: str, status: int, seconds: float, received: int) -> None:
+        """Note a request that was answered."""
+        method = method if method in METHODS else "other"
+        self._answered.labels(route, method, str(status)).inc()
+        self._seconds.labels(route, method).observe(seconds)
+        if received:
+            self._received.labels(route).inc(received)
+
+
+def install(app: FastAPI) -> RequestMetrics:
+    """Watch every request of the application."""
+    metrics = RequestMetrics()
+    app.add_middleware(_Observed, metrics=metrics)
+    return metrics
+
+
+class _Observed:
+    def __init__(self, app: ASGIApp, metrics: RequestMetrics) -> None:
+        self._app, self._metrics = app, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request_id = logs.request_id(Headers(scope=scope).get(REQUEST_ID))
+        # Each request has a context of its own. It stays bound, so that what the server logs of a failure has it too.
+        logs.bind(request=request_id)
+        started = time.perf_counter()
+        status, received = 500, 0  # what is answered where nothing was before an exception
+
+        async def counted() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            return message
+
+        async def noted(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                MutableHeaders(scope=message)[REQUEST_ID] = request_id
+            await send(message)
+
+        try:
+            await self._app(scope, counted, noted)
+        finally:
+            seconds = time.perf_counter() - started
+            route = getattr(scope.get("route"), "path", NOWHERE)
+            self._metrics.count(route, scope["method"], status, seconds, received)
+            routine = route in ROUTINE and status < 500
+            log.log(
+                logging.DEBUG if routine else logging.INFO,
+                "%s %s %d",
+                scope["method"] if scope["method"] in METHODS else "other",
+                scope["path"],  # without the query
+                status,
+                extra={"fields": {"route": route, "status": status, "seconds": round(seconds, 4)}},
+            )
