@@ -12,11 +12,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -165,10 +166,24 @@ def _made(
         yield from (_make_one(made, plan, number, scenes) for number in numbers)
         return
     # Fork would carry this process's threads' locks along.
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        processes, mp_context=get_context("spawn"), initializer=_end_with_parent
+    ) as pool:
         waiting = [pool.submit(_make_one, made, plan, number, scenes) for number in numbers]
         for future in as_completed(waiting):
             yield future.result()
+
+
+def _end_with_parent() -> None:
+    """A process of the pool would outlive a parent that was killed, and go on making."""
+
+    def wait() -> None:
+        parent = parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _make_one(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane]) -> tuple[int, str, float]:
