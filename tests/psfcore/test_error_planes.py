@@ -191,6 +191,7 @@ def test_what_is_no_covariance_is_refused(wrong: Plane) -> None:
     assert caught.value.code == "bad-covariance"
 
 
+@pytest.mark.slow
 def test_sigma_points_agree_with_many_random_samples(psf: Psf) -> None:
     """The scattered total known to 0.01: what that does to the image, by two points and by 60 draws."""
     image = see(cut(0.5), psf, None)

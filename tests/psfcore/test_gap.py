@@ -69,7 +69,7 @@ def test_clean_images_have_no_gap_and_the_report_is_json(of_clean: Diagnosis) ->
     assert sum(axis["share"] for axis in report["where"]) == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("offset_dn", [3.0, -3.0])
+@pytest.mark.parametrize("offset_dn", [3.0, pytest.param(-3.0, marks=pytest.mark.slow)])
 def test_a_dark_offset_is_found_with_its_size_and_taken_out(
     clean: Transit, of_clean: Diagnosis, offset_dn: float
 ) -> None:

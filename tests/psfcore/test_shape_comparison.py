@@ -47,6 +47,7 @@ def test_the_shape_that_was_put_in_gains_most() -> None:
     assert shapes["stretched"].significance == shapes["stretched"].gain / 2
 
 
+@pytest.mark.slow
 def test_nothing_is_found_where_nothing_was_put_in() -> None:
     shapes = fitted().shapes
     assert [shape.name for shape in shapes] == [name for name in SHAPES if name != SOFTENED_POWER_LAW.name]

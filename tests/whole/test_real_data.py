@@ -26,6 +26,7 @@ def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
         yield running
 
 
+@pytest.mark.slow
 def test_the_real_hri_image(stack: Stack, shared: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.fits"
     product = stack.client.deconvolve(shared / HRI, output)

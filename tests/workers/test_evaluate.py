@@ -99,6 +99,7 @@ def test_a_given_psf_is_judged_without_a_fit(
     assert again["created_at"] == row["created_at"]
 
 
+@pytest.mark.slow
 def test_a_given_psf_needs_no_diffraction(
     service: LocalService, transit: Path, true_psf: Path, tmp_path: Path
 ) -> None:
