@@ -6,7 +6,7 @@ COPY psfcore psfcore
 COPY service service
 COPY workers workers
 RUN python -m venv /opt/heliopsf \
- && /opt/heliopsf/bin/pip install --no-cache-dir -c constraints.txt .
+ && /opt/heliopsf/bin/pip install --no-cache-dir -c constraints.txt '.[s3]'
 
 FROM python:3.11-slim
 COPY --from=build /opt/heliopsf /opt/heliopsf

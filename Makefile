@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test test-full bench bench-peers blind lint openapi clean
+.PHONY: demo test test-full bench bench-peers blind chaos lint openapi clean
 .DELETE_ON_ERROR:
 
 $(RUN): pyproject.toml constraints.txt
@@ -32,12 +32,18 @@ bench: $(DEV)
 	$(BIN)/python -m tests.bench_ring_sums --quick
 	$(BIN)/python -m tests.bench_fit
 	$(BIN)/python -m tests.bench_crossval
+	$(BIN)/python -m tests.bench_bulk --images 24
 
 # What others use, in an environment of its own, timed in turn with ours on the same data.
 bench-peers: $(DEV)
 	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9'
 	$(BIN)/python -m tests.bench_peers .venv-peers/bin/python
+
+# Jobs while workers, Redis, PostgreSQL and the service are killed at random; needs both servers' programs.
+chaos: $(DEV)
+	$(BIN)/python -m tests.chaos
+	$(BIN)/python -m tests.chaos --seed 2 --redis-keeps
 
 # The gap diagnosis on cases whose effect it does not know: hours. Goes on where it was stopped.
 blind: $(RUN)

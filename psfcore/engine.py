@@ -88,6 +88,12 @@ class Engine:
         self.transfer = self._transfer_function(kernel, first)
 
     @property
+    def nbytes(self) -> int:
+        """Memory that it holds between two calls."""
+        scratch = self.threads * max(self.row_plan.length, self.column_plan.length) * 2 * LANES * 4
+        return self.transfer.nbytes + self._spectrum.nbytes + scratch
+
+    @property
     def symmetric(self) -> bool:
         """Whether the PSF is symmetric about its centre: its transfer function is real."""
         return self.transfer.shape[2] == 1

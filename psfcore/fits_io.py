@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from psfcore.errors import DataError
 from psfcore.header import (
     FitsLimits,
     HeaderSummary,
+    check_all_headers,
     optional_exposure_s,
     optional_number,
     optional_text,
@@ -38,6 +39,7 @@ from psfcore.psf import (
     plate_scale_arcsec,
     radial_profile,
 )
+from psfcore.tiles import check_tiles
 
 CardValue = str | int | float | bool
 Cards = Mapping[str, tuple[CardValue, str]]
@@ -82,8 +84,8 @@ def read_image(path: str | Path, limits: FitsLimits, *, saturation_dn: float | N
 
     saturation_dn: level in DN from which a pixel counts as saturated, besides the header's SATURATE or
     DATASAT (in the image's own unit); divided by the exposure where the unit is DN/s.
-    Raises HeaderError for what headers show, DataError: "unreadable-pixels", "no-exposure", "all-nan",
-    "all-saturated", "no-signal", "too-small".
+    Raises HeaderError for what headers show, DataError: "unreadable-pixels", "tile-too-large", "no-exposure",
+    "all-nan", "all-saturated", "no-signal", "too-small".
     """
     summary = read_summary(path, limits)
     pixels, header = _read_pixels(path, summary)
@@ -104,12 +106,16 @@ def read_plane(path: str | Path, limits: FitsLimits) -> NDArray[np.float64]:
 
 def _read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.float64], fits.Header]:
     try:
+        if summary.codec is not None:
+            _check_tiles(path, summary)
         # uint=False: astropy would turn unsigned integers (BZERO 32768) before it looks for BLANK.
         with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, uint=False) as hdus:
             hdu = hdus[summary.hdu]
             header = hdu.header.copy()
             data = hdu.data
             pixels = np.array(data, dtype=np.float64)
+    except DataError:
+        raise
     except _PIXEL_TROUBLE as error:
         _raise_if_storage(error)
         message = f"expected pixels in HDU {summary.hdu} of {Path(path).name}; got: {error!s:.120}"
@@ -118,6 +124,29 @@ def _read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.f
         message = f"expected {summary.shape} pixels as the header declares; got {pixels.shape}"
         raise DataError("unreadable-pixels", message)
     return pixels, header
+
+
+class _TableHeap:
+    def __init__(self, hdu: fits.BinTableHDU) -> None:
+        place = hdu.fileinfo()
+        self._file = place["file"]
+        rows_bytes = hdu.header["NAXIS1"] * hdu.header["NAXIS2"]
+        self._first = place["datLoc"] + int(hdu.header.get("THEAP", rows_bytes))
+
+    def read(self, offset: int, count: int) -> bytes:
+        self._file.seek(self._first + offset)
+        return bytes(self._file.read(count))
+
+
+def _check_tiles(path: str | Path, summary: HeaderSummary) -> None:
+    """Raise DataError "tile-too-large" where a tile unfolds to more than it may."""
+    with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as hdus:
+        table = hdus[summary.hdu]
+        tile_pixels = int(table.header.get("ZTILE1", summary.shape[1])) * int(table.header.get("ZTILE2", 1))
+        formats = {column.name: column.format for column in table.columns}
+        rows = np.asarray(table.data).view(np.ndarray)
+        assert summary.codec is not None
+        check_tiles(rows, formats, _TableHeap(table), summary.codec, tile_pixels)
 
 
 def _raise_if_storage(error: Exception) -> None:
@@ -421,7 +450,9 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     summary = read_summary(path, limits)
     kernel, header = _read_pixels(path, summary)
     own = "PSFNAME" in header
-    components, provenance, fitted = _read_extras(path, limits) if own and parts else ({}, {}, None)
+    components, provenance, fitted = (
+        _read_extras(path, limits, kernel.shape) if own and parts else ({}, {}, None)
+    )
     return Psf(
         kernel=kernel,
         name=optional_text(header, "PSFNAME") or Path(path).name.split(".")[0],
@@ -437,17 +468,20 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
 
 
 def _read_extras(
-    path: str | Path, limits: FitsLimits
+    path: str | Path, limits: FitsLimits, shape: tuple[int, ...]
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any], FittedShape | None]:
     """Components, the instrument's text and the fitted shape of a file that write_psf wrote."""
     fitted: FittedShape | None = None
     components: dict[str, NDArray[np.float64]] = {}
     provenance: dict[str, Any] = {}
+    # Anybody may write PSFNAME into a header: what stands behind the kernel is bounded like all else, and what
+    # write_psf never writes (compressed components, other shapes) is left alone.
+    check_all_headers(path, limits)
     try:
-        with fits.open(path, memmap=False) as hdus:
+        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-            for hdu in _extensions(hdus, limits):
-                if isinstance(hdu, fits.ImageHDU) and hdu.shape == hdus[0].shape:
+            for hdu in hdus[1:]:
+                if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
                     components[hdu.name] = np.array(hdu.data, dtype=np.float64)
                 elif hdu.name == "INSTRUMENT":
                     text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
@@ -458,9 +492,3 @@ def _read_extras(
         message = f"expected readable extensions in {Path(path).name}; got: {error!s:.120}"
         raise DataError("unreadable-pixels", message) from None
     return components, provenance, fitted
-
-
-def _extensions(hdus: fits.HDUList, limits: FitsLimits) -> Iterator[Any]:
-    if len(hdus) > limits.max_hdus:
-        raise DataError("too-many-hdus", f"expected at most {limits.max_hdus} HDUs; got {len(hdus)}")
-    yield from hdus[1:]

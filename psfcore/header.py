@@ -16,6 +16,8 @@ import io
 import math
 import os
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -52,7 +54,7 @@ _KNOWN_STARTS = (
 
 @dataclass(frozen=True)
 class FitsLimits:
-    """Bounds on what is read: pixels of an image or of a tile, bytes of one header, HDUs passed."""
+    """Bounds on what is read: pixels of an image or of a tile, bytes of all headers together, HDUs passed."""
 
     max_pixels: int
     max_header_bytes: int = 4 * 1024 * 1024
@@ -87,8 +89,22 @@ class HeaderSummary:
 
 def read_summary(path: str | os.PathLike[str], limits: FitsLimits) -> HeaderSummary:
     """The first 2-D image of the file at `path`; HeaderError says what is wrong with it otherwise."""
-    header, hdu, gzipped = _first_image(Path(path), limits)
-    return _summary(header, hdu, gzipped)
+    with _opened(Path(path), limits) as source:
+        header, hdu = _first_image(source, limits)
+        return _summary(header, hdu, source.gzipped)
+
+
+def first_image_header(path: str | os.PathLike[str], limits: FitsLimits) -> Header:
+    """The header of the first 2-D image of the file at `path`, as it stands; HeaderError as for `read_summary`."""
+    with _opened(Path(path), limits) as source:
+        return _first_image(source, limits)[0]
+
+
+def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
+    """HeaderError where a file does not keep the limits to its end: before all its HDUs are read, not the first image alone."""
+    with _opened(Path(path), limits) as source:
+        for _header, _hdu, _kind in _walk(source, limits, to_the_end=True):
+            pass
 
 
 # --- the walk ---------------------------------------------------------------------------------------------
@@ -149,34 +165,48 @@ class _GzipSource:
         return there
 
 
-def _first_image(path: Path, limits: FitsLimits) -> tuple[Header, int, bool]:
+@contextmanager
+def _opened(path: Path, limits: FitsLimits) -> Iterator[_Source]:
     with path.open("rb") as file:
-        start = file.read(32)
+        start = file.read(2)
         file.seek(0)
         if not start:
             raise HeaderError("empty-file", "expected a FITS file; got an empty file")
-        source: _Source = _PlainSource(file)
-        if start[:2] == b"\x1f\x8b":
-            source = _GzipSource(file, limits.max_pixels * 16 + limits.max_hdus * limits.max_header_bytes)
-        header, hdu = _walk(source, limits)
-        return header, hdu, source.gzipped
+        if start == b"\x1f\x8b":
+            yield _GzipSource(file, limits.max_pixels * 16 + limits.max_hdus * limits.max_header_bytes)
+        else:
+            yield _PlainSource(file)
 
 
-def _walk(source: _Source, limits: FitsLimits) -> tuple[Header, int]:
+def _first_image(source: _Source, limits: FitsLimits) -> tuple[Header, int]:
     seen: list[str] = []
-    for hdu in range(limits.max_hdus):
-        raw = _read_header(source, limits, first=hdu == 0)
-        if raw is None:
-            raise _no_image(seen)
-        header = _parse(raw, hdu)
-        kind = _kind(header, hdu)
-        seen.append(kind)
-        if kind == "image":
-            _check_image(header, limits)
-        _pass_data(source, header, hdu, limits, chosen=kind == "image")
+    for header, hdu, kind in _walk(source, limits, to_the_end=False):
         if kind == "image":
             return header, hdu
-    raise HeaderError("too-many-hdus", f"expected an image in the first {limits.max_hdus} HDUs; got none")
+        seen.append(kind)
+    raise _no_image(seen)
+
+
+def _walk(source: _Source, limits: FitsLimits, *, to_the_end: bool) -> Iterator[tuple[Header, int, str]]:
+    """Each HDU's header, number and kind; to the first image, or to the end of the file."""
+    header_bytes = 0
+    for hdu in range(limits.max_hdus):
+        raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=hdu == 0)
+        if raw is None:
+            return
+        header_bytes += len(raw)
+        header = _parse(raw, hdu)
+        kind = _kind(header, hdu)
+        last = kind == "image" and not to_the_end
+        if last:
+            _check_image(header, limits)
+        _pass_data(source, header, hdu, limits, last=last)
+        yield header, hdu, kind
+        if last:
+            return
+    if not to_the_end or source.read(1):
+        message = f"expected at most {limits.max_hdus} HDUs, an image among them; got more"
+        raise HeaderError("too-many-hdus", message)
 
 
 def _no_image(seen: list[str]) -> HeaderError:
@@ -192,10 +222,10 @@ def _no_image(seen: list[str]) -> HeaderError:
     return HeaderError("no-image", f"{wanted}; got {len(seen)} HDUs without data of two axes")
 
 
-def _read_header(source: _Source, limits: FitsLimits, *, first: bool) -> bytes | None:
-    """Cards up to END, or None where the file ends before another header starts."""
+def _read_header(source: _Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
+    """Cards up to END within ``most`` bytes, or None where the file ends before another header starts."""
     raw = bytearray()
-    while len(raw) < limits.max_header_bytes:
+    while len(raw) < most:
         block = source.read(BLOCK_BYTES)
         if not raw and first:
             _check_start(block)
@@ -208,7 +238,7 @@ def _read_header(source: _Source, limits: FitsLimits, *, first: bool) -> bytes |
         if len(block) < BLOCK_BYTES:
             message = f"expected an END card; the file stops after {len(raw)} bytes of this header"
             raise HeaderError("truncated-header", message)
-    message = f"expected an END card within {limits.max_header_bytes} bytes; got none"
+    message = f"expected headers of at most {limits.max_header_bytes} bytes, with an END card each; got more"
     raise HeaderError("header-too-long", message)
 
 
@@ -291,7 +321,7 @@ def _check_tiles(header: Header, nx: int, ny: int, limits: FitsLimits) -> None:
         raise HeaderError("bad-tiles", message)
 
 
-def _pass_data(source: _Source, header: Header, hdu: int, limits: FitsLimits, *, chosen: bool) -> None:
+def _pass_data(source: _Source, header: Header, hdu: int, limits: FitsLimits, *, last: bool) -> None:
     size = _data_bytes(header, hdu)
     if source.gzipped and size > limits.max_pixels * 16:
         message = (
@@ -302,7 +332,7 @@ def _pass_data(source: _Source, header: Header, hdu: int, limits: FitsLimits, *,
     if there < size:
         message = f"expected {size} bytes of data in HDU {hdu}, as its header declares; got {there}"
         raise HeaderError("truncated-data", message)
-    if not chosen:
+    if not last:
         source.skip(-size % BLOCK_BYTES)
 
 
@@ -381,6 +411,15 @@ def optional_number(header: Header, *keys: str) -> float | None:
         if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
             return float(value)
     return None
+
+
+def optional_value(header: Header, key: str) -> str | float | bool | None:
+    """What a card says, as a text without blanks around it, a finite number, or yes or no."""
+    value = _lenient(header, key)
+    if isinstance(value, bool):
+        return value
+    number = optional_number(header, key)
+    return optional_text(header, key) if number is None else number
 
 
 def optional_exposure_s(header: Header) -> float | None:

@@ -12,11 +12,11 @@ import base64
 import math
 import re
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
@@ -174,6 +174,20 @@ def with_error(value: float, sigma: float | None = None) -> str:
     digits = max(0, 1 - math.floor(math.log10(sigma)))
     rounded = round(value, digits) + 0.0  # no minus before a zero
     return f"{rounded:.{digits}f} ± {sigma:.{digits}f}"
+
+
+def provenance_values(provenance: Mapping[str, Any]) -> Values:
+    """What made a report: names and texts, a nested one's name with those that it lies in before it."""
+    return Values([Value(name, text) for name, text in _told(provenance)])
+
+
+def _told(provenance: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in provenance.items():
+        name = f"{before}{key}".replace("_", " ")
+        if isinstance(value, Mapping):
+            yield from _told(value, f"{name}: ")
+        elif value is not None:
+            yield name, str(value)
 
 
 def _is_number(cell: str) -> bool:

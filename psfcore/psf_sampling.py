@@ -38,23 +38,28 @@ Kernel = NDArray[np.float64]
 
 
 def psf_for_image(psf: Psf, header: Header) -> Psf:
-    """The PSF on the pixels of an image with this header.
+    """The PSF on the pixels of an image with this header: `psf` itself, or rebinned by its `binning_factor`."""
+    return rebinned(psf, binning_factor(psf, header))
 
-    Same scale to 1 %, or a scale that is not known: `psf` itself. A whole multiple on both axes: rebinned,
+
+def binning_factor(psf: Psf, header: Header) -> int:
+    """How many of the PSF's pixels a pixel of an image with this header has, on each axis.
+
+    Same scale to 1 %, or a scale that is not known: 1. A whole multiple on both axes: that,
     where the image is of the PSF's own instrument or the PSF names none: another telescope's pixels may be a
     multiple by chance (an FSI pixel is nine of HRI_EUV's). Raises DataError "plate-scale-mismatch".
     """
     if psf.plate_scale_arcsec is None:
-        return psf
+        return 1
     scales = [plate_scale_arcsec(header, axis) for axis in (1, 2)]
     factors = {_factor(scale / psf.plate_scale_arcsec) for scale in scales if scale is not None}
     if factors <= {1}:
-        return psf
+        return 1
     if len(factors) > 1 or None in factors or not _same_instrument(psf, header):
         found = " x ".join("unknown" if scale is None else f"{scale:g}" for scale in scales)
         wanted = f"{psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it, or its own images binned"
         raise DataError("plate-scale-mismatch", f"expected {wanted}; got CDELT1 x CDELT2 = {found} arcsec/px")
-    return rebinned(psf, factors.pop() or 1)
+    return factors.pop() or 1
 
 
 def _same_instrument(psf: Psf, header: Header) -> bool:

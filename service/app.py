@@ -8,39 +8,58 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from service import (
+    affected,
+    bulk,
+    bulk_results,
+    contexts,
+    description,
+    docs,
+    events,
+    guard,
     health,
     images,
     jobs,
+    lineage,
     metrics,
     observation,
     problems,
     products,
+    psf_choice,
     psf_queries,
+    psf_status,
     psfs,
     reports,
     transits,
     uws,
 )
+from service.access import Access
+from service.rates import Rates
 from service.state import State
+from service.streams import Streams
 from workers import queue
 from workers.catalogue import Catalogue
 from workers.reconciler import Reconciler
 from workers.settings import Settings, software_version
-from workers.store import Store
+from workers.store import open_store
 
 
-def create_app(settings: Settings) -> FastAPI:
-    """An application for these settings; its tables are made, and its reconciler runs, while it lives."""
+def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
+    """An application for these settings; its tables are made, and its reconciler runs, while it lives.
+
+    bound_to: the address that it is served on, by which it is open or asks for keys where the settings do not say.
+    """
+    access, rates = Access.of(settings, bound_to), Rates(settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         settings.data_dir.mkdir(parents=True, exist_ok=True)
         catalogue = Catalogue(settings.catalogue_url)
-        catalogue.create_tables()
-        store = Store(settings.data_dir)
+        catalogue.upgrade()
+        store = open_store(settings)
         store.sweep()
         reconciler = Reconciler(catalogue, queue.make_app(settings), settings)
-        app.state.heliopsf = State(settings, catalogue, store, reconciler)
+        streams = Streams(settings.streams_per_caller)
+        app.state.heliopsf = State(settings, catalogue, store, reconciler, access, rates, streams)
         reconciler.start()
         yield
         reconciler.stop()
@@ -51,9 +70,31 @@ def create_app(settings: Settings) -> FastAPI:
         version=software_version(),
         summary="Point-spread functions of solar EUV telescopes, and images freed of their stray light.",
         lifespan=lifespan,
+        docs_url=None,  # these load scripts from elsewhere; there is a page of our own
+        redoc_url=None,
     )
     problems.install(app)
+    description.install(app)
+    guard.install(app, access, settings.max_body_mib * 2**20)
     app.state.requests = observation.install(app)
-    for part in (images, transits, jobs, psfs, psf_queries, products, reports, uws, health, metrics):
+    # psf_choice before psfs: "best" is no id.
+    versions = (psf_choice, psf_status, contexts, affected, lineage)
+    for part in (
+        *versions,
+        images,
+        transits,
+        jobs,
+        psfs,
+        psf_queries,
+        products,
+        reports,
+        bulk,
+        bulk_results,
+        events,
+        uws,
+        health,
+        metrics,
+        docs,
+    ):
         app.include_router(part.router)
     return app

@@ -9,17 +9,24 @@ from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any, get_args
 
 import click
+from sqlalchemy.exc import SQLAlchemyError
 
 from service import (
+    cli_bulk,
+    cli_context,
+    cli_database,
     cli_diffraction,
     cli_doctor,
     cli_effects,
     cli_evaluate,
     cli_flare,
     cli_gap,
+    cli_key,
     cli_psf_query,
+    cli_psf_versions,
     cli_report,
     cli_simulate,
+    cli_store,
 )
 from service.cli_options import (
     FILE,
@@ -35,9 +42,12 @@ from service.cli_options import (
     user_errors,
 )
 from service.cli_service import LOCAL, SERVER, connection, named_psf
-from service.client import Heliopsf, percent
+from service.client import percent
+from workers import checks
 from workers.contract import Component, ShapeName
+from workers.schema import SchemaError
 from workers.settings import software_version
+from workers.urgency import Queue, queues_named
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -53,8 +63,10 @@ def main() -> None:
 def serve(host: str, port: int, data: Path | None) -> None:
     """Serve over HTTP until interrupted.
 
-    With no broker set (HELIOPSF_BROKER_URL) a worker is started beside the service.
+    With no broker set (HELIOPSF_BROKER_URL) a worker is started beside the service. On an address that other machines
+    reach, every request needs a key: `heliopsf key create`.
     """
+    from service.access import NoKeyYet
     from service.server import serve as run
 
     settings = read_settings(data)
@@ -67,23 +79,40 @@ def serve(host: str, port: int, data: Path | None) -> None:
         raise click.ClickException(f"cannot keep data in {where}: {error.strerror or error}") from error
     try:
         run(settings, host, port, lambda url: click.echo(f"heliopsf serves {url} (data in {where})"))
+    except (SchemaError, NoKeyYet) as error:
+        raise click.ClickException(str(error)) from error
+    except SQLAlchemyError as error:
+        raise click.ClickException(f"the database: {checks.database_said(error)}") from error
     except OSError as error:
         raise click.ClickException(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
 
 
 @main.command()
 @click.option("--processes", type=click.IntRange(1), help="Worker processes [default: 1]")
+@click.option("--queues", help=f"Of {', '.join(Queue)}, separated by commas [default: all]")
 @click.option("--data", type=OUTPUT_FOLDER, help="Folder for everything kept")
 @click.option("--stop-with-parent", type=int, metavar="PID", hidden=True)
-def worker(processes: int | None, data: Path | None, stop_with_parent: int | None) -> None:
-    """Run jobs from the broker until interrupted. Start as many as there are machines."""
+def worker(
+    processes: int | None, queues: str | None, data: Path | None, stop_with_parent: int | None
+) -> None:
+    """Run jobs from the broker until interrupted. Start as many as there are machines.
+
+    What people wait for (interactive) goes before cross-validations (crossval), and these before bulk, whatever the
+    order that queues are named in.
+    """
     import os
 
     from service.server import environment
 
     # The worker's module reads its settings when Celery imports it, so they go by the environment.
-    update: dict[str, Any] = {} if processes is None else {"worker_processes": processes}
-    os.environ |= environment(read_settings(data).model_copy(update=update))
+    update: dict[str, Any] = {"worker_processes": processes, "worker_queues": queues}
+    given = {name: value for name, value in update.items() if value is not None}
+    if queues is not None:
+        try:
+            queues_named(queues)
+        except ValueError as error:
+            raise click.BadParameter(str(error), param_hint="--queues") from error
+    os.environ |= environment(read_settings(data).model_copy(update=given))
     from workers.worker import main as run
 
     run(stop_with_parent)
@@ -156,7 +185,7 @@ def deconvolve(
 
 @main.group()
 def psf() -> None:
-    """Build and list PSFs."""
+    """Build, fit, look at, certify and list PSFs."""
 
 
 @psf.command("build")
@@ -305,20 +334,6 @@ def psf_show(file: Path, plot: Path | None) -> None:
         click.echo("\n".join(cli_diffraction.show(file, plot)))
 
 
-@psf.command("list")
-@click.option("--instrument", help="Only this instrument's")
-@SERVER
-def psf_list(instrument: str | None, server: str | None) -> None:
-    """List the PSF versions of a service."""
-    with user_errors(), Heliopsf(server) as service:
-        rows = list(service.psfs(**({"instrument": instrument} if instrument else {})))
-    if not rows:
-        click.echo("no PSF yet: `heliopsf psf build` makes one, and so does the first deconvolution")
-    for row in rows:
-        size = "x".join(map(str, row["details"]["shape"]))
-        click.echo(f"{row['id']}  {row['name']}  {row['version']}  {row['status']}  {size}")
-
-
 @main.command()
 @click.option("--image", type=FILE, help="An image of yours")
 @click.option(
@@ -355,11 +370,16 @@ for module in (
     cli_report,
     cli_flare,
     cli_effects,
+    cli_bulk,
     cli_doctor,
+    cli_database,
+    cli_store,
+    cli_key,
+    cli_context,
 ):
     for command in module.COMMANDS:
         main.add_command(command)
-for command in cli_psf_query.COMMANDS:
+for command in (*cli_psf_query.COMMANDS, *cli_psf_versions.COMMANDS):
     psf.add_command(command)
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import sys
 import textwrap
@@ -26,10 +25,12 @@ from packaging.utils import canonicalize_name
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
+from service.cli_database import sentence
 from service.cli_options import OUTPUT_FOLDER, read_settings
 from workers import checks
 from workers.catalogue import Catalogue
 from workers.settings import Settings, cores, software_version
+from workers.store import open_store
 
 State = Literal["ok", "warning", "broken"]
 SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
@@ -65,7 +66,9 @@ def doctor(data: Path | None, as_json: bool) -> None:
 
 def examine(settings: Settings) -> list[Finding]:
     """Everything, in the order in which one would mend it."""
-    findings = [versions(), threads(settings), storage(settings), broker(settings)]
+    findings = [versions(), threads(settings), storage(settings)]
+    findings += [object_store(settings)] if settings.store_url else []
+    findings.append(broker(settings))
     with _catalogue(settings) as (catalogue, finding):
         findings.append(finding)
         if catalogue is not None:
@@ -75,7 +78,9 @@ def examine(settings: Settings) -> list[Finding]:
                     findings.append(look(settings, catalogue))
                 except SQLAlchemyError as error:
                     name = look.__name__.replace("_", " ")
-                    findings.append(Finding(name, "broken", f"the database does not say: {_said(error)}"))
+                    findings.append(
+                        Finding(name, "broken", f"the database does not say: {checks.database_said(error)}")
+                    )
     return findings
 
 
@@ -177,6 +182,19 @@ def storage(settings: Settings) -> Finding:
     return Finding("storage", "ok", found)
 
 
+def object_store(settings: Settings) -> Finding:
+    """Does what keeps the files elsewhere take them?"""
+    try:
+        checks.object_store(open_store(settings))
+    except checks.Unusable as fault:
+        advice = "look at HELIOPSF_STORE_URL and at the AWS_* variables: endpoint, region, credentials"
+        return Finding("object store", "broken", f"{settings.store_url}: {fault}", advice)
+    except ImportError:
+        advice = "install heliopsf with its extra: pip install 'heliopsf[s3]'"
+        return Finding("object store", "broken", "the library for S3 is not installed", advice)
+    return Finding("object store", "ok", str(settings.store_url))
+
+
 def broker(settings: Settings) -> Finding:
     """Does the broker answer?"""
     if settings.embedded:
@@ -191,42 +209,49 @@ def broker(settings: Settings) -> Finding:
 
 
 def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
-    """Has the database what this version works with?"""
-    faults = catalogue.schema_faults()
-    if faults.empty:
-        return Finding(
-            "schema", "warning", "the database is empty", "the first `heliopsf serve` makes its tables"
-        )
+    """Is the database at the revision that this version works with, and is everything there?"""
+    status = catalogue.schema.status()
+    said = sentence(status)
+    match status.state:
+        case "empty":
+            return Finding("schema", "warning", said, "the first `heliopsf serve` makes them")
+        case "newer":
+            return Finding("schema", "broken", said, "run the version of heliopsf that upgraded it")
+        case "unversioned" | "older":
+            advice = (
+                "keep a copy of it, then `heliopsf database upgrade`; the next `heliopsf serve` does it too"
+            )
+            return Finding("schema", "warning", said, advice)
+        case "current":
+            faults = catalogue.schema.faults()
     if faults.columns:
-        found = f"missing columns: {', '.join(faults.columns)}"
-        return Finding("schema", "broken", found, "the database is of another version: move it, or add them")
+        found = f"{said}, but columns are missing: {', '.join(faults.columns)}"
+        return Finding("schema", "broken", found, "somebody changed the tables: take a copy from before")
     if faults.tables or faults.indexes:
-        found = f"missing: {', '.join((*faults.tables, *faults.indexes))}"
-        return Finding("schema", "warning", found, "restart `heliopsf serve`: it makes them")
-    return Finding("schema", "ok", "tables, columns and indexes are as this version wants them")
+        found = f"{said}, but these are missing: {', '.join((*faults.tables, *faults.indexes))}"
+        return Finding("schema", "warning", found, "`heliopsf database upgrade` makes them again")
+    return Finding("schema", "ok", f"{said}: tables, columns and indexes are there")
 
 
-def clock(settings: Settings, catalogue: Catalogue) -> Finding:
-    """Do this machine and the database's agree about the time? Leases rest on it."""
+def clock(_settings: Settings, catalogue: Catalogue) -> Finding:
+    """Do this machine and the database's agree about the time? Leases go by the database's alone."""
     before = time.time()
-    theirs = catalogue.clock()
+    theirs = catalogue.census.clock()
     after = time.time()
     apart = theirs - (before + after) / 2
     found = f"the database's clock is {abs(apart):.2f} s {'ahead' if apart > 0 else 'behind'}"
-    advice = "set both clocks by NTP: jobs of live workers are given to others"
-    if abs(apart) > settings.lease_s / 2 + (after - before):
-        return Finding("clock", "broken", f"{found}; a lease lasts {settings.lease_s:g} s", advice)
     if abs(apart) > 1.0 + (after - before):
-        return Finding("clock", "warning", found, "set both clocks by NTP")
+        advice = "set both clocks by NTP: when things were made, and when keys expire, goes by this machine's"
+        return Finding("clock", "warning", found, advice)
     return Finding("clock", "ok", f"within {max(0.01, abs(apart)):.2f} s of the database's")
 
 
 def workers(settings: Settings, catalogue: Catalogue) -> Finding:
     """Is anybody there to do the work, and of this version?"""
-    if "workers" in catalogue.schema_faults().tables:
+    if "workers" in catalogue.schema.faults().tables:
         return Finding("workers", "warning", "none has ever been here", _start(settings))
-    there = catalogue.workers(settings.lease_s)
-    waiting = catalogue.oldest_queued_at()
+    there = catalogue.census.workers(settings.lease_s)
+    waiting = catalogue.census.oldest_queued_at()
     if not there:
         found = f"none was heard of for {settings.lease_s:g} s"
         if waiting is not None:
@@ -246,10 +271,10 @@ def workers(settings: Settings, catalogue: Catalogue) -> Finding:
 
 def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
     """Jobs that a running service would have taken care of by now."""
-    if "jobs" in catalogue.schema_faults().tables:
+    if "jobs" in catalogue.schema.faults().tables:
         return Finding("stuck jobs", "ok", "no jobs yet")
-    silent = catalogue.count_silent(settings.lease_s + 5 * settings.reconcile_s)
-    left = catalogue.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))
+    silent = catalogue.census.count_silent(settings.lease_s + 5 * settings.reconcile_s)
+    left = catalogue.census.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))
     if not silent and not left:
         return Finding("stuck jobs", "ok", "none")
     found = f"{silent} at work without a sign of life, {left} queued that no server gave to the broker"
@@ -300,7 +325,7 @@ def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]
         catalogue.ping()
         took_ms = 1e3 * (time.perf_counter() - started)
     except SQLAlchemyError as error:
-        yield None, Finding("database", "broken", f"{where}: {_said(error)}", advice)
+        yield None, Finding("database", "broken", f"{where}: {checks.database_said(error)}", advice)
     else:
         yield catalogue, Finding("database", "ok", f"{where} answers in {took_ms:.0f} ms")
     finally:
@@ -316,27 +341,6 @@ def _database(settings: Settings) -> tuple[str, bool]:
     if url is not None and url.get_backend_name() == "sqlite" and url.database:
         return url.database, True
     return address(settings.catalogue_url), False
-
-
-REASONS = {
-    r"refused": "the connection is refused",
-    r"resolve|name or service|getaddrinfo": "the host's name is unknown",
-    r"authentication failed|no password supplied|no pg_hba": "the user or the password is not accepted",
-    r'database ".*" does not exist': "there is no database of that name",
-    r"timeout|timed out": "no answer within seconds",
-    r"unable to open|readonly": "the file cannot be opened or written to",
-    r"not a database|malformed": "the file is no SQLite database",
-    r"locked": "the file is locked by another process",
-}
-
-
-def _said(error: SQLAlchemyError) -> str:
-    """What a database's error comes to. Its own words may repeat the URL, so they are not passed on."""
-    words = str(getattr(error, "orig", None) or error).lower()
-    known = [reason for pattern, reason in REASONS.items() if re.search(pattern, words)]
-    return (
-        known[0] if known else f"it does not answer ({type(getattr(error, 'orig', None) or error).__name__})"
-    )
 
 
 def _start(settings: Settings) -> str:

@@ -51,6 +51,14 @@ DIAGNOSE = (
 @click.option("--keep", is_flag=True, help="Keep each transit after its report")
 @click.option("--scenes", multiple=True, type=FILE, help="Images (FITS) to take scenes from, in turn")
 @click.option("--only", multiple=True, metavar="EFFECT", help="Only single effects of these names, in turn")
+@click.option(
+    "--left",
+    "left_pct",
+    multiple=True,
+    type=click.FloatRange(0.05, 50),
+    metavar="PCT",
+    help="What an effect is to leave in the discs after a refit, in turn (0.5 to 10, drawn)",
+)
 @click.option("--clean-only", is_flag=True, help="Only cases without any effect: false alarms")
 @click.option("--synthetic", is_flag=True, help="Never the instrument's diffraction: starts faster")
 @click.option("--make-only", is_flag=True, help="Make and seal, diagnose nothing; transits stay")
@@ -64,6 +72,7 @@ def blind(
     keep: bool,
     scenes: tuple[Path, ...],
     only: tuple[str, ...],
+    left_pct: tuple[float, ...],
     clean_only: bool,
     synthetic: bool,
     make_only: bool,
@@ -76,7 +85,7 @@ def blind(
         click.echo(line, err=True)
 
     with user_errors():
-        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic)
+        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct)
         made = make_set(output, plan, scenes=_planes(scenes), processes=processes, progress=say)
         if make_only:
             click.echo(f"{output}: {cases} cases made and sealed")

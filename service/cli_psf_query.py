@@ -16,14 +16,12 @@ import click
 
 from service import psf_lookup
 from service.cli_options import OUTPUT, check_writable, limits, user_errors, write_json
-from service.client import DEFAULT_SERVER, Heliopsf
+from service.cli_service import remote, server_option
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
 
-SERVER = click.option(
-    "--server", envvar="HELIOPSF_SERVER", help=f"Service to ask for an ID [default: {DEFAULT_SERVER}]"
-)
+SERVER = server_option("Service to ask for an ID")
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -74,7 +72,7 @@ def cutout(psf: str, size: int, output: Path, server: str | None) -> None:
     check_writable(output)
     with user_errors():
         if _is_id(psf):
-            with Heliopsf(server) as service:
+            with remote(server) as service:
                 service.psf_cutout(psf, size, output)
         else:
             _write(output, _cut(_read(psf), size))
@@ -95,7 +93,7 @@ def rebin(psf: str, factor: int, output: Path, server: str | None) -> None:
         file = psf
         if _is_id(psf):
             file = str(Path(folder) / "psf.fits")
-            with Heliopsf(server) as service:
+            with remote(server) as service:
                 service.download(f"/v1/psfs/{psf}/file", file)
         binned = rebinned(_read(file), factor)
         _write(output, binned)
@@ -126,7 +124,7 @@ def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dic
 
         yield ask_files
         return
-    with Heliopsf(server) as service:
+    with remote(server) as service:
         yield lambda psf, question, **wanted: service.answer(
             ids if "/" in question else [psf], question, wanted
         )

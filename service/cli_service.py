@@ -3,32 +3,57 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, TypeVar
 
 import click
 
 from service.client import DEFAULT_SERVER, Heliopsf, Operations
 
-SERVER = click.option(
-    "--server", envvar="HELIOPSF_SERVER", help=f"Service to use [default: {DEFAULT_SERVER}]"
-)
+_KEY = "heliopsf.key"
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+def _remember(context: click.Context, _parameter: click.Parameter, key: str | None) -> None:
+    context.meta[_KEY] = key
+
+
+def server_option(what: str) -> Callable[[Command], Command]:
+    """The options of a command that asks a service: which one, and the key that lets it in."""
+    key = click.option(
+        "--key",
+        envvar="HELIOPSF_KEY",
+        expose_value=False,
+        callback=_remember,
+        help="Key for it; HELIOPSF_KEY keeps it out of the list of processes",
+    )
+    server = click.option("--server", envvar="HELIOPSF_SERVER", help=f"{what} [default: {DEFAULT_SERVER}]")
+    return lambda command: server(key(command))
+
+
+SERVER = server_option("Service to use")
 LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
+
+
+def remote(server: str | None) -> Heliopsf:
+    """A service over HTTP, with the key that the command was given."""
+    return Heliopsf(server, key=click.get_current_context().meta.get(_KEY))
 
 
 @contextmanager
 def connection(server: str | None, local: bool) -> Iterator[Operations]:
     """A service over HTTP, or one that lives in this process."""
     if not local:
-        with Heliopsf(server) as remote:
-            remote.health()
-            yield remote
+        with remote(server) as service:
+            service.health()
+            yield service
         return
     from service.local import local_service
 
-    with local_service() as service:
-        yield service
+    with local_service() as here:
+        yield here
 
 
 def named_psf(service: Operations, psf: str | None) -> str | None:

@@ -43,7 +43,7 @@ def healthz(state: Shared) -> Health:
 def readyz(state: Shared) -> Readiness:
     """200 where database, storage, and broker (or the embedded worker) answer; else 503 that says which does not."""
     parts = {}
-    for name, check in checks.needed(state.settings, state.catalogue).items():
+    for name, check in checks.needed(state.settings, state.catalogue, state.store).items():
         try:
             check()
             parts[name] = "ok"

@@ -9,12 +9,14 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
 
 from service import uploads
+from service.callers import Reading, Submitting
 from service.paging import Cursor, Limit, Page, page, position
 from service.problems import RESPONSES, Problem
+from service.quotas import Allowed
 from service.state import Shared
-from workers.catalogue import DEFAULT_OWNER, ImageRow
 from workers.contract import Identity
 from workers.intake import image_row
+from workers.tables import ImageRow
 
 router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)
 
@@ -43,11 +45,13 @@ class ImageView(BaseModel):
     openapi_extra=uploads.OPENAPI_BODY,
     responses={200: {"model": ImageView, "description": "The same file was uploaded before."}},
 )
-async def upload_image(request: Request, response: Response, state: Shared) -> ImageView:
+async def upload_image(request: Request, response: Response, caller: Submitting, state: Shared) -> ImageView:
     """Stream one FITS file in. Its header is inspected; its pixels are not touched here."""
-    async with uploads.receive(request, state.store, state.limits, state.settings.max_upload_bytes) as upload:
+    take = Allowed(state, caller)
+    limit = state.settings.max_upload_bytes
+    async with uploads.receive(request, state.store, state.limits, limit, take) as upload:
         await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
-    row = image_row(DEFAULT_OWNER, upload.sha256, upload.bytes, upload.filename, upload.summary)
+    row = image_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
     row, new = await run_in_threadpool(state.catalogue.add, row)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/images/{row.id}"
@@ -55,16 +59,18 @@ async def upload_image(request: Request, response: Response, state: Shared) -> I
 
 
 @router.get("", summary="List uploaded images")
-def list_images(request: Request, state: Shared, limit: Limit = 50, cursor: Cursor = None) -> Page[ImageView]:
+def list_images(
+    request: Request, caller: Reading, state: Shared, limit: Limit = 50, cursor: Cursor = None
+) -> Page[ImageView]:
     """Uploaded images, newest first."""
-    rows = state.catalogue.page(ImageRow, limit=limit + 1, after=position(cursor))
+    rows = state.catalogue.page(ImageRow, owner=caller.owner, limit=limit + 1, after=position(cursor))
     return page(request, rows, limit, ImageView.of)
 
 
 @router.get("/{image_id}", summary="One uploaded image")
-def get_image(image_id: Identity, state: Shared) -> ImageView:
+def get_image(image_id: Identity, caller: Reading, state: Shared) -> ImageView:
     """What is known of an uploaded image."""
-    row = state.catalogue.get(ImageRow, image_id)
+    row = state.catalogue.get(ImageRow, image_id, caller.owner)
     if row is None:
         raise Problem(404, "no-such-image", f"no image was uploaded with id {image_id}")
     return ImageView.of(row)

@@ -23,12 +23,13 @@ from service.psf_cutout import cutout
 from service.psfs import PsfView
 from service.reports import ReportView
 from service.transits import TransitDetails
-from workers.catalogue import DEFAULT_OWNER, Catalogue, ProductRow, PsfRow, ReportRow
+from workers.catalogue import Catalogue
 from workers.contract import JobRequest, Phase
 from workers.intake import image_row, resolve, transit_row, uploaded_psf_row
 from workers.runner import Runner
 from workers.settings import Settings
 from workers.store import Store
+from workers.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
 
 
 class LocalService(Operations):
@@ -38,7 +39,7 @@ class LocalService(Operations):
         self._settings = settings
         self._store = Store(settings.data_dir)
         self._catalogue = Catalogue(settings.catalogue_url)
-        self._catalogue.create_tables()
+        self._catalogue.upgrade()
         self._runner = Runner(settings, self._catalogue, self._store)
 
     def close(self) -> None:
@@ -63,7 +64,14 @@ class LocalService(Operations):
         return TransitDetails.of(self._catalogue.add(row)[0]).model_dump(mode="json")
 
     def upload_psf(
-        self, path: str | Path, *, name: str | None = None, version: str | None = None
+        self,
+        path: str | Path,
+        *,
+        name: str | None = None,
+        version: str | None = None,
+        instrument: str | None = None,
+        channel: str | None = None,
+        kind: str | None = None,
     ) -> dict[str, Any]:
         """Take a PSF in."""
         source = Path(path)
@@ -77,6 +85,9 @@ class LocalService(Operations):
             summary,
             name=name,
             version=version,
+            instrument=instrument,
+            channel=channel,
+            kind=kind,
         )
         return PsfView.of(self._catalogue.add(row)[0]).model_dump(mode="json")
 
@@ -91,14 +102,14 @@ class LocalService(Operations):
         resolved = resolve(
             request, self._catalogue, DEFAULT_OWNER, added_effects=self._settings.added_effects
         )
-        row, _ = self._catalogue.submit(kind, *resolved)
+        row, _ = self._catalogue.jobs.submit(kind, *resolved, DEFAULT_OWNER)
         return JobView.of(row).model_dump(mode="json")
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
         """Run the job here; returns it completed, or raises ``ServiceError``."""
         while not Phase(job["phase"]).ended:  # a passing failure is tried again, as often as the settings say
             self._runner.run(job["id"], progress)
-            row = self._catalogue.job(job["id"])
+            row = self._catalogue.jobs.get(job["id"])
             assert row is not None
             job = JobView.of(row).model_dump(mode="json")
         return self._ended(job)
@@ -123,6 +134,7 @@ class LocalService(Operations):
             "preview": row.preview_sha256,
             "effects": row.details.get("effects_picture_sha256"),
             "report": row.details.get("report_sha256"),
+            "output": row.details.get("output_sha256"),
             "page": row.details.get("page_sha256"),
         }
         digest = digests[part]
@@ -155,7 +167,7 @@ class LocalService(Operations):
         return tables
 
     def _psf(self, psf_id: str) -> PsfRow:
-        row = self._catalogue.get(PsfRow, psf_id)
+        row = self._catalogue.get(PsfRow, psf_id, DEFAULT_OWNER)
         if row is None:
             raise ServiceError(f"the catalogue holds no PSF with id {psf_id}", code="no-such-psf")
         return row
@@ -164,11 +176,11 @@ class LocalService(Operations):
         _, collection, identity = address.rsplit("/", 2)
         row: ProductRow | PsfRow | ReportRow | None
         if collection == "products":
-            row = self._catalogue.get(ProductRow, identity)
+            row = self._catalogue.get(ProductRow, identity, DEFAULT_OWNER)
         elif collection == "reports":
-            row = self._catalogue.get(ReportRow, identity)
+            row = self._catalogue.get(ReportRow, identity, DEFAULT_OWNER)
         else:
-            row = self._catalogue.get(PsfRow, identity)
+            row = self._catalogue.get(PsfRow, identity, DEFAULT_OWNER)
         assert row is not None
         return row
 

@@ -102,5 +102,18 @@ class _Observed:
                 scope["method"] if scope["method"] in METHODS else "other",
                 scope["path"],  # without the query
                 status,
-                extra={"fields": {"route": route, "status": status, "seconds": round(seconds, 4)}},
+                extra={
+                    "fields": {
+                        "route": route,
+                        "status": status,
+                        "seconds": round(seconds, 4),
+                        **_caller(scope),
+                    }
+                },
             )
+
+
+def _caller(scope: Scope) -> dict[str, str]:
+    """Who asked, as far as it is known: the owner, and the key's id or the address. Never the key."""
+    caller = scope.get("state", {}).get("caller")
+    return {} if caller is None else {"owner": caller.owner, "caller": caller.name}

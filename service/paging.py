@@ -35,16 +35,39 @@ Cursor = Annotated[str | None, Query(description="from the `next` of the page be
 
 def position(cursor: str | None) -> tuple[float, str] | None:
     """The (created_at, id) in a cursor; ``Problem`` 422 where it is none of ours."""
+    parts = place(cursor, 2)
+    return None if parts is None else (number(parts[0]), parts[1])
+
+
+def place(cursor: str | None, count: int) -> list[str] | None:
+    """The parts of the place in a cursor, the last of them an id; ``Problem`` 422 where it is none of ours."""
     if cursor is None:
         return None
     try:
-        created_at, _, identity = base64.urlsafe_b64decode(cursor.encode()).decode("ascii").partition(" ")
-        at = (float(created_at), identity)
+        parts = base64.urlsafe_b64decode(cursor.encode()).decode("ascii").split(" ")
     except (binascii.Error, ValueError) as error:
         raise _no_cursor() from error
-    if not math.isfinite(at[0]) or not at[1].isalnum():
+    if len(parts) != count or not parts[-1].isalnum() or not all(map(str.isprintable, parts)):
+        raise _no_cursor()
+    return parts
+
+
+def number(part: str) -> float:
+    """A time in a cursor; ``Problem`` 422 where it is none."""
+    try:
+        at = float(part)
+    except ValueError as error:
+        raise _no_cursor() from error
+    if not math.isfinite(at):
         raise _no_cursor()
     return at
+
+
+def following(request: Request, *parts: str) -> str:
+    """The address of the page that begins behind a place."""
+    cursor = base64.urlsafe_b64encode(" ".join(parts).encode()).decode()
+    query = request.url.include_query_params(cursor=cursor)
+    return f"{query.path}?{query.query}"
 
 
 def _no_cursor() -> Problem:
@@ -53,10 +76,6 @@ def _no_cursor() -> Problem:
 
 def page(request: Request, rows: Sequence[Row], limit: int, view: Callable[[Row], Item]) -> Page[Item]:
     """The page for ``limit + 1`` rows that were asked for: one more than is shown tells of a next page."""
-    following = None
-    if len(rows) > limit:
-        last = rows[limit - 1]
-        cursor = base64.urlsafe_b64encode(f"{last.created_at!r} {last.id}".encode()).decode()
-        query = request.url.include_query_params(cursor=cursor)
-        following = f"{query.path}?{query.query}"
-    return Page(items=[view(row) for row in rows[:limit]], next=following)
+    after = rows[limit - 1] if len(rows) > limit else None
+    next_page = None if after is None else following(request, repr(after.created_at), after.id)
+    return Page(items=[view(row) for row in rows[:limit]], next=next_page)

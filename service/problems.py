@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
 
@@ -15,9 +16,18 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
 from workers import logs
+from workers.store import StoreAway
 
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
+# On every answer, unless a route has its own: nothing is guessed, framed, told to others, or loaded by a page.
+SECURITY_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
 
 
 class ProblemDocument(BaseModel):
@@ -36,12 +46,17 @@ class ProblemDocument(BaseModel):
 class Problem(Exception):
     """Raised by any endpoint; answered as a problem document."""
 
-    def __init__(self, status: int, code: str, detail: str, **more: Any) -> None:
+    def __init__(
+        self, status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
+    ) -> None:
         super().__init__(detail)
         self.status, self.code, self.detail, self.more = status, code, detail, more
+        self.headers = dict(headers or {})
 
 
-def answer(status: int, code: str, detail: str, **more: Any) -> JSONResponse:
+def answer(
+    status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
+) -> JSONResponse:
     """The response for a problem."""
     body = {
         "type": f"urn:heliopsf:{code}",
@@ -50,7 +65,7 @@ def answer(status: int, code: str, detail: str, **more: Any) -> JSONResponse:
         "detail": detail,
         **more,
     }
-    return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE)
+    return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -63,7 +78,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Problem)
     def _problem(_request: Request, problem: Problem) -> JSONResponse:
-        return answer(problem.status, problem.code, problem.detail, **problem.more)
+        return answer(problem.status, problem.code, problem.detail, headers=problem.headers, **problem.more)
 
     @app.exception_handler(RequestValidationError)
     def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
@@ -91,11 +106,19 @@ def install(app: FastAPI) -> None:
         problem.headers["Retry-After"] = "5"
         return problem
 
+    @app.exception_handler(StoreAway)
+    def _store(_request: Request, error: StoreAway) -> JSONResponse:
+        log.error("storage: %s", error)
+        return answer(
+            503,
+            "storage-away",
+            "the storage of files does not answer; try again in a moment",
+            headers={"Retry-After": "5"},
+        )
+
     @app.exception_handler(Exception)
     def _ours(_request: Request, _error: Exception) -> JSONResponse:
         # Starlette logs the traceback and passes the error on to the server after this answer.
-        problem = answer(500, "internal-error", "the service failed; the error is in its log")
-        problem.headers["X-Request-ID"] = logs.about().get(
-            "request", ""
-        )  # this answer goes past what sets it
-        return problem
+        # This answer goes past all that sets headers.
+        headers = {**SECURITY_HEADERS, "X-Request-ID": logs.about().get("request", "")}
+        return answer(500, "internal-error", "the service failed; the error is in its log", headers=headers)

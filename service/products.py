@@ -8,11 +8,12 @@ from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, Field
 
 from service import files
+from service.callers import Caller, Reading
 from service.paging import Cursor, Limit, Page, page, position
 from service.problems import RESPONSES, Problem
 from service.state import Shared
-from workers.catalogue import ProductRow
 from workers.contract import Identity
+from workers.tables import ProductRow
 
 router = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)
 
@@ -56,6 +57,7 @@ class ProductView(BaseModel):
 @router.get("", summary="List products")
 def list_products(
     request: Request,
+    caller: Reading,
     state: Shared,
     image_id: Identity | None = None,
     psf_id: Identity | None = None,
@@ -64,21 +66,26 @@ def list_products(
 ) -> Page[ProductView]:
     """Products, newest first; of one image or of one PSF where asked."""
     rows = state.catalogue.page(
-        ProductRow, limit=limit + 1, after=position(cursor), image_id=image_id, psf_id=psf_id
+        ProductRow,
+        owner=caller.owner,
+        limit=limit + 1,
+        after=position(cursor),
+        image_id=image_id,
+        psf_id=psf_id,
     )
     return page(request, rows, limit, ProductView.of)
 
 
 @router.get("/{product_id}", summary="One product")
-def get_product(product_id: Identity, state: Shared) -> ProductView:
+def get_product(product_id: Identity, caller: Reading, state: Shared) -> ProductView:
     """What is known of a product."""
-    return ProductView.of(_find(state, product_id))
+    return ProductView.of(_find(state, caller, product_id))
 
 
 @router.get("/{product_id}/file", summary="The product as FITS", response_class=Response)
-def get_product_file(product_id: Identity, request: Request, state: Shared) -> Response:
+def get_product_file(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the product; its hash is the ETag."""
-    row = _find(state, product_id)
+    row = _find(state, caller, product_id)
     return files.send(
         request, state.store, row.file_sha256, files.FITS_TYPE, f"heliopsf-{product_id[:12]}.fits"
     )
@@ -87,15 +94,17 @@ def get_product_file(product_id: Identity, request: Request, state: Shared) -> R
 @router.get(
     "/{product_id}/preview", summary="Before, after and the change, as a picture", response_class=Response
 )
-def get_product_preview(product_id: Identity, request: Request, state: Shared) -> Response:
+def get_product_preview(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The picture as PNG."""
-    return files.send(request, state.store, _find(state, product_id).preview_sha256, "image/png", None)
+    return files.send(
+        request, state.store, _find(state, caller, product_id).preview_sha256, "image/png", None
+    )
 
 
 @router.get("/{product_id}/effects", summary="What changed, as a picture", response_class=Response)
-def get_product_effects(product_id: Identity, request: Request, state: Shared) -> Response:
+def get_product_effects(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Before, after, change, difference, ratio and histogram as PNG, where the job was asked for it."""
-    digest = _find(state, product_id).details.get("effects_picture_sha256")
+    digest = _find(state, caller, product_id).details.get("effects_picture_sha256")
     if digest is None:
         raise Problem(
             404, "no-effects-picture", "expected a job with effects_picture true; this product's had it false"
@@ -103,9 +112,9 @@ def get_product_effects(product_id: Identity, request: Request, state: Shared) -
     return files.send(request, state.store, digest, "image/png", None)
 
 
-def _find(state: Shared, product_id: str) -> ProductRow:
+def _find(state: Shared, caller: Caller, product_id: str) -> ProductRow:
     """The product's row; ``Problem`` 404 where there is none."""
-    row = state.catalogue.get(ProductRow, product_id)
+    row = state.catalogue.get(ProductRow, product_id, caller.owner)
     if row is None:
         raise Problem(404, "no-such-product", f"there is no product with id {product_id}")
     return row

@@ -54,10 +54,12 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
 
 def _header(file: BinaryIO) -> Header:
     """The first header; the file is left at the first byte of its data."""
-    raw = b""
-    while not any(raw[at : at + _CARD_BYTES] == _END for at in range(0, len(raw), _CARD_BYTES)):
-        raw += file.read(BLOCK_BYTES)  # read_summary has seen the END
-    return Header.fromstring(raw)
+    raw = bytearray()
+    block = b""
+    while not any(block[at : at + _CARD_BYTES] == _END for at in range(0, len(block), _CARD_BYTES)):
+        block = file.read(BLOCK_BYTES)  # read_summary has seen the END
+        raw += block
+    return Header.fromstring(bytes(raw))
 
 
 def _middle(file: BinaryIO, first: int, shape: tuple[int, int], size: int, pixel_bytes: int) -> bytes:

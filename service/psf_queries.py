@@ -17,11 +17,12 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from service import files, psf_lookup
+from service.callers import Caller, Reading
 from service.problems import RESPONSES, Problem
 from service.psf_cutout import cutout
 from service.state import Shared
-from workers.catalogue import PsfRow
 from workers.contract import Identity
+from workers.tables import PsfRow
 
 # Enters every ETag: raised by hand when an answer changes that the same tables give.
 ANSWERS_VERSION = 1
@@ -103,6 +104,7 @@ class ComparisonAnswer(BaseModel):
 def get_curve(
     psf_id: Identity,
     request: Request,
+    caller: Reading,
     state: Shared,
     radii: Annotated[
         str | None, Query(max_length=12_000, description="px, as 1,10,100; none: those of the table")
@@ -110,31 +112,37 @@ def get_curve(
 ) -> Response:
     """The cumulative curve, with errors where the PSF was fitted."""
     wanted = None if radii is None else _numbers(radii)
-    return _answer(request, state, [psf_id], lambda tables: psf_lookup.curve(tables, wanted))
+    return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.curve(tables, wanted))
 
 
 @router.get("/{psf_id}/profile", summary="Mean weight by radius", response_model=ProfileAnswer)
-def get_profile(psf_id: Identity, request: Request, state: Shared) -> Response:
+def get_profile(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The radial profile, and how uneven the PSF is round each ring."""
-    return _answer(request, state, [psf_id], psf_lookup.profile)
+    return _answer(request, caller, state, [psf_id], psf_lookup.profile)
 
 
 @router.get("/{psf_id}/encircled", summary="Light within a radius", response_model=EncircledAnswer)
-def get_encircled(psf_id: Identity, radius: Radius, request: Request, state: Shared) -> Response:
+def get_encircled(
+    psf_id: Identity, radius: Radius, request: Request, caller: Reading, state: Shared
+) -> Response:
     """Encircled energy."""
-    return _answer(request, state, [psf_id], lambda tables: psf_lookup.encircled(tables, radius))
+    return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.encircled(tables, radius))
 
 
 @router.get("/{psf_id}/annulus", summary="Light between two radii", response_model=AnnulusAnswer)
-def get_annulus(psf_id: Identity, inner: Radius, outer: Radius, request: Request, state: Shared) -> Response:
+def get_annulus(
+    psf_id: Identity, inner: Radius, outer: Radius, request: Request, caller: Reading, state: Shared
+) -> Response:
     """Light farther than `inner`, and not farther than `outer`."""
-    return _answer(request, state, [psf_id], lambda tables: psf_lookup.annulus(tables, inner, outer))
+    return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.annulus(tables, inner, outer))
 
 
 @router.get("/{psf_id}/compare/{other_id}", summary="Two PSFs side by side", response_model=ComparisonAnswer)
-def get_comparison(psf_id: Identity, other_id: Identity, request: Request, state: Shared) -> Response:
+def get_comparison(
+    psf_id: Identity, other_id: Identity, request: Request, caller: Reading, state: Shared
+) -> Response:
     """Differences of curves in points and of totals, the second less the first."""
-    return _answer(request, state, [psf_id, other_id], psf_lookup.compare)
+    return _answer(request, caller, state, [psf_id, other_id], psf_lookup.compare)
 
 
 @router.get("/{psf_id}/cutout", summary="The middle of a PSF as FITS", response_class=Response)
@@ -142,10 +150,11 @@ def get_cutout(
     psf_id: Identity,
     size: Annotated[int, Query(ge=1, description="edge in px, at most the PSF's own")],
     request: Request,
+    caller: Reading,
     state: Shared,
 ) -> Response:
     """The central weights, not renormalised, centre at [size // 2, size // 2]."""
-    row = _find(state, psf_id)
+    row = _find(state, caller, psf_id)
     headers = _headers(f"{row.file_sha256} cutout {size}")
     if files.known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
@@ -158,10 +167,10 @@ def get_cutout(
 
 
 def _answer(
-    request: Request, state: Shared, psf_ids: list[str], ask: Callable[..., dict[str, Any]]
+    request: Request, caller: Caller, state: Shared, psf_ids: list[str], ask: Callable[..., dict[str, Any]]
 ) -> Response:
     """The answer of the tables of these PSFs, or 304 where the client has it already."""
-    rows = [_find(state, psf_id) for psf_id in psf_ids]
+    rows = [_find(state, caller, psf_id) for psf_id in psf_ids]
     digests = [_tables_of(row) for row in rows]
     headers = _headers(f"{' '.join(digests)} {request.url.path} {request.url.query}")
     if files.known(request, headers["ETag"]):
@@ -212,8 +221,8 @@ def _numbers(text: str) -> list[float]:
         raise Problem(422, "bad-radius", f"radii: expected numbers and commas; got {text!r:.60}") from error
 
 
-def _find(state: Shared, psf_id: str) -> PsfRow:
-    row = state.catalogue.get(PsfRow, psf_id)
+def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
+    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
         raise Problem(404, "no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
     return row

@@ -2,34 +2,50 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
 
+from psfcore.errors import DataError
 from service import files, uploads
+from service.callers import Caller, Reading, Submitting
 from service.paging import Cursor, Limit, Page, page, position
 from service.problems import RESPONSES, Problem
+from service.psf_filters import PRINTABLE, Filters, InContext
+from service.psf_problems import problem
+from service.quotas import Allowed
 from service.state import Shared
-from workers.catalogue import DEFAULT_OWNER, PsfRow
 from workers.contract import Identity
 from workers.intake import uploaded_psf_row
+from workers.psf_contexts import NOW
+from workers.psf_lines import WORD
+from workers.psf_rows import PsfFilter
+from workers.psf_status import PsfStatus
+from workers.tables import PsfRow
+from workers.validity import iso
 
-PRINTABLE = r"^[^\x00-\x1f\x7f]+$"
-Filter = Annotated[str | None, Query(max_length=80, pattern=PRINTABLE)]
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
 
 class PsfView(BaseModel):
-    """A PSF version. It never changes; a change is another version with another id."""
+    """A PSF. Its content never changes: another content has another id. What changes is how far it is trusted."""
 
     id: str
     created_at: float
     name: str
     version: str
     instrument: str | None
-    status: str = Field(description="draft, or uploaded")
+    channel: str | None = Field(description="wavelength in whole angstrom; null where it is not known")
+    kind: str = Field(
+        description="total, a component's name as diffraction, or uploaded where nobody said which"
+    )
+    status: PsfStatus
+    valid_from: str | None = Field(description="time of observation; null: from ever, or never certified")
+    valid_to: str | None = Field(description="null: open, or never certified")
+    successor: str | None = Field(description="id of the PSF to use instead, of a deprecated one")
     origin: str = Field(description="built here, fitted to a transit, or uploaded")
     bytes: int
     details: dict[str, Any] = Field(description="shape, curve, parameters, where it came from")
@@ -47,7 +63,12 @@ class PsfView(BaseModel):
             name=row.name,
             version=row.version,
             instrument=row.instrument,
-            status=row.status,
+            channel=row.channel,
+            kind=row.kind,
+            status=PsfStatus(row.status),
+            valid_from=None if row.valid_from is None else iso(row.valid_from),
+            valid_to=None if row.valid_to is None else iso(row.valid_to),
+            successor=row.successor_id,
             origin=row.origin,
             bytes=row.bytes,
             details=row.details,
@@ -67,6 +88,7 @@ class PsfView(BaseModel):
 async def upload_psf(
     request: Request,
     response: Response,
+    caller: Submitting,
     state: Shared,
     name: Annotated[
         str | None,
@@ -75,21 +97,39 @@ async def upload_psf(
     version: Annotated[
         str | None, Query(max_length=40, pattern=PRINTABLE, description="default: PSFVERS, or 0.0.0+hash")
     ] = None,
+    instrument: Annotated[
+        str | None, Query(pattern=WORD, description="default: DETECTOR or INSTRUME")
+    ] = None,
+    channel: Annotated[
+        str | None, Query(pattern=WORD, description="default: WAVELNTH in whole angstrom")
+    ] = None,
+    kind: Annotated[
+        str | None,
+        Query(
+            pattern=WORD,
+            description="total, for a whole PSF; default: uploaded, which images are not given unasked",
+        ),
+    ] = None,
 ) -> PsfView:
     """Stream a PSF in: one 2-D image, its centre at [n//2, n//2], its sum at most 1.
 
     The header is inspected here; a job that uses the PSF says what its pixels lack.
     """
-    async with uploads.receive(request, state.store, state.limits, state.settings.max_upload_bytes) as upload:
+    take = Allowed(state, caller)
+    limit = state.settings.max_upload_bytes
+    async with uploads.receive(request, state.store, state.limits, limit, take) as upload:
         await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
     row = uploaded_psf_row(
-        DEFAULT_OWNER,
+        caller.owner,
         upload.sha256,
         upload.bytes,
         upload.filename,
         upload.summary,
         name=name,
         version=version,
+        instrument=instrument,
+        channel=channel,
+        kind=kind,
     )
     row, new = await run_in_threadpool(state.catalogue.add, row)
     response.status_code = 201 if new else 200
@@ -97,54 +137,51 @@ async def upload_psf(
     return PsfView.of(row)
 
 
-@router.get("", summary="List PSF versions")
+@router.get("", summary="List PSFs")
 def list_psfs(
     request: Request,
+    caller: Reading,
     state: Shared,
-    instrument: Filter = None,
-    name: Filter = None,
-    version: Filter = None,
+    filters: Filters,
+    context: InContext = None,
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[PsfView]:
-    """PSF versions, newest first."""
-    rows = state.catalogue.page(
-        PsfRow,
-        limit=limit + 1,
-        after=position(cursor),
-        instrument=instrument,
-        name=name,
-        version=version,
-    )
+    """PSFs, newest first; with a time, those that are certified for it, or that the context pins for it."""
+    try:
+        wanted = _in_context(state, caller, filters, context)
+    except DataError as error:
+        raise problem(error) from error
+    rows = state.catalogue.psfs.page(wanted, caller.owner, limit=limit + 1, after=position(cursor))
     return page(request, rows, limit, PsfView.of)
 
 
 @router.get("/{psf_id}", summary="One PSF version")
-def get_psf(psf_id: Identity, state: Shared) -> PsfView:
+def get_psf(psf_id: Identity, caller: Reading, state: Shared) -> PsfView:
     """What is known of a PSF version."""
-    return PsfView.of(_find(state, psf_id))
+    return PsfView.of(_find(state, caller, psf_id))
 
 
 @router.get("/{psf_id}/file", summary="The PSF as FITS", response_class=Response)
-def get_psf_file(psf_id: Identity, request: Request, state: Shared) -> Response:
+def get_psf_file(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the PSF; its hash is the ETag."""
-    row = _find(state, psf_id)
+    row = _find(state, caller, psf_id)
     return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, f"psf-{psf_id[:12]}.fits")
 
 
 @router.get("/{psf_id}/preview", summary="A picture of the PSF", response_class=Response)
-def get_psf_preview(psf_id: Identity, request: Request, state: Shared) -> Response:
+def get_psf_preview(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The PSF, its radial profile and its cumulative curve as PNG."""
-    row = _find(state, psf_id)
+    row = _find(state, caller, psf_id)
     if row.preview_sha256 is None:
         raise Problem(404, "no-preview", "an uploaded PSF has no picture until a job psf-tables draws it")
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
 
 
 @router.get("/{psf_id}/report", summary="What a fit found, as JSON", response_class=Response)
-def get_psf_report(psf_id: Identity, request: Request, state: Shared) -> Response:
+def get_psf_report(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Parameters with errors, curves and bands, every image's residual, and what these data cannot say."""
-    digest = _find(state, psf_id).details.get("report_sha256")
+    digest = _find(state, caller, psf_id).details.get("report_sha256")
     if digest is None:
         raise Problem(
             404, "no-report", "this PSF was not fitted to a transit; its details say where it is from"
@@ -152,9 +189,18 @@ def get_psf_report(psf_id: Identity, request: Request, state: Shared) -> Respons
     return files.send(request, state.store, digest, "application/json", f"psf-{psf_id[:12]}.json")
 
 
-def _find(state: Shared, psf_id: str) -> PsfRow:
+def _in_context(state: Shared, caller: Caller, filters: PsfFilter, context: str | None) -> PsfFilter:
+    """The filters with the context that a list is asked for in. Raises ``DataError`` "no-such-context"."""
+    if context is None:
+        return filters
+    if context == NOW:
+        return replace(filters, status=PsfStatus.CERTIFIED)
+    return replace(filters, context_id=state.catalogue.contexts.named(context, caller.owner).id)
+
+
+def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
     """The PSF's row; ``Problem`` 404 where there is none."""
-    row = state.catalogue.get(PsfRow, psf_id)
+    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
         raise Problem(404, "no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
     return row

@@ -18,8 +18,10 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
+from service.access import check_can_serve
 from service.app import create_app
 from workers import logs
+from workers.catalogue import Catalogue
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -39,13 +41,15 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
         address = f"http://{host_name}:{listener.getsockname()[1]}"
         server = _Server(
             uvicorn.Config(
-                create_app(settings),
+                create_app(settings, host),
                 log_config=None,
                 log_level="warning",
                 access_log=False,
+                server_header=False,
                 timeout_graceful_shutdown=ceil(settings.stop_s),
             )
         )
+        _prepare(settings, host)
         # The server passes a signal on once it has shut down; as exceptions they let the worker be stopped too.
         signal.signal(signal.SIGTERM, _raise_exit)
         with embedded_worker(settings):
@@ -54,6 +58,20 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
                 server.run(sockets=[listener])
             except KeyboardInterrupt:
                 log.info("interrupted")
+
+
+def _prepare(settings: Settings, host: str) -> None:
+    """Bring the database to this version's tables before a worker beside looks at them, and see to it that nobody is let in who should not be.
+
+    Raises ``SchemaError``, ``NoKeyYet``.
+    """
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    catalogue = Catalogue(settings.catalogue_url)
+    try:
+        catalogue.upgrade()
+        check_can_serve(settings, host, catalogue)
+    finally:
+        catalogue.close()
 
 
 class _Server(uvicorn.Server):

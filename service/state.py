@@ -8,6 +8,9 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from psfcore.header import FitsLimits
+from service.access import Access
+from service.rates import Rates
+from service.streams import Streams
 from workers.catalogue import Catalogue
 from workers.reconciler import Reconciler
 from workers.settings import Settings
@@ -22,6 +25,9 @@ class State:
     catalogue: Catalogue
     store: Store
     reconciler: Reconciler
+    access: Access
+    rates: Rates
+    streams: Streams
 
     @property
     def limits(self) -> FitsLimits:

@@ -7,12 +7,14 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
 
 from service import uploads
+from service.callers import Reading, Submitting
 from service.paging import Cursor, Limit, Page, page, position
 from service.problems import RESPONSES, Problem
+from service.quotas import Allowed
 from service.state import Shared
-from workers.catalogue import DEFAULT_OWNER, TransitRow
 from workers.contract import Identity, NoiseFigures
 from workers.intake import transit_row
+from workers.tables import TransitRow
 
 router = APIRouter(prefix="/v1/transits", tags=["transits"], responses=RESPONSES)
 
@@ -75,17 +77,23 @@ def _content(row: TransitRow) -> dict[str, object]:
     openapi_extra=uploads.OPENAPI_TRANSIT_BODY,
     responses={200: {"model": TransitDetails, "description": "The same file was uploaded before."}},
 )
-async def upload_transit(request: Request, response: Response, state: Shared) -> TransitDetails:
+async def upload_transit(
+    request: Request, response: Response, caller: Submitting, state: Shared
+) -> TransitDetails:
     """Stream one archive in: images of a transit, their transit.json, and the known part of the PSF if there is one.
 
     Its table of contents and transit.json are checked; its pixels are not touched here.
     """
     settings = state.settings
     async with uploads.receive_transit(
-        request, state.store, settings.archive_limits, settings.max_transit_bytes
+        request,
+        state.store,
+        settings.archive_limits,
+        settings.max_transit_bytes,
+        Allowed(state, caller),
     ) as upload:
         await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
-    row = transit_row(DEFAULT_OWNER, upload.sha256, upload.bytes, upload.filename, upload.summary)
+    row = transit_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
     row, new = await run_in_threadpool(state.catalogue.add, row)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/transits/{row.id}"
@@ -94,17 +102,17 @@ async def upload_transit(request: Request, response: Response, state: Shared) ->
 
 @router.get("", summary="List uploaded transits")
 def list_transits(
-    request: Request, state: Shared, limit: Limit = 50, cursor: Cursor = None
+    request: Request, caller: Reading, state: Shared, limit: Limit = 50, cursor: Cursor = None
 ) -> Page[TransitView]:
     """Uploaded transits, newest first, without their files' names."""
-    rows = state.catalogue.page(TransitRow, limit=limit + 1, after=position(cursor))
+    rows = state.catalogue.page(TransitRow, owner=caller.owner, limit=limit + 1, after=position(cursor))
     return page(request, rows, limit, TransitView.of)
 
 
 @router.get("/{transit_id}", summary="One uploaded transit")
-def get_transit(transit_id: Identity, state: Shared) -> TransitDetails:
+def get_transit(transit_id: Identity, caller: Reading, state: Shared) -> TransitDetails:
     """What is known of an uploaded transit."""
-    row = state.catalogue.get(TransitRow, transit_id)
+    row = state.catalogue.get(TransitRow, transit_id, caller.owner)
     if row is None:
         raise Problem(404, "no-such-transit", f"no transit was uploaded with id {transit_id}")
     return TransitDetails.of(row)

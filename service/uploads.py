@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
 FORM_BYTES = 2**16  # what a form may add to the file
+LARGE = frozenset({"/v1/images", "/v1/psfs", "/v1/transits"})  # where files come in, with limits of their own
+UNDECLARED_BYTES = 2**20  # taken at a time from the allowance where a request does not say how long it is
+Take = Callable[[int], object]
 _ARCHIVE_STATUS = {"archive-too-large": 413, "not-an-archive": 415}
 
 
@@ -99,35 +102,38 @@ class _Format(Protocol[FoundOut]):
 
 @asynccontextmanager
 async def receive(
-    request: Request, store: Store, limits: FitsLimits, max_bytes: int
+    request: Request, store: Store, limits: FitsLimits, max_bytes: int, take: Take
 ) -> AsyncIterator[Upload[HeaderSummary]]:
     """Stream the request's FITS file to a temporary path and inspect its header.
 
-    Raises ``Problem`` 413 over the size limit, 415 for what is no FITS, 400 for a broken form or an upload
+    take: counts bytes against the caller's allowance. Raises ``Problem`` 413 over the size limit, 415 for what is no FITS, 400 for a broken form or an upload
     that ended early, and 422 for a header that shows a file that cannot be used.
     """
-    async with _receive(request, store, _Fits(limits), max_bytes) as upload:
+    async with _receive(request, store, _Fits(limits), max_bytes, take) as upload:
         yield upload
 
 
 @asynccontextmanager
 async def receive_transit(
-    request: Request, store: Store, limits: ArchiveLimits, max_bytes: int
+    request: Request, store: Store, limits: ArchiveLimits, max_bytes: int, take: Take
 ) -> AsyncIterator[Upload[ArchiveContents]]:
     """Stream a transit's archive to a temporary path and check its table of contents and its transit.json.
 
     Raises ``Problem`` as ``receive`` does: 413 also where more would come out than the limits allow, 415 for what
     is no archive, and 422 for one that cannot be used.
     """
-    async with _receive(request, store, _Archive(limits), max_bytes) as upload:
+    async with _receive(request, store, _Archive(limits), max_bytes, take) as upload:
         yield upload
 
 
 @asynccontextmanager
 async def _receive(
-    request: Request, store: Store, expected: _Format[Found], max_bytes: int
+    request: Request, store: Store, expected: _Format[Found], max_bytes: int, take: Take
 ) -> AsyncIterator[Upload[Found]]:
-    _refuse_by_length(request, max_bytes)
+    declared = _refuse_by_length(request, max_bytes)
+    taken = declared
+    if declared:  # refused before it is sent, where it is known how much that will be
+        await run_in_threadpool(take, declared)
     with store.temporary() as path:
         body = _Body(request, max_bytes)
         digest, size, start = hashlib.sha256(), 0, b""
@@ -139,6 +145,9 @@ async def _receive(
                 size += len(chunk)
                 if size > max_bytes:
                     raise _too_large(max_bytes)
+                if size > taken:
+                    await run_in_threadpool(take, UNDECLARED_BYTES)
+                    taken += UNDECLARED_BYTES
                 digest.update(chunk)
                 file.write(chunk)
         if size == 0:
@@ -188,10 +197,13 @@ class _Archive:
             raise Problem(_ARCHIVE_STATUS.get(error.code, 422), error.code, error.message) from error
 
 
-def _refuse_by_length(request: Request, max_bytes: int) -> None:
-    declared = request.headers.get("content-length", "")
-    if declared.isdecimal() and int(declared) > max_bytes + FORM_BYTES:
+def _refuse_by_length(request: Request, max_bytes: int) -> int:
+    """The length that the request declares; 0 where it declares none."""
+    text = request.headers.get("content-length", "")
+    declared = int(text) if text.isdecimal() else 0
+    if declared > max_bytes + FORM_BYTES:
         raise _too_large(max_bytes)
+    return declared
 
 
 def _too_large(max_bytes: int) -> Problem:
@@ -235,8 +247,8 @@ class _Body:
             "on_part_data": self._part_data,
             "on_end": self._end,
         }
-        parser = MultipartParser(options[b"boundary"], callbacks)
         try:
+            parser = MultipartParser(options[b"boundary"], callbacks)
             sent = 0
             async for chunk in self._request.stream():
                 sent += len(chunk)

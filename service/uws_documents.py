@@ -13,8 +13,9 @@ from typing import Any
 from xml.etree import ElementTree
 
 from service.jobs import RESULTS
-from workers.catalogue import JobLine, JobRow, TermsRow
 from workers.contract import Fault, JobError, Phase
+from workers.tables import JobRow, TermsRow
+from workers.uws_rows import JobLine
 
 MEDIA_TYPE = "application/xml"
 UWS = "http://www.ivoa.net/xml/UWS/v1.0"

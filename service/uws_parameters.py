@@ -17,9 +17,10 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 
 from psfcore.errors import DataError
 from service.problems import Problem
+from service.quotas import check_room
 from service.state import State
 from service.uws_documents import NO_XML
-from workers.catalogue import DEFAULT_OWNER
+from workers import estimates
 from workers.contract import JobRequest, Phase
 from workers.intake import resolve
 
@@ -115,14 +116,21 @@ def check(kind: str, given: dict[str, str]) -> None:
         raise _wrong(kind, wrong)
 
 
-def resolved(state: State, kind: str, given: dict[str, str]) -> tuple[dict[str, Any], str]:
-    """A job's parameters with nothing left open, and the identity of what it makes; ``Problem`` 400 where they are wrong."""
+def resolved(
+    state: State, owner: str, kind: str, given: dict[str, str]
+) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    """A job's parameters with nothing left open, the identity of what it makes, and what it is expected to need.
+
+    ``Problem`` 400 where they are wrong, or ask for more than a job may need; 507 where there is no room.
+    """
+    check_room(state, owner)
     values, errors = _understood(kind, given)
     if errors:
         raise _wrong(kind, errors)
     asked: Any = REQUESTS[kind].model_validate({"kind": kind, "parameters": values})
     try:
-        return resolve(asked, state.catalogue, DEFAULT_OWNER, added_effects=state.settings.added_effects)
+        parameters, key = resolve(asked, state.catalogue, owner, added_effects=state.settings.added_effects)
+        return parameters, key, estimates.checked(kind, parameters, state.catalogue, owner, state.settings)
     except DataError as error:
         raise bad(error.message) from error
 

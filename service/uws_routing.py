@@ -23,8 +23,7 @@ class PlainErrors(APIRoute):
             try:
                 return await handle(request)
             except Problem as problem:
-                nosniff = {"X-Content-Type-Options": "nosniff"}
-                return PlainTextResponse(f"{problem.detail}\n", problem.status, headers=nosniff)
+                return PlainTextResponse(f"{problem.detail}\n", problem.status, headers=problem.headers)
 
         return answer
 

@@ -11,6 +11,46 @@ from astropy.io import fits
 
 REPOSITORY = Path(__file__).parents[1]
 
+# The files that take longest, so that they are begun first: begun last, one of them would leave a core idle.
+LONGEST_FIRST = (
+    "whole/test_bulk.py",
+    "psfcore/test_gap.py",
+    "whole/test_service.py",
+    "psfcore/test_deconvolve_methods.py",
+    "psfcore/test_build.py",
+    "whole/test_real_data.py",
+    "service/test_bulk.py",
+    "service/test_cli_gap.py",
+    "psfcore/test_gap_searches.py",
+    "psfcore/test_psf_report.py",
+    "psfcore/test_arms.py",
+    "psfcore/test_error_planes.py",
+    "whole/test_uws.py",
+    "workers/test_schema.py",
+    "whole/test_storage.py",
+    "workers/test_stopping.py",
+    "workers/test_psf_fit.py",
+    "workers/test_crossval.py",
+    "workers/test_evaluate.py",
+    "psfcore/test_evaluation_shapes.py",
+    "psfcore/test_photon_bound.py",
+    "psfcore/test_fit.py",
+    "psfcore/test_cross_validation.py",
+    "workers/test_gap_task.py",
+    "workers/test_rerun.py",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have xdist keep our order of files: its own begins with those of the most tests."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first."""
+    rank = {REPOSITORY / "tests" / name: place for place, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+
 
 # An instrument so small that its PSF is built in a second.
 SMALL_INSTRUMENT = """

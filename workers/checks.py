@@ -5,6 +5,7 @@ The sentences name no address and no credentials, so that they may be shown to a
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from workers import queue
 from workers.catalogue import Catalogue
 from workers.settings import Settings
+from workers.store import Store
 
 
 class Unusable(Exception):
@@ -37,6 +39,14 @@ def storage(folder: Path) -> None:
             probe.flush()
     except OSError as error:
         raise Unusable(f"the data folder cannot be written to ({error.strerror or _kind(error)})") from error
+
+
+def object_store(store: Store) -> None:
+    """Files can be kept elsewhere, where that is where they are kept."""
+    try:
+        store.check()
+    except OSError as error:
+        raise Unusable(f"the object store cannot be written to ({_kind(error)})") from error
 
 
 def free_bytes(folder: Path) -> int:
@@ -64,24 +74,47 @@ def broker(settings: Settings) -> None:
 def embedded_worker(catalogue: Catalogue, settings: Settings) -> None:
     """A worker said that it is there."""
     try:
-        workers = catalogue.workers(settings.lease_s)
+        workers = catalogue.census.workers(settings.lease_s)
     except SQLAlchemyError as error:
         raise Unusable(f"the database does not say ({_kind(error)})") from error
     if not workers:
         raise Unusable(f"no worker has been heard of for {settings.lease_s:g} s")
 
 
-def needed(settings: Settings, catalogue: Catalogue) -> dict[str, Callable[[], None]]:
+def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, Callable[[], None]]:
     """What must be there before requests are taken, by name."""
     checks: dict[str, Callable[[], None]] = {
         "database": lambda: database(catalogue),
         "storage": lambda: storage(settings.data_dir),
     }
+    if settings.store_url is not None:
+        checks["object store"] = lambda: object_store(store)
     if settings.embedded:
         checks["worker"] = lambda: embedded_worker(catalogue, settings)
     else:
         checks["broker"] = lambda: broker(settings)
     return checks
+
+
+_REASONS = {
+    r"refused": "the connection is refused",
+    r"resolve|name or service|getaddrinfo": "the host's name is unknown",
+    r"authentication failed|no password supplied|no pg_hba": "the user or the password is not accepted",
+    r'database ".*" does not exist': "there is no database of that name",
+    r"timeout|timed out": "no answer within seconds",
+    r"unable to open|readonly": "the file cannot be opened or written to",
+    r"not a database|malformed": "the file is no SQLite database",
+    r"locked": "the file is locked by another process",
+}
+
+
+def database_said(error: SQLAlchemyError) -> str:
+    """What a database's error comes to. Its own words may repeat the URL, so they are not passed on."""
+    words = str(getattr(error, "orig", None) or error).lower()
+    known = [reason for pattern, reason in _REASONS.items() if re.search(pattern, words)]
+    return (
+        known[0] if known else f"it does not answer ({type(getattr(error, 'orig', None) or error).__name__})"
+    )
 
 
 def _kind(error: BaseException) -> str:

@@ -1,7 +1,6 @@
 """What the web process and the workers agree on: job kinds, parameters, phases, errors and identities.
 
-Both import this module, so it holds no numerics. A new method of deconvolution is a class here, a file in
-``psfcore`` and a test.
+Both import this module, so it holds no numerics. Methods of deconvolution are in ``workers.methods``.
 """
 
 from __future__ import annotations
@@ -11,10 +10,14 @@ import json
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from psfcore.instruments.files import instrument_path
+from workers.methods import Method, NoiseFigures, Parameters, RichardsonLucy
 
+ContextName = Annotated[
+    str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="an id or a name")
+]
 Identity = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256, 64 hexadecimal digits")]
 
 
@@ -58,101 +61,10 @@ class JobError(BaseModel):
     message: str
 
 
-class _Parameters(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class _Method(_Parameters):
-    """What every method of deconvolution takes. A method's own parameters stand beside."""
-
-    algorithm_version: ClassVar[int]
-    stop: Literal["fixed", "discrepancy"] = Field(
-        "fixed",
-        description="after all steps, or once the residual is down at the noise (needs noise figures)",
-    )
-    edges: Literal["zero", "symmetric", "extended"] | None = Field(
-        None, description="what is taken to lie beyond the field; none: what the method does best with"
-    )
-    margin_px: int | None = Field(
-        None,
-        ge=0,
-        le=4096,
-        description="how far the scene is followed beyond the field; none: as the PSF asks",
-    )
-
-
-class RichardsonLucy(_Method):
-    """Richardson-Lucy; with 20 steps and zero edges it is what the paper recommends."""
-
-    algorithm_version: ClassVar[int] = 2
-    name: Literal["richardson-lucy"] = "richardson-lucy"
-    steps: int = Field(20, ge=1, le=200, description="iterations; the paper uses 20")
-
-
-class RichardsonLucyAccelerated(_Method):
-    """Richardson-Lucy with the extrapolation of Biggs and Andrews: fewer steps to the same point."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["richardson-lucy-accelerated"]
-    steps: int = Field(10, ge=1, le=200)
-    order: Literal[1, 2] = Field(1, description="of the extrapolation")
-
-
-class RichardsonLucyExtended(_Method):
-    """Richardson-Lucy that finds what lies beyond the edges too (Bertero and Boccacci)."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["richardson-lucy-extended"]
-    steps: int = Field(20, ge=1, le=200)
-
-
-class RichardsonLucyTotalVariation(_Method):
-    """Richardson-Lucy with a price on variation: less noise, for pictures more than for photometry."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["richardson-lucy-total-variation"]
-    steps: int = Field(20, ge=1, le=200)
-    smoothing: float = Field(0.01, ge=0, le=0.02, description="the price, in counts; 0 is Richardson-Lucy")
-
-
-class BasicIterative(_Method):
-    """Basic iterative deconvolution: the paper's advice for a bright source near an edge."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["basic-iterative"]
-    steps: int = Field(20, ge=1, le=200)
-
-
-class Linear(_Method):
-    """The linear reconstruction: no positivity, no bias on faint pixels, settled after about five steps."""
-
-    algorithm_version: ClassVar[int] = 1
-    name: Literal["linear"]
-    steps: int = Field(5, ge=1, le=200)
-
-
-Method = Annotated[
-    RichardsonLucy
-    | RichardsonLucyAccelerated
-    | RichardsonLucyExtended
-    | RichardsonLucyTotalVariation
-    | BasicIterative
-    | Linear,
-    Field(discriminator="name"),
-]
-
-
-class NoiseFigures(_Parameters):
-    """Variance of a pixel in DN^2 = photon_gain_dn * signal in DN + read_noise_dn^2."""
-
-    photon_gain_dn: float = Field(ge=0, allow_inf_nan=False, description="DN a detected photon")
-    read_noise_dn: float = Field(ge=0, allow_inf_nan=False, description="DN rms of the readout")
-
-
 Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
 
 
-class PsfBuild(_Parameters):
+class PsfBuild(Parameters):
     """Build a PSF from an instrument file: one that ships with the software, or one of the user's."""
 
     algorithm_version: ClassVar[int] = 2
@@ -173,11 +85,18 @@ class PsfBuild(_Parameters):
         return self
 
 
-class Deconvolve(_Parameters):
+class Deconvolve(Parameters):
     """Deconvolve an uploaded image with a PSF."""
 
     image_id: Identity = Field(description="id that the upload of the image answered")
-    psf_id: Identity | None = Field(None, description="a PSF of the catalogue; none: the image's instrument")
+    psf_id: Identity | None = Field(
+        None,
+        description="a PSF of the catalogue; none: the certified one for the image, else its instrument's",
+    )
+    context: ContextName | None = Field(
+        None,
+        description="the set to find the image's PSF in: its id, its name, or now; none: the default one",
+    )
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
         None, description="of the image's gain mode; none: the instrument's, if known"
@@ -189,6 +108,12 @@ class Deconvolve(_Parameters):
         0, ge=0, le=64, description="noise draws for an ERROR plane (4 or more; each costs one deconvolution)"
     )
     effects_picture: bool = Field(False, description="also draw difference, ratio and histogram")
+
+    @model_validator(mode="after")
+    def _one_choice(self) -> Deconvolve:
+        if self.psf_id is not None and self.context is not None:
+            raise ValueError("expected psf_id, or a context to find the PSF in, or neither; got both")
+        return self
 
 
 ShapeName = Literal[
@@ -202,7 +127,7 @@ ShapeName = Literal[
 ]
 
 
-class PsfFit(_Parameters):
+class PsfFit(Parameters):
     """Fit the diffuse scatter of an uploaded transit: a PSF version with its errors, curves and report."""
 
     algorithm_version: ClassVar[int] = 1
@@ -232,7 +157,7 @@ class CrossValidate(PsfFit):
     runs: int = Field(10, ge=1, le=50, description="each holds every block out once; the paper has ten")
 
 
-class Evaluate(_Parameters):
+class Evaluate(Parameters):
     """Report on an uploaded transit: its PSF fitted, cross-validated and judged on images held out; or one given, judged."""
 
     algorithm_version: ClassVar[int] = 1
@@ -253,7 +178,7 @@ class Evaluate(_Parameters):
     )
 
 
-class GapDiagnose(_Parameters):
+class GapDiagnose(Parameters):
     """Diagnose the gap between an uploaded transit and the model fitted to it: is there one, where, and which effect."""
 
     algorithm_version: ClassVar[int] = 1
@@ -274,60 +199,80 @@ class GapDiagnose(_Parameters):
     )
 
 
-class PsfTables(_Parameters):
+class PsfTables(Parameters):
     """Make the tables that questions about a PSF are answered from: those that are built or fitted here have them."""
 
     algorithm_version: ClassVar[int] = 1
     psf_id: Identity = Field(description="a PSF of the catalogue, as one that was uploaded")
 
 
-class DeconvolveRequest(_Parameters):
+class Rerun(Parameters):
+    """Make a product or a PSF again from the same parameters, and compare: nothing that is there is changed."""
+
+    of: Literal["product", "psf"]
+    id: Identity = Field(description="of what is made again; a PSF that was uploaded was not made here")
+
+
+class _Request(Parameters):
+    queue: Literal["bulk"] | None = Field(
+        None, description="bulk: after all that people wait for; none: where jobs of this kind wait"
+    )
+
+
+class DeconvolveRequest(_Request):
     """A request for a deconvolution."""
 
     kind: Literal["deconvolve"]
     parameters: Deconvolve
 
 
-class PsfBuildRequest(_Parameters):
+class PsfBuildRequest(_Request):
     """A request for a PSF build."""
 
     kind: Literal["psf-build"]
     parameters: PsfBuild
 
 
-class PsfFitRequest(_Parameters):
+class PsfFitRequest(_Request):
     """A request for a fit of a transit."""
 
     kind: Literal["psf-fit"]
     parameters: PsfFit
 
 
-class CrossValidateRequest(_Parameters):
+class CrossValidateRequest(_Request):
     """A request for a cross-validation."""
 
     kind: Literal["cross-validate"]
     parameters: CrossValidate
 
 
-class EvaluateRequest(_Parameters):
+class EvaluateRequest(_Request):
     """A request for a report on a transit and its PSF."""
 
     kind: Literal["evaluate"]
     parameters: Evaluate
 
 
-class GapDiagnoseRequest(_Parameters):
+class GapDiagnoseRequest(_Request):
     """A request for a diagnosis of the gap."""
 
     kind: Literal["gap-diagnose"]
     parameters: GapDiagnose
 
 
-class PsfTablesRequest(_Parameters):
+class PsfTablesRequest(_Request):
     """A request for a PSF's tables."""
 
     kind: Literal["psf-tables"]
     parameters: PsfTables
+
+
+class RerunRequest(_Request):
+    """A request to make a thing again."""
+
+    kind: Literal["rerun"]
+    parameters: Rerun
 
 
 JobRequest = Annotated[
@@ -337,13 +282,20 @@ JobRequest = Annotated[
     | PsfTablesRequest
     | CrossValidateRequest
     | EvaluateRequest
-    | GapDiagnoseRequest,
+    | GapDiagnoseRequest
+    | RerunRequest,
     Field(discriminator="kind"),
 ]
 
 
 class ResolvedPsfFit(PsfFit):
     """A fit as the worker gets it: with the recipe of the diffraction, where the transit brings none."""
+
+    diffraction_recipe: PsfBuild | None = None
+
+
+class ResolvedCrossValidate(CrossValidate):
+    """A cross-validation as the worker gets it."""
 
     diffraction_recipe: PsfBuild | None = None
 
@@ -361,12 +313,25 @@ class ResolvedGapDiagnose(GapDiagnose):
     added_effects: tuple[str, ...] = ()
 
 
-class ResolvedDeconvolve(_Parameters):
+# Jobs on an uploaded transit, as the worker gets them.
+ResolvedOnTransit = ResolvedPsfFit | ResolvedCrossValidate | ResolvedEvaluate | ResolvedGapDiagnose
+
+
+class ResolvedRerun(Rerun):
+    """A rerun as the worker gets it: the kind of job that made the thing, and that job's own parameters."""
+
+    kind: Literal["deconvolve", "psf-build", "psf-fit", "gap-diagnose"]
+    parameters: dict[str, Any]
+
+
+class ResolvedDeconvolve(Parameters):
     """A deconvolution as the worker gets it: the PSF is named, with its recipe where it may not exist yet."""
 
     image_id: Identity
     psf_id: Identity
     psf_recipe: PsfBuild | None = None
+    picked_for: str | None = None  # the image's instrument, where nobody named the PSF
+    context_id: str | None = None  # where it was found then
     method: Method
     noise: NoiseFigures | None = None
     saturation_dn: float | None = None
@@ -412,59 +377,52 @@ def psf_tables_identity(request: PsfTables) -> str:
 
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: input bytes, PSF, method with all parameters, algorithm version."""
+    # The PSF's id says what it is; the recipe only how to make it where it is missing, the context where it was found.
+    beside = {"psf_recipe", "context_id"} | ({"picked_for"} if request.picked_for is None else set())
     return canonical_hash(
         {
             "kind": "deconvolve",
-            # The PSF's id says what it is; the recipe only how to make it where it is missing.
-            "request": request.model_dump(mode="json", exclude={"psf_recipe"}),
+            "request": request.model_dump(mode="json", exclude=beside),
             "algorithm_version": request.method.algorithm_version,
         }
     )
 
 
-class ResolvedCrossValidate(CrossValidate):
-    """A cross-validation as the worker gets it."""
-
-    diffraction_recipe: PsfBuild | None = None
-
-
 def psf_fit_identity(request: ResolvedPsfFit | ResolvedCrossValidate) -> str:
     """Identity of a fit or a cross-validation: the transit's bytes, parameters, the diffraction's identity, version."""
-    recipe = request.diffraction_recipe
-    return canonical_hash(
-        {
-            "kind": "psf-fit" if isinstance(request, ResolvedPsfFit) else "cross-validate",
-            "request": request.model_dump(mode="json", exclude={"diffraction_recipe"}),
-            "diffraction": None if recipe is None else psf_identity(recipe),
-            "algorithm_version": request.algorithm_version,
-        }
-    )
+    return _transit_identity("psf-fit" if isinstance(request, ResolvedPsfFit) else "cross-validate", request)
 
 
 def evaluate_identity(request: ResolvedEvaluate) -> str:
     """Identity of a report: the transit's bytes, the PSF's identity or the diffraction's, parameters, version."""
-    recipe = request.diffraction_recipe
-    return canonical_hash(
-        {
-            "kind": "evaluate",
-            "request": request.model_dump(mode="json", exclude={"diffraction_recipe"}),
-            "diffraction": None if recipe is None else psf_identity(recipe),
-            "algorithm_version": request.algorithm_version,
-        }
-    )
+    return _transit_identity("evaluate", request)
 
 
 def gap_identity(request: ResolvedGapDiagnose) -> str:
     """Identity of a diagnosis: the transit's bytes, the PSF's and the diffraction's identity, parameters, version."""
-    recipe = request.diffraction_recipe
+    return _transit_identity("gap-diagnose", request)
+
+
+def diffraction_identity(request: ResolvedOnTransit) -> str | None:
+    """Identity of the diffraction that is built for a request; None where its transit or its PSF brings it."""
+    return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
+
+
+def _transit_identity(kind: str, request: ResolvedOnTransit) -> str:
     return canonical_hash(
         {
-            "kind": "gap-diagnose",
+            "kind": kind,
+            # The diffraction's identity says what it is; the recipe only how to make it.
             "request": request.model_dump(mode="json", exclude={"diffraction_recipe"}),
-            "diffraction": None if recipe is None else psf_identity(recipe),
+            "diffraction": diffraction_identity(request),
             "algorithm_version": request.algorithm_version,
         }
     )
+
+
+def rerun_identity(request: ResolvedRerun, job_id: str) -> str:
+    """Identity of what one rerun found: every job that is asked for is one of its own."""
+    return canonical_hash({"kind": "rerun", "of": request.of, "id": request.id, "job": job_id})
 
 
 def corrected_psf_identity(diagnosis: str) -> str:

@@ -28,11 +28,12 @@ from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
 from psfcore.transit.transit import Transit
-from workers.catalogue import Part, ReportRow
 from workers.context import Context
 from workers.contract import ResolvedCrossValidate, psf_fit_identity
-from workers.psf_fit_task import load_transit, write_json
-from workers.settings import library_versions, software_version
+from workers.kept_reports import keep_report, provenance_of, write_json
+from workers.part_rows import Part
+from workers.psf_fit_task import load_transit
+from workers.tables import ReportRow
 
 WAIT_S = 0.5
 MOST_HELPERS = 16
@@ -59,15 +60,15 @@ def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> 
     """Take folds of a job that runs elsewhere, until none is left."""
     request = ResolvedCrossValidate.model_validate(parameters)
     identity = psf_fit_identity(request)
-    part = context.catalogue.take_part(context.owner, identity, context.settings.lease_s)
+    part = context.catalogue.parts.take(context.owner, identity, context.settings.lease_s)
     if part is None:
         return
-    context.catalogue.release_part(part)  # reading and fitting a transit takes longer than a lease may last
+    context.catalogue.parts.release(part)  # reading and fitting a transit takes longer than a lease may last
     transit = load_transit(context, request)[0]
     wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
     solution = _solution(context, request, transit)
     while (
-        part := context.catalogue.take_part(context.owner, identity, context.settings.lease_s)
+        part := context.catalogue.parts.take(context.owner, identity, context.settings.lease_s)
     ) is not None:
         _one(context, solution, wanted, part, done=0)
 
@@ -84,14 +85,14 @@ def _exact(
 ) -> tuple[FoldFit, ...]:
     """Every fold a fit of its own, done here or by whoever helps."""
     catalogue, owner = context.catalogue, context.owner
-    catalogue.open_parts(owner, identity, len(wanted))
+    catalogue.parts.open(owner, identity, len(wanted))
     context.call_for_help(min(MOST_HELPERS, len(wanted) - 1))
     while True:
-        done = catalogue.part_results(owner, identity)
+        done = catalogue.parts.results(owner, identity)
         context.report("folds", len(done), len(wanted))
         if len(done) == len(wanted):
             return tuple(FoldFit.from_json(result) for result in done)
-        part = catalogue.take_part(owner, identity, context.settings.lease_s)
+        part = catalogue.parts.take(owner, identity, context.settings.lease_s)
         if part is None:
             time.sleep(WAIT_S)  # the rest is with other workers
             continue
@@ -103,9 +104,9 @@ def _one(context: Context, solution: Solution, wanted: tuple[Draw, ...], part: P
     try:
         fit = exact_fit(solution, wanted[part.number], progress=_alive(context, part, done, len(wanted)))
     except BaseException:
-        context.catalogue.release_part(part)
+        context.catalogue.parts.release(part)
         raise
-    context.catalogue.finish_part(part, fit.to_json())
+    context.catalogue.parts.finish(part, fit.to_json())
 
 
 def _alive(context: Context, part: Part, done: int, folds: int) -> Callable[[str, int, int], None]:
@@ -117,7 +118,7 @@ def _alive(context: Context, part: Part, done: int, folds: int) -> Callable[[str
         context.report("folds", done, folds)
         if time.monotonic() - last > context.settings.heartbeat_s:
             last = time.monotonic()
-            context.catalogue.part_heartbeat(part)
+            context.catalogue.parts.heartbeat(part)
 
     return report
 
@@ -140,31 +141,20 @@ def _save(
         "files": {str(n): frame.file for n, frame in enumerate(transit.frames)},
         "folds": [fit.to_json() for fit in fits],
         "inputs_sha256": transit.sha256,
-        "provenance": {
-            "transit_sha256": request.transit_id,
-            "parameters": request.model_dump(mode="json", exclude_none=True),
-            "algorithm_version": request.algorithm_version,
-            "software_version": software_version(),
-            "libraries": library_versions(),
-            "job_id": context.job_id,
-        },
+        "provenance": provenance_of(context, request),
     }
     with context.store.temporary() as text, context.store.temporary() as picture:
         write_json(text, said)
         cross_validation_png(found, fits, [frame.fov for frame in transit.frames], picture)
-        file_sha256 = context.store.keep(text)
-        row = ReportRow(
-            owner=context.owner,
-            id=identity,
-            created_at=time.time(),
-            kind="cross-validation",
-            transit_id=request.transit_id,
-            file_sha256=file_sha256,
-            bytes=context.store.path(file_sha256).stat().st_size,
-            preview_sha256=context.store.keep(picture),
+        keep_report(
+            context,
+            request,
+            identity,
+            "cross-validation",
+            text=text,
+            picture=picture,
             details={"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},
         )
-    context.catalogue.add(row)
 
 
 def sentence(found: Bands, folds: int) -> str:

@@ -16,7 +16,7 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore import plots
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.effects import Effects, effects
 from psfcore.deconvolve.effects_plot import effects_png
 from psfcore.deconvolve.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
@@ -25,7 +25,6 @@ from psfcore.deconvolve.quality import QualityBit, quality_plane
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.errors import DataError
 from psfcore.fits_io import read_image, read_psf, write_image
-from psfcore.header import FitsLimits
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.gain import noise_for, saturation_for
 from psfcore.instruments.model import load_instrument
@@ -33,14 +32,13 @@ from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
 from psfcore.scatter.samples import possible_psfs
-from workers.catalogue import ImageRow, ProductRow, PsfRow
 from workers.context import Context
 from workers.contract import ResolvedDeconvolve, product_identity
+from workers.prepared_psfs import PreparedPsfs
 from workers.psf_task import psf_of
-from workers.settings import software_version
+from workers.settings import library_versions, software_version
+from workers.tables import ImageRow, ProductRow, PsfRow
 
-# PSFs prepared by this process; its jobs run one after the other, and often with the same PSF.
-_ENGINES = EngineCache()
 # What a method itself takes, beside what stands in its conditions.
 _CONDITIONS = {"name", "edges", "margin_px"}
 
@@ -52,9 +50,12 @@ def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
     if context.catalogue.get(ProductRow, identity, context.owner) is not None:
         return identity
     psf_row = psf_of(context, request)
-    work = _Work(context, request, psf_row, _load(context, request))
-    result = work.run(work.image, "deconvolving")
-    _save(work, identity, result)
+    image = _load(context, request)
+    made = make(context, request, psf_row, image)
+    with context.store.temporary() as path:
+        write(made, path)
+        context.report("saving", 1, 1)
+        keep(made, path)
     return identity
 
 
@@ -62,9 +63,14 @@ def _load(context: Context, request: ResolvedDeconvolve) -> Image:
     upload = context.catalogue.get(ImageRow, request.image_id, context.owner)
     if upload is None:
         raise DataError("no-such-image", f"no image was uploaded with id {request.image_id}")
+    return load(context, request, context.store.path(request.image_id), upload.summary)
+
+
+def load(context: Context, request: ResolvedDeconvolve, path: Path, summary: Mapping[str, Any]) -> Image:
+    """The image in a file whose header says what ``summary`` does."""
     context.report("reading", 0, request.method.steps)
-    level = request.saturation_dn or _known_saturation_dn(upload.summary)
-    return read_image(context.store.path(request.image_id), context.limits, saturation_dn=level)
+    level = request.saturation_dn or _known_saturation_dn(summary)
+    return read_image(path, context.limits, saturation_dn=level)
 
 
 def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
@@ -74,10 +80,10 @@ def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
     return saturation_for(load_instrument(summary["instrument"]), Header({"GAINCOMB": summary["gain_mode"]}))
 
 
-@lru_cache(maxsize=2)
-def _read_psf(path: Path, limits: FitsLimits) -> Psf:
-    """A PSF that this process read before is not read again; its file never changes."""
-    return read_psf(path, limits, parts=False)
+@lru_cache(maxsize=1)
+def _prepared(max_bytes: int) -> PreparedPsfs:
+    """Those of this process; its jobs run one after the other, and often with the same PSF."""
+    return PreparedPsfs(max_bytes)
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,12 @@ class _Work:
     def psf(self) -> Psf:
         """The PSF on the image's pixels."""
         path = self.context.store.path(self.psf_row.file_sha256)
-        return psf_for_image(_read_psf(path, self.context.limits), self.image.header)
+        return self.prepared.on_pixels_of(self.image.header, path, self.context.limits)
+
+    @property
+    def prepared(self) -> PreparedPsfs:
+        """PSFs that were prepared before."""
+        return _prepared(self.context.settings.psf_cache_mib * 2**20)
 
     @cached_property
     def noise(self) -> Noise | None:
@@ -101,9 +112,8 @@ class _Work:
         if self.request.noise is not None:
             return Noise(**self.request.noise.model_dump())
         recipe = self.request.psf_recipe
-        if recipe is None or recipe.instrument is None:
-            return None
-        return noise_for(load_instrument(recipe.instrument), self.image.header)
+        instrument = self.request.picked_for if recipe is None else recipe.instrument
+        return None if instrument is None else noise_for(load_instrument(instrument), self.image.header)
 
     @cached_property
     def possible_psfs(self) -> list[Psf]:
@@ -123,7 +133,7 @@ class _Work:
             noise=self.noise,
             threads=self.context.settings.threads,
             progress=None if stage is None else self.progress(stage),
-            engine_for=_ENGINES,
+            engine_for=self.prepared.engine_for,
         )
         return method_named(method.name)(
             image, psf or self.psf, conditions, **method.model_dump(exclude=_CONDITIONS)
@@ -143,6 +153,7 @@ class _Work:
                 "expected noise (photon_gain_dn and read_noise_dn) to draw errors from; got none, and the "
                 "instrument's are not known",
             )
+        self.context.times.begin("drawing errors")
         planes = error_planes(
             self.image,
             self.psf,
@@ -156,6 +167,7 @@ class _Work:
         )
         if not self.possible_psfs:
             return planes
+        self.context.times.begin("errors of the PSF")
         from_psf = psf_error_plane(
             self.possible_psfs,
             lambda psf: self.run(self.image, psf=psf).pixels,
@@ -165,56 +177,89 @@ class _Work:
         return with_psf_error(planes, from_psf)
 
 
-def _save(work: _Work, identity: str, result: Deconvolved) -> None:
-    context, image = work.context, work.image
+@dataclass(frozen=True)
+class Made:
+    """A deconvolution that is done, and what it did; not yet written."""
+
+    work: _Work
+    result: Deconvolved
+    errors: ErrorPlanes | None
+    found: Effects
+    quality: NDArray[np.uint8]
+    details: dict[str, Any]
+    preview_sha256: str | None
+
+    @property
+    def identity(self) -> str:
+        """Of the product."""
+        return product_identity(self.work.request)
+
+
+def make(
+    context: Context, request: ResolvedDeconvolve, psf_row: PsfRow, image: Image, *, preview: bool = True
+) -> Made:
+    """Deconvolve an image that was read, and look at what that did."""
+    work = _Work(context, request, psf_row, image)
+    context.times.begin("deconvolving")
+    result = work.run(image, "deconvolving")
     errors = work.errors(result)
     context.report("saving", 0, 1)
     edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
     with ThreadPoolExecutor(1) as beside:
-        preview = beside.submit(_preview, work, result)
+        picture = beside.submit(_preview, work, result) if preview else None
         found = effects(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
-        preview_sha256 = preview.result()
-    planes: dict[str, NDArray[Any]] = {
-        "QUALITY": quality_plane(
+        quality = quality_plane(
             image,
             result.pixels,
             edge_px=edge_px,
             suspected=found.artefacts.suspected,
             error=None if errors is None else errors.error,
         )
-    }
+        details = _details(work, result, errors, found)
+        preview_sha256 = None if picture is None else picture.result()
+    return Made(work, result, errors, found, quality, details, preview_sha256)
+
+
+def write(made: Made, path: Path) -> None:
+    """Write a product's file."""
+    work, result, errors = made.work, made.result, made.errors
+    planes: dict[str, NDArray[Any]] = {"QUALITY": made.quality}
     if errors is not None:
         planes["ERROR"] = errors.error
         if errors.psf_error is not None:
             planes["PSF_ERROR"] = errors.psf_error
-    with context.store.temporary() as path:
-        write_image(
-            path,
-            dataclasses.replace(image, pixels=result.pixels),
-            cards=_cards(work, identity, result, errors),
-            history=_history(work, result),
-            mask=image.mask,
-            planes=planes,
-            plane_bits={"QUALITY": QualityBit},
-        )
-        file_sha256 = context.store.keep(path)
-    effects_sha256 = _effects_picture(work, result, found) if work.request.effects_picture else None
-    context.report("saving", 1, 1)
-    context.catalogue.add(
-        ProductRow(
-            owner=context.owner,
-            id=identity,
-            created_at=time.time(),
-            kind="deconvolved-image",
-            image_id=work.request.image_id,
-            psf_id=work.psf_row.id,
-            psf_version=work.psf_row.version,
-            file_sha256=file_sha256,
-            bytes=context.store.path(file_sha256).stat().st_size,
-            preview_sha256=preview_sha256,
-            details=_details(work, result, errors, found) | {"effects_picture_sha256": effects_sha256},
-        )
+    write_image(
+        path,
+        dataclasses.replace(work.image, pixels=result.pixels),
+        cards=_cards(work, made.identity, result, errors),
+        history=_history(work, result),
+        mask=work.image.mask,
+        planes=planes,
+        plane_bits={"QUALITY": QualityBit},
     )
+
+
+def keep(made: Made, path: Path) -> ProductRow:
+    """Move a product's file, written already, into the store, and add it to the catalogue."""
+    work, context = made.work, made.work.context
+    size_bytes = path.stat().st_size
+    file_sha256 = context.store.keep(path)
+    picture = _effects_picture(work, made.result, made.found) if work.request.effects_picture else None
+    assert made.preview_sha256 is not None
+    row = ProductRow(
+        owner=context.owner,
+        id=made.identity,
+        created_at=time.time(),
+        kind="deconvolved-image",
+        image_id=work.request.image_id,
+        psf_id=work.psf_row.id,
+        psf_version=work.psf_row.version,
+        file_sha256=file_sha256,
+        bytes=size_bytes,
+        preview_sha256=made.preview_sha256,
+        details=made.details | {"effects_picture_sha256": picture},
+    )
+    return context.catalogue.add(row)[0]
 
 
 def _preview(work: _Work, result: Deconvolved) -> str:
@@ -281,6 +326,8 @@ def _details(work: _Work, result: Deconvolved, errors: ErrorPlanes | None, found
         "method": work.request.method.model_dump(mode="json"),
         "algorithm_version": work.request.method.algorithm_version,
         "software_version": software_version(),
+        "libraries": library_versions(),
+        "parameters": work.request.model_dump(mode="json", exclude_none=True),
         "job_id": work.context.job_id,
         "steps_done": result.steps_done,
         "stopped_because": result.stopped_because,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits_io import read_psf, write_psf
+from psfcore.fits_io import write_psf
 from psfcore.gap.added_effects import Added, added_effects, library_with
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
@@ -17,12 +16,17 @@ from psfcore.gap.gap_report import gap_report
 from psfcore.plots import psf_png
 from psfcore.psf import Psf
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from workers.catalogue import PsfRow, ReportRow
 from workers.context import Context
-from workers.contract import ResolvedGapDiagnose, corrected_psf_identity, gap_identity
-from workers.psf_fit_task import load_transit, write_json
-from workers.psf_task import psf_row
-from workers.settings import library_versions, software_version
+from workers.contract import (
+    ResolvedGapDiagnose,
+    corrected_psf_identity,
+    diffraction_identity,
+    gap_identity,
+)
+from workers.kept_reports import keep_report, provenance_of, write_json
+from workers.psf_fit_task import load_transit
+from workers.psf_task import given_psf, psf_row
+from workers.tables import ReportRow
 
 KIND = "gap"
 
@@ -35,7 +39,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
         return identity
     _check_effects(context, request)
     added = added_effects(request.added_effects)
-    parent = _parent(context, request)
+    parent = given_psf(context, request.psf_id)
     shape, start = (SOFTENED_POWER_LAW, None) if parent is None else start_of(parent)
     transit, _ = load_transit(context, request)
     found = diagnose(
@@ -65,16 +69,6 @@ def _check_effects(context: Context, request: ResolvedGapDiagnose) -> None:
         )
 
 
-def _parent(context: Context, request: ResolvedGapDiagnose) -> Psf | None:
-    """The PSF that the fit starts from, where one is named."""
-    if request.psf_id is None:
-        return None
-    row = context.catalogue.get(PsfRow, request.psf_id, context.owner)
-    if row is None:
-        raise DataError("no-such-psf", f"the catalogue holds no PSF with id {request.psf_id}")
-    return read_psf(context.store.path(row.file_sha256), context.limits)
-
-
 def _provenance(
     context: Context,
     request: ResolvedGapDiagnose,
@@ -87,15 +81,11 @@ def _provenance(
     )
     return {
         "report_id": identity,
-        "transit_sha256": request.transit_id,
         "started_from_psf": started,
+        "diffraction_psf_id": diffraction_identity(request),
         "seed": request.seed,
         "added_effects": {one.source: one.sha256 for one in added},
-        "parameters": request.model_dump(mode="json", exclude_none=True),
-        "algorithm_version": request.algorithm_version,
-        "software_version": software_version(),
-        "libraries": library_versions(),
-        "job_id": context.job_id,
+        **provenance_of(context, request),
     }
 
 
@@ -122,7 +112,11 @@ def _save_psf(context: Context, report_id: str, found: Diagnosis, provenance: di
             file_sha256=context.store.keep(file),
             store=context.store,
             preview_sha256=context.store.keep(picture),
-            details={"transit_id": parents["transit"], "parents": parents},
+            details={
+                "transit_id": parents["transit"],
+                "parents": parents,
+                "diffraction_psf_id": provenance["diffraction_psf_id"],
+            },
             threads=context.settings.threads,
         )
     context.catalogue.add(row)
@@ -147,22 +141,18 @@ def _save(
         write_json(text, said)
         page.write_text(gap_page(found, said).html(), "utf-8")
         picture.write_bytes(gap_png(found, said))
-        file_sha256 = context.store.keep(text)
-        row = ReportRow(
-            owner=context.owner,
-            id=identity,
-            created_at=time.time(),
-            kind=KIND,
-            transit_id=request.transit_id,
-            file_sha256=file_sha256,
-            bytes=context.store.path(file_sha256).stat().st_size,
-            preview_sha256=context.store.keep(picture),
+        keep_report(
+            context,
+            request,
+            identity,
+            KIND,
+            text=text,
+            page=page,
+            picture=picture,
             details={
                 **{name: said[name] for name in ("sentence", "verdict", "answer", "gap", "cautions")},
                 "strongest_axis": said["where"][0]["axis"],
                 "psf_id": request.psf_id,
                 "corrected_psf_id": corrected,
-                "page_sha256": context.store.keep(page),
             },
         )
-    context.catalogue.add(row)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+import uuid
 from pathlib import PurePath
 from typing import Any
 
@@ -12,10 +13,11 @@ from psfcore.header import HeaderSummary
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import parse_instrument
 from psfcore.transit.archive import ArchiveContents
-from workers.catalogue import Catalogue, ImageRow, PsfRow, TransitRow
+from workers.catalogue import Catalogue
 from workers.contract import (
     CrossValidate,
     CrossValidateRequest,
+    Deconvolve,
     DeconvolveRequest,
     Evaluate,
     EvaluateRequest,
@@ -27,11 +29,14 @@ from workers.contract import (
     PsfFit,
     PsfFitRequest,
     PsfTablesRequest,
+    Rerun,
+    RerunRequest,
     ResolvedCrossValidate,
     ResolvedDeconvolve,
     ResolvedEvaluate,
     ResolvedGapDiagnose,
     ResolvedPsfFit,
+    canonical_hash,
     evaluate_identity,
     gap_identity,
     instrument_text,
@@ -40,6 +45,11 @@ from workers.contract import (
     psf_identity,
     psf_tables_identity,
 )
+from workers.lineage import made_by
+from workers.psf_choice import picked_for_image
+from workers.psf_lines import UPLOADED, channel_of, instrument_of, line_of
+from workers.psf_status import PsfStatus
+from workers.tables import ImageRow, ProductRow, PsfRow, TransitRow
 
 
 def image_row(
@@ -89,16 +99,26 @@ def uploaded_psf_row(
     *,
     name: str | None = None,
     version: str | None = None,
+    instrument: str | None = None,
+    channel: str | None = None,
+    kind: str | None = None,
 ) -> PsfRow:
-    """The row of an uploaded PSF; its name and version come from the request, the header or the file."""
+    """The row of an uploaded PSF, a draft; its name, version and line come from the request, the header or the file."""
+    header = dataclasses.asdict(summary)
+    instrument = instrument or instrument_of(header)
+    channel = channel or channel_of(instrument, summary.wavelnth)
+    kind = kind or UPLOADED
     return PsfRow(
         owner=owner,
         id=sha256,
         created_at=time.time(),
         name=name or summary.psf_name or PurePath(filename or "uploaded").stem,
         version=version or summary.psf_version or f"0.0.0+{sha256[:8]}",
-        instrument=summary.instrument,
-        status="uploaded",
+        instrument=instrument,
+        channel=channel,
+        kind=kind,
+        line=line_of(instrument, channel, kind),
+        status=PsfStatus.DRAFT,
         origin="uploaded",
         file_sha256=sha256,
         bytes=size_bytes,
@@ -118,7 +138,7 @@ def resolve(
     """Parameters with nothing left open, and the identity of what the job makes.
 
     added_effects: modules of effects that the operator adds to a diagnosis. Raises ``DataError`` with code ``no-such-image``, ``no-such-psf``, ``no-psf-for-instrument``,
-    ``unknown-instrument`` or ``bad-instrument-file``.
+    ``unknown-instrument`` or ``bad-instrument-file``, and as ``workers.psf_choice`` does.
     """
     match request:
         case PsfBuildRequest(parameters=build):
@@ -142,27 +162,43 @@ def resolve(
         case PsfTablesRequest(parameters=asked):
             _check_psf(catalogue, asked.psf_id, owner)
             return asked.model_dump(mode="json"), psf_tables_identity(asked)
+        case RerunRequest(parameters=again):
+            made = made_by(catalogue, _thing(catalogue, again, owner))
+            # Of its own: a rerun that found an earlier one's result would be none.
+            return made.model_dump(mode="json"), canonical_hash({"kind": "rerun", "asked": uuid.uuid4().hex})
         case DeconvolveRequest(parameters=wanted):
             image = catalogue.get(ImageRow, wanted.image_id, owner)
             if image is None:
                 raise DataError("no-such-image", f"no image was uploaded with id {wanted.image_id}")
-            recipe = _default_psf(image.summary) if wanted.psf_id is None else None
-            if recipe is not None:
-                psf_id = psf_identity(recipe)
-            elif wanted.psf_id is not None and catalogue.get(PsfRow, wanted.psf_id, owner) is not None:
-                psf_id = wanted.psf_id
-            else:
-                raise DataError("no-such-psf", f"the catalogue holds no PSF with id {wanted.psf_id}")
-            resolved = ResolvedDeconvolve(
-                psf_id=psf_id, psf_recipe=recipe, **wanted.model_dump(exclude={"psf_id"})
-            )
+            resolved = resolved_deconvolution(wanted, image.summary, catalogue, owner)
             return resolved.model_dump(mode="json"), product_identity(resolved)
+
+
+def resolved_deconvolution(
+    wanted: Deconvolve, header: dict[str, Any], catalogue: Catalogue, owner: str
+) -> ResolvedDeconvolve:
+    """A deconvolution of an image with this header, its PSF found. Raises ``DataError`` as ``resolve`` does."""
+    return ResolvedDeconvolve(
+        **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
+    )
 
 
 def _transit(catalogue: Catalogue, transit_id: str, owner: str) -> TransitRow:
     row = catalogue.get(TransitRow, transit_id, owner)
     if row is None:
         raise DataError("no-such-transit", f"no transit was uploaded with id {transit_id}")
+    return row
+
+
+def _thing(catalogue: Catalogue, again: Rerun, owner: str) -> ProductRow | PsfRow:
+    """What is to be made again."""
+    row: ProductRow | PsfRow | None
+    if again.of == "psf":
+        row = catalogue.get(PsfRow, again.id, owner)
+    else:
+        row = catalogue.get(ProductRow, again.id, owner)
+    if row is None:
+        raise DataError(f"no-such-{again.of}", f"the catalogue holds no {again.of} with id {again.id}")
     return row
 
 
@@ -218,6 +254,22 @@ def _diffraction_of(summary: dict[str, Any], fit: PsfFit | Evaluate | GapDiagnos
             f"got neither ({summary['instrument']!r})",
         )
     return PsfBuild(instrument=summary["instrument"], component="diffraction")
+
+
+def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, owner: str) -> dict[str, Any]:
+    """The PSF of a deconvolution: the one named, the certified one for the image, or its instrument's as it is built."""
+    if wanted.psf_id is not None:
+        _check_psf(catalogue, wanted.psf_id, owner)
+        return {"psf_id": wanted.psf_id}
+    found = picked_for_image(catalogue, header, owner, wanted.context)
+    if found is not None:
+        return {
+            "psf_id": found.one().id,
+            "picked_for": header["instrument"],
+            "context_id": None if found.context is None else found.context.id,
+        }
+    recipe = _default_psf(header)
+    return {"psf_id": psf_identity(recipe), "psf_recipe": recipe}
 
 
 def _default_psf(header: dict[str, Any]) -> PsfBuild:

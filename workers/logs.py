@@ -93,7 +93,7 @@ def configure(settings: Settings) -> None:
     handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-    # Their news are of single requests and connections; ours says the same with the request's id.
-    for chatty in ("httpx", "httpcore", "uvicorn.access"):
+    # Their news are of single requests, connections and plug-ins; ours says the same with the request's id.
+    for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime.plugins"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     logging.captureWarnings(True)

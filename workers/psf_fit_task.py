@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from psfcore.errors import DataError
@@ -16,17 +14,11 @@ from psfcore.transit.archive import unpack
 from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
-from workers.catalogue import PsfRow, TransitRow
 from workers.context import Context
-from workers.contract import (
-    ResolvedCrossValidate,
-    ResolvedEvaluate,
-    ResolvedGapDiagnose,
-    ResolvedPsfFit,
-    psf_fit_identity,
-)
+from workers.contract import ResolvedOnTransit, ResolvedPsfFit, diffraction_identity, psf_fit_identity
+from workers.kept_reports import provenance_of, write_json
 from workers.psf_task import built_psf, psf_row
-from workers.settings import library_versions, software_version
+from workers.tables import PsfRow, TransitRow
 
 
 def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
@@ -50,7 +42,7 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
 
 def load_transit(
     context: Context,
-    request: ResolvedPsfFit | ResolvedCrossValidate | ResolvedEvaluate | ResolvedGapDiagnose,
+    request: ResolvedOnTransit,
     *,
     diffraction: Kernel | None = None,
 ) -> tuple[Transit, Prepared]:
@@ -79,7 +71,7 @@ def load_transit(
 
 def _built_diffraction(
     context: Context,
-    request: ResolvedPsfFit | ResolvedCrossValidate | ResolvedEvaluate | ResolvedGapDiagnose,
+    request: ResolvedOnTransit,
 ) -> Kernel:
     """The diffraction of the transit's instrument, built now or before; cut to nothing, it sums to 1 on 2048 px."""
     if request.diffraction_recipe is None:
@@ -94,13 +86,8 @@ def _save(
     """The PSF's file, its report and its picture into the store, its row into the catalogue."""
     provenance = {
         "psf_id": identity,
-        "transit_sha256": request.transit_id,
         "inputs_sha256": fit.transit.sha256,
-        "parameters": request.model_dump(mode="json", exclude_none=True),
-        "algorithm_version": request.algorithm_version,
-        "software_version": software_version(),
-        "libraries": library_versions(),
-        "job_id": context.job_id,
+        **provenance_of(context, request),
     }
     name = f"{fit.transit.instrument or 'transit'}-fitted"
     psf = psf_of(fit, name=name, version=f"0.1.0+{identity[:8]}", provenance=provenance)
@@ -123,6 +110,7 @@ def _save(
             preview_sha256=context.store.keep(picture),
             details={
                 "transit_id": request.transit_id,
+                "diffraction_psf_id": diffraction_identity(request),
                 "report_sha256": context.store.keep(text),
                 "fit": {
                     key: said[key]
@@ -140,8 +128,3 @@ def _save(
             threads=context.settings.threads,
         )
     context.catalogue.add(row)
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """JSON for people too; a number that is none would be no JSON and is an error of ours."""
-    path.write_text(json.dumps(content, indent=1, allow_nan=False), "utf-8")

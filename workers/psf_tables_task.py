@@ -5,21 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from psfcore.errors import DataError
 from psfcore.fits_io import read_psf
 from psfcore.plots import psf_png
-from workers.catalogue import PsfRow
 from workers.context import Context
 from workers.contract import PsfTables
-from workers.psf_task import keep_tables
+from workers.psf_task import keep_tables, named_psf
 
 
 def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
     """Make the tables of a PSF of the catalogue, and its picture where it has none; returns the PSF's id."""
     request = PsfTables.model_validate(parameters)
-    row = context.catalogue.get(PsfRow, request.psf_id, context.owner)
-    if row is None:
-        raise DataError("no-such-psf", f"the catalogue holds no PSF with id {request.psf_id}")
+    row = named_psf(context, request.psf_id)
     context.report("reading", 0, 3)
     psf = read_psf(context.store.path(row.file_sha256), context.limits)
     context.report("making tables", 1, 3)
@@ -30,7 +26,7 @@ def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
             psf_png(psf, picture)
         preview_sha256 = row.preview_sha256 or context.store.keep(picture)
     context.report("drawing", 3, 3)
-    context.catalogue.describe_psf(
+    context.catalogue.psfs.describe(
         row.id, context.owner, tables_sha256=tables_sha256, preview_sha256=preview_sha256
     )
     return row.id

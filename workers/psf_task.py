@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 from psfcore import plots
 from psfcore.build import build_psf
 from psfcore.errors import DataError
-from psfcore.fits_io import read_image, write_psf
+from psfcore.fits_io import read_image, read_psf, write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.psf import Psf, cumulative_curve
 from psfcore.psf_tables import tables_of
-from workers.catalogue import PsfRow
 from workers.context import Context
 from workers.contract import PsfBuild, ResolvedDeconvolve, instrument_text, psf_identity
-from workers.settings import software_version
+from workers.psf_lines import TOTAL, channel_of, line_of
+from workers.psf_status import PsfStatus
+from workers.settings import library_versions, software_version
 from workers.store import Store
+from workers.tables import PsfRow
 
 CURVE_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -31,6 +33,21 @@ CURVE_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 def psf_build(context: Context, parameters: Mapping[str, Any]) -> str:
     """Build a PSF from an instrument file and add it to the catalogue; returns its id."""
     return built_psf(context, PsfBuild.model_validate(parameters)).id
+
+
+def named_psf(context: Context, psf_id: str) -> PsfRow:
+    """The catalogue's row of a PSF. Raises DataError "no-such-psf"."""
+    row = context.catalogue.get(PsfRow, psf_id, context.owner)
+    if row is None:
+        raise DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+    return row
+
+
+def given_psf(context: Context, psf_id: str | None) -> Psf | None:
+    """The PSF that a request may name, with what its file says of its parts and errors."""
+    if psf_id is None:
+        return None
+    return read_psf(context.store.path(named_psf(context, psf_id).file_sha256), context.limits)
 
 
 def psf_of(context: Context, request: ResolvedDeconvolve) -> PsfRow:
@@ -89,6 +106,8 @@ def built_psf(context: Context, build: PsfBuild) -> PsfRow:
             file_sha256=context.store.keep(path),
             store=context.store,
             preview_sha256=context.store.keep(picture),
+            kind=build.component or TOTAL,
+            details={"job_id": context.job_id, "libraries": library_versions()},
             threads=context.settings.threads,
         )
     return context.catalogue.add(row)[0]
@@ -120,13 +139,15 @@ def psf_row(
     file_sha256: str,
     store: Store,
     preview_sha256: str | None,
+    kind: str = TOTAL,
     details: Mapping[str, Any] | None = None,
     threads: int = 1,
 ) -> PsfRow:
-    """The catalogue's row of a PSF whose file is in the store, where its tables are put too.
+    """The catalogue's row, a draft, of a PSF whose file is in the store, where its tables are put too.
 
     details: more than can be read off its kernel.
     """
+    channel = channel_of(psf.instrument, psf.wavelength_angstrom)
     curve = cumulative_curve(psf.kernel, np.array(CURVE_RADII_PX, dtype=float))
     return PsfRow(
         owner=owner,
@@ -135,7 +156,10 @@ def psf_row(
         name=psf.name,
         version=psf.version,
         instrument=psf.instrument,
-        status=psf.status,
+        channel=channel,
+        kind=kind,
+        line=line_of(psf.instrument, channel, kind),
+        status=PsfStatus.DRAFT,
         origin=origin,
         file_sha256=file_sha256,
         bytes=store.path(file_sha256).stat().st_size,

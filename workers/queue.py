@@ -12,14 +12,15 @@ from typing import Any
 
 from celery import Celery
 from kombu import Connection
+from kombu import Queue as BrokerQueue
 from kombu.exceptions import KombuError, OperationalError
 from redis.exceptions import RedisError
 
 from workers.settings import Settings
+from workers.urgency import Queue, broker_name
 
 RUN_JOB = "heliopsf.run_job"
 ASSIST = "heliopsf.assist"
-QUEUE = "heliopsf"
 AWAY = (OperationalError, KombuError, RedisError, OSError)
 log = logging.getLogger(__name__)
 
@@ -35,19 +36,21 @@ def make_app(settings: Settings) -> Celery:
         # does not survive the loss of its broker (kombu 5.7).
         task_acks_late=False,
         worker_prefetch_multiplier=1,
-        task_default_queue=QUEUE,
+        task_queues=[BrokerQueue(broker_name(queue), routing_key=broker_name(queue)) for queue in Queue],
+        task_default_queue=broker_name(Queue.INTERACTIVE),
         broker_connection_retry_on_startup=True,
         worker_hijack_root_logger=False,
         worker_send_task_events=False,
+        broker_transport="workers.broker_order:FolderTransport" if settings.embedded else None,
         broker_transport_options=_transport_options(settings),
     )
     return app
 
 
-def submit(app: Celery, job_id: str) -> bool:
+def submit(app: Celery, job_id: str, queue: Queue = Queue.INTERACTIVE) -> bool:
     """Give the job's id to the broker; False where the broker is away (the reconciler tries again)."""
     try:
-        app.send_task(RUN_JOB, args=[job_id], retry=False)
+        app.send_task(RUN_JOB, args=[job_id], queue=broker_name(queue), retry=False)
     except AWAY as error:
         log.warning("broker away, job %s stays queued: %s", job_id, error)
         return False
@@ -58,7 +61,7 @@ def call_for_help(app: Celery, job_id: str, workers: int) -> None:
     """Ask idle workers to share a job's parts. Where the messages are lost, its own worker does them all."""
     try:
         for _ in range(workers):
-            app.send_task(ASSIST, args=[job_id], retry=False)
+            app.send_task(ASSIST, args=[job_id], queue=broker_name(Queue.CROSSVAL), retry=False)
     except AWAY as error:
         log.warning("broker away, job %s goes on alone: %s", job_id, error)
 
@@ -75,7 +78,8 @@ def check(settings: Settings) -> None:
 
 def _transport_options(settings: Settings) -> dict[str, Any]:
     if not settings.embedded:
-        return {"socket_connect_timeout": 5, "socket_timeout": 30}
+        patience = {"socket_connect_timeout": 5, "socket_timeout": 30}
+        return {**patience, "queue_order_strategy": "workers.broker_order:MostUrgentFirst"}
     broker = settings.data_dir.resolve() / "broker"
     queue, control = broker / "queue", broker / "control"
     for folder in (queue, control):

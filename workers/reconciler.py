@@ -8,26 +8,30 @@ import threading
 from celery import Celery
 from sqlalchemy.exc import SQLAlchemyError
 
-from workers import queue
+from workers import bulk_turns, queue
 from workers.catalogue import Catalogue
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
+# So few that what is more urgent, and comes while many are submitted, does not wait for all of them.
+AT_ONCE = 50
 
 
 def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
-    """One pass; returns how many jobs were submitted. Any number of processes may do this at once."""
-    for job_id in catalogue.give_up_silent(settings.lease_s, settings.max_attempts):
+    """One pass; returns how many jobs were submitted, ``AT_ONCE`` at most. Any number of processes may do this at once."""
+    for job_id in catalogue.jobs.give_up_silent(settings.lease_s, settings.max_attempts):
         log.warning("job %s: its worker fell silent; queued again", job_id)
-    for job_id in catalogue.end_by_terms():
+    for job_id in catalogue.uws.end_by_terms():
         log.info("job %s: its time had come; destroyed", job_id)
-    submitted = 0
-    for job_id in catalogue.unsubmitted(settings.resubmit_s):
-        if not queue.submit(app, job_id):
+    bulk_turns.keep_turns(catalogue, settings)
+    submitted: list[str] = []
+    for job in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE):
+        if not queue.submit(app, job.id, job.queue):
             break
-        catalogue.mark_submitted(job_id)
-        submitted += 1
-    return submitted
+        submitted.append(job.id)
+    if submitted:
+        catalogue.jobs.mark_submitted(*submitted)
+    return len(submitted)
 
 
 class Reconciler:
@@ -61,9 +65,11 @@ class Reconciler:
     def _loop(self) -> None:
         while not self._stopping:
             self._wake.clear()
+            submitted = 0
             try:
-                reconcile(self._catalogue, self._app, self._settings)
+                submitted = reconcile(self._catalogue, self._app, self._settings)
             except SQLAlchemyError as error:
                 # The database may be restarting; the next pass finds out.
                 log.warning("reconciler: database away: %s", error)
-            self._wake.wait(self._settings.reconcile_s)
+            if submitted < AT_ONCE:
+                self._wake.wait(self._settings.reconcile_s)

@@ -11,10 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from psfcore.transit.archive import ArchiveLimits
+from workers.urgency import Queue, queues_named
 
 EMBEDDED_BROKER = "filesystem://"
 
@@ -25,6 +26,17 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="HELIOPSF_", frozen=True)
 
     data_dir: Path = Field(Path("heliopsf-data"), description="folder of files, and of SQLite when embedded")
+    store_url: str | None = Field(
+        None,
+        pattern=r"^s3://[^/]+(/.*)?$",
+        description="where files are kept, as s3://bucket/prefix; none means in data_dir",
+    )
+    store_cache_mib: int = Field(
+        20_480, ge=1, description="room in data_dir for copies of files that are kept elsewhere"
+    )
+    quota_mib: int = Field(
+        0, ge=0, description="files that one owner may have kept, unless another is set; 0: no limit"
+    )
     database_url: str | None = Field(None, description="SQLAlchemy URL; none means SQLite in data_dir")
     broker_url: str = Field(EMBEDDED_BROKER, description="Celery broker; the default needs no server")
     max_upload_mib: int = Field(160, ge=1, le=65_536, description="largest file taken, as sent")
@@ -35,6 +47,13 @@ class Settings(BaseSettings):
     )
     worker_processes: int = Field(1, ge=1)
     worker_threads: int | None = Field(None, ge=1, description="none means cores / worker_processes")
+    worker_queues: str = Field(
+        ",".join(Queue),
+        description="queues that a worker serves, separated by commas; the order is always ours",
+    )
+    psf_cache_mib: int = Field(
+        1024, ge=0, description="memory of a worker process for PSFs prepared, which images that follow share"
+    )
     heartbeat_s: float = Field(2.0, gt=0, description="how often a running job says that it is alive")
     lease_s: float = Field(15.0, gt=0, description="silence after which a running job's worker is given up")
     reconcile_s: float = Field(2.0, gt=0, description="how often the job table is compared with the broker")
@@ -59,10 +78,50 @@ class Settings(BaseSettings):
         2_592_000, ge=1, lt=2**31, description="longest that a UWS client may have a job kept"
     )
 
+    bulk_roots: str = Field(
+        "", description="folders whose files a bulk may read, with the system's separator between them"
+    )
+    bulk_output_roots: str = Field("", description="folders below which a bulk may write files, likewise")
+
+    access: Literal["open", "keys"] | None = Field(
+        None,
+        description="who may ask: all, or who has a key; none means keys unless bound to a loopback address",
+    )
+    allowed_hosts: str = Field(
+        "",
+        description="names that the service is called by, separated by commas, besides the loopback ones; * means any",
+    )
+    max_body_mib: int = Field(16, ge=1, le=1024, description="largest request that is no file")
+    reads_per_minute: int = Field(12_000, ge=0, description="of one caller; 0 means no limit")
+    submissions_per_minute: int = Field(
+        3_000, ge=0, description="uploads and jobs of one caller; 0: no limit"
+    )
+    upload_mib_per_minute: int = Field(16_384, ge=0, description="sent in by one caller; 0 means no limit")
+    streams_per_caller: int = Field(
+        32, ge=1, description="streams of events that one caller may have open at a time, of one server"
+    )
+    stream_s: float = Field(
+        3600.0, gt=0, description="longest that a stream of events lasts; its client then comes back"
+    )
+    max_job_memory_mib: int = Field(
+        65_536, ge=1, description="most memory that a job may be expected to need; it is refused else"
+    )
+    max_job_s: float = Field(
+        172_800.0,
+        gt=0,
+        description="longest that a job may be expected to take, and that one attempt may execute; it is stopped then",
+    )
+
     gap_effects: str = Field(
         "",
         description="modules of effects that a gap's diagnosis tries too, separated by commas; their code is run",
     )
+
+    @field_validator("worker_queues")
+    @classmethod
+    def _known_queues(cls, names: str) -> str:
+        queues_named(names)
+        return names
 
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
@@ -73,6 +132,16 @@ class Settings(BaseSettings):
     def added_effects(self) -> tuple[str, ...]:
         """The modules, or files, of effects that a diagnosis tries beside the library's."""
         return tuple(name.strip() for name in self.gap_effects.split(",") if name.strip())
+
+    @property
+    def host_names(self) -> tuple[str, ...]:
+        """The names that the operator says the service is called by, in small letters."""
+        return tuple(name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip())
+
+    @property
+    def queues(self) -> tuple[Queue, ...]:
+        """The queues that a worker serves, most urgent first."""
+        return queues_named(self.worker_queues)
 
     @property
     def embedded(self) -> bool:

@@ -1,4 +1,4 @@
-"""Files by the hash of their content, in a local folder.
+"""Files by the hash of their content, in a local folder; in ``workers.remote_store`` also in S3.
 
 A file is written beside its place under a temporary name, forced to disk and renamed, so that a file that
 exists is whole. Names come from hashes alone, never from a client.
@@ -13,14 +13,30 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+
+from workers.settings import Settings
+
+
+class StoreAway(ConnectionError):
+    """Where the files are does not answer; it may in a moment."""
+
+
+@dataclass(frozen=True)
+class Blob:
+    """A file that is kept."""
+
+    digest: str
+    bytes: int
+    kept_at: float  # when it was kept last, though it may have been there before
 
 
 class Store:
     """A folder of content-addressed files."""
 
-    def __init__(self, folder: Path) -> None:
-        self._blobs = folder / "blobs"
+    def __init__(self, folder: Path, blobs: str = "blobs") -> None:
+        self._blobs = folder / blobs
         self._tmp = folder / "tmp"
         self._blobs.mkdir(parents=True, exist_ok=True)
         self._tmp.mkdir(parents=True, exist_ok=True)
@@ -35,8 +51,13 @@ class Store:
                     path.unlink(missing_ok=True)
 
     def path(self, digest: str) -> Path:
-        """Where the file of this SHA-256 is, or would be."""
+        """Where the file of this SHA-256 is, or would be, to be opened soon."""
         return self._blobs / digest[:2] / digest
+
+    def check(self) -> None:
+        """Raise OSError where files cannot be kept now."""
+        with self.temporary() as probe:
+            probe.write_bytes(b"heliopsf")
 
     @contextmanager
     def temporary(self) -> Iterator[Path]:
@@ -66,6 +87,40 @@ class Store:
         os.replace(temporary, target)
         _sync(target.parent)
         return digest
+
+    def blobs(self) -> Iterator[Blob]:
+        """All files that are kept."""
+        for folder in sorted(self._blobs.iterdir()):
+            for path in sorted(folder.iterdir()):
+                found = path.stat()
+                yield Blob(path.name, found.st_size, found.st_mtime)
+
+    def remove(self, digest: str, kept_before: float) -> bool:
+        """Remove a file, unless it is gone or was kept again since; whether it was removed.
+
+        It is put aside first and looked at there, so that a file that is kept at this very moment is not lost.
+        """
+        aside = self._tmp / uuid.uuid4().hex
+        target = self.path(digest)
+        try:
+            os.replace(target, aside)
+        except FileNotFoundError:
+            return False
+        if aside.stat().st_mtime >= kept_before:
+            os.replace(aside, target)  # whatever was put there meanwhile is the same
+            return False
+        aside.unlink()
+        return True
+
+
+def open_store(settings: Settings) -> Store:
+    """The store that the settings name."""
+    if settings.store_url is None:
+        return Store(settings.data_dir)
+    # What it needs is installed where it is used.
+    from workers.remote_store import RemoteStore
+
+    return RemoteStore(settings.store_url, settings.data_dir, settings.store_cache_mib * 2**20)
 
 
 def sha256_of(path: Path) -> str:

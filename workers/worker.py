@@ -19,8 +19,10 @@ from typing import TYPE_CHECKING
 from celery.signals import setup_logging, worker_init, worker_process_init, worker_shutting_down
 
 from workers import logs, queue
+from workers.broker_order import TakeWhatCanStart
 from workers.settings import Settings, software_version
 from workers.stopping import Stopping
+from workers.urgency import broker_name
 
 if TYPE_CHECKING:
     from workers.catalogue import Catalogue
@@ -29,7 +31,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 settings = Settings()
 app = queue.make_app(settings)
+app.select_queues([broker_name(name) for name in settings.queues])
+app.steps["consumer"].add(TakeWhatCanStart)
 LOOK_EVERY_S = 0.5
+WAIT_S = 2.0  # for a database that does not answer, before it is asked again
 stopping = Stopping()  # made before the fork: the children see what is asked of their parent
 
 
@@ -53,12 +58,47 @@ def _logs(**_: object) -> None:
 
 @worker_init.connect
 def _watch(**_: object) -> None:
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from workers import checks
+    from workers.schema import SchemaError
+
+    try:
+        check_tables()
+    # Celery goes on after an Exception here, but not after an exit.
+    except SchemaError as error:
+        raise SystemExit(f"Error: {error}") from error
+    except SQLAlchemyError as error:
+        raise SystemExit(f"Error: the database: {checks.database_said(error)}") from error
     threading.Thread(target=_end_at_the_latest, name="end at the latest", daemon=True).start()
 
 
 @worker_shutting_down.connect
 def _stop(**_: object) -> None:
     stopping.ask(settings.stop_s)
+
+
+def check_tables() -> None:
+    """Wait for a database that does not answer, and look whether its tables are this version's.
+
+    Raises ``workers.schema.SchemaError`` where they are not.
+    """
+    from sqlalchemy.exc import OperationalError
+
+    from workers import checks
+    from workers.catalogue import Catalogue
+
+    catalogue = Catalogue(settings.catalogue_url)  # closed again: no connection may be there at the fork
+    try:
+        while True:
+            try:
+                catalogue.schema.check()
+                return
+            except OperationalError as error:
+                log.warning("waiting for the database: %s", checks.database_said(error))
+                time.sleep(WAIT_S)
+    finally:
+        catalogue.close()
 
 
 def _end_at_the_latest() -> None:
@@ -88,9 +128,9 @@ def _be_present() -> None:
         leaving = stopping.asked
         try:
             if leaving:
-                _catalogue().take_leave(worker_name())
+                _catalogue().census.take_leave(worker_name())
             else:
-                _catalogue().announce(worker_name(), started_at, software_version())
+                _catalogue().census.announce(worker_name(), started_at, software_version())
         except SQLAlchemyError as error:
             log.warning("presence not written: %s", str(error).splitlines()[0])
         if leaving:
@@ -106,14 +146,15 @@ def _runner() -> Runner:
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
     from workers.runner import Runner
-    from workers.store import Store
+    from workers.store import open_store
 
     return Runner(
         settings,
         _catalogue(),
-        Store(settings.data_dir),
+        open_store(settings),
         call_for_help=lambda job_id, workers: queue.call_for_help(app, job_id, workers),
         stopping=stopping,
+        submit=lambda job_id, queue_name: queue.submit(app, job_id, queue_name),
     )
 
 
@@ -125,13 +166,23 @@ def _catalogue() -> Catalogue:
 
 
 def main(parent: int | None = None) -> None:
-    """Run a worker in this process until it is told to stop, or until the process ``parent`` is gone."""
+    """Run a worker in this process until it is told to stop, or until the process ``parent`` is gone.
+
+    SystemExit with a line and status 1 where the database is not at this version's revision.
+    """
     logs.configure(settings)  # before Celery has anything to say
     if parent is not None:
         threading.Thread(target=_stop_with, args=(parent,), daemon=True).start()
     pool = ["--pool", "prefork", "--concurrency", str(settings.worker_processes)]
     quiet = ["--without-gossip", "--without-mingle", "--without-heartbeat"]
-    app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])
+    try:
+        app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])
+    except SystemExit as ended:
+        if ended.code == 0 and stopping.asked:
+            # All is ended in order. The interpreter's own end would wait for the idle threads of the pool.
+            logging.shutdown()
+            os._exit(0)
+        raise
 
 
 def _stop_with(parent: int) -> None:

@@ -34,7 +34,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SetPlan:
-    """How a set is made. first: the number of its first case; only, clean_only: as draw_case has them."""
+    """How a set is made. first: the number of its first case; the others: as draw_case has them."""
 
     cases: int
     seed: int
@@ -44,6 +44,7 @@ class SetPlan:
     only: tuple[str, ...] = ()
     clean_only: bool = False
     built_diffraction: bool = True
+    left_pct: tuple[float, ...] = ()
 
     @property
     def numbers(self) -> range:
@@ -196,6 +197,7 @@ def _make_one(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane
         only=plan.only,
         clean_only=plan.clean_only,
         built_diffraction=plan.built_diffraction,
+        left_pct=plan.left_pct,
     )
     result = make(case, scenes)
     write_transit(result, case.plan, made.transit(number))

@@ -71,10 +71,12 @@ def draw_case(
     only: Sequence[str] = (),
     clean_only: bool = False,
     built_diffraction: bool = True,
+    left_pct: Sequence[float] = (),
 ) -> Case:
     """Case `number` (from 0) of a set. only: single effects of these names in turn, no others.
 
-    built_diffraction: half of the cases have the instrument's diffraction; else all have a synthetic one.
+    built_diffraction: half of the cases have the instrument's diffraction; else all have a synthetic one. left_pct: what
+    the effects are to leave in the discs after a refit, in turn, each for all of `only`; none: drawn.
     Raises DataError "unknown-effect", "bad-plan".
     """
     kind, names = _what(seed, number, only, clean_only)
@@ -87,6 +89,8 @@ def draw_case(
     effects = tuple(effect_named(name).drawn(effect_named(name).nominal, plan, own) for name in names)
     low, high = (float(np.log(pct)) for pct in _TARGET_PCT)
     targets = np.exp(own.uniform(low, high, len(names)))
+    if left_pct:
+        targets[:] = left_pct[number // max(len(only), 1) % len(left_pct)]
     own_seed = int(own.integers(2**31))
     return Case(number, own_seed, kind, plan, law, glass, effects, tuple(float(t) for t in targets), headroom)
 

@@ -15,7 +15,6 @@ import json
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from psfcore.blind.fine_optics import boxed_glass, fine_optics
 from psfcore.blind.left import LinearEstimator, refitted, rms_difference
 from psfcore.fits_io import Cards, CardValue, write_plane
 from psfcore.simulate.plan import HIGH, Plan
+from psfcore.simulate.transit_files import instrument_values, shot_values
 from psfcore.transit.prepare import Exposure, prepare
 from psfcore.transit.transit import Frame, Place
 
@@ -36,8 +36,6 @@ Plane = NDArray[np.float64]
 SCHEMA = "transit/1"
 TRIALS = 2
 STRENGTH_WITHIN = 1.4  # of the target: nearer than this, a strength is good
-_START = datetime(2023, 1, 3, 3, 42)
-_SCALE_ARCSEC = 0.492
 _PLACE_STREAM = 2003
 
 
@@ -196,7 +194,7 @@ def write_transit(made: Made, plan: Plan, folder: Path) -> None:
     for n, dn in enumerate(made.exposures):
         cards = _frame_cards(plan, n, made.saturation_dn)
         write_plane(folder / f"{n:03d}.fits", dn.astype(np.int32), cards=cards)
-    write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(_instrument()))
+    write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(instrument_values()))
     entries = [
         {"file": f"{n:03d}.fits", "fov": shot.fov, "x": place.x_px, "y": place.y_px, "r": place.radius_px}
         for n, (shot, place) in enumerate(zip(plan.shots, made.reported, strict=True))
@@ -214,28 +212,10 @@ def write_transit(made: Made, plan: Plan, folder: Path) -> None:
 
 def _frame_cards(plan: Plan, index: int, level: float | None) -> Cards:
     shot = plan.shots[index]
-    begin = (_START + timedelta(seconds=shot.time_s)).isoformat(timespec="milliseconds")
-    values = _instrument() | {
-        "DATE-BEG": begin,
-        "XPOSURE": shot.exposure_s,
-        "GAINCOMB": shot.gain_mode,
-        "BUNIT": "DN",
-    }
+    values = shot_values(shot, "DN")
     if level is not None and shot.gain_mode == HIGH:
         values["SATURATE"] = level
     return _cards(values)
-
-
-def _instrument() -> dict[str, CardValue]:
-    return {
-        "ORIGIN": "SIMULATED by heliopsf",
-        "TELESCOP": "SOLO/EUI/HRI_EUV",
-        "INSTRUME": "EUI",
-        "DETECTOR": "HRI_EUV",
-        "WAVELNTH": 174,
-        "CDELT1": _SCALE_ARCSEC,
-        "CDELT2": _SCALE_ARCSEC,
-    }
 
 
 def _cards(values: dict[str, CardValue]) -> Cards:

@@ -10,6 +10,8 @@ error and is counted as such.
 
 Rows, each with its cases. An answer is what the verdict `attributed` or `tie` names.
 - false alarms: clean cases whose verdict is not `none`; those that say `inconclusive` are counted once more, alone.
+- of the first, where the discs show it: of `contains`, the cases whose discs' means alone, without any fit of an effect, exceed
+  their noise by chi2 SHOWN_CHI2 or more: less is hidden from anyone who looks at the discs.
 - contains: single known effects and pairs at or above a level left in the discs after the refit; the answer names the
   true effect; of a pair both, but for one that alone leaves less than 1 % where the other leaves more. At 1 %,
   `inconclusive` counts half.
@@ -41,6 +43,7 @@ from psfcore.blind.effects import KNOWN, UNKNOWN
 SCHEMA = "gap-blind/1"
 Z95 = 1.959963984540054
 LEVEL_PCT, LOWER_LEVEL_PCT = 2.0, 1.0
+SHOWN_CHI2 = 30.0  # where one known pattern was looked for it would be 5.5 sigma
 LEAST_CLOSURE = 0.1  # below it a ratio of closures says nothing
 POWER_EDGES_PCT = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
 NONE, ATTRIBUTED, TIE, UNKNOWN_VERDICT, INCONCLUSIVE = "none", "attributed", "tie", "unknown", "inconclusive"
@@ -216,6 +219,13 @@ def _rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
             lambda p: p >= 0.8,
         ),
         _share(
+            "of the first, where the discs show it",
+            [case for case in seen if (shown_chi2(case.truth) or 0.0) >= SHOWN_CHI2],
+            _contains,
+            "",
+            None,
+        ),
+        _share(
             "first place is the truth",
             single,
             lambda case: case.first == case.true_names[0],
@@ -337,6 +347,19 @@ def true_closure(truth: dict[str, Any]) -> float | None:
     return 1 - stays / gap if gap > 0 else None
 
 
+def shown_chi2(truth: dict[str, Any]) -> float | None:
+    """What the effect leaves in the discs' means after the refit, over their noise, squared and summed; None where it
+    was not measured."""
+    if "refitted" not in truth:
+        return None
+    left, noise, clean = (
+        truth["refitted"]["residual_pct"],
+        truth["refitted"]["noise_pct"],
+        truth["clean_by_image_pct"],
+    )
+    return float(sum(((left[n] - clean[n]) / noise[n]) ** 2 for n in set(left) & set(clean)))
+
+
 def _axis_right(case: Judged) -> bool:
     where = case.report.get("where") or [{}]
     return where[0].get("axis") in AXES[case.true_names[0]]
@@ -401,6 +424,7 @@ def _case(case: Judged) -> dict[str, Any]:
         "left_before_refit_pct": case.truth["left_before_refit_pct"],
         "left_after_refit_pct": case.left_pct,
         "clean_left_pct": case.truth.get("clean_left_pct"),
+        "shown_chi2": shown_chi2(case.truth),
         "verdict": case.verdict,
         "answer": list(case.answer),
         "first": case.first,

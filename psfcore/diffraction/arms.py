@@ -33,6 +33,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from threadpoolctl import threadpool_limits
 
 from psfcore.errors import DataError
 
@@ -100,6 +101,8 @@ class ArmMeasurement:
         return self.chi2 / self.degrees_of_freedom
 
 
+# Factorisations so small that threads cost several times what they bring.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def measure_arms(
     image: Plane,
     centre_xy: tuple[float, float] | None = None,

@@ -4,8 +4,11 @@
     nu = cells + trace(J Cov J^T)      noise, and the error of the fit that they were held out of      Eq. (2)
     gap = sqrt(mean(residual^2 - noise^2))     of the discs' means, in percent                Eq. (3)
 
-Two schemes: blocks of time with a guard, and one pointing left out. chi2 is that of the discs' cells; where these hardly
-show a gap, as with a gain that differs between images, the lit blocks' is added. Intervals: images drawn again.
+Two schemes: blocks of time with a guard, and one pointing left out. chi2 is that of the discs' cells; where the lit blocks
+show more of a gap that is the effect's, as with a gain that differs between images, theirs is added. Intervals hold what the cause closes, not
+our estimate of it alone: images are drawn again; the noise's scale, which nu goes by, is drawn from how well one
+simulation knows it; what the errors of the effect's parameters add to chi2_after may be none of the effect's; and its form is right to
+FORM_ERROR.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from psfcore.transit.blocks import Fold, folds
 Vector = NDArray[np.float64]
 
 DRAWS = 1000
-SHOWN = 3.0  # sigmas of chi2 by which the discs must show a gap, for them to be judged alone
+FORM_ERROR = 0.1  # of an effect's amplitude: its square is a share of chi2
 INTERVAL = (5.0, 95.0)
 HIDDEN_SIGMA = 1.645  # 95 % of a normal distribution lies below
 
@@ -108,7 +111,9 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             disc, white = evidence.discs[by_index[n]], model.discs[by_index[n]]
             left = white.residual - white.answers[here].T @ step.values
             error = float(np.einsum("ki,kl,li->", white.answers[here], step.covariance, white.answers[here]))
-            lit, freedom = evidence.lit.held_out_chi2(columns, step.values[base:], [n], fitted)
+            lit, of_lit = evidence.lit.held_out_chi2(
+                columns, step.values[base:], step.covariance[base:, base:], [n], fitted
+            )
             answer = disc.answers[here] @ disc.share
             mean = float(disc.share @ disc.residual - answer @ step.values)
             noise = math.sqrt(disc.mean_noise**2 + float(answer @ step.covariance @ answer))
@@ -118,7 +123,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
                     float(left @ left),
                     left.size + error,
                     lit / model.lit_scale,
-                    float(freedom),
+                    of_lit,
                     -100 * mean / disc.observed,
                     100 * noise / disc.observed,
                 )
@@ -137,27 +142,38 @@ def _in_both(before: HeldOut, after: HeldOut) -> tuple[HeldOut, HeldOut] | None:
     return before.of(common), after.of(common)
 
 
-def closure(before: HeldOut, after: HeldOut, rng: np.random.Generator) -> Interval | None:
-    """Eq. (1) with its interval; none where there is nothing to close."""
+def closure(
+    before: HeldOut, after: HeldOut, rng: np.random.Generator, scale_error: float = 0.0
+) -> Interval | None:
+    """Eq. (1) with its interval; none where there is nothing to close. scale_error: of the noise's variance, a share."""
     both = _in_both(before, after)
     if both is None:
         return None
     before, after = both
-    excess = before.chi2 - before.expected
-    left = after.chi2 - before.expected
-    if excess.sum() < SHOWN * math.sqrt(2 * float(before.expected.sum())):
-        excess = excess + before.lit_chi2 - before.lit_expected
-        left = left + after.lit_chi2 - before.lit_expected
-    total = float(excess.sum())
+    chi2_before, chi2_after, nu, nu_after = before.chi2, after.chi2, before.expected, after.expected
+    shown = float((before.lit_chi2 - before.lit_expected).sum())
+    fallen = float((before.lit_chi2 - after.lit_chi2).sum())
+    if shown > (chi2_before - nu).sum() and fallen > shown / 2:
+        chi2_before, chi2_after = chi2_before + before.lit_chi2, chi2_after + after.lit_chi2
+        nu, nu_after = nu + before.lit_expected, nu_after + after.lit_expected
+    total = float((chi2_before - nu).sum())
     if total <= 0:
         return None
-    chosen = rng.integers(0, excess.size, (DRAWS, excess.size))
-    totals = excess[chosen].sum(axis=1)
-    drawn = 1 - left[chosen].sum(axis=1)[totals > 0] / totals[totals > 0]
-    if drawn.size < DRAWS // 2:
+    chosen = rng.integers(0, nu.size, (DRAWS, nu.size))
+    scale = np.exp(scale_error * rng.standard_normal(DRAWS))
+    totals = chi2_before[chosen].sum(axis=1) / scale - nu[chosen].sum(axis=1)
+    use = totals > 0
+    if use.sum() < DRAWS // 2:
         return None
+    seen = chi2_after[chosen].sum(axis=1) / scale
+    drawn, without_errors = (
+        1 - (seen - expected[chosen].sum(axis=1))[use] / totals[use] for expected in (nu, nu_after)
+    )
+    value = 1 - float((chi2_after - nu).sum()) / total
     low, high = np.percentile(drawn, INTERVAL)
-    return Interval(1 - float(left.sum()) / total, float(low), float(high))
+    high = max(high, np.percentile(without_errors, INTERVAL[1]))
+    # No cause closes more than all of a gap.
+    return Interval(value, float(low) - FORM_ERROR**2, max(value, min(float(high), 1.0)) + FORM_ERROR**2)
 
 
 def fall(before: HeldOut, after: HeldOut) -> float:

@@ -57,7 +57,8 @@ def corrected(transit: Transit, view: View, effects: Sequence[Effect], theta: Ve
     for n, frame in enumerate(transit.frames):
         error = np.zeros(transit.shape)
         for value, change in zip(theta, changes, strict=True):
-            error += value * change.change(n, view.expected)
+            if change.disc:  # what the discs do not answer to is part of each image's own scene
+                error += value * change.change(n, view.expected)
         frames.append(replace(frame, pixels=(frame.pixels - error).astype(np.float32)))
     return replace(transit, frames=tuple(frames))
 
@@ -78,21 +79,24 @@ def add_to_model(
     values = {name: value for name, (value, _, _) in found.values.items()}
     theta = np.array(list(values.values()))
     current, rounds = solution, 0
-    for _ in range(ROUNDS):
+    in_images = np.array([change.disc for effect in held for change in effect.changes(view)])
+    for _ in range(ROUNDS if in_images.any() else 1):
         rounds += 1
-        clean = corrected(transit, View(current), held, theta)
-        current = invert(
-            clean,
-            solution.inversion.shape,
-            start=current.inversion.coordinates,
-            threads=solution.threads,
-            progress=progress,
-        )
+        if in_images.any():
+            current = invert(
+                corrected(transit, View(current), held, theta),
+                solution.inversion.shape,
+                start=current.inversion.coordinates,
+                threads=solution.threads,
+                progress=progress,
+            )
         evidence = _with_noise_of(model.evidence, gather(current, held, progress=progress))
         again = replace(model, evidence=evidence)
         left = fitted(again, evidence.effects, any_sign=True)
-        steps = np.array([value for value, _, _ in left.values.values()])
+        found_now = np.array([value for value, _, _ in left.values.values()])
         sigma = np.array([s for _, s, _ in left.values.values()])
+        # What was taken out of the images shows what is left of it, the rest shows all of it.
+        steps = np.where(in_images, found_now, found_now - theta)
         theta = theta + steps
         if float(np.abs(steps / np.maximum(sigma, 1e-300)).max()) < SETTLED:
             break
@@ -108,6 +112,23 @@ def add_to_model(
         },
         rounds=rounds,
     )
+
+
+def beyond(
+    added: Corrected,
+    library: Sequence[Effect],
+    model: LinearModel,
+    *,
+    progress: Progress = lambda stage, step, steps: None,
+) -> LinearModel:
+    """The model about a fit with effects in it, which are always fitted, and how it answers to others of a library."""
+    names = {effect.name for effect in added.effects}
+    others = [effect for effect in library if effect.name not in names]
+    evidence = gather(added.solution, (*added.effects, *others), progress=progress)
+    evidence = _with_noise_of(model.evidence, evidence)
+    base = len(evidence.base) + sum(len(evidence.columns.get(name, ())) for name in names)
+    effects = tuple(effect for effect in evidence.effects if effect.name not in names)
+    return replace(model, evidence=replace(evidence, base=tuple(range(base)), effects=effects))
 
 
 def hold(effect: Effect, view: View) -> Effect:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
 
-FAINT_DN = 60.0
+FAINT_DN = (30.0, 150.0)  # a mixture of both follows a loss at any faint level between
 
 
 def flat(view: View) -> Field:
@@ -50,11 +51,11 @@ def _one_gain_mode(view: View) -> str | None:
 
 
 def _nonlinearity(view: View) -> Sequence[Change]:
-    def change(n: int, images: Sequence[Field]) -> Field:
+    def change(n: int, images: Sequence[Field], faint_dn: float) -> Field:
         counts = np.maximum(images[n] * np.float32(view.exposure_s(n)), 0)
-        return np.asarray(-images[n] * np.exp(-counts / np.float32(FAINT_DN)))
+        return np.asarray(-images[n] * np.exp(-counts / np.float32(faint_dn)))
 
-    return [Change(change)]
+    return [Change(lambda n, images, k=k: change(n, images, k)) for k in FAINT_DN]  # type: ignore[misc]
 
 
 def _flat_field(view: View) -> Sequence[Change]:
@@ -71,14 +72,20 @@ def _column_smear(view: View) -> Sequence[Change]:
 
 
 def _persistence(view: View) -> Sequence[Change]:
-    """Shares of the image before and of the one before that, whatever they showed: traps empty slowly."""
+    """Shares of the image before and of the one before that, whatever they showed: traps empty slowly, and with time."""
+    frames = view.solution.transit.frames
+    waits = np.array([later.time_s - earlier.time_s for earlier, later in pairwise(frames)])
+    usual = max(float(waits.mean()), 1e-9) if waits.size else 1.0
 
     def before(n: int, images: Sequence[Field], back: int) -> Field:
         if n < back:
             return np.zeros(view.solution.transit.shape, np.float32)
         return images[n - back] * np.float32(view.exposure_s(n - back) / view.exposure_s(n))
 
-    return [Change(lambda n, images, back=back: before(n, images, back)) for back in (1, 2)]  # type: ignore[misc]
+    def faded(n: int, images: Sequence[Field]) -> Field:
+        return before(n, images, 1) * np.float32(waits[n - 1] / usual - 1 if n else 0.0)
+
+    return [*(Change(lambda n, images, back=back: before(n, images, back)) for back in (1, 2)), Change(faded)]  # type: ignore[misc]
 
 
 def _filled(view: View) -> Sequence[Change]:
@@ -112,7 +119,7 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _gradient),
     Effect("gain_mismatch", "detector", (_p("excess", "", 0.05),), "Combined and high-only images differ in gain.",
            "the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
-    Effect("nonlinearity", "detector", (_p("loss", "", 0.05),), "Faint signals are read out too low.",
+    Effect("nonlinearity", "detector", (_p("loss", "", 0.05), _p("loss_beyond", "", 0.05)), "Faint signals are read out too low.",
            "a ladder of exposures at one pointing", ("intensity",), _nonlinearity),
     Effect("flat_field_residual", "detector",
            tuple(_p(name, unit, 0.05) for name, unit in
@@ -121,7 +128,8 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _flat_field),
     Effect("column_smear", "detector", (_p("share", "", 0.01, True),), "Charge is smeared along columns while they are read.",
            "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
-    Effect("persistence", "detector", (_p("share", "", 0.01, True), _p("share_of_second", "", 0.01, True)),
+    Effect("persistence", "detector", (_p("share", "", 0.01, True), _p("share_of_second", "", 0.01, True),
+            _p("change_with_wait", "", 0.01)),
            "Shares of the two images before are left in the next.",
            "a dark exposure after a bright one", ("time", "pointing"), _persistence),
     Effect("saturation_fill", "detector", (_p("excess", "", 0.1),), "What was filled in for saturated pixels is wrong.",

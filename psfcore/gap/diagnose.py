@@ -14,13 +14,13 @@ import numpy as np
 
 from psfcore.errors import DataError
 from psfcore.gap.closure import HeldOut, Interval, closure, fall, gap, hold_out, pointings, time_blocks
-from psfcore.gap.correction import Corrected, add_to_model
+from psfcore.gap.correction import Corrected, add_to_model, beyond
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.expected_gap import ExpectedGap, expected_gap
-from psfcore.gap.judge import FLOOR, LEAST_IMAGES, Judgement, Tried, judge
+from psfcore.gap.judge import LEAST_IMAGES, Judgement, Tried, judge
 from psfcore.gap.library import LIBRARY
-from psfcore.gap.linear_model import LinearModel
+from psfcore.gap.linear_model import FLOOR, LinearModel
 from psfcore.gap.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.where import Axis, where
 from psfcore.psf import Psf
@@ -135,13 +135,14 @@ def diagnose_solution(
         FLOOR,
         disc_scale=float(np.clip(expected.disc_scale, SMALLEST_SCALE, LARGEST_SCALE)),
         lit_scale=float(np.clip(expected.lit_scale, SMALLEST_SCALE, LARGEST_SCALE)),
+        scale_error=expected.scale_error,
     )
     refits = _Refits(solution, model, progress)
-    found = judge(model, refits.model) if refit else judge(model)
+    found = judge(model, refits.model, refits.beyond) if refit else judge(model)
     fits = refits.of(found) if refit else ()
     rng = np.random.default_rng(seed)
     shrinking, before, after = _shrinking(model, found, fits, rng)
-    favoured = [axis for effect in evidence.effects if effect.name in found.answer for axis in effect.axes]
+    favoured = [axis for effect in evidence.effects if effect.name in _likely(found) for axis in effect.axes]
     nothing = Interval(0.0, 0.0, 0.0)
     rms = gap(before, rng) if before is not None else nothing
     gone = found.verdict in ("attributed", "tie") and after is not None
@@ -151,7 +152,7 @@ def diagnose_solution(
         model=model,
         expected=expected,
         noise=noise,
-        where=where(model, rng, favoured),
+        where=where(model, rng, favoured, found.best.step if found.answer and found.best else None),
         before_refit=_before_refit(model, found, rng) or rms,
         rms=rms,
         after=gap(after, rng) if gone and after is not None else rms,
@@ -164,6 +165,13 @@ def diagnose_solution(
         residual_after=after if gone else None,
         cautions=(*_cautions(solution, noise, evidence), *refits.failures),
     )
+
+
+def _likely(found: Judgement) -> tuple[str, ...]:
+    """The answer's effects; where a gap has no sure answer, those of what explains most of it."""
+    if found.answer or found.verdict == "none" or found.best is None:
+        return found.answer
+    return found.best.names
 
 
 def _shrinking(
@@ -189,7 +197,9 @@ def _shrinking(
         if found.best is not None and tried.label == found.best.label:
             best = after[0]
         closures = [
-            closure(b, a, rng) if found.verdict != "none" and b is not None and a is not None else None
+            closure(b, a, rng, model.scale_error)
+            if found.verdict != "none" and b is not None and a is not None
+            else None
             for b, a in zip(before, after, strict=True)
         ]
         falls = fall(before[0], after[0]) if before[0] is not None and after[0] is not None else None
@@ -220,6 +230,17 @@ class _Refits:
         """The model about the refit with an effect, or a pair; none where there is no fit with it."""
         made = self._fit(tried)
         return None if made is None else made.model
+
+    def beyond(self, tried: Tried) -> LinearModel | None:
+        """The same with the rest of the library beside it."""
+        made = self._fit(tried)
+        if made is None:
+            return None
+
+        def say(stage: str, step: int, steps: int) -> None:
+            self._progress(f"beyond {tried.label}: {stage}", step, steps)
+
+        return beyond(made, self._model.evidence.effects, self._model, progress=say)
 
     def of(self, found: Judgement) -> tuple[Corrected, ...]:
         """Of the answer; with a tie, of each of its effects, the best first."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,25 @@ class View:
     """
 
     solution: Solution
+
+    @cached_property
+    def kept(self) -> dict[type, Any]:
+        """What is worked out about it once, by its kind: searches."""
+        return {}
+
+    @cached_property
+    def kernel(self) -> Vector:
+        """The solution's total PSF [y, x]."""
+        return self.solution.total.kernel(self.solution.inversion.coordinates)
+
+    @cached_property
+    def slopes(self) -> tuple[Blur, ...]:
+        """How it changes with each coordinate of its shape."""
+        solution = self.solution
+        return tuple(
+            Blur(slope, solution.transit.shape, threads=solution.threads)
+            for slope in solution.total.slopes(solution.inversion.coordinates)
+        )
 
     @cached_property
     def expected(self) -> Sequence[Field]:
@@ -186,11 +205,14 @@ class Change:
     """What one unit of one parameter does: change(n, images) to image n [y, x] in DN/s.
 
     images: all images as they should be, or, for the lit part, their pointings' means. lit: whether it differs
-    between images of one pointing, so that the lit part shows it.
+    between images of one pointing, so that the lit part shows it. disc: whether the discs do. numbers: how many numbers
+    of its own were taken from the lit parts to make it, which its gain pays for.
     """
 
     change: Callable[[int, Sequence[Field]], Field]
     lit: bool = True
+    disc: bool = True
+    numbers: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ them: one look at each image gives how its cells (`cells`) and its lit blocks (`
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from psfcore.gap.cells import DiscCells, disc_cells
 from psfcore.gap.effect import Change, Effect, View
-from psfcore.gap.lit_blocks import LitBlocks, blocks, lit_blocks
+from psfcore.gap.lit_blocks import LitBlocks, LitEquations, blocks, lit_blocks
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.optics import Blur
 from psfcore.transit.occulter import FoundPlace
@@ -41,7 +41,8 @@ class Taken:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """All that a diagnosis goes by. discs: of the images that took part. taken: of all images."""
+    """All that a diagnosis goes by. discs: of the images that took part. taken: of all images. numbers: of `Change`, by
+    column."""
 
     effects: tuple[Effect, ...]
     columns: dict[str, tuple[int, ...]]
@@ -50,11 +51,30 @@ class Evidence:
     lit: LitBlocks
     taken: tuple[Taken, ...]
     untestable: dict[str, str]
+    numbers: dict[int, int] = field(default_factory=dict)
+
+    def numbers_of(self, columns: Sequence[int]) -> int:
+        """How many numbers were taken from the lit parts to make the changes of these columns."""
+        return sum(self.numbers.get(column, 0) for column in columns)
 
     @cached_property
     def images(self) -> tuple[int, ...]:
         """Positions, among all images, of those with a disc."""
         return tuple(disc.index for disc in self.discs)
+
+    def lit_equations(self, images: Sequence[int] | None = None) -> LitEquations:
+        """The lit blocks' equations of all columns, from some images (none: all)."""
+        return self.whole_lit if images is None else self.lit.equations(range(self.size), images)
+
+    @cached_property
+    def whole_lit(self) -> LitEquations:
+        """`lit_equations` of all images."""
+        return self.lit.equations(range(self.size))
+
+    @cached_property
+    def steady_lit(self) -> LitEquations:
+        """`whole_lit` with restless blocks weighed by what they show: what is left is judged by these."""
+        return self.lit.with_restless_blocks().equations(range(self.size))
 
     @property
     def size(self) -> int:
@@ -74,18 +94,14 @@ def gather(
     base = tuple(range(solution.inversion.coordinates.size))
     columns = {name: tuple(c + len(base) for c in here) for name, here in columns.items()}
     lit = lit_blocks(view, len(base) + len(changes), progress)
-    slopes = [
-        Blur(slope, solution.transit.shape, threads=solution.threads)
-        for slope in solution.total.slopes(solution.inversion.coordinates)
-    ]
     part = set(solution.part)
     discs, distances = [], []
     count = len(solution.transit.frames)
-    far = _Distance(solution)
+    far = _Distance(view)
     for n in range(count):
         progress("effects", n, count)
         if n in part:
-            discs.append(_disc(view, n, slopes, changes))
+            discs.append(_disc(view, n, changes))
             distances.append(far.of(view, n))
         else:
             distances.append(float("nan"))
@@ -105,6 +121,7 @@ def gather(
             )
         ),
         untestable=untestable,
+        numbers={len(base) + k: change.numbers for k, change in enumerate(changes) if change.numbers},
     )
     return _without_unseen(found)
 
@@ -127,22 +144,24 @@ def _changes(
     return changes, columns, untestable
 
 
-def _disc(view: View, n: int, slopes: Sequence[Blur], changes: Sequence[Change]) -> DiscCells:
+def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
     """The cells of one image with the answers of all columns."""
     solution = view.solution
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
     lit = view.lit_scene(n)
-    answers = [flat @ slope.field(slope.see(lit)).ravel() for slope in slopes]
-    answers.extend(flat @ np.asarray(change.change(n, view.expected)).ravel() for change in changes)
+    answers = [flat @ slope.field(slope.see(lit)).ravel() for slope in view.slopes]
+    for change in changes:
+        hidden = np.zeros(flat.shape[0])
+        answers.append(flat @ np.asarray(change.change(n, view.expected)).ravel() if change.disc else hidden)
     return replace(cells, answers=np.array(answers, dtype=np.float64))
 
 
 class _Distance:
     """From how far, on average, light scatters into a disc: the mean of r weighted by the light that comes from there."""
 
-    def __init__(self, solution: Solution) -> None:
-        kernel = solution.total.kernel(solution.inversion.coordinates)
+    def __init__(self, view: View) -> None:
+        kernel, solution = view.kernel, view.solution
         d = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
         weighted = kernel * np.hypot(d[:, None], d[None, :])
         self._blur = Blur(weighted, solution.transit.shape, threads=solution.threads)

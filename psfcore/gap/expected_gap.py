@@ -22,11 +22,12 @@ from psfcore.transit.transit import Transit
 
 @dataclass(frozen=True)
 class ExpectedGap:
-    """disc_scale, lit_scale: chi2 a degree of freedom of cells and lit blocks. residual_pct: rms residual
-    of the discs' means."""
+    """disc_scale, lit_scale: chi2 a degree of freedom of cells and lit blocks. scale_error: of disc_scale, a share.
+    residual_pct: rms residual of the discs' means."""
 
     disc_scale: float
     lit_scale: float
+    scale_error: float
     residual_pct: float
 
 
@@ -61,11 +62,12 @@ def expected_gap(
     )
     model = LinearModel(gather(again, (), progress=say), floor)
     left = model.left(model.base)
-    cells = sum(one.size for one in left) - len(model.base.columns)
-    lit = model.whole_lit
+    cells = max(sum(one.size for one in left) - len(model.base.columns), 1)
+    lit = model.evidence.whole_lit
     residual = [100 * float(d.share @ d.residual) / d.observed for d in model.evidence.discs]
     return ExpectedGap(
-        disc_scale=sum(float(one @ one) for one in left) / max(cells, 1),
+        disc_scale=sum(float(one @ one) for one in left) / cells,
         lit_scale=lit.chi2 / lit.freedom,
+        scale_error=float(np.sqrt(2 / cells)),
         residual_pct=float(np.sqrt(np.mean(np.square(residual)))),
     )

@@ -23,9 +23,23 @@ from psfcore.gap.gap_plot import (
     where_png,
 )
 from psfcore.gap.gap_report import AXIS_WORDS, words
-from psfcore.gap.judge import ALARM, ENOUGH, FLOOR, TIE
+from psfcore.gap.judge import ALARM, ENOUGH, TIE
+from psfcore.gap.linear_model import FLOOR
 from psfcore.gap.where import DRAWS
-from psfcore.page import DASH, Bullets, Details, Figure, Page, Part, Section, Table, Value, Values, with_error
+from psfcore.page import (
+    DASH,
+    Bullets,
+    Details,
+    Figure,
+    Page,
+    Part,
+    Section,
+    Table,
+    Value,
+    Values,
+    provenance_values,
+    with_error,
+)
 from psfcore.scatter.inversion import Inversion
 
 Report = dict[str, Any]
@@ -428,7 +442,7 @@ def _made_of(found: Diagnosis, report: Report) -> list[Part]:
         Details(f"All {len(report['images'])} images", (_images(report),)),
         Details(
             "Versions, seed and parameters",
-            (Values([Value(n, t) for n, t in _told(report.get("provenance", {}))]),),
+            (provenance_values(report.get("provenance", {})),),
         ),
         Details(f"{len(report['inputs_sha256'])} input files with their SHA-256", (files,)),
     ]
@@ -467,15 +481,3 @@ def _images(report: Report) -> Table:
 
 def _number(value: float | None) -> float:
     return float(np.nan) if value is None else value
-
-
-def _told(provenance: dict[str, Any], before: str = "") -> list[tuple[str, str]]:
-    """Names and texts of what made the report, nested ones by a dotted name."""
-    out: list[tuple[str, str]] = []
-    for key, value in provenance.items():
-        name = f"{before}{key}".replace("_", " ")
-        if isinstance(value, dict):
-            out += _told(value, f"{name}: ")
-        elif value is not None:
-            out.append((name, str(value)))
-    return out

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from psfcore.gap.closure import Interval
 from psfcore.gap.correction import Corrected
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.effect import Effect
-from psfcore.gap.judge import ALARM, LEAST_IMAGES, Tried
+from psfcore.gap.judge import ALARM, LEAST_IMAGES, TIE, Tried
 from psfcore.gap.probes import PROBES
 from psfcore.scatter.inversion import Inversion
 
@@ -214,8 +214,8 @@ def _lit_alone(found: Diagnosis) -> bool:
     left = model.left(model.base)
     cells = sum(float(one @ one) for one in left)
     freedom = sum(one.size for one in left)
-    lit = model.whole_steady_lit
-    return bool(chi2.sf(cells, freedom) > ALARM > chi2.sf(model.left_lit(model.base), lit.freedom))
+    lit = model.evidence.steady_lit
+    return bool(chdtrc(freedom, cells) > ALARM > chdtrc(lit.freedom, max(model.left_lit(model.base), 0.0)))
 
 
 def _explained(found: Diagnosis, best: Tried) -> str:
@@ -236,7 +236,9 @@ def _excluded(found: Diagnosis, best: Tried) -> str:
     if not others:
         return ""
     next_best = max(others, key=lambda t: t.score)
-    sigmas = max(best.score - next_best.score, 0.0) ** 0.5
+    if best.score - next_best.score < TIE:  # it was set aside by the images held out
+        return f"; {words(next_best.label)} fits as well, but fails on images held out of its fit"
+    sigmas = (best.score - next_best.score) ** 0.5
     shrunk = found.shrinking[next_best.label].closure
     closes = "" if shrunk is None else f" closes {100 * max(shrunk.value, 0.0):.0f} % and"
     return f"; {words(next_best.label)}{closes} is excluded at {sigmas:.1f} sigma"

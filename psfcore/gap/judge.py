@@ -5,7 +5,8 @@ Gains of effects are compared after what their parameters, and a search over man
     score = gain - PENALTY parameters - 2 ln trials                         Eq. (1)
 
 There is a gap where patterns that any gap makes (`patterns`), all cells, the lit blocks or an effect's gain are less
-likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be told from it.
+likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be told from it,
+unless it does clearly worse on images held out of its fit.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
 TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
 sky's. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
@@ -13,7 +14,8 @@ model for real, and what that leaves is looked at. Pairs are searched exhaustive
 Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
 where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better,
 or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
-the floor; where it flips, the answer holds both, or is inconclusive.
+the floor; where it flips, the answer holds both, or is inconclusive. So it is where the answer predicts images held out of
+its fit worse than nothing does.
 """
 
 from __future__ import annotations
@@ -26,17 +28,16 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
+from psfcore.gap.closure import fall, hold_out, time_blocks
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence import Evidence
 from psfcore.gap.linear_model import LinearModel, Step
-from psfcore.gap.patterns import patterns
 
 Vector = NDArray[np.float64]
 Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 
-FLOOR = 0.003
 FLOORS = (0.5, 2.0)  # the verdict is repeated with
 ALARM = 0.005
 CONFIDENT = 1e-3  # of an effect that is named, counted for how many were tried
@@ -47,6 +48,7 @@ TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less wou
 LEFT_SHARE = 0.15
 BEHIND = 0.85  # of the best score: what a rival may reach at most
 NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits anything a little
+MANY_PLACES = 100
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
@@ -59,7 +61,8 @@ class Tried:
     """One effect, or two, fitted beside the PSF: values and errors by "effect.parameter", its gain, what is left.
 
     p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show, and left_share:
-    the largest share of what they showed before; none where it was not worth asking.
+    the largest share of what they showed before; none where it was not worth asking. explains: whether of what showed
+    most, little is left.
     """
 
     names: tuple[str, ...]
@@ -71,6 +74,7 @@ class Tried:
     step: Step
     left_p_value: float | None = None
     left_share: float | None = None
+    explains: bool = False
 
     @property
     def label(self) -> str:
@@ -99,21 +103,26 @@ class Judgement:
 Refit = Callable[[Tried], LinearModel | None]
 
 
-def judge(model: LinearModel, refit: Refit = lambda tried: None) -> Judgement:
-    """The verdict under the model's floor, and twice with others. refit: asked at most once for an effect or a pair."""
-    asked: dict[str, LinearModel | None] = {}
+def no_refit(tried: Tried) -> LinearModel | None:
+    """Where no effect is added to the model for real."""
+    return None
 
-    def once(tried: Tried) -> LinearModel | None:
-        if tried.label not in asked:
-            asked[tried.label] = refit(tried)
-        return asked[tried.label]
 
-    found = _judge(model, once)
+def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit) -> Judgement:
+    """The verdict under the model's floor, and twice with others.
+
+    refit, beyond: the model about a real refit with an effect or a pair, and the same with the effect always fitted and
+    the rest of the library beside it. Each is asked at most once for the same.
+    """
+    once, further = _once(refit), _once(beyond)
+    found = _judge(model, once, further)
+    if found.answer and _worse_held_out(model, found, once):
+        return replace(found, verdict="inconclusive")
     if found.verdict == "none" and len(model.evidence.discs) < LEAST_IMAGES:
         return replace(found, verdict="inconclusive")
     if found.verdict in ("none", "inconclusive"):
         return found
-    others = [_judge(replace(model, floor=model.floor * factor), once) for factor in FLOORS]
+    others = [_judge(replace(model, floor=model.floor * factor), once, further) for factor in FLOORS]
     if any(other.verdict in ("none", "inconclusive") for other in others):
         return replace(found, verdict="inconclusive")
     if any((other.verdict == "unknown") != (found.verdict == "unknown") for other in others):
@@ -128,18 +137,55 @@ def judge(model: LinearModel, refit: Refit = lambda tried: None) -> Judgement:
     return replace(found, verdict="tie", answer=tuple(sorted(answers)))
 
 
-def _judge(model: LinearModel, refit: Refit) -> Judgement:
+def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
+    """Whether the answer says less than nothing of images held out of its fit, so that it fits by its freedom alone."""
+    scheme = time_blocks(model)
+    before = hold_out(model, (), scheme)
+    if found.best is None or before is None:
+        return False
+    linear = hold_out(model, found.best.step.columns[len(model.evidence.base) :], scheme)
+    if linear is not None and fall(before, linear) > 0:
+        return False
+    real = refit(found.best)
+    after = (
+        None if real is None else hold_out(real, range(len(real.evidence.base), real.evidence.size), scheme)
+    )
+    tried = [one for one in (linear, after) if one is not None]
+    return bool(tried) and all(fall(before, one) <= 0 for one in tried)
+
+
+def _once(ask: Refit) -> Refit:
+    asked: dict[str, LinearModel | None] = {}
+
+    def once(tried: Tried) -> LinearModel | None:
+        if tried.label not in asked:
+            asked[tried.label] = ask(tried)
+        return asked[tried.label]
+
+    return once
+
+
+def _judge(model: LinearModel, refit: Refit, beyond: Refit) -> Judgement:
     evidence = model.evidence
     every = [fitted(model, (effect,)) for effect in evidence.effects]
     named = sorted((t for t in every if t.named), key=lambda t: -t.score)
     probes = tuple(sorted((t for t in every if not t.named), key=lambda t: -t.score))
-    p_gap = _p_of_gap(model, named)
+    before = _left(model, model.base, np.zeros(len(model.base.columns)))
+    p_gap = _p_of_gap(before, named)
     if p_gap > ALARM or not named:
         return Judgement("none", (), p_gap, tuple(named), probes, named[0] if named else None)
-    best = named[0] = _with_left(model, named[0], refit)
-    rivals = max((t.score for t in (*named[1:], *probes)), default=0.0)
+    named, failed = _held_out_first(model, named)
+    best = named[0] = _with_left(model, named[0], before, refit)
+    # What was measured in the lit parts fits them whatever the cause: it is behind where its score is.
+    measured = {t.label for t in named if evidence.numbers_of(t.step.columns)}
+    behind = measured | failed
+    rivals = max((t.score for t in (*named[1:], *probes) if t.label not in behind), default=0.0)
     enough = _is_enough(best, rivals)
-    pair = None if enough else _best_pair(model, best, refit)
+    if not enough and (best.explains or best.label in measured) and rivals < BEHIND * best.score:
+        second = _beside(model, best, beyond)
+        if second is not None:
+            return replace(second, p_value=p_gap, tried=(*second.tried, *named), probes=probes)
+    pair = None if enough else _best_pair(model, best, before, refit)
     winner = pair or best
     if (not enough and pair is None) or best.p_value * len(named) > ALARM:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
@@ -152,7 +198,11 @@ def _judge(model: LinearModel, refit: Refit) -> Judgement:
     alike = max(
         TIE, TIE_SHARE * best.gain, (1 - NEAR_BEHIND) * best.score if _searched(best, evidence) else 0.0
     )
-    tied = [t.names[0] for t in named[1:] if best.score - t.score < alike]
+    tied = [
+        t.names[0]
+        for t in named[1:]
+        if t.label not in failed and best.score - t.score < (TIE if _freer(t, best, measured) else alike)
+    ]
     if tied:
         return Judgement("tie", tuple(sorted({*best.names, *tied})), p_gap, tuple(named), probes, best)
     if probes and _searched(best, evidence) and best.score - probes[0].score < alike:
@@ -160,8 +210,60 @@ def _judge(model: LinearModel, refit: Refit) -> Judgement:
     return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
 
 
+def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tried], set[str]]:
+    """Of effects that are about as good as the best, those first that are as good on images held out of their fit; and
+    the labels of those that are not: they fit by their freedom."""
+    best = named[0]
+    alike = [t for t in named if best.score - t.score < max(TIE, TIE_SHARE * best.gain)]
+    scheme = time_blocks(model)
+    before = hold_out(model, (), scheme)
+    base = len(model.evidence.base)
+    if len(alike) < 2 or before is None:
+        return list(named), set()
+    falls = {}
+    for tried in alike:
+        after = hold_out(model, tried.step.columns[base:], scheme)
+        falls[tried.label] = 0.0 if after is None else fall(before, after)
+    most = max(falls.values())
+    failed = {label for label, down in falls.items() if down < most - max(TIE, TIE_SHARE * most)}
+    return sorted(named, key=lambda t: (t not in alike or t.label in failed, -t.score)), failed
+
+
+def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
+    """The verdict where one effect explains most of a gap and not all: is another at work beside it? None where that
+    cannot be said. Its tried are the answer's alone.
+
+    So too where the best was measured in the lit parts and leaves much there: a Sun that flickers faster than it is
+    followed. The discs do not show that, and what they show is judged by itself."""
+    rest = beyond(best)
+    if rest is None:
+        return None
+    lit = rest.evidence.steady_lit
+    rest = replace(rest, floor=model.floor)
+    # Of so much as the first explained in the lit parts a little is left, its form being not quite the sky's: no form
+    # that fits this remainder by chance may come out of it.
+    excess = rest.left_lit(rest.base) - (lit.freedom - rest.evidence.numbers_of(rest.base.columns))
+    rest = replace(rest, lit_scale=rest.lit_scale * max(excess / CLEAR, 1.0))
+    second = _judge(rest, no_refit, no_refit)
+    if second.verdict == "none":
+        return Judgement("attributed", best.names, second.p_value, (), (), best) if best.explains else None
+    if second.verdict not in ("attributed", "tie") or second.best is None or len(second.best.names) > 1:
+        return None
+    effects = {effect.name: effect for effect in model.evidence.effects}
+    pair = fitted(model, [effects[name] for name in (*best.names, *second.best.names)])
+    pair = replace(pair, left_p_value=second.best.left_p_value, left_share=second.best.left_share)
+    answer = tuple(sorted({*best.names, *second.answer}))
+    return Judgement(second.verdict, answer, second.p_value, (pair,), (), pair)
+
+
+def _freer(tried: Tried, best: Tried, measured: set[str]) -> bool:
+    """Whether an effect has more freedom than the best: if it does worse all the same, it is not its form that is amiss."""
+    return tried.label in measured or len(tried.values) > len(best.values)
+
+
 def _searched(tried: Tried, evidence: Evidence) -> bool:
-    return any(effect.trials > 1 for effect in evidence.effects if effect.name in tried.names)
+    """Whether a place was looked for all over the field."""
+    return any(effect.trials >= MANY_PLACES for effect in evidence.effects if effect.name in tried.names)
 
 
 def _is_enough(tried: Tried, rival_score: float) -> bool:
@@ -170,7 +272,7 @@ def _is_enough(tried: Tried, rival_score: float) -> bool:
     return tried.left_p_value >= ENOUGH or nearly
 
 
-def _best_pair(model: LinearModel, best: Tried, refit: Refit) -> Tried | None:
+def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit) -> Tried | None:
     """The pair of effects that explains most, if it is clearly better than one and leaves nothing."""
     effects = [effect for effect in model.evidence.effects if effect.named]
     pairs = sorted(
@@ -178,7 +280,7 @@ def _best_pair(model: LinearModel, best: Tried, refit: Refit) -> Tried | None:
     )
     if not pairs or pairs[0].score < best.score + CLEAR:
         return None
-    pair = _with_left(model, pairs[0], refit)
+    pair = _with_left(model, pairs[0], before, refit)
     # Two forms that are not quite right fit too much: of a pair nothing may be left.
     return pair if (pair.left_p_value or 0.0) >= ENOUGH else None
 
@@ -186,7 +288,8 @@ def _best_pair(model: LinearModel, best: Tried, refit: Refit) -> Tried | None:
 def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> Tried:
     """The PSF's parameters with these effects.
 
-    A parameter that can be positive alone and would not be is left out, unless any_sign: a step may have either.
+    A parameter that can be positive alone and would not be is left out, unless any_sign: a step may have either. So
+    is one whose change was measured in the lit parts and gains less than that costs.
     """
     columns = {
         column: (effect, parameter)
@@ -197,6 +300,11 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
     step = model.fit(tuple(columns))
     base = len(model.evidence.base)
     while not any_sign:
+        idle = _not_worth_its_numbers(model, step)
+        if idle is not None:
+            del columns[idle]
+            step = model.fit(tuple(columns))
+            continue
         below = {
             column: float(value)
             for column, value in zip(step.columns[base:], step.values[base:], strict=True)
@@ -206,8 +314,9 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
             break
         del columns[min(below, key=lambda column: below[column])]
         step = model.fit(tuple(columns))
-    gain = max(step.fall - model.base.fall, 0.0)
+    gain = model.gain(step)
     trials = math.prod(effect.trials for effect in effects)
+    freedom = len(columns) + model.evidence.numbers_of(tuple(columns))
     sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
     values = {}
     for k, (effect, parameter) in enumerate(columns.values(), base):
@@ -218,18 +327,28 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
         named=all(effect.named for effect in effects),
         values=values,
         gain=gain,
-        score=gain - PENALTY * len(columns) - 2 * math.log(trials),
-        p_value=min(1.0, trials * float(chi2_distribution.sf(gain, len(columns)))) if columns else 1.0,
+        score=gain - PENALTY * freedom - 2 * math.log(trials),
+        p_value=min(1.0, trials * float(chdtrc(freedom, gain))) if columns else 1.0,
         step=step,
     )
 
 
-def _p_of_gap(model: LinearModel, named: Sequence[Tried]) -> float:
+def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
+    """The column of a step that gains least of those that gain less than the numbers in them cost; none where none does."""
+    columns = step.columns[len(model.evidence.base) :]
+    idle = {}
+    for column in columns:
+        numbers = model.evidence.numbers_of([column])
+        gain = step.fall - model.fit([c for c in columns if c != column]).fall if numbers else 0.0
+        if numbers and gain < PENALTY * (1 + numbers):
+            idle[column] = gain
+    return min(idle, key=lambda column: idle[column]) if idle else None
+
+
+def _p_of_gap(left: _Left, named: Sequence[Tried]) -> float:
     """The least of the p-values of patterns, cells, lit blocks and single effects, times how many they are."""
     effects = min((t.p_value for t in named), default=1.0) * max(len(named), 1)
-    return float(
-        min(1.0, TESTS * min(*_left(model, model.base, np.zeros(len(model.base.columns))).p_values, effects))
-    )
+    return float(min(1.0, TESTS * min(*left.p_values, effects)))
 
 
 @dataclass(frozen=True)
@@ -242,9 +361,7 @@ class _Left:
     @property
     def p_values(self) -> tuple[float, ...]:
         """Of each of the three."""
-        return tuple(
-            float(chi2_distribution.sf(gain, k)) for gain, k in zip(self.gains, self.freedom, strict=True)
-        )
+        return tuple(float(chdtrc(k, gain)) for gain, k in zip(self.gains, self.freedom, strict=True))
 
     @property
     def p_value(self) -> float:
@@ -262,8 +379,14 @@ class _Left:
         ]
         return max(shares, default=0.0)
 
+    def of_most(self, before: _Left) -> float:
+        """Of what showed the largest excess before, the share of it that is left."""
+        excess = [gain - k for gain, k in zip(before.gains, before.freedom, strict=True)]
+        most = int(np.argmax(excess))
+        return max(self.gains[most] - self.freedom[most], 0.0) / max(excess[most], 1e-9)
 
-def _with_left(model: LinearModel, tried: Tried, refit: Refit) -> Tried:
+
+def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refit) -> Tried:
     """With what is left: in the linear model, and where that is too much, after a real refit."""
     unsure = np.array(tried.step.values) * TEMPLATE_ERROR
     unsure[: len(model.base.columns)] = 0.0
@@ -274,13 +397,16 @@ def _with_left(model: LinearModel, tried: Tried, refit: Refit) -> Tried:
             again = replace(again, floor=model.floor)
             step = again.fit(range(len(again.evidence.base), again.evidence.size))
             left = max(left, _left(again, step, unsure), key=lambda one: one.p_value)
-    before = _left(model, model.base, np.zeros(len(model.base.columns)))
-    return replace(tried, left_p_value=left.p_value, left_share=left.share_of(before))
+    return replace(
+        tried,
+        left_p_value=left.p_value,
+        left_share=left.share_of(before),
+        explains=left.of_most(before) < LEFT_SHARE,
+    )
 
 
 def _left(model: LinearModel, step: Step, unsure: Vector) -> _Left:
     """What a step leaves, its columns' own answers unsure by so much."""
-    evidence = model.evidence
     here = list(step.columns)
     # An unsure template adds a covariance along its own answer: taken off along that direction, disc by disc.
     shrink = []
@@ -290,13 +416,9 @@ def _left(model: LinearModel, step: Step, unsure: Vector) -> _Left:
         shrink.append(left - answer * float(answer @ left) / (1 + length))
     freedom = max(sum(left.size for left in shrink) - len(here), 1)
     cells = sum(float(left @ left) for left in shrink)
-    gain, directions = model.gain_of_patterns(step, patterns(evidence), shrink)
-    lit = model.whole_steady_lit
+    gain, directions = model.gain_of_patterns(step, model.patterns, shrink)
+    lit = model.evidence.steady_lit
     moved = float(unsure @ lit.normal[np.ix_(here, here)] @ unsure) / model.lit_scale
     of_lit = max(model.left_lit(step) - moved, 0.0) / (1 + LIT_WIDTH)
-    return _Left((gain, cells, of_lit), (directions, freedom, lit.freedom))
-
-
-def model_of(evidence: Evidence, *, disc_scale: float = 1.0, lit_scale: float = 1.0) -> LinearModel:
-    """The linear model with the floor that verdicts start from."""
-    return LinearModel(evidence, FLOOR, disc_scale, lit_scale)
+    of_lit_freedom = max(lit.freedom - model.evidence.numbers_of(here), 1)
+    return _Left((gain, cells, of_lit), (directions, freedom, of_lit_freedom))

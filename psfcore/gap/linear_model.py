@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 
 from psfcore.gap.cells import DiscCells
 from psfcore.gap.evidence import Evidence
-from psfcore.gap.lit_blocks import LitEquations
+from psfcore.gap.patterns import patterns
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
+FLOOR = 0.003  # f of Eq. (2) that verdicts start from
 UNLIKELY = 10.0
 WEAKEST = 1e-9  # of a normal matrix scaled to a unit diagonal
 
@@ -56,12 +57,13 @@ class Step:
 @dataclass(frozen=True, eq=False)
 class LinearModel:
     """Eq. (1) on some evidence. floor: f of Eq. (2). disc_scale, lit_scale: by what factor chi2 of discs and of lit
-    blocks exceeds its degrees of freedom where there is no gap."""
+    blocks exceeds its degrees of freedom where there is no gap; scale_error: how well the discs' is known, a share."""
 
     evidence: Evidence
     floor: float
     disc_scale: float = 1.0
     lit_scale: float = 1.0
+    scale_error: float = 0.0
 
     @cached_property
     def discs(self) -> tuple[Whitened, ...]:
@@ -84,12 +86,8 @@ class LinearModel:
             if images is None or disc.index in images:
                 normal += disc.answers @ disc.answers.T
                 score += disc.answers @ disc.residual
-        lit = self.lit(images)
+        lit = self.evidence.lit_equations(images)
         return normal + lit.normal / self.lit_scale, score + lit.score / self.lit_scale
-
-    def lit(self, images: Sequence[int] | None = None) -> LitEquations:
-        """The lit blocks' equations of all columns."""
-        return self.evidence.lit.equations(range(self.evidence.size), images)
 
     @cached_property
     def whole(self) -> tuple[Matrix, Vector]:
@@ -97,15 +95,9 @@ class LinearModel:
         return self.equations()
 
     @cached_property
-    def whole_lit(self) -> LitEquations:
-        """`lit` of all images."""
-        return self.lit()
-
-    @cached_property
-    def whole_steady_lit(self) -> LitEquations:
-        """`whole_lit` with restless blocks weighed by what they show: what is left is judged by these."""
-        steady = self.evidence.lit.with_restless_blocks()
-        return steady.equations(range(self.evidence.size))
+    def patterns(self) -> tuple[Matrix, ...]:
+        """`patterns.patterns` of the evidence."""
+        return patterns(self.evidence)
 
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
         """The PSF's coordinates and these columns, from some equations (none: of all images)."""
@@ -132,9 +124,9 @@ class LinearModel:
         """The PSF's coordinates alone."""
         return self.fit(())
 
-    def gain(self, columns: Sequence[int]) -> float:
-        """What chi2 falls by with these columns, beyond the PSF's coordinates."""
-        return max(self.fit(columns).fall - self.base.fall, 0.0)
+    def gain(self, step: Step) -> float:
+        """What chi2 falls by with a step's columns, beyond the PSF's coordinates."""
+        return max(step.fall - self.base.fall, 0.0)
 
     def left(self, step: Step) -> tuple[Vector, ...]:
         """The whitened residuals of every disc after a step."""
@@ -142,7 +134,7 @@ class LinearModel:
 
     def left_lit(self, step: Step) -> float:
         """chi2 of the lit blocks after a step, over lit_scale, restless blocks weighed by what they show."""
-        here, lit = list(step.columns), self.whole_steady_lit
+        here, lit = list(step.columns), self.evidence.steady_lit
         theta = step.values
         fall = 2 * theta @ lit.score[here] - theta @ lit.normal[np.ix_(here, here)] @ theta
         return float(lit.chi2 - fall) / self.lit_scale

@@ -123,12 +123,18 @@ class LitBlocks:
         return np.asarray(self.variance[images] + (FLOOR * self.levels[images]) ** 2)
 
     def held_out_chi2(
-        self, columns: Sequence[int], theta: Vector, images: Sequence[int], fitted: Sequence[int]
-    ) -> tuple[float, int]:
-        """chi2 and degrees of freedom of images against the scene of others, the effect's step taken out of both."""
-        chi2, freedom = 0.0, 0
-        error = np.tensordot(theta, self.errors[list(columns)], axes=1) if len(columns) else 0.0
-        level = self.levels - error
+        self,
+        columns: Sequence[int],
+        theta: Vector,
+        covariance: Matrix,
+        images: Sequence[int],
+        fitted: Sequence[int],
+    ) -> tuple[float, float]:
+        """chi2 of images against the scene of others, the effect's step taken out of both, and what is expected of it:
+        the degrees of freedom, and what the step's own errors (covariance) add."""
+        chi2, expected = 0.0, 0.0
+        errors = self.errors[list(columns)]
+        level = self.levels - (np.tensordot(theta, errors, axes=1) if len(columns) else 0.0)
         for n in images:
             others = [k for k in fitted if self.fov[k] == self.fov[n] and self.part[k]]
             if not self.part[n] or len(others) < LEAST_IMAGES - 1:
@@ -145,8 +151,11 @@ class LitBlocks:
             mean = self.means[n, use]
             gain = float((w * mean * left).sum() / ((w * mean**2).sum() + 1 / self.gain_width**2))
             chi2 += float((w * (left - gain * mean) ** 2).sum()) + (gain / self.gain_width) ** 2
-            freedom += int(use.sum())
-        return chi2, freedom
+            answers = errors[:, n, use] - (errors[:, here] * weight).sum(axis=1)[:, use] / total[use]
+            along = (w * mean * answers).sum(axis=1) / ((w * mean**2).sum() + 1 / self.gain_width**2)
+            answers = answers - along[:, None] * mean
+            expected += float(use.sum()) + float(np.einsum("kb,kl,lb,b->", answers, covariance, answers, w))
+        return chi2, expected
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,16 +11,22 @@ from scipy.ndimage import affine_transform, gaussian_filter, rotate
 
 from psfcore.fourier import Convolver
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
-from psfcore.gap.search import PlaceSearch, displaced
+from psfcore.gap.search import KERNEL_REACH_PX, displaced, place_search
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.optics import Blur
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
 from psfcore.scatter.total_psf import TotalPsf
 
 Kernel = NDArray[np.float64]
+Steps = tuple[tuple[int, int], ...]
 GHOST_TRIALS = 300  # a field of 512 px holds about that many copies that differ
-ROTATION_DEG = 0.5
-PITCH_SHARE = 0.005
+ANGLES_DEG = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
+PITCHES_PCT = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
+DIRECTIONS: tuple[Steps, ...] = (((1, 0), (0, 1)), ((1, 0),), ((0, 1),), ((1, 1),), ((1, -1),))
+BLURS = tuple((width, steps) for width in (0.4, 0.8, 1.5, 2.5) for steps in DIRECTIONS)
+BETWEEN = 6  # parts that the steps on both sides of the best are divided into
+SPLINE = 3  # a linear interpolation would blur what it turns
+AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate that says how much is scattered
 
 
 def by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
@@ -49,7 +55,7 @@ def not_a_power_law(view: View) -> str | None:
 
 def core_slope(view: View) -> Blur:
     """A Gaussian blur of variance 1 px^2 along each axis: half the Laplacian of the PSF."""
-    kernel = view.solution.total.kernel(view.solution.inversion.coordinates)
+    kernel = view.kernel
     neighbours = sum(np.roll(kernel, step, axis) for axis in (0, 1) for step in (-1, 1))
     return _blur(view, (neighbours - 4 * kernel) / 2)
 
@@ -60,7 +66,7 @@ def _blur(view: View, kernel: Kernel) -> Blur:
 
 def _ghost(view: View) -> Sequence[Change]:
     """A blurred copy, displaced to where the discs ask for it most, by a search over the field."""
-    return _copy(*PlaceSearch(view).copy())
+    return _copy(*place_search(view).copy())
 
 
 def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
@@ -71,7 +77,7 @@ def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
 
 
 def _held_ghost(view: View) -> Effect:
-    blur_px, dx, dy = PlaceSearch(view).copy()
+    blur_px, dx, dy = place_search(view).copy()
     ghost = next(effect for effect in EFFECTS if effect.name == "ghost")
     return replace(
         ghost,
@@ -90,7 +96,7 @@ def _halo(view: View) -> Sequence[Change]:
 
 
 def _field_dependent(view: View) -> Sequence[Change]:
-    (slope,) = shape_slopes(view, SOFTENED_POWER_LAW.name, (2,))
+    slope = view.slopes[AMOUNT]
     # The coordinate is a logit: a share of the amount of scatter is what people ask for.
     share = np.float32(1 - view.solution.inversion.values["total"])
     x, y = view.places
@@ -98,7 +104,37 @@ def _field_dependent(view: View) -> Sequence[Change]:
 
 
 def _core_blur(view: View) -> Sequence[Change]:
-    return [by_psf(view, core_slope(view))]
+    return blur_as(view, *_sought_blur(view))
+
+
+def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
+    """A blur of that width, for a variance of 1 px^2."""
+    change = (_blurred(view.kernel, width_px, steps) - view.kernel) / width_px**2
+    return [by_psf(view, _blur(view, change))]
+
+
+def _sought_blur(view: View) -> tuple[float, Steps]:
+    """Width (px) and directions of the blur that explains most."""
+    near = crop_or_pad(view.kernel, 2 * KERNEL_REACH_PX + 1)
+    best = place_search(view).kernel([_blurred(near, *blur) - near for blur in BLURS])
+    return BLURS[best]
+
+
+def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
+    """A kernel [y, x] blurred to that width along each of some directions: a random walk of these steps (y, x).
+
+    On pixels a Gaussian of less than one would ring; this one is nowhere negative and has its variance exactly.
+    """
+    fy, fx = np.fft.fftfreq(kernel.shape[0])[:, None], np.fft.rfftfreq(kernel.shape[1])[None, :]
+    walk = sum((np.cos(2 * np.pi * (y * fy + x * fx)) - 1) / (y * y + x * x) for y, x in steps)
+    transfer = np.exp(width_px**2 * walk)
+    return np.asarray(np.fft.irfft2(np.fft.rfft2(kernel) * transfer, s=kernel.shape))
+
+
+def _held_blur(view: View) -> Effect:
+    blur = _sought_blur(view)
+    core = next(effect for effect in EFFECTS if effect.name == "core_blur")
+    return replace(core, changes=lambda view: blur_as(view, *blur), held=None)
 
 
 def _mesh(view: View, changed: Kernel) -> list[Change]:
@@ -110,22 +146,68 @@ def _mesh(view: View, changed: Kernel) -> list[Change]:
     return [by_psf(view, _blur(view, np.asarray(through.apply(scatter), dtype=np.float64)))]
 
 
-def _rotation(view: View) -> Sequence[Change]:
+def _odd(view: View) -> Kernel:
+    """The diffraction pattern with its centre in the middle."""
     pattern = view.solution.transit.diffraction
-    odd = pattern[1 - pattern.shape[0] % 2 :, 1 - pattern.shape[1] % 2 :]  # its centre in the middle
-    there, back = (rotate(odd, a, reshape=False, order=1) for a in (ROTATION_DEG, -ROTATION_DEG))
-    return _mesh(view, crop_or_pad(np.asarray(there - back) / (2 * ROTATION_DEG), pattern.shape[0]))
+    return np.asarray(pattern[1 - pattern.shape[0] % 2 :, 1 - pattern.shape[1] % 2 :])
 
 
-def _pitch(view: View) -> Sequence[Change]:
-    pattern = view.solution.transit.diffraction
+def _turned(pattern: Kernel, angle_deg: float) -> Kernel:
+    return np.asarray(rotate(pattern, angle_deg, reshape=False, order=SPLINE))
+
+
+def _stretched(pattern: Kernel, percent: float) -> Kernel:
+    by = 1 + percent / 100
     centre = np.array(pattern.shape) // 2
+    return np.asarray(
+        affine_transform(pattern, np.eye(2) / by, offset=centre - centre / by, order=SPLINE) / by**2
+    )
 
-    def scaled(by: float) -> Kernel:
-        offset = centre - centre / by
-        return np.asarray(affine_transform(pattern, np.eye(2) / by, offset=offset, order=1)) / by**2
 
-    return _mesh(view, (scaled(1 + PITCH_SHARE) - scaled(1 - PITCH_SHARE)) / (2 * PITCH_SHARE * 100))
+def _sought(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> float:
+    """By how much the diffraction pattern has to change for the discs: looked for, the orders move by more than they are wide.
+
+    form(pattern, amount): the pattern changed. steps: sizes of amounts that are tried, both signs; then between them.
+    """
+    search, pattern = place_search(view), _near(_odd(view))
+    tried = sorted(sign * step for step in steps for sign in (-1, 1))
+    best = search.kernel([form(pattern, amount) - pattern for amount in tried])
+    low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
+    between = [low + (high - low) * k / BETWEEN for k in range(1, BETWEEN)]
+    between = [amount for amount in between if abs(amount) >= min(steps)]
+    return between[search.kernel([form(pattern, amount) - pattern for amount in between])]
+
+
+def _near(pattern: Kernel) -> Kernel:
+    """What of a pattern a search looks at."""
+    return crop_or_pad(pattern, min(2 * KERNEL_REACH_PX + 1, pattern.shape[0]))
+
+
+def _changed_mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: float) -> list[Change]:
+    """The mesh changed by an amount, for one unit of it."""
+    pattern = _odd(view)
+    change = (form(pattern, amount) - pattern) / amount
+    return _mesh(view, crop_or_pad(change, view.solution.transit.diffraction.shape[0]))
+
+
+def _mesh_effect(name: str, form: Callable[[Kernel, float], Kernel], steps: Sequence[float],
+                 parameter: EffectParameter, cause: str, axes: tuple[str, ...]) -> Effect:  # fmt: skip
+    def held(view: View) -> Effect:
+        amount = _sought(view, form, steps)
+        return replace(effect, changes=lambda view: _changed_mesh(view, form, amount), held=None)
+
+    effect = Effect(
+        name,
+        "optics",
+        (parameter,),
+        cause,
+        "the arms of a flare",
+        axes,
+        lambda view: _changed_mesh(view, form, _sought(view, form, steps)),
+        trials=2 * len(steps),
+        held=held,
+    )
+    return effect
 
 
 def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
@@ -146,10 +228,11 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "A second, wide component of scatter.",
            "an eclipse or a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,
            not_a_power_law),
-    Effect("core_blur", "optics", (_p("variance", "px2", 0.5, True),), "Jitter or defocus widens the core.",
-           "a sharp limb, or a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur),
-    Effect("mesh_rotation", "optics", (_p("angle", "deg", 2.0),), "The meshes are turned against the detector.",
-           "the arms of a flare", ("azimuth_in_disc", "detector_x", "detector_y"), _rotation),
-    Effect("mesh_pitch", "optics", (_p("stretch", "%", 3.0),), "The meshes' pitch is not the drawing's.",
-           "the arms of a flare", ("radius_in_disc", "azimuth_in_disc"), _pitch),
+    Effect("core_blur", "optics", (_p("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
+           "a sharp limb, or a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur, trials=len(BLURS),
+           held=_held_blur),
+    _mesh_effect("mesh_rotation", _turned, ANGLES_DEG, _p("angle", "deg", 3.0),
+                 "The meshes are turned against the detector.", ("azimuth_in_disc", "detector_x", "detector_y")),
+    _mesh_effect("mesh_pitch", _stretched, PITCHES_PCT, _p("stretch", "%", 3.0),
+                 "The meshes' pitch is not the drawing's.", ("radius_in_disc", "azimuth_in_disc")),
 )  # fmt: skip

@@ -13,9 +13,15 @@ import numpy as np
 
 from psfcore.gap.detector_effects import fixed, flat, times_image
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
-from psfcore.gap.optics_effects import by_psf, by_psf_in_time, core_slope, not_a_power_law, shape_slopes
-from psfcore.gap.search import PlaceSearch
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from psfcore.gap.optics_effects import (
+    AMOUNT,
+    by_psf,
+    by_psf_in_time,
+    core_slope,
+    not_a_power_law,
+    shape_slopes,
+)
+from psfcore.gap.search import place_search
 from psfcore.transit.occulter import coverage
 
 PATCH_SHARE = 0.08  # of the field: width of a patch of light or shadow
@@ -31,7 +37,7 @@ def _hours(view: View, n: int) -> float:
 def _patch(view: View, *, of_image: bool, sign: float) -> Field:
     ny, nx = view.solution.transit.shape
     width = PATCH_SHARE * min(ny, nx)
-    x, y = PlaceSearch(view).place(width, of_image=of_image, sign=sign)
+    x, y = place_search(view).place(width, of_image=of_image, sign=sign)
     up = np.exp(-0.5 * ((np.arange(ny) - y) / width) ** 2)
     along = np.exp(-0.5 * ((np.arange(nx) - x) / width) ** 2)
     return np.asarray(up[:, None] * along[None, :], dtype=np.float32)
@@ -80,8 +86,7 @@ def _focus_drift(view: View) -> Sequence[Change]:
 
 
 def _scatter_drift(view: View) -> Sequence[Change]:
-    (slope,) = shape_slopes(view, SOFTENED_POWER_LAW.name, (2,))
-    return [by_psf_in_time(view, slope, lambda n: _hours(view, n))]
+    return [by_psf_in_time(view, view.slopes[AMOUNT], lambda n: _hours(view, n))]
 
 
 def _one_sided(view: View) -> Sequence[Change]:

@@ -8,12 +8,16 @@ q_n being the disc's sensitivity (`cells`): a correlation. Of what the PSF's own
 
     gain(d) = (sum r T)^2 / sum T^2     where the sum r T has the form's sign        Eq. (2)
 
-r and T over their noise, the PSF's part taken out.
+r and T over their noise, the PSF's part taken out. In the same way a change K of the PSF changes disc n's mean by
+
+    T_n = sum over displacements of K(d) C_n(d),   C_n(d) = sum over pixels of q_n(x) scene_n(x - d)     Eq. (3)
+
+so that any number of kernels is looked at for the price of one correlation a disc.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +27,8 @@ from scipy.ndimage import gaussian_filter
 from psfcore.fourier import linear_convolve
 from psfcore.gap.cells import sensitivities
 from psfcore.gap.effect import View
+from psfcore.gap.linear_model import FLOOR
+from psfcore.psf import crop_or_pad
 
 Plane = NDArray[np.float64]
 
@@ -31,27 +37,50 @@ FINE_PX = 2
 COARSE_BLUR_PX = 8.0
 BLURS_PX = (2.0, 4.0, 8.0, 16.0)
 NEAREST_PX = 40.0
-FLOOR = 0.003
+KERNEL_REACH_PX = 255  # beyond it no order of a mesh has much light
 SEEN = 1e-4  # of the best seen place's sum T^2: a place that the discs see less of is not looked at
 
 
+def place_search(view: View) -> PlaceSearch:
+    """The search about a view: made once."""
+    if PlaceSearch not in view.kept:
+        view.kept[PlaceSearch] = PlaceSearch(view)
+    found = view.kept[PlaceSearch]
+    assert isinstance(found, PlaceSearch)
+    return found
+
+
 class PlaceSearch:
-    """The discs' sensitivities on a grid of STEP_PX, for any number of searches."""
+    """The discs' sensitivities on a grid of STEP_PX, and to displacements, for any number of searches."""
 
     def __init__(self, view: View) -> None:
-        self._view = view
-        solution = view.solution
+        solution, self._expected = view.solution, view.expected
         self._planes, self._fine = {}, {}
+        to_displacements = []
         for n in solution.part:
             dark = solution.sky.dark[n]
             (plane,) = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
             self._planes[n] = _binned(plane, STEP_PX) * STEP_PX**2
             self._fine[n] = _binned(plane, FINE_PX) * FINE_PX**2
+            scene = solution.optics.field(view.lit_scene(n))
+            to_displacements.append(_correlation(plane, scene, KERNEL_REACH_PX))
+        self._to_displacements = np.array(to_displacements, dtype=np.float32)
         frames = solution.inversion.frames
         self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
         self._absorbed = np.linalg.qr(np.array([f.answer for f in frames]) / self._sigma[:, None])[0]
         residual = np.array([f.observed - f.expected for f in frames]) / self._sigma
         self._residual = self._left(residual)
+
+    def kernel(self, kernels: Sequence[Plane]) -> int:
+        """Which of some changes of the PSF [y, x], their centres at n//2, explains most as it stands, Eq. (2) and (3)."""
+        gains = []
+        for kernel in kernels:
+            seen = crop_or_pad(kernel, self._to_displacements.shape[1]).astype(np.float32)
+            answer = np.einsum("nyx,yx->n", self._to_displacements, seen).astype(np.float64) / self._sigma
+            left = self._left(answer)
+            along = float(self._residual @ left)
+            gains.append(along**2 / max(float(left @ left), 1e-300) if along > 0 else 0.0)
+        return int(np.argmax(gains))
 
     def copy(self) -> tuple[float, int, int]:
         """Blur (px) and displacement (whole pixels x, y) of a copy of each image that explains most of the residuals.
@@ -70,7 +99,7 @@ class PlaceSearch:
         rows, columns = (2 * n - 1 for n in next(iter(self._planes.values())).shape)
 
         def answer(n: int, q: Plane) -> Plane:
-            copy = _binned(gaussian_filter(self._view.expected[n], blur_px), STEP_PX)
+            copy = _binned(gaussian_filter(self._expected[n], blur_px), STEP_PX)
             return linear_convolve(q, copy[::-1, ::-1], (rows, columns))
 
         dy, dx = (_displacements(n) for n in (rows, columns))
@@ -85,7 +114,7 @@ class PlaceSearch:
         steps = np.arange(-reach, reach + 1)
 
         def answer(n: int, _: Plane) -> Plane:
-            copy = _binned(gaussian_filter(self._view.expected[n], blur_px), FINE_PX)
+            copy = _binned(gaussian_filter(self._expected[n], blur_px), FINE_PX)
             q = self._fine[n]
             out = np.zeros((steps.size, steps.size))
             for j, k in np.ndindex(out.shape):
@@ -104,7 +133,7 @@ class PlaceSearch:
         """
 
         def answer(n: int, q: Plane) -> Plane:
-            seen = q * _binned(self._view.expected[n], STEP_PX) if of_image else q
+            seen = q * _binned(self._expected[n], STEP_PX) if of_image else q
             return np.asarray(gaussian_filter(seen, width_px / STEP_PX, mode="constant"))
 
         gain = self._gains(answer, sign)
@@ -126,6 +155,16 @@ class PlaceSearch:
     def _left(self, of_discs: Plane) -> Plane:
         """What the PSF's parameters leave."""
         return np.asarray(of_discs - self._absorbed @ (self._absorbed.T @ of_discs))
+
+
+def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int) -> Plane:
+    """C of Eq. (3) for displacements up to reach_px along each axis: (2 reach + 1, 2 reach + 1), none in the middle."""
+    count = 2 * reach_px + 3
+    both = plane.astype(np.float64), scene[::-1, ::-1].astype(np.float64)
+    wide = np.asarray(linear_convolve(*both, (count, count)), dtype=np.float64)
+    # Of lines of even length the convolution's middle is a displacement of one.
+    y, x = (reach_px + 1 - (n + 1) % 2 for n in plane.shape)
+    return wide[y - reach_px : y + reach_px + 1, x - reach_px : x + reach_px + 1]
 
 
 def _displacements(count: int) -> NDArray[np.intp]:

@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from psfcore.gap.cells import DiscCells
 from psfcore.gap.evidence import Evidence, Taken
-from psfcore.gap.linear_model import LinearModel
+from psfcore.gap.linear_model import LinearModel, Step
 from psfcore.gap.patterns import in_disc
 
 Matrix = NDArray[np.float64]
@@ -46,30 +47,35 @@ class Axis:
         return {"axis": self.name, "share": self.share, "p_value": self.p_value, "at": self.at}
 
 
-def where(model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = ()) -> tuple[Axis, ...]:
+def where(
+    model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = (), explained: Step | None = None
+) -> tuple[Axis, ...]:
     """All axes, the strongest first: of those that chance does not explain, the one with the largest share.
 
     favoured: axes of the effect that was found; of axes that explain about as much, they come first, for the effect was
-    found by more than its place on the track.
+    found by more than its place on the track. explained: the fit of an effect that explains the gap; shares are then of
+    what it explains, which has no noise.
     """
     designs = _designs(model.evidence)
-    disc, lit = _equations(model, designs)
+    cells, lit = _of_cells(model, designs), _of_lit(model, designs)
+    disc = cells.equations([one.residual for one in model.discs])
+    seen = disc if explained is None else cells.equations(_explained(model, explained))
     names = list(designs)
     spans = _spans(designs)
     subset = {
-        chosen: _fall(disc, lit, [c for name in chosen for c in spans[name]])
+        chosen: _fall(seen, lit, [c for name in chosen for c in spans[name]])
         for size in range(len(names) + 1)
         for chosen in itertools.combinations(names, size)
     }
     shares = _shapley(names, subset)
     total = max(sum(max(share, 0.0) for share in shares.values()), 1e-300)
-    draws = _drawn(model, designs, rng)
+    draws = _drawn_scores(model, cells, rng)
     out = []
     for name in names:
         alone = subset[(name,)]
-        beaten = sum(_fall(d, None, spans[name]) >= _fall(disc, None, spans[name]) for d in draws)
-        p_value = min(1.0, (1 + beaten) / (1 + len(draws)) * len(names))
-        if lit is not None and _fall_of(lit, spans[name]) > 0:
+        beaten = int((_falls(disc.normal, draws, spans[name]) >= _fall_of(disc, spans[name])).sum())
+        p_value = min(1.0, (1 + beaten) / (1 + DRAWS) * len(names))
+        if _fall_of(lit, spans[name]) > 0:
             p_value = min(p_value, _p_of_lit(lit, spans[name], len(names)))
         out.append(Axis(name, max(shares[name], 0.0) / total, p_value, alone, _at(model, name)))
     best = max((axis.alone for axis in out), default=0.0)
@@ -148,28 +154,46 @@ class _Normal:
     score: Vector
 
 
-def _equations(model: LinearModel, designs: dict[str, list[Matrix]]) -> tuple[_Normal, _Normal | None]:
-    """Normal equations of all axes' columns, the PSF's part taken out: of the discs, and of the lit blocks' brightness."""
-    design, residual = _projected(model, designs)
-    return _Normal(design @ design.T, design @ residual), _of_lit(model, designs)
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """All discs' cells, whitened: the axes' columns without what the PSF's coordinates take up, and a basis of that."""
+
+    design: Matrix
+    absorbed: Matrix
+
+    def left(self, of_discs: Sequence[Vector]) -> Vector:
+        """What the PSF's coordinates leave of residuals, disc by disc, in a row."""
+        residual = np.concatenate(of_discs)
+        return np.asarray(residual - self.absorbed @ (self.absorbed.T @ residual))
+
+    def equations(self, of_discs: Sequence[Vector]) -> _Normal:
+        """Normal equations of the axes' columns for residuals, disc by disc."""
+        return _Normal(self.design @ self.design.T, self.design @ self.left(of_discs))
 
 
-def _projected(model: LinearModel, designs: dict[str, list[Matrix]]) -> tuple[Matrix, Vector]:
-    """Whitened columns and residuals of all cells, what the PSF's coordinates take up taken out."""
+def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Cells:
     base = list(model.evidence.base)
-    rows, psf, residual = [], [], []
-    for k, disc in enumerate(model.discs):
-        rows.append(np.vstack([patterns[k] for patterns in designs.values()]) @ disc.white)
-        psf.append(disc.answers[base])
-        residual.append(disc.residual)
-    design, absorbed, left = np.hstack(rows), np.linalg.qr(np.hstack(psf).T)[0], np.concatenate(residual)
-    return design - (design @ absorbed) @ absorbed.T, left - absorbed @ (absorbed.T @ left)
+    rows = [
+        np.vstack([patterns[k] for patterns in designs.values()]) @ disc.white
+        for k, disc in enumerate(model.discs)
+    ]
+    design = np.hstack(rows)
+    absorbed = np.linalg.qr(np.hstack([disc.answers[base] for disc in model.discs]).T)[0]
+    return _Cells(design - (design @ absorbed) @ absorbed.T, absorbed)
 
 
-def _of_lit(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal | None:
-    """The same of how bright the images are among those of their pointing: their gains over the width of these."""
+def _explained(model: LinearModel, step: Step) -> list[Vector]:
+    """What a fit's effects explain in each disc's cells."""
+    base = len(model.evidence.base)
+    here, values = list(step.columns[base:]), step.values[base:]
+    return [disc.answers[here].T @ values for disc in model.discs]
+
+
+def _of_lit(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal:
+    """Normal equations of the axes' columns for how bright the images are among those of their pointing: their gains over
+    the width of these."""
     lit = model.evidence.lit
-    gains = model.whole_lit.gains[list(model.evidence.images)] / lit.gain_width
+    gains = model.evidence.whole_lit.gains[list(model.evidence.images)] / lit.gain_width
     columns = np.vstack(
         [
             np.array(
@@ -186,23 +210,27 @@ def _of_lit(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal | N
     return _Normal(columns @ columns.T, columns @ gains)
 
 
-def _fall(disc: _Normal, lit: _Normal | None, columns: list[int]) -> float:
-    return _fall_of(disc, columns) + (_fall_of(lit, columns) if lit is not None else 0.0)
+def _fall(disc: _Normal, lit: _Normal, columns: list[int]) -> float:
+    return _fall_of(disc, columns) + _fall_of(lit, columns)
 
 
 def _fall_of(of: _Normal, columns: list[int]) -> float:
+    return float(_falls(of.normal, of.score[None, :], columns)[0])
+
+
+def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
+    """How far chi2 falls by these columns beyond their number, for every row of scores (draws, columns)."""
     if not columns:
-        return 0.0
-    normal, score = of.normal[np.ix_(columns, columns)], of.score[columns]
+        return np.zeros(scores.shape[0])
+    normal, scores = normal[np.ix_(columns, columns)], scores[:, columns]
     size = np.sqrt(np.maximum(np.diag(normal), 1e-12))
     inverse = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-6, hermitian=True)
-    return max(float((score / size) @ inverse @ (score / size)) - len(columns), 0.0)
+    scores = scores / size
+    return np.maximum(np.einsum("ni,ij,nj->n", scores, inverse, scores) - len(columns), 0.0)
 
 
 def _p_of_lit(lit: _Normal, columns: list[int], axes: int) -> float:
-    from scipy.stats import chi2
-
-    return min(1.0, axes * float(chi2.sf(_fall_of(lit, columns) + len(columns), len(columns))))
+    return min(1.0, axes * float(chdtrc(len(columns), _fall_of(lit, columns) + len(columns))))
 
 
 def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
@@ -219,15 +247,12 @@ def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str,
     return out
 
 
-def _drawn(model: LinearModel, designs: dict[str, list[Matrix]], rng: np.random.Generator) -> list[_Normal]:
-    """Equations with every image's residuals turned over or not."""
-    design, residual = _projected(model, designs)
+def _drawn_scores(model: LinearModel, cells: _Cells, rng: np.random.Generator) -> Matrix:
+    """Scores of all columns with every image's residuals turned over or not: (DRAWS, columns)."""
+    residual = cells.left([disc.residual for disc in model.discs])
     which = np.repeat(np.arange(len(model.discs)), [d.residual.size for d in model.discs])
-    normal = design @ design.T
-    return [
-        _Normal(normal, design @ (residual * rng.choice((-1.0, 1.0), len(model.discs))[which]))
-        for _ in range(DRAWS)
-    ]
+    signs = np.array([rng.choice((-1.0, 1.0), len(model.discs)) for _ in range(DRAWS)])
+    return np.asarray((signs[:, which] * residual) @ cells.design.T)
 
 
 def _at(model: LinearModel, name: str) -> dict[str, Any]:

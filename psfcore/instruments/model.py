@@ -5,14 +5,17 @@ Units stand in the keys. Angles are in degrees from +x of the detector towards +
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_path
+
+_MOST_DOTS = 64  # in one stretch of a file without brackets, commas or line ends
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -216,13 +219,23 @@ def parse_instrument(text: str, label: str) -> Instrument:
     Raises DataError "bad-instrument-file" (one line that names the key, what was expected and what came).
     """
     try:
-        return Instrument.model_validate(tomllib.loads(text))
+        return Instrument.model_validate(_parse_toml(text))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "file"
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         problem = f"{label}: {key}: {first['msg']}; got {first['input']!r:.80}{more}"
         raise DataError("bad-instrument-file", problem) from None
-    except tomllib.TOMLDecodeError as error:
-        reason = " ".join(str(error).split())
-        raise DataError("bad-instrument-file", f"{label}: expected TOML; {reason}") from None
+    except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
+        # Integers of thousands of digits, and lists in lists in lists, end as the latter two.
+        deep = isinstance(error, RecursionError)
+        reason = "values nested less deeply" if deep else " ".join(str(error).split())
+        raise DataError("bad-instrument-file", f"{label}: expected TOML; {reason:.200}") from None
+
+
+def _parse_toml(text: str) -> dict[str, Any]:
+    # The parser's time goes with the square of a dotted key's length: 64 kB of "a.a.a" would take half a minute.
+    for stretch in re.split(r"[^\w\"'. \t-]", text):
+        if stretch.count(".") > _MOST_DOTS:
+            raise ValueError(f"keys of at most {_MOST_DOTS} parts; got {stretch.strip()[:40]!r} ...")
+    return tomllib.loads(text)

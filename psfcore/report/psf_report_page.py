@@ -7,7 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.page import DASH, Bullets, Details, Figure, Page, Part, Section, Table, Value, Values, with_error
+from psfcore.page import (
+    DASH,
+    Bullets,
+    Details,
+    Figure,
+    Page,
+    Part,
+    Section,
+    Table,
+    Value,
+    Values,
+    provenance_values,
+    with_error,
+)
 from psfcore.psf import REACH_GRID_PX
 from psfcore.psf_tables import TOTAL
 from psfcore.report.psf_report import CrossValidated, PsfReport, inputs_of
@@ -522,7 +535,7 @@ def _made_of(report: PsfReport, provenance: dict[str, Any]) -> list[Part]:
     return [
         data,
         Values(_algorithm(report)),
-        Values([Value(name, text) for name, text in _told(provenance)]),
+        provenance_values(provenance),
         Details(f"{len(report.transit.sha256)} input files with their SHA-256", (files,)),
     ]
 
@@ -556,15 +569,3 @@ def _algorithm(report: PsfReport) -> list[Value]:
             ),
         ]
     return values
-
-
-def _told(provenance: dict[str, Any], before: str = "") -> list[tuple[str, str]]:
-    """Names and texts of what made the report, nested ones by a dotted name."""
-    out: list[tuple[str, str]] = []
-    for key, value in provenance.items():
-        name = f"{before}{key}".replace("_", " ")
-        if isinstance(value, dict):
-            out += _told(value, f"{name}: ")
-        elif value is not None:
-            out.append((name, str(value)))
-    return out

@@ -17,7 +17,7 @@ import numpy as np
 from psfcore.errors import DataError
 from psfcore.fits_io import Cards, CardValue, read_plane, write_plane
 from psfcore.header import FitsLimits
-from psfcore.simulate.plan import HIGH, plan_from_json
+from psfcore.simulate.plan import HIGH, Shot, plan_from_json
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import TrueSky, true_sky
 from psfcore.simulate.transit import PLATE_SCALE_ARCSEC, SimulatedTransit
@@ -44,8 +44,8 @@ def write(simulated: SimulatedTransit, folder: str | Path) -> None:
         write_plane(folder / "noise_free" / frame.file, noise_free, cards=cards)
     for fov, scene in simulated.scenes.items():
         about: dict[str, CardValue] = {"BUNIT": "DN/s", "FOV": fov, "MARGIN": simulated.plan.margin_px}
-        write_plane(folder / "scenes" / f"fov{fov}.fits", scene, cards=_cards(_instrument() | about))
-    write_plane(folder / DIFFRACTION_FILE, simulated.sky.diffraction, cards=_cards(_instrument()))
+        write_plane(folder / "scenes" / f"fov{fov}.fits", scene, cards=_cards(instrument_values() | about))
+    write_plane(folder / DIFFRACTION_FILE, simulated.sky.diffraction, cards=_cards(instrument_values()))
     _write_json(folder / "transit.json", _transit_json(simulated))
     _write_json(folder / TRUTH_FILE, simulated.truth.as_json() | {"plan": simulated.plan.as_json()})
 
@@ -99,20 +99,26 @@ def _transit_json(simulated: SimulatedTransit) -> dict[str, Any]:
 
 def _frame_cards(simulated: SimulatedTransit, index: int, unit: str) -> Cards:
     shot = simulated.plan.shots[index]
-    begin = (_START + timedelta(seconds=shot.time_s)).isoformat(timespec="milliseconds")
-    values = _instrument() | {
-        "DATE-BEG": begin,
-        "XPOSURE": shot.exposure_s,
-        "GAINCOMB": shot.gain_mode,
-        "BUNIT": unit,
-    }
+    values = shot_values(shot, unit)
     level = simulated.plan.saturation_dn
     if level is not None and shot.gain_mode == HIGH and unit == "DN":
         values["SATURATE"] = float(np.rint(level)) if simulated.plan.whole_dn else level
     return _cards(values)
 
 
-def _instrument() -> dict[str, CardValue]:
+def shot_values(shot: Shot, unit: str) -> dict[str, CardValue]:
+    """What the header of a simulated image says of how it was taken."""
+    begin = (_START + timedelta(seconds=shot.time_s)).isoformat(timespec="milliseconds")
+    return instrument_values() | {
+        "DATE-BEG": begin,
+        "XPOSURE": shot.exposure_s,
+        "GAINCOMB": shot.gain_mode,
+        "BUNIT": unit,
+    }
+
+
+def instrument_values() -> dict[str, CardValue]:
+    """What every header says of the instrument that is imitated."""
     return {
         "ORIGIN": "SIMULATED by heliopsf",
         "TELESCOP": "SOLO/EUI/HRI_EUV",

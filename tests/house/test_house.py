@@ -82,9 +82,36 @@ def test_the_web_process_carries_no_numerics_and_no_task() -> None:
         "workers.tasks",
         "workers.runner",
         "psfcore.fourier",
+        "psfcore.fits_io",  # pixels are read by workers alone
         "service.local",
+        "service.client",
+        "httpx",
     }
     assert loaded & heavy == set()
+
+
+def test_servers_and_workers_fetch_nothing_and_take_no_objects_from_outside() -> None:
+    """No address that a request brings can be asked for from here, and nothing is read that could be code."""
+    fetching = {
+        "httpx",
+        "requests",
+        "urllib.request",
+        "urllib3",
+        "aiohttp",
+        "http.client",
+        "ftplib",
+        "smtplib",
+    }
+    unpacking = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
+    wrong = [
+        (path.name, name)
+        for path in (*sources("service"), *sources("workers"), *sources("psfcore"))
+        # A store's address is the operator's, and a client is no server.
+        if not path.name.startswith("client") and path.name != "remote_store.py"
+        for name in imports(path)
+        if name in fetching | unpacking
+    ]
+    assert wrong == []
 
 
 def test_a_transit_s_archive_is_looked_into_without_numerics() -> None:

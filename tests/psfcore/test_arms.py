@@ -76,7 +76,7 @@ def measured(expected: NDArray[np.float64], seed: int) -> ArmMeasurement:
     return measure_arms(image, noise=(1.0, READ_NOISE), saturated=saturated)
 
 
-@pytest.mark.parametrize("seed", [100, 101, 102])
+@pytest.mark.parametrize("seed", [100, *(pytest.param(n, marks=pytest.mark.slow) for n in (101, 102))])
 def test_angle_and_spacing_come_out(expected: NDArray[np.float64], seed: int) -> None:
     found = measured(expected, seed)
     assert found.angles_deg == pytest.approx((ANGLE_DEG - 90, ANGLE_DEG), abs=0.1)

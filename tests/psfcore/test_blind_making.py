@@ -45,6 +45,13 @@ def test_a_case_is_the_same_for_its_seed_and_number() -> None:
         draw_case(1, 0, SIZE_PX, IMAGES, only=("gremlins",))
 
 
+def test_what_is_to_be_left_comes_in_turn_for_every_effect() -> None:
+    names, left_pct = ("ghost", "wide_halo"), (2.0, 4.0, 8.0)
+    cases = [draw_case(1, n, SIZE_PX, IMAGES, only=names, left_pct=left_pct) for n in range(7)]
+    found = [(case.effects[0].name, *case.target_pct) for case in cases]
+    assert found == [(name, pct) for pct in (*left_pct, 2.0) for name in names][:7]
+
+
 def test_a_transit_is_read_as_any_other(made: BlindSet) -> None:
     transit = read_transit(made.transit(0), FitsLimits(max_pixels=SIZE_PX**2))
     assert (len(transit.frames), transit.shape) == (IMAGES, (SIZE_PX, SIZE_PX))

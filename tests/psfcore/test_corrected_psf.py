@@ -15,7 +15,7 @@ from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, start_of
 from psfcore.gap.effect import Effect
 from psfcore.gap.library import LIBRARY
-from psfcore.gap.optics_effects import EFFECTS
+from psfcore.gap.optics_effects import DIRECTIONS, EFFECTS, blur_as
 from psfcore.header import FitsLimits
 from psfcore.psf import REACH_GRID_PX, Psf, cumulative_curve
 from psfcore.scatter.shapes import SHAPES
@@ -103,7 +103,8 @@ def test_its_errors_are_those_with_the_effect_free_beside_the_scatter() -> None:
 
 def test_a_blur_of_the_core_is_in_the_kernel_with_its_own_value_among_others() -> None:
     """Half the Laplacian of the kernel for each unit of variance; the dark offset before it is not in it."""
-    diagnosis = answered(effect("dark_offset"), effect("core_blur"), values=(5.0, 0.02))
+    narrow = replace(effect("core_blur"), changes=lambda view: blur_as(view, 0.003, DIRECTIONS[0]), held=None)
+    diagnosis = answered(effect("dark_offset"), narrow, values=(5.0, 0.02))
     psf, plain = made(diagnosis), fitted_kernel()
     window = (slice(MIDDLE - 30, MIDDLE + 31),) * 2
     around = sum(np.roll(plain, step, axis) for axis in (0, 1) for step in (-1, 1))

@@ -107,6 +107,7 @@ def test_a_patch_of_light_is_nobodys_effect(clean: Transit) -> None:
     assert "patch of added light" in report["looks_like"][0]["form"]
 
 
+@pytest.mark.slow
 def test_brightness_that_wavers_from_image_to_image_is_no_gap(clean: Transit) -> None:
     rng = np.random.default_rng(3)
     waver = 1 + 0.01 * rng.standard_normal(len(clean.frames))
@@ -114,7 +115,7 @@ def test_brightness_that_wavers_from_image_to_image_is_no_gap(clean: Transit) ->
     assert found.judgement.verdict in ("none", "inconclusive") and found.judgement.answer == ()
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_noise_figures_that_are_wrong_are_noticed_and_no_gap(clean: Transit, factor: float) -> None:
     wrong = Noise(clean.noise.photon_gain_dn * factor, clean.noise.read_noise_dn * factor)
     found = verdict(replace(clean, noise=wrong))

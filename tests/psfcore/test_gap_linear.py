@@ -13,7 +13,8 @@ from psfcore.gap.closure import HeldOut, closure, gap
 from psfcore.gap.detector_effects import EFFECTS
 from psfcore.gap.effect import View
 from psfcore.gap.evidence import Evidence, gather
-from psfcore.gap.linear_model import UNLIKELY, LinearModel
+from psfcore.gap.judge import Judgement, _worse_held_out, fitted, no_refit
+from psfcore.gap.linear_model import FLOOR, UNLIKELY, LinearModel
 from psfcore.gap.search import PlaceSearch, displaced
 from psfcore.gap.where import _shapley
 from psfcore.scatter.inversion import Solution, invert
@@ -115,7 +116,9 @@ def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> 
         return float(np.sum((b - a @ solved) ** 2))
 
     base = list(evidence.base)
-    assert model.gain(columns) == pytest.approx(chi2(base) - chi2([*base, *columns]), rel=1e-4, abs=1e-6)
+    assert model.gain(model.fit(columns)) == pytest.approx(
+        chi2(base) - chi2([*base, *columns]), rel=1e-4, abs=1e-6
+    )
 
 
 def test_lit_blocks_give_back_what_was_added_and_do_not_mind_brightness(solution: Solution) -> None:
@@ -160,3 +163,45 @@ def test_closure_and_gap_by_hand() -> None:
     assert gap(before, rng).value == pytest.approx(np.sqrt(24.0))
     assert gap(after, rng).value == 0.0
     assert closure(held_out([9.0] * 4, [0.0] * 4), after, rng) is None
+
+
+def test_the_interval_of_closure_holds_what_the_cause_would_close() -> None:
+    ones = np.ones(6)
+
+    def held_out(chi2: float, expected: float, lit: float = 0.0) -> HeldOut:
+        return HeldOut(tuple(range(6)), chi2 * ones, expected * ones, lit * ones, 0 * ones, 0 * ones, ones)
+
+    before, after = held_out(110.0, 10.0), held_out(30.0, 10.0)
+    # All images alike: nothing is drawn but the form's error.
+    same = closure(before, after, np.random.default_rng(1))
+    assert same is not None
+    assert (same.low, same.value, same.high) == pytest.approx((0.79, 0.80, 0.81))
+    # 15 of the 20 that are left are errors of the parameters.
+    unsure = closure(before, held_out(30.0, 25.0), np.random.default_rng(1))
+    assert unsure is not None and (unsure.value, unsure.high) == pytest.approx((0.80, 0.96))
+    # A scale that is known to 20 % alone: chi2 / 1.2 is less, and as much of the gap's 100 is closed more surely.
+    wide = closure(before, after, np.random.default_rng(1), 0.2)
+    assert wide is not None and wide.low < same.low - 0.02 and same.high + 0.02 < wide.high <= 1.01
+    # The lit blocks are asked where they show more, and the effect is what they show.
+    for lit_before, lit_after, closed in ((900.0, 0.0, 0.9), (90.0, 0.0, 0.0), (900.0, 800.0, 0.0)):
+        found = closure(
+            held_out(110.0, 10.0, lit_before), held_out(110.0, 10.0, lit_after), np.random.default_rng(1)
+        )
+        assert found is not None and found.value == pytest.approx(closed)
+
+
+@pytest.mark.parametrize(
+    ("name", "offset_dn", "worse"), [("dark_offset", 3.0, False), ("flat_field_residual", 0.0, True)]
+)
+def test_what_fits_by_its_freedom_predicts_held_out_images_worse_than_nothing(
+    clean: Transit, name: str, offset_dn: float, worse: bool
+) -> None:
+    """An offset that is there, and five numbers fitted to noise."""
+    frames = tuple(replace(f, pixels=f.pixels + np.float32(offset_dn / f.exposure_s)) for f in clean.frames)
+    effects = [effect for effect in EFFECTS if effect.name == name]
+    model = LinearModel(gather(invert(replace(clean, frames=frames)), effects), FLOOR)
+    best = fitted(model, effects)
+    assert best.gain > 0
+    assert (
+        _worse_held_out(model, Judgement("attributed", best.names, 0.0, (best,), (), best), no_refit) is worse
+    )

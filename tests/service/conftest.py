@@ -9,11 +9,19 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from workers.catalogue import Catalogue, JobRow
+from tests.tables import copied_tables
+from workers.catalogue import Catalogue
 from workers.contract import Phase
 from workers.runner import Runner
 from workers.settings import Settings
 from workers.store import Store
+from workers.tables import DEFAULT_OWNER, JobRow
+
+
+@pytest.fixture(scope="package", autouse=True)
+def _tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with copied_tables(tmp_path_factory.mktemp("tables")):
+        yield
 
 
 @pytest.fixture
@@ -22,6 +30,7 @@ def settings(tmp_path: Path) -> Settings:
         data_dir=tmp_path / "data",
         database_url=None,
         broker_url="filesystem://",
+        allowed_hosts="testserver",
         max_upload_mib=2,
         max_pixels=512 * 512,
     )
@@ -38,7 +47,7 @@ def run_jobs(settings: Settings, api: TestClient) -> Callable[[], None]:
     def run() -> None:
         catalogue = Catalogue(settings.catalogue_url)
         runner = Runner(settings, catalogue, Store(settings.data_dir))
-        for row in catalogue.page(JobRow, limit=100, phase=Phase.QUEUED):
+        for row in catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=100, phase=Phase.QUEUED):
             runner.run(row.id)
         catalogue.close()
 

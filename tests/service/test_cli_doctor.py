@@ -16,7 +16,9 @@ from service.cli import main
 from tests.whole.stack import free_port
 from workers import checks
 from workers.catalogue import Catalogue
+from workers.census import Census
 from workers.settings import Settings, software_version
+from workers.tables import DEFAULT_OWNER
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +34,7 @@ def plain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def catalogue(tmp_path: Path) -> Catalogue:
     (tmp_path / "data").mkdir()
     catalogue = Catalogue(Settings().catalogue_url)
-    catalogue.create_tables()
+    catalogue.upgrade()
     return catalogue
 
 
@@ -59,7 +61,7 @@ def test_with_nothing_there_it_says_so_and_makes_nothing(tmp_path: Path) -> None
 
 
 def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue) -> None:
-    catalogue.announce("host:1", time.time(), software_version())
+    catalogue.census.announce("host:1", time.time(), software_version())
     assert set(states()) == {
         "versions", "threads", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs",
     }  # fmt: skip
@@ -130,21 +132,37 @@ def test_a_database_of_another_version(catalogue: Catalogue, statement: str, sta
 
 
 @pytest.mark.parametrize(
-    ("apart", "state"), [(0.2, "ok"), (-3.0, "warning"), (60.0, "broken"), (-60.0, "broken")]
+    ("statement", "state", "says"),
+    [
+        ("DROP TABLE alembic_version", "warning", "no revision"),
+        ("UPDATE alembic_version SET version_num = '0001'", "warning", "at revision 0001"),
+        ("UPDATE alembic_version SET version_num = '9999'", "broken", "made by a later version"),
+    ],
+)
+def test_a_database_at_another_revision(catalogue: Catalogue, statement: str, state: str, says: str) -> None:
+    with catalogue._engine.begin() as connection:
+        connection.execute(text(statement))
+    found = findings()["schema"]
+    assert found["state"] == state and says in found["found"]
+    assert ("heliopsf database upgrade" if state == "warning" else "run the version") in found["advice"]
+
+
+@pytest.mark.parametrize(
+    ("apart", "state"), [(0.2, "ok"), (-3.0, "warning"), (60.0, "warning"), (-60.0, "warning")]
 )
 def test_clocks(catalogue: Catalogue, apart: float, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = Catalogue.clock
-    monkeypatch.setattr(Catalogue, "clock", lambda self: real(self) + apart)
+    real = Census.clock
+    monkeypatch.setattr(Census, "clock", lambda self: real(self) + apart)
     assert states()["clock"] == state
 
 
 def test_a_worker_of_another_version(catalogue: Catalogue) -> None:
-    catalogue.announce("host:1", time.time(), "0.0.1")
+    catalogue.census.announce("host:1", time.time(), "0.0.1")
     assert findings()["workers"]["state"] == "warning" and "0.0.1" in findings()["workers"]["found"]
 
 
 def test_jobs_that_nobody_takes(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-    catalogue.submit("psf-build", {}, "k")
+    catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     assert states()["workers"] == "warning" and states()["stuck jobs"] == "ok"
     with catalogue._engine.begin() as connection:
         connection.execute(text("UPDATE jobs SET created_at = created_at - 7200"))
@@ -156,8 +174,8 @@ def test_jobs_that_nobody_takes(catalogue: Catalogue, monkeypatch: pytest.Monkey
 
 
 def test_a_job_whose_worker_is_gone(catalogue: Catalogue) -> None:
-    job, _ = catalogue.submit("psf-build", {}, "k")
-    catalogue.claim(job.id, "host:1")
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+    catalogue.jobs.claim(job.id, "host:1")
     assert states()["stuck jobs"] == "ok"
     with catalogue._engine.begin() as connection:
         connection.execute(text("UPDATE jobs SET heartbeat_at = heartbeat_at - 7200"))

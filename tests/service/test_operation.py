@@ -23,6 +23,7 @@ from tests.whole.stack import Missing, Redis, free_port
 from workers import logs
 from workers.catalogue import Catalogue
 from workers.settings import Settings
+from workers.tables import DEFAULT_OWNER
 
 AWAY = OperationalError("SELECT 1", None, Exception("no route to s3cret.example"))
 
@@ -148,15 +149,15 @@ def test_the_setting_decides_the_form(
 
 def test_jobs_are_counted_wherever_they_were_worked_on(api: TestClient, settings: Settings) -> None:
     elsewhere = Catalogue(settings.catalogue_url)  # as another process would have it
-    first, _ = elsewhere.submit("psf-build", {}, "a")
-    second, _ = elsewhere.submit("psf-build", {}, "b")
+    first, _ = elsewhere.jobs.submit("psf-build", {}, "a", DEFAULT_OWNER)
+    second, _ = elsewhere.jobs.submit("psf-build", {}, "b", DEFAULT_OWNER)
     for _ in range(2):
-        lease = elsewhere.claim(first.id, "w")
-        assert lease is not None and elsewhere.requeue(lease)
-    lease = elsewhere.claim(second.id, "w")
+        lease = elsewhere.jobs.claim(first.id, "w")
+        assert lease is not None and elsewhere.jobs.requeue(lease)
+    lease = elsewhere.jobs.claim(second.id, "w")
     assert lease is not None
     time.sleep(0.05)
-    elsewhere.complete(lease, "r")
+    elsewhere.jobs.complete(lease, "r")
     elsewhere.close()
     found = scrape(api)
     assert found[sample("heliopsf_jobs", kind="psf-build", phase="QUEUED")] == 1
@@ -165,7 +166,7 @@ def test_jobs_are_counted_wherever_they_were_worked_on(api: TestClient, settings
     assert found[sample("heliopsf_job_attempts", kind="psf-build")] == 3
     assert found[sample("heliopsf_job_retries", kind="psf-build")] == 1
     assert 0.05 <= found[sample("heliopsf_job_run_seconds", kind="psf-build")] < 5
-    assert 0.05 <= found[sample("heliopsf_oldest_queued_seconds", queue="heliopsf")] < 60
+    assert 0.05 <= found[sample("heliopsf_oldest_queued_seconds", queue="interactive")] < 60
 
 
 def test_bytes_that_came_and_bytes_that_are_kept(api: TestClient, image_file: Path) -> None:
@@ -181,10 +182,10 @@ def test_bytes_that_came_and_bytes_that_are_kept(api: TestClient, image_file: Pa
 def test_workers_that_are_there_and_jobs_that_none_looks_after(api: TestClient, settings: Settings) -> None:
     catalogue = handles(api).catalogue
     assert scrape(api)[sample("heliopsf_workers")] == 0
-    catalogue.announce("host:1", time.time(), "1")
-    catalogue.announce("host:1", time.time(), "1")
-    catalogue.announce("host:2", time.time(), "1")
-    catalogue.take_leave("host:2")
+    catalogue.census.announce("host:1", time.time(), "1")
+    catalogue.census.announce("host:1", time.time(), "1")
+    catalogue.census.announce("host:2", time.time(), "1")
+    catalogue.census.take_leave("host:2")
     found = scrape(api)
     assert found[sample("heliopsf_workers")] == 1 and found[sample("heliopsf_jobs_silent")] == 0
 
@@ -235,7 +236,7 @@ def test_metrics_say_that_the_database_is_away(api: TestClient, monkeypatch: pyt
     def away() -> None:
         raise AWAY
 
-    monkeypatch.setattr(handles(api).catalogue, "tally", away)
+    monkeypatch.setattr(handles(api).catalogue.census, "tally", away)
     found = scrape(api)
     assert found[sample("heliopsf_database_up")] == 0
     assert not any(name == "heliopsf_jobs" for name, _ in found)
@@ -250,7 +251,7 @@ def test_ready_once_the_embedded_worker_is_there(api: TestClient) -> None:
     parts = answer.json()["parts"]
     assert parts["database"] == parts["storage"] == "ok" and "no worker" in parts["worker"]
     assert api.get("/healthz").status_code == 200
-    handles(api).catalogue.announce("host:1", time.time(), "1")
+    handles(api).catalogue.census.announce("host:1", time.time(), "1")
     assert api.get("/readyz").json() == {
         "status": "ready",
         "parts": {"database": "ok", "storage": "ok", "worker": "ok"},

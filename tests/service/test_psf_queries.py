@@ -29,10 +29,11 @@ from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
 from tests.conftest import write_psf as write_plain_psf
 from tests.service.conftest import upload
-from workers.catalogue import Catalogue, PsfRow
+from workers.catalogue import Catalogue
 from workers.runner import Runner
 from workers.settings import Settings
 from workers.store import Store
+from workers.tables import DEFAULT_OWNER, PsfRow
 
 LIMITS = FitsLimits(max_pixels=512 * 512)
 AT = SOFTENED_POWER_LAW.coordinates({"b_px": 5.0, "c": 2.6, "total": 0.4})
@@ -50,14 +51,20 @@ class Served:
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("served")
-    settings = Settings(data_dir=folder, database_url=None, broker_url="filesystem://", max_pixels=512 * 512)
+    settings = Settings(
+        data_dir=folder,
+        database_url=None,
+        broker_url="filesystem://",
+        allowed_hosts="testserver",
+        max_pixels=512 * 512,
+    )
     body = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
     with TestClient(create_app(settings), raise_server_exceptions=False) as api:
         job = api.post("/v1/jobs", json=body).json()
         catalogue, store = Catalogue(settings.catalogue_url), Store(folder)
         Runner(settings, catalogue, store).run(job["id"])
         psf = api.get(api.get(f"/v1/jobs/{job['id']}").json()["result"]).json()
-        row = catalogue.get(PsfRow, psf["id"])
+        row = catalogue.get(PsfRow, psf["id"], DEFAULT_OWNER)
         catalogue.close()
         assert row is not None
         yield Served(api, psf, store.path(row.file_sha256))

@@ -21,9 +21,10 @@ from service.client import Heliopsf, ServiceError
 from service.local import LocalService
 from tests.service.conftest import upload
 from tests.transit_files import READ_NOISE, write_transit
-from workers.catalogue import Catalogue, TransitRow
+from workers.catalogue import Catalogue
 from workers.settings import Settings
 from workers.store import Store
+from workers.tables import DEFAULT_OWNER, TransitRow
 
 WHERE = "/v1/transits"
 MIB = 2**20
@@ -288,7 +289,7 @@ def test_the_local_service_takes_the_same(settings: Settings, api: TestClient, f
         with pytest.raises(DataError, match="not-an-archive"):
             local.upload_transit(folder / "letter.zip")
         catalogue = Catalogue(Settings.apart(folder.parent / "local").catalogue_url)
-        row = catalogue.get(TransitRow, here["id"])
+        row = catalogue.get(TransitRow, here["id"], DEFAULT_OWNER)
         assert row is not None and row.summary["images"] == 4
         catalogue.close()
     finally:

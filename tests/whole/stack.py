@@ -15,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import psutil
+import pytest
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import OperationalError
 
@@ -122,6 +123,14 @@ def embedded(folder: Path) -> Iterator[Stack]:
 
 
 @contextmanager
+def alone(folder: Path) -> Iterator[Stack]:
+    """A service that nobody works for: its broker is not there."""
+    broker = f"redis://127.0.0.1:{free_port()}/0"
+    with _running(Stack(folder / "data", {"HELIOPSF_BROKER_URL": broker})) as stack:
+        yield stack
+
+
+@contextmanager
 def served(folder: Path, workers: int = 1) -> Iterator[Stack]:
     """A service on Redis and PostgreSQL, with workers of its own; ``Missing`` where either is not there."""
     with ExitStack() as resources:
@@ -135,6 +144,12 @@ def served(folder: Path, workers: int = 1) -> Iterator[Stack]:
         for _ in range(workers):
             stack.start_worker()
         yield stack
+
+
+MODES = {"embedded": embedded, "redis and postgresql": served}
+# For tests of which `make test` runs one of the two: the other takes minutes for little more.
+EMBEDDED_FIRST = ["embedded", pytest.param("redis and postgresql", marks=pytest.mark.slow)]
+SERVED_FIRST = [pytest.param("embedded", marks=pytest.mark.slow), "redis and postgresql"]
 
 
 @contextmanager

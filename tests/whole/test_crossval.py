@@ -13,7 +13,8 @@ from sqlalchemy import create_engine, func, select
 from tests.transit_files import write_simulated
 from tests.whole import stack as stacks
 from tests.whole.stack import Missing, Stack, wait_for
-from workers.catalogue import Catalogue, PartRow
+from workers.catalogue import Catalogue
+from workers.tables import PartRow
 
 RUNS, BLOCKS = 12, 3
 
@@ -41,7 +42,7 @@ class Parts:
 def kill_worker_of(stack: Stack, job_id: str, *, own: bool) -> None:
     """SIGKILL to the worker that runs the job, or to the one that helps it, with all its processes."""
     catalogue = Catalogue(stack.environment["HELIOPSF_DATABASE_URL"])
-    row = catalogue.job(job_id)
+    row = catalogue.jobs.get(job_id)
     catalogue.close()
     assert row is not None and row.worker is not None
     pid = int(row.worker.rsplit(":", 1)[1])

@@ -10,6 +10,7 @@ import pytest
 from astropy.io import fits
 
 from service.client import ServiceError
+from tests.conftest import write_psf
 from tests.whole import stack as stacks
 from tests.whole.stack import Stack
 
@@ -54,10 +55,13 @@ def test_images_of_other_telescopes_need_a_psf_of_theirs(
     assert len(fits.getheader(tmp_path / "out.fits")) > 50
 
 
-def test_a_psf_of_another_plate_scale_is_refused(stack: Stack, shared: Path) -> None:
-    hri = stack.client.build_psf("hri_euv", size=256)
+def test_a_psf_of_another_plate_scale_is_refused(stack: Stack, shared: Path, tmp_path: Path) -> None:
+    write_psf(tmp_path / "psf.fits")
+    for card, value in {"CDELT1": 3.0, "CDELT2": 3.0, "CUNIT1": "arcsec", "CUNIT2": "arcsec"}.items():
+        fits.setval(tmp_path / "psf.fits", card, value=value)
+    psf_id = stack.client.upload_psf(tmp_path / "psf.fits")["id"]
     with pytest.raises(ServiceError, match="arcsec") as failed:
-        stack.client.deconvolve(shared / FSI, psf_id=hri["id"])
+        stack.client.deconvolve(shared / FSI, psf_id=psf_id)
     assert failed.value.code == "plate-scale-mismatch"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from pathlib import Path
 
 import psutil
@@ -15,20 +15,28 @@ from astropy.io import fits
 from service.client import ServiceError
 from tests.conftest import write_image
 from tests.whole import stack as stacks
-from tests.whole.stack import Missing, Stack, wait_for
-
-MODES = {"embedded": stacks.embedded, "redis and postgresql": stacks.served}
+from tests.whole.stack import EMBEDDED_FIRST, Missing, Stack, wait_for
 
 
-@pytest.fixture(params=MODES)
+def running(mode: str, folder: Path, resources: ExitStack) -> Stack:
+    try:
+        return resources.enter_context(stacks.MODES[mode](folder))
+    except Missing as missing:
+        pytest.skip(str(missing))
+
+
+@pytest.fixture
 def stack(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Stack]:
-    mode: AbstractContextManager[Stack] = MODES[request.param](tmp_path)
+    """One of the test's own, to kill things in."""
     with ExitStack() as resources:
-        try:
-            running = resources.enter_context(mode)
-        except Missing as missing:
-            pytest.skip(str(missing))
-        yield running
+        yield running(request.param, tmp_path, resources)
+
+
+@pytest.fixture(scope="module")
+def living(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
+    """One that is shared, so that its products may be of other tests too."""
+    with ExitStack() as resources:
+        yield running(request.param, tmp_path_factory.mktemp("stack"), resources)
 
 
 def big_image(path: Path) -> Path:
@@ -37,25 +45,27 @@ def big_image(path: Path) -> Path:
     return path
 
 
-def test_an_image_in_and_a_product_out(stack: Stack, tmp_path: Path, psf_file: Path) -> None:
+@pytest.mark.parametrize("living", EMBEDDED_FIRST, indirect=True)
+def test_an_image_in_and_a_product_out(living: Stack, tmp_path: Path, psf_file: Path) -> None:
     write_image(tmp_path / "image.fits")
-    psf_id = stack.client.upload_psf(psf_file)["id"]
+    psf_id = living.client.upload_psf(psf_file)["id"]
     output, picture = tmp_path / "out.fits", tmp_path / "out.png"
-    product = stack.client.deconvolve(tmp_path / "image.fits", output, psf_id=psf_id, preview=picture)
+    product = living.client.deconvolve(tmp_path / "image.fits", output, psf_id=psf_id, preview=picture)
     with fits.open(output, checksum=True) as hdus:
         assert hdus[0].header["PSFID"] == psf_id
     assert picture.read_bytes().startswith(b"\x89PNG")
-    again = stack.client.deconvolve(tmp_path / "image.fits", psf_id=psf_id)
+    again = living.client.deconvolve(tmp_path / "image.fits", psf_id=psf_id)
     assert again == product
-    assert [p["id"] for p in stack.client.products()] == [product["id"]]
+    assert [p["id"] for p in living.client.products()].count(product["id"]) == 1
 
 
+@pytest.mark.parametrize("stack", EMBEDDED_FIRST, indirect=True)
 def test_a_killed_worker_loses_nothing_and_nothing_is_done_twice(
     stack: Stack, tmp_path: Path, psf_file: Path
 ) -> None:
     image_id = stack.client.upload_image(big_image(tmp_path / "image.fits"))["id"]
     psf_id = stack.client.upload_psf(psf_file)["id"]
-    method = {"name": "richardson-lucy", "steps": 200}
+    method = {"name": "richardson-lucy", "steps": 100}
     job = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
     wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 5, "the job is at work")
     stack.kill_workers()
@@ -69,20 +79,23 @@ def test_a_killed_worker_loses_nothing_and_nothing_is_done_twice(
     assert len(blobs) == 4, "image, PSF, product, picture"
 
 
-def test_cancel_at_work(stack: Stack, tmp_path: Path, psf_file: Path) -> None:
-    image_id = stack.client.upload_image(big_image(tmp_path / "image.fits"))["id"]
-    psf_id = stack.client.upload_psf(psf_file)["id"]
+@pytest.mark.parametrize("living", EMBEDDED_FIRST, indirect=True)
+def test_cancel_at_work(living: Stack, tmp_path: Path, psf_file: Path) -> None:
+    before = list(living.client.products())
+    image_id = living.client.upload_image(big_image(tmp_path / "image.fits"))["id"]
+    psf_id = living.client.upload_psf(psf_file)["id"]
     method = {"name": "richardson-lucy", "steps": 200}
-    job = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
-    wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 2, "the job is at work")
-    stack.client.cancel(job["id"])
+    job = living.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
+    wait_for(lambda: living.client.job(job["id"])["progress"]["step"] > 2, "the job is at work")
+    living.client.cancel(job["id"])
     with pytest.raises(ServiceError, match="cancelled"):
-        stack.client.wait(job, timeout_s=30)
-    ended = stack.client.job(job["id"])
+        living.client.wait(job, timeout_s=30)
+    ended = living.client.job(job["id"])
     assert ended["phase"] == "ABORTED" and ended["progress"]["step"] < 200
-    assert list(stack.client.products()) == []
+    assert list(living.client.products()) == before
 
 
+@pytest.mark.parametrize("stack", EMBEDDED_FIRST, indirect=True)
 def test_what_was_queued_while_everything_was_down_is_done(
     stack: Stack, tmp_path: Path, psf_file: Path
 ) -> None:
@@ -118,7 +131,7 @@ def test_a_broker_killed_at_work_costs_nothing(tmp_path: Path, psf_file: Path) -
         assert stack.redis is not None
         image_id = stack.client.upload_image(big_image(tmp_path / "image.fits"))["id"]
         psf_id = stack.client.upload_psf(psf_file)["id"]
-        many, few = ({"name": "richardson-lucy", "steps": n} for n in (200, 3))
+        many, few = ({"name": "richardson-lucy", "steps": n} for n in (100, 3))
         running = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=many)
         wait_for(lambda: stack.client.job(running["id"])["progress"]["step"] > 2, "the job is at work")
         stack.redis.kill()
@@ -140,8 +153,9 @@ def test_a_server_that_dies_takes_its_worker_along(tmp_path: Path) -> None:
         assert left == []
 
 
-def test_the_command_line_over_http_and_local_agree(tmp_path: Path, psf_file: Path) -> None:
-    write_image(tmp_path / "image.fits")
+@pytest.mark.parametrize("living", ["embedded"], indirect=True)
+def test_the_command_line_over_http_and_local_agree(living: Stack, tmp_path: Path, psf_file: Path) -> None:
+    write_image(tmp_path / "image.fits", seed=7)
     files = {"over-http": tmp_path / "h.fits", "local": tmp_path / "l.fits"}
     base = [
         sys.executable,
@@ -152,9 +166,8 @@ def test_the_command_line_over_http_and_local_agree(tmp_path: Path, psf_file: Pa
         "--psf",
         str(psf_file),
     ]
-    with stacks.embedded(tmp_path) as stack:
-        over_http = [*base, "-o", str(files["over-http"]), "--server", stack.client.server]
-        subprocess.run(over_http, check=True)
+    over_http = [*base, "-o", str(files["over-http"]), "--server", living.client.server]
+    subprocess.run(over_http, check=True)
     subprocess.run([*base, "-o", str(files["local"]), "--local"], check=True)
     assert files["over-http"].read_bytes() == files["local"].read_bytes()
 

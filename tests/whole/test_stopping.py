@@ -41,7 +41,9 @@ def test_a_server_lets_requests_end_and_does_not_wait_for_those_that_do_not(
         wait_for(lambda: _up(url), "the server is up")
         port = int(url.rsplit(":", 1)[1])
         with socket.create_connection(("127.0.0.1", port)) as line:
-            line.sendall(b"POST /v1/images HTTP/1.1\r\nHost: x\r\nContent-Length: 2880\r\n\r\nSIMPLE  =")
+            line.sendall(
+                b"POST /v1/images HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 2880\r\n\r\nSIMPLE  ="
+            )
             wait_for(lambda: any((tmp_path / "data" / "tmp").iterdir()), "the upload is at work")
             told = time.monotonic()
             server.send_signal(signal.SIGTERM)

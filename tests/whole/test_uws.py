@@ -134,7 +134,7 @@ def test_a_job_that_executes_too_long_is_aborted_and_one_that_is_due_is_destroye
 
 
 def test_who_waits_does_not_keep_the_service_from_stopping(tmp_path: Path) -> None:
-    with stacks.embedded(tmp_path) as stack:
+    with stacks.alone(tmp_path) as stack:
         job = created(stack, **BUILD)
         assert stack.server is not None
         answers: list[requests.Response] = []

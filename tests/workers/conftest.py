@@ -9,9 +9,16 @@ from pathlib import Path
 import pytest
 
 from service.local import LocalService
+from tests.tables import copied_tables
 from tests.whole.stack import Missing, postgres_database
 from workers.catalogue import Catalogue
 from workers.settings import Settings
+
+
+@pytest.fixture(scope="package", autouse=True)
+def _tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with copied_tables(tmp_path_factory.mktemp("tables")):
+        yield
 
 
 @pytest.fixture
@@ -30,7 +37,7 @@ def local(settings: Settings) -> Iterator[LocalService]:
 def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalogue]:
     if request.param == "sqlite":
         catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
-        catalogue.create_tables()
+        catalogue.upgrade()
         yield catalogue
         catalogue.close()
         return
@@ -40,6 +47,6 @@ def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalo
         except Missing as missing:
             pytest.skip(str(missing))
         catalogue = Catalogue(Settings(database_url=url).catalogue_url)
-        catalogue.create_tables()
+        catalogue.upgrade()
         yield catalogue
         catalogue.close()

@@ -5,45 +5,49 @@ from __future__ import annotations
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from workers.catalogue import Catalogue, JobRow, Lease, ProductRow
+from workers.catalogue import Catalogue
 from workers.contract import Fault, JobError, Phase
+from workers.job_rows import Lease
+from workers.tables import DEFAULT_OWNER, JobRow, ProductRow
 
 BROKEN = JobError(fault=Fault.INTERNAL, code="broken", message="broken")
 
 
 def submitted(catalogue: Catalogue, key: str = "k") -> JobRow:
-    return catalogue.submit("psf-build", {"instrument": "hri_euv"}, key)[0]
+    return catalogue.jobs.submit("psf-build", {"instrument": "hri_euv"}, key, DEFAULT_OWNER)[0]
 
 
 def claimed(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, Lease]:
     job = submitted(catalogue, key)
-    lease = catalogue.claim(job.id, "me")
+    lease = catalogue.jobs.claim(job.id, "me")
     assert lease is not None
     return job, lease
 
 
 def phase(catalogue: Catalogue, job: JobRow) -> Phase:
-    row = catalogue.job(job.id)
+    row = catalogue.jobs.get(job.id)
     assert row is not None
     return Phase(row.phase)
 
 
 def test_an_equal_request_shares_the_live_job(catalogue: Catalogue) -> None:
-    first, new = catalogue.submit("psf-build", {}, "same")
-    second, again = catalogue.submit("psf-build", {}, "same")
+    first, new = catalogue.jobs.submit("psf-build", {}, "same", DEFAULT_OWNER)
+    second, again = catalogue.jobs.submit("psf-build", {}, "same", DEFAULT_OWNER)
     assert (new, again) == (True, False)
     assert first.id == second.id
 
 
 def test_an_equal_request_after_a_failure_is_a_new_job(catalogue: Catalogue) -> None:
     job, lease = claimed(catalogue)
-    assert catalogue.fail(lease, BROKEN)
+    assert catalogue.jobs.fail(lease, BROKEN)
     assert submitted(catalogue).id != job.id
 
 
 def test_many_equal_requests_at_once_make_one_job(catalogue: Catalogue) -> None:
     with ThreadPoolExecutor(8) as pool:
-        answers = list(pool.map(lambda _: catalogue.submit("psf-build", {}, "same"), range(24)))
+        answers = list(
+            pool.map(lambda _: catalogue.jobs.submit("psf-build", {}, "same", DEFAULT_OWNER), range(24))
+        )
     assert len({row.id for row, _ in answers}) == 1
     assert sum(new for _, new in answers) == 1
 
@@ -51,81 +55,85 @@ def test_many_equal_requests_at_once_make_one_job(catalogue: Catalogue) -> None:
 def test_of_many_that_claim_one_succeeds(catalogue: Catalogue) -> None:
     job = submitted(catalogue)
     with ThreadPoolExecutor(8) as pool:
-        leases = list(pool.map(lambda n: catalogue.claim(job.id, str(n)), range(24)))
+        leases = list(pool.map(lambda n: catalogue.jobs.claim(job.id, str(n)), range(24)))
     assert sum(lease is not None for lease in leases) == 1
-    row = catalogue.job(job.id)
+    row = catalogue.jobs.get(job.id)
     assert row is not None and row.attempt == 1
 
 
 def test_a_lost_lease_changes_nothing(catalogue: Catalogue) -> None:
     job, lease = claimed(catalogue)
     stranger = Lease(job.id, "0" * 32)
-    assert not catalogue.complete(stranger, "r")
-    assert not catalogue.progress(stranger, "s", 1, 2)
-    assert not catalogue.fail(stranger, BROKEN)
-    assert not catalogue.requeue(stranger)
+    assert not catalogue.jobs.complete(stranger, "r")
+    assert not catalogue.jobs.progress(stranger, "s", 1, 2)
+    assert not catalogue.jobs.fail(stranger, BROKEN)
+    assert not catalogue.jobs.requeue(stranger)
     assert phase(catalogue, job) == Phase.EXECUTING
-    assert catalogue.complete(lease, "r")
-    assert not catalogue.fail(lease, BROKEN)
+    assert catalogue.jobs.complete(lease, "r")
+    assert not catalogue.jobs.fail(lease, BROKEN)
     assert phase(catalogue, job) == Phase.COMPLETED
 
 
 def test_cancel_of_each_phase(catalogue: Catalogue) -> None:
     queued = submitted(catalogue, "a")
-    catalogue.cancel(queued.id)
+    catalogue.jobs.cancel(queued.id)
     assert phase(catalogue, queued) == Phase.ABORTED
-    assert catalogue.claim(queued.id, "me") is None
+    assert catalogue.jobs.claim(queued.id, "me") is None
 
     running, lease = claimed(catalogue, "b")
-    catalogue.cancel(running.id)
+    catalogue.jobs.cancel(running.id)
     assert phase(catalogue, running) == Phase.EXECUTING
-    assert not catalogue.heartbeat(lease)
-    assert catalogue.abort(lease)
+    assert not catalogue.jobs.heartbeat(lease)
+    assert catalogue.jobs.abort(lease)
     assert phase(catalogue, running) == Phase.ABORTED
 
     done, lease = claimed(catalogue, "c")
-    catalogue.complete(lease, "r")
-    catalogue.cancel(done.id)
+    catalogue.jobs.complete(lease, "r")
+    catalogue.jobs.cancel(done.id)
     assert phase(catalogue, done) == Phase.COMPLETED
 
 
 def test_a_silent_worker_loses_its_job_and_three_are_enough(catalogue: Catalogue) -> None:
     job, lease = claimed(catalogue)
-    assert catalogue.give_up_silent(60, 3) == []
+    assert catalogue.jobs.give_up_silent(60, 3) == []
     for attempt in (1, 2):
         time.sleep(0.02)
-        assert catalogue.give_up_silent(0.01, 3) == [job.id], attempt
-        assert not catalogue.complete(lease, "r"), "the silent worker came back and must not be heard"
-        again = catalogue.claim(job.id, "other")
+        assert catalogue.jobs.give_up_silent(0.01, 3) == [job.id], attempt
+        assert not catalogue.jobs.complete(lease, "r"), "the silent worker came back and must not be heard"
+        again = catalogue.jobs.claim(job.id, "other")
         assert again is not None
         lease = again
     time.sleep(0.02)
-    assert catalogue.give_up_silent(0.01, 3) == []
-    row = catalogue.job(job.id)
+    assert catalogue.jobs.give_up_silent(0.01, 3) == []
+    row = catalogue.jobs.get(job.id)
     assert row is not None and row.phase == Phase.ERROR
     assert row.error is not None and row.error["code"] == "worker-lost"
 
 
 def test_a_silent_worker_of_a_cancelled_job_aborts_it(catalogue: Catalogue) -> None:
     job, _ = claimed(catalogue)
-    catalogue.cancel(job.id)
+    catalogue.jobs.cancel(job.id)
     time.sleep(0.02)
-    assert catalogue.give_up_silent(0.01, 3) == []
+    assert catalogue.jobs.give_up_silent(0.01, 3) == []
     assert phase(catalogue, job) == Phase.ABORTED
+
+
+def waiting(catalogue: Catalogue) -> list[str]:
+    return [job.id for job in catalogue.jobs.unsubmitted(0.05)]
 
 
 def test_what_the_broker_lost_is_submitted_again_but_not_at_once(catalogue: Catalogue) -> None:
     job = submitted(catalogue)
-    assert catalogue.unsubmitted(0.05) == [job.id]
-    catalogue.mark_submitted(job.id)
-    assert catalogue.unsubmitted(0.05) == []
+    assert waiting(catalogue) == [job.id]
+    catalogue.jobs.mark_submitted(job.id)
+    assert waiting(catalogue) == []
     time.sleep(0.06)
-    assert catalogue.unsubmitted(0.05) == [job.id]
-    catalogue.mark_submitted(job.id)
+    assert waiting(catalogue) == [job.id]
+    catalogue.jobs.mark_submitted(job.id)
     time.sleep(0.06)
-    assert catalogue.unsubmitted(0.05) == [], "the wait doubles"
+    assert waiting(catalogue) == [], "the wait doubles"
     time.sleep(0.06)
-    assert catalogue.unsubmitted(0.05) == [job.id]
+    assert waiting(catalogue) == [job.id]
 
 
 def product(identity: str) -> ProductRow:
@@ -157,7 +165,7 @@ def test_pages_hold_every_row_once_newest_first(catalogue: Catalogue) -> None:
         catalogue.add(product(f"{n:064x}"))
     seen: list[str] = []
     after = None
-    while rows := catalogue.page(ProductRow, limit=3, after=after):
+    while rows := catalogue.page(ProductRow, owner=DEFAULT_OWNER, limit=3, after=after):
         seen += [row.id for row in rows]
         after = (rows[-1].created_at, rows[-1].id)
     assert len(seen) == len(set(seen)) == 7

@@ -13,8 +13,9 @@ import pytest
 from service.local import LocalService
 from tests.transit_files import write_simulated
 from workers import crossval_task
-from workers.catalogue import Catalogue, Part
+from workers.catalogue import Catalogue
 from workers.contract import Phase
+from workers.part_rows import Part, Parts
 from workers.runner import Runner
 from workers.settings import Settings
 from workers.store import Store
@@ -127,16 +128,16 @@ def test_a_worker_killed_half_way_loses_no_fold_and_counts_none_twice(
 
     monkeypatch.setattr(crossval_task, "exact_fit", counted)
     # A killed process gives nothing back: the fold stays taken until its lease is over.
-    monkeypatch.setattr(Catalogue, "release_part", lambda self, part: None)
+    monkeypatch.setattr(Parts, "release", lambda self, part: None)
     job_id = submit(service, transit, seed=11)
     catalogue = Catalogue(settings.catalogue_url)
     runner = Runner(settings, catalogue, Store(settings.data_dir))
     with pytest.raises(Killed):
         runner.run(job_id)
     threading.Event().wait(settings.lease_s + 0.2)
-    assert catalogue.give_up_silent(settings.lease_s, settings.max_attempts) == [job_id]
+    assert catalogue.jobs.give_up_silent(settings.lease_s, settings.max_attempts) == [job_id]
     runner.run(job_id)
-    row = catalogue.job(job_id)
+    row = catalogue.jobs.get(job_id)
     assert row is not None and row.phase == Phase.COMPLETED and row.attempt == 2
     finished = [fold for fold in done if fold != (-1, -1)]
     assert sorted(finished) == [(run, fold) for run in range(3) for fold in range(3)]  # each once
@@ -174,7 +175,7 @@ def test_another_worker_shares_the_folds(
     catalogue = Catalogue(settings.catalogue_url)
     Runner(settings, catalogue, Store(settings.data_dir), call_for_help).run(job_id)
     helpers[0].join()
-    row = catalogue.job(job_id)
+    row = catalogue.jobs.get(job_id)
     assert row is not None and row.phase == Phase.COMPLETED
     assert asked == [8] and "helper" in by_thread and len(by_thread) == 2
     assert sorted(fold for folds in by_thread.values() for fold in folds) == [
@@ -186,19 +187,19 @@ def test_another_worker_shares_the_folds(
 
 def test_a_part_is_done_once_whoever_tries(settings: Settings) -> None:
     catalogue = Catalogue(settings.catalogue_url)
-    catalogue.create_tables()
-    catalogue.open_parts("o", "k" * 64, 2)
-    catalogue.open_parts("o", "k" * 64, 2)
-    first, second = (catalogue.take_part("o", "k" * 64, 60.0) for _ in range(2))
+    catalogue.upgrade()
+    catalogue.parts.open("o", "k" * 64, 2)
+    catalogue.parts.open("o", "k" * 64, 2)
+    first, second = (catalogue.parts.take("o", "k" * 64, 60.0) for _ in range(2))
     assert first is not None and second is not None and (first.number, second.number) == (0, 1)
-    assert catalogue.take_part("o", "k" * 64, 60.0) is None
-    stolen = catalogue.take_part("o", "k" * 64, -1.0)  # every lease is over
+    assert catalogue.parts.take("o", "k" * 64, 60.0) is None
+    stolen = catalogue.parts.take("o", "k" * 64, -1.0)  # every lease is over
     assert stolen is not None and stolen.number == 0
-    assert not catalogue.finish_part(first, {"a": 1}) and not catalogue.part_heartbeat(first)
-    assert catalogue.finish_part(stolen, {"a": 2}) and not catalogue.finish_part(stolen, {"a": 3})
-    catalogue.release_part(second)
-    again = catalogue.take_part("o", "k" * 64, 60.0)
-    assert again is not None and again.number == 1 and catalogue.finish_part(again, {"a": 4})
-    assert catalogue.part_results("o", "k" * 64) == [{"a": 2}, {"a": 4}]
-    assert catalogue.finish_part(Part("o", "k" * 64, 9, "x"), {}) is False
+    assert not catalogue.parts.finish(first, {"a": 1}) and not catalogue.parts.heartbeat(first)
+    assert catalogue.parts.finish(stolen, {"a": 2}) and not catalogue.parts.finish(stolen, {"a": 3})
+    catalogue.parts.release(second)
+    again = catalogue.parts.take("o", "k" * 64, 60.0)
+    assert again is not None and again.number == 1 and catalogue.parts.finish(again, {"a": 4})
+    assert catalogue.parts.results("o", "k" * 64) == [{"a": 2}, {"a": 4}]
+    assert catalogue.parts.finish(Part("o", "k" * 64, 9, "x"), {}) is False
     catalogue.close()

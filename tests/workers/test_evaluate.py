@@ -18,9 +18,9 @@ from service.client import ServiceError
 from service.local import LocalService
 from tests.html_page import check_stands_alone, read_page
 from tests.transit_files import TRUTH, diffraction, write_simulated
-from workers.catalogue import ReportRow
 from workers.contract import Evaluate, ResolvedEvaluate, evaluate_identity
 from workers.settings import Settings
+from workers.tables import DEFAULT_OWNER, ReportRow
 
 
 @pytest.fixture(scope="module")
@@ -150,5 +150,7 @@ def test_reports_of_other_parameters_are_other_reports() -> None:
 
 
 def test_the_row_is_in_the_catalogue_once(service: LocalService, made: dict[str, Any]) -> None:
-    rows = service._catalogue.page(ReportRow, limit=100, transit_id=made["row"]["transit_id"])
+    rows = service._catalogue.page(
+        ReportRow, owner=DEFAULT_OWNER, limit=100, transit_id=made["row"]["transit_id"]
+    )
     assert [row.id for row in rows].count(made["row"]["id"]) == 1

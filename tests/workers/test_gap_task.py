@@ -18,9 +18,9 @@ from tests.gap_files import EDGE_GLOW, answer_at_once, write_gap
 from tests.html_page import check_stands_alone
 from tests.psfcore import small_gaps
 from workers import gap_task
-from workers.catalogue import PsfRow, ReportRow
 from workers.contract import GapDiagnose, ResolvedGapDiagnose, corrected_psf_identity, gap_identity
 from workers.settings import Settings
+from workers.tables import DEFAULT_OWNER, PsfRow, ReportRow
 
 
 def service_in(folder: Path, gap_effects: str = "") -> LocalService:
@@ -104,6 +104,21 @@ def test_the_corrected_psf_is_a_new_draft_that_names_its_parents_effects_and_the
     assert service.ask(psf["id"], "encircled", radius=10.0)
 
 
+def test_the_corrected_psf_is_made_again_and_neither_it_nor_its_report_is_there_twice(
+    service: LocalService, transit: Path, asked: list[dict[str, Any]]
+) -> None:
+    def counts() -> list[int]:
+        page = service._catalogue.page
+        return [len(page(kind, owner=DEFAULT_OWNER, limit=200)) for kind in (PsfRow, ReportRow)]  # type: ignore[type-var]
+
+    psf_id = service.diagnose_gap(transit, seed=9)["details"]["corrected_psf_id"]
+    psfs, reports = counts()
+    report = service.get(service.wait(service.submit("rerun", of="psf", id=psf_id))["result"])
+    assert [how["seed"] for how in asked] == [9, 9]
+    assert report["details"]["same"] is True, report["details"]["sentence"]
+    assert counts() == [psfs, reports + 1]
+
+
 def test_an_equal_request_is_answered_with_what_is_there(
     service: LocalService, made: dict[str, Any], transit: Path, asked: list[dict[str, Any]]
 ) -> None:
@@ -111,7 +126,9 @@ def test_an_equal_request_is_answered_with_what_is_there(
     assert asked == [] and again["id"] == made["row"]["id"]
     assert again["created_at"] == made["row"]["created_at"]
     for kind, identity in ((ReportRow, again["id"]), (PsfRow, again["details"]["corrected_psf_id"])):
-        assert [row.id for row in service._catalogue.page(kind, limit=100)].count(identity) == 1  # type: ignore[arg-type]
+        assert [row.id for row in service._catalogue.page(kind, owner=DEFAULT_OWNER, limit=100)].count(
+            identity
+        ) == 1  # type: ignore[arg-type]
 
 
 def test_a_job_that_lost_its_worker_after_the_psf_is_done_again_with_one_result(
@@ -128,7 +145,7 @@ def test_a_job_that_lost_its_worker_after_the_psf_is_done_again_with_one_result(
     monkeypatch.setattr(gap_task, "_save", once_lost)
     row = service.diagnose_gap(transit, seed=4)
     assert len(calls) == len(asked) == 2
-    psfs = [psf.id for psf in service._catalogue.page(PsfRow, limit=100)]
+    psfs = [psf.id for psf in service._catalogue.page(PsfRow, owner=DEFAULT_OWNER, limit=100)]
     assert psfs.count(row["details"]["corrected_psf_id"]) == 1
 
 
@@ -151,10 +168,10 @@ def test_a_fitted_psf_is_where_the_fit_starts_and_a_parent_of_the_next(
 def test_no_psf_is_made_where_none_is_wanted(
     service: LocalService, transit: Path, asked: list[dict[str, Any]]
 ) -> None:
-    before = len(service._catalogue.page(PsfRow, limit=100))
+    before = len(service._catalogue.page(PsfRow, owner=DEFAULT_OWNER, limit=100))
     row = service.diagnose_gap(transit, correct=False)
     assert len(asked) == 1 and row["details"]["corrected_psf_id"] is None
-    assert len(service._catalogue.page(PsfRow, limit=100)) == before
+    assert len(service._catalogue.page(PsfRow, owner=DEFAULT_OWNER, limit=100)) == before
 
 
 def test_a_psf_that_was_not_fitted_is_refused(

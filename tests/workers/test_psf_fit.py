@@ -113,6 +113,14 @@ def test_an_equal_request_is_answered_with_the_psf_that_is_there(
     assert again["id"] == fitted["psf"]["id"] and again["created_at"] == fitted["psf"]["created_at"]
 
 
+@pytest.mark.slow
+def test_a_fit_made_again_is_the_same_bit_for_bit(service: LocalService, fitted: dict[str, Any]) -> None:
+    psf_id = fitted["psf"]["id"]
+    report = service.get(service.wait(service.submit("rerun", of="psf", id=psf_id))["result"])
+    assert report["details"]["same"] is True, report["details"]["sentence"]
+    assert service.get(f"/v1/psfs/{psf_id}")["created_at"] == fitted["psf"]["created_at"]
+
+
 def test_a_deconvolution_with_it_carries_the_psfs_own_error(
     service: LocalService, fitted: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -19,13 +19,15 @@ from sqlalchemy import inspect, text
 
 from tests.whole.stack import wait_for
 from workers import logs, queue, tasks
-from workers.catalogue import Catalogue, FileTally, ImageRow, JobRow, PsfRow
+from workers.catalogue import Catalogue
+from workers.census import FileTally
 from workers.context import Context
 from workers.contract import Phase
 from workers.runner import Runner
 from workers.settings import Settings
 from workers.stopping import Stopping
 from workers.store import Store
+from workers.tables import DEFAULT_OWNER, ImageRow, JobRow, PsfRow
 
 Task = Callable[[Context, Mapping[str, Any]], str]
 
@@ -42,15 +44,15 @@ class Bench:
     def run(self, task: Task) -> JobRow:
         """The job's row after a run of it."""
         self._monkeypatch.setitem(tasks.TASKS, "psf-build", task)
-        job, _ = self.catalogue.submit("psf-build", {}, "k")
-        self.catalogue.mark_submitted(job.id)
+        job, _ = self.catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+        self.catalogue.jobs.mark_submitted(job.id)
         store = Store(self._settings.data_dir)
         Runner(self._settings, self.catalogue, store, stopping=self.stopping).run(job.id)
         return self.row(job.id)
 
     def row(self, job_id: str) -> JobRow:
         """The job's row."""
-        row = self.catalogue.job(job_id)
+        row = self.catalogue.jobs.get(job_id)
         assert row is not None
         return row
 
@@ -79,7 +81,9 @@ def test_a_job_that_lasts_is_handed_back_and_the_attempt_does_not_count(bench: B
     row = bench.run(steps_for(60.0, at_work=lambda: bench.stopping.ask(0.1)))
     assert time.monotonic() - started < 30.0
     assert (row.phase, row.attempt, row.lease) == (Phase.QUEUED, 0, None)
-    assert bench.catalogue.unsubmitted(3600.0) == [row.id], "it is submitted again at once"
+    assert [job.id for job in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], (
+        "it is submitted again at once"
+    )
     bench.stopping = Stopping()  # another worker
     row = bench.run(steps_for(0.0))
     assert (row.phase, row.attempt, row.result_id) == (Phase.COMPLETED, 1, "result")
@@ -106,12 +110,14 @@ def test_a_worker_that_stops_takes_no_job(bench: Bench) -> None:
     bench.stopping.ask(30.0)
     row = bench.run(steps_for(0.0))
     assert (row.phase, row.attempt) == (Phase.QUEUED, 0)
-    assert bench.catalogue.unsubmitted(3600.0) == [row.id], "the message is gone, so it is submitted again"
+    assert [job.id for job in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], (
+        "the message is gone, so it is submitted again"
+    )
 
 
 def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:
     def cancelled(context: Context, _: Mapping[str, Any]) -> str:
-        bench.catalogue.cancel(context.job_id)
+        bench.catalogue.jobs.cancel(context.job_id)
         bench.stopping.ask(0.0)
         return steps_for(60.0)(context, {})
 
@@ -159,31 +165,31 @@ def test_the_counts_of_files(catalogue: Catalogue) -> None:
                 file_sha256="f", bytes=3, details={},
             )
         )  # fmt: skip
-    counted = set(catalogue.tally_files())
+    counted = set(catalogue.census.tally_files())
     assert FileTally("image", "uploaded", 2, 2**41) in counted
     assert {FileTally("psf", "built", 1, 3), FileTally("psf", "uploaded", 2, 6)} <= counted
     assert FileTally("transit", "uploaded", 0, 0) in counted
 
 
 def test_the_counts_of_jobs(catalogue: Catalogue) -> None:
-    assert catalogue.tally() == [] and catalogue.oldest_queued_at() is None
-    job, _ = catalogue.submit("psf-build", {}, "a")
-    catalogue.submit("deconvolve", {}, "b")
-    lease = catalogue.claim(job.id, "w")
-    assert lease is not None and catalogue.complete(lease, "r")
-    (waiting, done) = sorted(catalogue.tally(), key=lambda tally: tally.kind)
+    assert catalogue.census.tally() == [] and catalogue.census.oldest_queued_at() is None
+    job, _ = catalogue.jobs.submit("psf-build", {}, "a", DEFAULT_OWNER)
+    catalogue.jobs.submit("deconvolve", {}, "b", DEFAULT_OWNER)
+    lease = catalogue.jobs.claim(job.id, "w")
+    assert lease is not None and catalogue.jobs.complete(lease, "r")
+    (waiting, done) = sorted(catalogue.census.tally(), key=lambda tally: tally.kind)
     assert (waiting.phase, waiting.jobs, waiting.attempts, waiting.run_s) == (Phase.QUEUED, 1, 0, 0.0)
     assert (done.phase, done.jobs, done.attempts, done.retries) == (Phase.COMPLETED, 1, 1, 0)
-    assert abs(catalogue.clock() - time.time()) < 1.0
+    assert abs(catalogue.census.clock() - time.time()) < 1.0
 
 
-def test_an_older_database_gets_the_indexes_that_it_lacks(catalogue: Catalogue) -> None:
+def test_a_database_gets_back_the_indexes_that_it_lacks(catalogue: Catalogue) -> None:
     with catalogue._engine.begin() as connection:
         connection.execute(text("DROP INDEX jobs_tallied"))
-    assert catalogue.schema_faults().indexes == ("jobs_tallied",)
-    catalogue.create_tables()
+    assert catalogue.schema.faults().indexes == ("jobs_tallied",)
+    catalogue.schema.mend()
     assert "jobs_tallied" in {index["name"] for index in inspect(catalogue._engine).get_indexes("jobs")}
-    assert catalogue.schema_faults().indexes == ()
+    assert catalogue.schema.faults().indexes == ()
 
 
 # Real processes -------------------------------------------------------------------------------------
@@ -223,8 +229,8 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://", stop_s=0.5, heartbeat_s=0.2)
     settings.data_dir.mkdir()
     catalogue = Catalogue(settings.catalogue_url)
-    catalogue.create_tables()
-    job, _ = catalogue.submit("psf-build", {}, "k")
+    catalogue.upgrade()
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     assert queue.submit(queue.make_app(settings), job.id)
     log = tmp_path / "worker.log"
     with log.open("wb") as written:
@@ -236,7 +242,7 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
         )
     try:
         wait_for(lambda: _phase(catalogue, job) == "EXECUTING", "the job is at work")
-        wait_for(lambda: len(catalogue.workers(3.0)) == 1, "the worker says that it is there")
+        wait_for(lambda: len(catalogue.census.workers(3.0)) == 1, "the worker says that it is there")
         processes = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
         worker.send_signal(signal.SIGTERM)
         told = time.monotonic()
@@ -248,17 +254,17 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
             worker.kill()
             worker.wait()
     assert code == 0 and left == [], f"{code}, {left}; {log.read_text()}"
-    row = catalogue.job(job.id)
+    row = catalogue.jobs.get(job.id)
     assert row is not None and (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
     told_of = log.read_text()
     assert ("left to another worker" in told_of) == (task == "listens"), told_of
     assert "ending now" in told_of or task == "listens", f"{took_s:.1f} s; {told_of}"
-    assert catalogue.workers(60.0) == [], "it took its leave"
+    assert catalogue.census.workers(60.0) == [], "it took its leave"
     catalogue.close()
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert any(line.get("job") == job.id for line in lines)
 
 
 def _phase(catalogue: Catalogue, job: JobRow) -> str | None:
-    row = catalogue.job(job.id)
+    row = catalogue.jobs.get(job.id)
     return row and row.phase

@@ -16,9 +16,10 @@ from service.client import ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from workers import deconvolve_task, runner, tasks
-from workers.catalogue import Catalogue, ProductRow
+from workers.catalogue import Catalogue
 from workers.contract import Phase
 from workers.settings import Settings
+from workers.tables import DEFAULT_OWNER, ProductRow
 
 
 def test_a_product_names_what_made_it_and_keeps_the_frame(
@@ -64,7 +65,7 @@ def test_a_job_redelivered_after_its_end_does_nothing(
     image_id, psf_id = local.upload_image(image_file)["id"], local.upload_psf(psf_file)["id"]
     job = local.wait(local.submit("deconvolve", image_id=image_id, psf_id=psf_id))
     local.wait(job)
-    rows = Catalogue(settings.catalogue_url).page(ProductRow, limit=10)
+    rows = Catalogue(settings.catalogue_url).page(ProductRow, owner=DEFAULT_OWNER, limit=10)
     assert len(rows) == 1
     assert local.wait(job)["attempt"] == 1
 
@@ -119,14 +120,14 @@ def test_a_cancelled_job_stops_at_its_next_step(
     def cancel_at_five(stage: str, step: int, _steps: int) -> None:
         steps.append(step)
         if (stage, step) == ("deconvolving", 5):
-            catalogue.cancel(job["id"])
+            catalogue.jobs.cancel(job["id"])
 
     with pytest.raises(ServiceError, match="cancelled"):
         local.wait(job, progress=cancel_at_five)
-    row = catalogue.job(job["id"])
+    row = catalogue.jobs.get(job["id"])
     assert row is not None and row.phase == Phase.ABORTED
     assert max(steps) == 5
-    assert catalogue.page(ProductRow, limit=1) == []
+    assert catalogue.page(ProductRow, owner=DEFAULT_OWNER, limit=1) == []
 
 
 def test_a_passing_failure_is_tried_again_and_then_given_up(
@@ -141,7 +142,7 @@ def test_a_passing_failure_is_tried_again_and_then_given_up(
     phases = []
     for _ in range(settings.max_attempts):
         local._runner.run(job["id"])
-        row = catalogue.job(job["id"])
+        row = catalogue.jobs.get(job["id"])
         assert row is not None
         phases.append(row.phase)
     assert phases == [Phase.QUEUED] * (settings.max_attempts - 1) + [Phase.ERROR]

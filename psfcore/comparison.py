@@ -1,0 +1,48 @@
+"""Two arrays that ought to be one: are they the same bit for bit, and if not, how far apart are they?"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What two arrays have in common.
+
+    largest_relative: the largest difference over the largest magnitude of the first; None where the shapes differ, or
+    one has a value where the other has none.
+    """
+
+    same: bool
+    largest_relative: float | None
+    values_that_differ: int | None  # None where the shapes differ
+    sha256: tuple[str, str]  # of the values in C order, each array's own kind of number, little end first
+
+
+def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
+    """Compare two arrays of numbers; NaN is the same as NaN."""
+    hashes = (_sha256(first), _sha256(again))
+    kinds = {array.dtype.newbyteorder("<") for array in (first, again)}
+    same = first.shape == again.shape and len(kinds) == 1 and hashes[0] == hashes[1]
+    if first.shape != again.shape:
+        return Comparison(False, None, None, hashes)
+    one, other = (np.asarray(array, dtype=np.float64) for array in (first, again))
+    differ = ~((one == other) | (np.isnan(one) & np.isnan(other)))
+    count = int(np.count_nonzero(differ))
+    if not np.array_equal(np.isfinite(one), np.isfinite(other)):
+        return Comparison(same, None, count, hashes)
+    finite = np.isfinite(one)
+    apart = float(np.abs(other[finite] - one[finite]).max(initial=0.0))
+    largest = float(np.abs(one[finite]).max(initial=0.0))
+    relative = 0.0 if apart == 0.0 else apart / largest if largest > 0.0 else None
+    return Comparison(same, relative, count, hashes)
+
+
+def _sha256(array: NDArray[Any]) -> str:
+    plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return hashlib.sha256(plain.tobytes()).hexdigest()

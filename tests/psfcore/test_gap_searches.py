@@ -1,0 +1,148 @@
+"""What is looked for before it is fitted: changes of the PSF, a turned mesh, a blur, a Sun that changes; and a second effect."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import rotate
+
+from psfcore.gap import judge as judging
+from psfcore.gap.cells import sensitivities
+from psfcore.gap.correction import add_to_model, beyond
+from psfcore.gap.effect import View
+from psfcore.gap.evidence import gather
+from psfcore.gap.judge import fitted
+from psfcore.gap.library import LIBRARY
+from psfcore.gap.linear_model import FLOOR, LinearModel
+from psfcore.gap.optics_effects import ANGLES_DEG, BLURS, DIRECTIONS, _blurred, _sought, _turned
+from psfcore.gap.search import place_search
+from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.optics import Blur
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
+from psfcore.transit.occulter import coverage
+from psfcore.transit.transit import Transit
+from tests.transit_files import TRUTH, diffraction
+
+Plane = NDArray[np.float64]
+
+
+@cache
+def clean(images: int = 18) -> Transit:
+    plan = default_plan(images, 128, oversampling=1, brightness=8.0)
+    return simulate(plan, TRUTH, diffraction(), seed=3).transit
+
+
+@cache
+def solution() -> Solution:
+    return invert(clean())
+
+
+def effect(name: str):  # type: ignore[no-untyped-def]
+    return next(one for one in LIBRARY if one.name == name)
+
+
+def test_a_change_of_the_psf_moves_the_discs_as_its_sum_over_displacements_says() -> None:
+    view, rng = View(solution()), np.random.default_rng(1)
+    kernel = rng.normal(size=(31, 31))
+    search, blur = place_search(view), Blur(kernel, solution().transit.shape)
+    half = search._to_displacements.shape[1] // 2
+    window = search._to_displacements[:, half - 15 : half + 16, half - 15 : half + 16]
+    for k, n in enumerate(solution().part[:4]):
+        dark = solution().sky.dark[n]
+        (plane,) = sensitivities(solution().optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
+        moved = float(np.vdot(plane, view.blurred(n, blur)))
+        assert float(np.vdot(window[k], kernel)) == pytest.approx(moved, rel=2e-3, abs=1e-4)
+    assert place_search(view) is search
+
+
+def test_a_blur_is_nowhere_negative_and_as_wide_as_it_says() -> None:
+    point = np.zeros((63, 63))
+    point[31, 31] = 1.0
+    y, x = np.indices(point.shape) - 31
+    for width, steps in BLURS:
+        seen = _blurred(point, width, steps)
+        assert seen.min() > -1e-12 and seen.sum() == pytest.approx(1.0)
+        # Along its own direction; an even one along any.
+        dy, dx = steps[0]
+        along = (y * dy + x * dx) / np.hypot(dy, dx)
+        assert float((seen * along**2).sum()) == pytest.approx(width**2, rel=1e-6)
+    assert {steps for _, steps in BLURS} == set(DIRECTIONS)
+
+
+@cache
+def cross() -> Plane:
+    """A core with orders along a cross that is 3 to 45 px from it, 127 px, sum 1."""
+    plane = np.zeros((127, 127))
+    for r in range(3, 46, 3):
+        plane[63, 63 + r] = plane[63, 63 - r] = plane[63 + r, 63] = plane[63 - r, 63] = 1 / r
+    plane *= 0.3 / plane.sum()
+    plane[63, 63] = 0.7
+    return plane
+
+
+def test_a_turned_mesh_is_found_at_its_angle() -> None:
+    """Turned by more than its orders are wide: what a derivative cannot tell."""
+    plan = default_plan(12, 128, oversampling=1, brightness=8.0)
+    turned = np.maximum(rotate(cross(), 12.0, reshape=False, order=1), 0.0)
+    transit = simulate(plan, TRUTH, turned / turned.sum(), seed=4).transit
+    view = View(invert(replace(transit, diffraction=cross())))
+    assert _sought(view, _turned, ANGLES_DEG) == pytest.approx(12.0, abs=2.0)
+
+
+def brightening(share: float) -> Transit:
+    """A patch of the first pointing brightens by a share in its images' time; behind the occulter it does not show."""
+    transit = clean()
+    first = [frame for frame in transit.frames if frame.fov == 1]
+    start, end = first[0].time_s, first[-1].time_s
+    y, x = np.indices(transit.shape)
+    patch = np.exp(-((y - 90) ** 2 + (x - 40) ** 2) / (2 * 15**2))
+    frames = []
+    for frame in transit.frames:
+        at = (frame.time_s - start) / (end - start) - 0.5 if frame.fov == 1 else 0.0
+        seen = 1 + share * at * patch * (1 - coverage(transit.shape, frame.place))
+        frames.append(replace(frame, pixels=(frame.pixels * seen).astype(np.float32)))
+    return replace(transit, frames=tuple(frames))
+
+
+@pytest.mark.parametrize(("share", "seen"), [(0.0, False), (1.0, True)])
+def test_a_sun_that_changes_shows_in_the_lit_parts_alone(share: float, seen: bool) -> None:
+    evidence = gather(invert(brightening(share)), [effect("scene_evolution")])
+    columns = evidence.columns["scene_evolution"]
+    assert all((disc.answers[list(columns)] == 0).all() for disc in evidence.discs)
+    model = LinearModel(evidence, FLOOR)
+    tried = fitted(model, evidence.effects)
+    # It pays for every number that was taken from the lit parts, and for no more than these have.
+    assert 10 < evidence.numbers_of(columns) < evidence.whole_lit.freedom
+    assert (tried.p_value < 1e-6, tried.score > 0) == (seen, seen)
+    # It changed evenly: the uneven part is not worth its numbers.
+    assert set(tried.values) == ({"rms"} if seen else set())
+
+
+def test_beside_an_effect_that_explains_the_lit_parts_a_second_is_found_in_the_discs() -> None:
+    """A difference of gain, which the discs hide, and a light leak, which they alone show."""
+    transit = clean()
+    x = np.indices(transit.shape)[1] / 128 - 0.5
+    frames = tuple(
+        replace(
+            frame,
+            pixels=(
+                (frame.pixels + 6.0 + 20.0 * x) * (1.1 if (frame.gain_mode or "") == "combined" else 1.0)
+            ).astype(np.float32),
+        )
+        for frame in transit.frames
+    )
+    found = invert(replace(transit, frames=frames))
+    library = [effect(name) for name in ("gain_mismatch", "intensity_gradient", "dark_offset", "core_blur")]
+    model = LinearModel(gather(found, library), FLOOR)
+    best = fitted(model, [library[0]])
+    added = add_to_model(found, [library[0]], best, model)
+    second = judging._beside(model, best, lambda tried: beyond(added, library, model))
+    assert second is not None and second.verdict == "attributed"
+    assert second.answer == ("gain_mismatch", "intensity_gradient")
+    nothing = judging._beside(model, best, judging.no_refit)
+    assert nothing is None

@@ -1,0 +1,336 @@
+"""Requests and files that attack the service, as a table: what is sent, and what is to be answered."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import stat
+import tarfile
+import warnings
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+from tests.fits_bombs import lying_tiles, padded
+
+MIB = 2**20
+JSON = {"Content-Type": "application/json"}
+A = "a" * 64
+DEEP = 20_000
+
+
+@dataclass(frozen=True)
+class Attack:
+    """A request with ann's key, where it brings no other, and the refusal that it is to get."""
+
+    name: str
+    status: int
+    code: str
+    method: str = "POST"
+    address: str = "/v1/jobs"
+    headers: dict[str, str] = field(default_factory=dict)
+    content: Callable[[], bytes] | None = None
+    json: Any = None
+
+
+def job(name: str, status: int, code: str, kind: str, **parameters: Any) -> Attack:
+    """A job that cannot be."""
+    return Attack(name, status, code, json={"kind": kind, "parameters": parameters})
+
+
+def body(name: str, status: int, code: str, content: bytes, **more: Any) -> Attack:
+    """A body that is no request."""
+    return Attack(name, status, code, content=lambda: content, headers=JSON, **more)
+
+
+def got(name: str, status: int, code: str, address: str, **headers: str) -> Attack:
+    """An address that is none."""
+    return Attack(
+        name, status, code, "GET", address, headers={k.replace("_", "-"): v for k, v in headers.items()}
+    )
+
+
+def image(name: str, status: int, code: str, make: Callable[[], bytes]) -> Attack:
+    """A file that is no image."""
+    return Attack(name, status, code, address="/v1/images", content=make)
+
+
+def transit(name: str, status: int, code: str, make: Callable[[], bytes]) -> Attack:
+    """An archive that is no transit."""
+    return Attack(name, status, code, address="/v1/transits", content=make)
+
+
+# Files of FITS --------------------------------------------------------------------------------------
+
+
+def cards(*lines: str) -> bytes:
+    """A header of these cards."""
+    return padded(b"".join(line.ljust(80).encode() for line in (*lines, "END")), b" ")
+
+
+def primary(bitpix: object = 16, *axes: object, more: tuple[str, ...] = ()) -> bytes:
+    """The header of an image."""
+    sizes = [f"NAXIS{n:<3}= {axis:>20}" for n, axis in enumerate(axes, 1)]
+    return cards(
+        "SIMPLE  =                    T",
+        f"BITPIX  = {bitpix:>20}",
+        f"NAXIS   = {len(axes):>20}",
+        *sizes,
+        *more,
+    )
+
+
+def written(*hdus: Any) -> bytes:
+    """The HDUs as a file."""
+    file = io.BytesIO()
+    fits.HDUList(list(hdus)).writeto(file)
+    return file.getvalue()
+
+
+def tiles(px: int, codec: str = "GZIP_1") -> bytes:
+    """An honest file of zeros in compressed tiles: px * px pixels of 16 bits, a tile a row, all of one stream."""
+    stream = gzip.compress(bytes(2 * px))
+    rows = np.zeros(px, dtype=[("COMPRESSED_DATA", ">i4", (2,))])
+    rows["COMPRESSED_DATA"][:, 0] = len(stream)
+    header = fits.open(io.BytesIO(lying_tiles(stream)), disable_image_compression=True)[1].header
+    header.update(NAXIS2=px, PCOUNT=len(stream), ZNAXIS1=px, ZNAXIS2=px, ZTILE1=px, ZCMPTYPE=codec)
+    return (
+        fits.PrimaryHDU().header.tostring().encode()
+        + header.tostring().encode()
+        + padded(rows.tobytes() + stream)
+    )
+
+
+def changed_tiles(**changes: object) -> bytes:
+    """A small file of tiles whose header says something else."""
+    content = lying_tiles(gzip.compress(bytes(128)))
+    for key, value in changes.items():
+        at = content.index(f"{key:<8}=".encode())
+        content = content[:at] + f"{key:<8}= {value!s:>20}".ljust(80).encode() + content[at + 80 :]
+    return content
+
+
+def long_header(mib: int) -> bytes:
+    """Cards without end."""
+    return primary(16, 8, 8)[:400] + b"COMMENT x".ljust(80) * (mib * MIB // 80)
+
+
+EMPTY_IMAGE = cards(
+    "XTENSION= 'IMAGE   '", "BITPIX  =                    8", "NAXIS   =                    0"
+)
+FILES = [
+    image("half a megabyte of tiles for 537 of pixels", 422, "too-many-pixels", lambda: tiles(16384)),
+    image("tiles of a codec that is not taken", 422, "codec-not-allowed", lambda: tiles(64, "HCOMPRESS_1")),
+    image("tiles of a codec there is not", 422, "codec-not-allowed", lambda: tiles(64, "ZIP_99")),
+    image("tiles of no size", 422, "bad-tiles", lambda: changed_tiles(ZTILE1=0)),
+    image("tiles larger than any image", 422, "bad-tiles", lambda: changed_tiles(ZTILE1=2**31)),
+    image("tiles that are fewer than said", 422, "bad-tiles", lambda: changed_tiles(ZNAXIS2=65)),
+    image("tiles of negative pixels", 422, "bad-card", lambda: changed_tiles(ZNAXIS1=-64)),
+    image("tiles of 5 bits", 422, "bad-card", lambda: changed_tiles(ZBITPIX=5)),
+    image("a heap that is not there", 422, "truncated-data", lambda: changed_tiles(PCOUNT=10**9)),
+    image("60000 x 60000 pixels", 422, "too-many-pixels", lambda: primary(16, 60_000, 60_000)),
+    image("2^40 x 2^40 pixels", 422, "too-many-pixels", lambda: primary(8, 2**40, 2**40)),
+    image("pixels beyond counting", 422, "bad-card", lambda: primary(8, 10**30, 10**30)),
+    image("negative pixels", 422, "bad-card", lambda: primary(8, -64, 64)),
+    image("no pixels", 422, "zero-size", lambda: primary(8, 0, 64)),
+    image("999 axes", 422, "not-2d", lambda: primary(8, *([1] * 999)) + bytes(2880)),
+    image("1000 axes", 422, "bad-card", lambda: cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = 1000")),
+    image("negative axes", 422, "bad-card", lambda: cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = -2")),
+    image("pixels of 7 bits", 422, "bad-card", lambda: primary(7, 64, 64) + bytes(8640)),
+    image("pixels of a word of bits", 422, "bad-card", lambda: primary("'many'", 64, 64) + bytes(8640)),
+    image("two widths", 422, "bad-card", lambda: primary(8, 64, 64, more=("NAXIS1  =                   32",)) + bytes(8640)),
+    image("a size larger than the file", 422, "truncated-data", lambda: primary(16, 512, 512) + bytes(2880)),
+    image("a header without end", 422, "truncated-header", lambda: primary(16, 64, 64)[:400]),
+    image("6 MB of cards", 422, "header-too-long", lambda: long_header(6)),
+    image("100 MB of cards in gzip", 422, "header-too-long", lambda: gzip.compress(long_header(100), 1)),
+    image("thousands of HDUs", 422, "too-many-hdus", lambda: cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = 0") + 2500 * EMPTY_IMAGE),
+    image("gzip that declares 300 GB", 422, "too-many-bytes", lambda: gzip.compress(primary(8, 10**5, 10**5, 30) + bytes(10**6))),
+    image("gzip of gzip", 422, "not-fits", lambda: gzip.compress(gzip.compress(primary(8, 8, 8)))),
+    image("gzip that breaks off", 422, "truncated-gzip", lambda: gzip.compress(np.random.default_rng(0).bytes(99_999))[:2000]),
+    image("gzip that is none", 422, "bad-gzip", lambda: b"\x1f\x8b" + b"\xff" * 5000),
+    image("an image in a zip", 415, "not-fits", lambda: zipped(("x.fits", primary(8, 8, 8) + bytes(2880)))),
+    image("an image in bzip2", 415, "not-fits", lambda: b"BZh91AY&SY" + bytes(100)),
+    image("letters above ASCII in the header", 422, "bad-card", lambda: primary(8, 64, 64).replace(b"64  ", b"\xff\xfe\xfd ", 1)),
+    image("a script", 415, "not-fits", lambda: b"#!/bin/sh\nrm -rf /\n" * 500),
+    image("markup", 415, "not-fits", lambda: b"<svg onload=alert(1)>" * 200),
+    image("more than may be sent", 413, "too-large", lambda: b"SIMPLE  =" + bytes(9 * MIB)),
+    image("nothing", 400, "empty-upload", lambda: b""),
+    image("a cube", 422, "three-axes", lambda: written(fits.PrimaryHDU(np.zeros((2, 8, 8), "u1")))),
+    image("random groups", 422, "random-groups", lambda: primary(8, 8, 64, more=("GROUPS  =                    T",)) + bytes(2880)),
+]  # fmt: skip
+
+
+# Archives -------------------------------------------------------------------------------------------
+
+SMALL_FITS = primary(8, 8, 8) + bytes(2880)
+
+
+def manifest(**changes: Any) -> bytes:
+    """The transit.json of one image."""
+    entry = {"file": "0.fits", "fov": 1, "x": 4.0, "y": 4.0, "r": 2.0}
+    content = {"schema": "transit/1", "instrument": "hri_euv", "images": [entry]}
+    return json.dumps(content | changes).encode()
+
+
+def zipped(*members: tuple[str | zipfile.ZipInfo, bytes]) -> bytes:
+    """A .zip of these."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # names that stand twice
+        for name, content in members:
+            archive.writestr(name, content)
+    return file.getvalue()
+
+
+def transit_zip(*more: tuple[str | zipfile.ZipInfo, bytes], **changes: Any) -> bytes:
+    """The archive of a transit with more in it."""
+    return zipped(("transit.json", manifest(**changes)), ("0.fits", SMALL_FITS), *more)
+
+
+def linked(target: str) -> zipfile.ZipInfo:
+    """A symbolic link, as a zip has it."""
+    info = zipfile.ZipInfo("link.fits")
+    info.create_system, info.external_attr = 3, (stat.S_IFLNK | 0o777) << 16
+    return info
+
+
+def tarred(
+    name: str, *, kind: bytes = tarfile.REGTYPE, link: str = "", content: bytes = b"x", mode: str = "w"
+) -> bytes:
+    """A .tar of a transit, and one more member."""
+    file = io.BytesIO()
+    with tarfile.open(fileobj=file, mode=mode) as archive:  # type: ignore[call-overload]
+        for one, of in (("transit.json", manifest()), ("0.fits", SMALL_FITS), (name, content)):
+            info = tarfile.TarInfo(one)
+            info.size = len(of)
+            if one == name:
+                info.type, info.linkname = kind, link
+                info.size = len(of) if kind == tarfile.REGTYPE else 0
+            archive.addfile(info, io.BytesIO(of) if info.size else None)
+    return file.getvalue()
+
+
+def lying_tar() -> bytes:
+    """A member that says it is of 2^60 bytes."""
+    content = bytearray(tarred("b.fits"))
+    at = content.rindex(b"b.fits")
+    info = tarfile.TarInfo("b.fits")
+    info.size = 2**60
+    content[at : at + 512] = info.tobuf(tarfile.GNU_FORMAT)
+    return bytes(content)
+
+
+ARCHIVES = [
+    transit("a name that climbs, zip", 422, "archive-climbs", lambda: transit_zip(("../x.fits", b"x"))),
+    transit("a name that climbs from within", 422, "archive-climbs", lambda: transit_zip(("a/../../x.fits", b"x"))),
+    transit("an absolute name, zip", 422, "archive-climbs", lambda: transit_zip(("/etc/passwd", b"x"))),
+    transit("a name with a drive", 422, "archive-climbs", lambda: transit_zip(("C:/x.fits", b"x"))),
+    transit("a name with backslashes", 422, "archive-climbs", lambda: transit_zip(("..\\x.fits", b"x"))),
+    transit("a name that climbs, tar", 422, "archive-climbs", lambda: tarred("../../x.fits")),
+    transit("an absolute name, tar", 422, "archive-climbs", lambda: tarred("/etc/cron.d/x")),
+    transit("a name of many folders", 422, "archive-not-plain", lambda: tarred("a/" * 500 + "x.fits")),
+    transit("a name twice", 422, "archive-not-plain", lambda: transit_zip(("0.fits", b"x"))),
+    transit("a name of NUL", 422, "archive-not-plain", lambda: tarred("x\n.fits")),
+    transit("a symbolic link, zip", 422, "archive-not-plain", lambda: transit_zip((linked("/etc/passwd"), b"/etc/passwd"))),
+    transit("a symbolic link, tar", 422, "archive-not-plain", lambda: tarred("l.fits", kind=tarfile.SYMTYPE, link="/etc/passwd")),
+    transit("a hard link, tar", 422, "archive-not-plain", lambda: tarred("l.fits", kind=tarfile.LNKTYPE, link="../../x")),
+    transit("a device", 422, "archive-not-plain", lambda: tarred("l.fits", kind=tarfile.CHRTYPE)),
+    transit("a pipe", 422, "archive-not-plain", lambda: tarred("l.fits", kind=tarfile.FIFOTYPE)),
+    transit("a zip of 100 MB of zeros", 413, "archive-too-large", lambda: transit_zip(("b.fits", bytes(100 * MIB)))),
+    transit("a tar.gz of 100 MB of zeros", 413, "archive-too-large", lambda: tarred("b.fits", content=bytes(100 * MIB), mode="w:gz")),
+    transit("a member of 2^60 bytes", 413, "archive-too-large", lying_tar),
+    transit("20000 members", 413, "archive-too-large", lambda: transit_zip(*((f"{n}.x", b"") for n in range(20_000)))),
+    transit("gzip of no tar", 415, "not-an-archive", lambda: gzip.compress(bytes(10 * MIB))),
+    transit("a zip that breaks off", 422, "archive-broken", lambda: transit_zip()[:-30]),
+    transit("no transit.json", 422, "no-manifest", lambda: zipped(("0.fits", SMALL_FITS))),
+    transit("a transit.json that names a path", 422, "bad-manifest", lambda: transit_zip(known_psf="../../etc/passwd")),
+    transit("a transit.json that names what is not there", 422, "missing-file", lambda: transit_zip(known_psf="k.fits")),
+    transit("a transit.json of lists in lists", 422, "bad-manifest", lambda: zipped(("transit.json", b"[" * DEEP))),
+    transit("a transit.json of 20 MB", 422, "bad-manifest", lambda: zipped(("transit.json", b" " * 20 * MIB))),
+    transit("a transit.json of NaN", 422, "bad-manifest", lambda: transit_zip(noise={"photon_gain_dn": float("nan"), "read_noise_dn": 1})),
+    transit("an image that is none", 422, "not-fits", lambda: zipped(("transit.json", manifest()), ("0.fits", b"<html>"))),
+]  # fmt: skip
+
+
+# Requests -------------------------------------------------------------------------------------------
+
+FORM = {"Content-Type": "multipart/form-data; boundary=x"}
+PART = b'--x\r\nContent-Disposition: form-data; name="%s"\r\n\r\n'
+
+
+def form(name: str, content: bytes, kind: str = FORM["Content-Type"], code: str = "bad-form") -> Attack:
+    """An upload's form that is none."""
+    return Attack(
+        name, 400, code, address="/v1/images", headers={"Content-Type": kind}, content=lambda: content
+    )
+
+
+REQUESTS = [
+    body("no JSON", 422, "invalid-request", b"kind=deconvolve"),
+    body("lists in lists", 400, "http-400", b"[" * DEEP),
+    body("objects in objects", 400, "http-400", b'{"kind":' * DEEP + b"1" + b"}" * DEEP),
+    body("a number of 5000 digits", 400, "http-400", b'{"kind":' + b"9" * 5000 + b"}"),
+    body("no UTF-8", 400, "http-400", b'{"kind":"\xff\xfe"}'),
+    body("half a character", 422, "invalid-request", b'{"kind":"\\ud800","parameters":{}}'),
+    body("NaN", 422, "invalid-request", b'{"kind":"deconvolve","parameters":{"image_id":"%s","saturation_dn":NaN}}' % A.encode()),
+    body("infinity", 422, "invalid-request", b'{"kind":"deconvolve","parameters":{"image_id":"%s","saturation_dn":1e999}}' % A.encode()),
+    body("20 MB of JSON", 413, "too-large", b'"' + b"x" * 20 * MIB + b'"'),
+    Attack("JSON that says it is text", 422, "invalid-request", content=lambda: b'{"kind":"psf-build"}', headers={"Content-Type": "text/plain"}),
+    job("a kind that is code", 422, "invalid-request", "__import__('os').system('true')"),
+    job("a parameter more", 422, "invalid-request", "psf-build", instrument="hri_euv", callback="http://evil.example/"),
+    job("an instrument that is a path", 422, "unknown-instrument", "psf-build", instrument="../../../etc/passwd"),
+    job("an instrument that is an address", 422, "unknown-instrument", "psf-build", instrument="http://169.254.169.254/"),
+    job("an instrument of NUL", 422, "unknown-instrument", "psf-build", instrument="hri_euv\0"),
+    job("an image that is a path", 422, "invalid-request", "deconvolve", image_id="../" * 20 + "etc/passwd"),
+    job("an image that was not uploaded", 404, "no-such-image", "deconvolve", image_id=A),
+    job("a transit that was not uploaded", 404, "no-such-transit", "psf-fit", transit_id=A),
+    job("steps without end", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "linear", "steps": 10**9}),
+    job("a margin without end", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "linear", "margin_px": 10**9}),
+    job("draws without end", 422, "invalid-request", "deconvolve", image_id=A, error_draws=10**9),
+    job("a PSF without end", 422, "invalid-request", "psf-build", instrument="hri_euv", size=2**31),
+    job("TOML: lists in lists", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "[" * DEEP),
+    job("TOML: tables in tables", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "{b=" * DEEP),
+    job("TOML: a key of 30000 parts", 422, "bad-instrument-file", "psf-build", instrument_file=".".join("a" * 30_000) + " = 1"),
+    job("TOML: a table of 30000 parts", 422, "bad-instrument-file", "psf-build", instrument_file="[" + " . ".join("a" * 15_000) + "]"),
+    job("TOML: a number of 60000 digits", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "9" * 60_000),
+    body("TOML: half a character", 422, "invalid-request", b'{"kind":"psf-build","parameters":{"instrument_file":"\\ud800"}}'),
+    job("TOML: more than fits", 422, "invalid-request", "psf-build", instrument_file="#" * 70_000),
+    form("a form without boundary", b"--x\r\n", kind="multipart/form-data"),
+    form("a form with a boundary of 5000", b"--x\r\n", kind="multipart/form-data; boundary=" + "x" * 5000),
+    form("a form without a file", PART % b"other" + b"1\r\n--x--\r\n"),
+    form("a form of 20000 parts", PART % b"other" + b"1\r\n" + 20_000 * (PART % b"o" + b"1\r\n") + b"--x--\r\n"),
+    form("a part with a name of 2 MB", PART % (b"n" * 2 * MIB) + b"1\r\n--x--\r\n"),
+    form("a part with 200000 headers", b"--x\r\n" + b"A: b\r\n" * 200_000 + b"\r\n1\r\n--x--\r\n"),
+    form("a form that breaks off", PART % b"file" + b"SIMPLE  =", code="upload-ended-early"),
+    got("an id that climbs", 404, "http-404", "/v1/images/..%2f..%2fetc%2fpasswd"),
+    got("an id that climbs in a download", 404, "http-404", "/v1/products/..%2f..%2fcatalogue.sqlite/file"),
+    got("an id of dots", 422, "invalid-request", "/v1/products/%2e%2e/file"),
+    got("an id of NUL", 422, "invalid-request", "/v1/images/%00"),
+    got("an id with a line end", 422, "invalid-request", "/v1/images/%0d%0aSet-Cookie:x=1"),
+    got("an id of 9000 letters", 422, "invalid-request", "/v1/images/" + "a" * 9000),
+    got("an id in capitals", 422, "invalid-request", "/v1/images/" + "A" * 64),
+    got("a page without end", 422, "invalid-request", "/v1/jobs?limit=1000000"),
+    got("a page of 5000 digits", 422, "invalid-request", "/v1/jobs?limit=" + "9" * 5000),
+    got("a cursor of ours it is not", 422, "bad-cursor", "/v1/jobs?cursor=%FF%00"),
+    got("a cursor to infinity", 422, "bad-cursor", "/v1/jobs?cursor=aW5mIHg="),
+    got("a cursor of SQL", 422, "bad-cursor", "/v1/jobs?cursor=MSAnOyBEUk9QIFRBQkxFIGpvYnM="),
+    got("a name of control letters", 422, "invalid-request", "/v1/psfs?name=%1b%5b31m"),
+    got("a host of another's", 421, "host-not-served", "/v1/jobs", Host="evil.example"),
+    Attack("a page of another site", 403, "cross-site", address="/v1/jobs", headers={"Origin": "http://evil.example"}, content=lambda: b"{}"),
+    Attack("a word that is no method", 405, "http-405", "BREW", "/v1/jobs"),
+    Attack("an upload to where there is none", 405, "http-405", "PUT", "/v1/images"),
+    got("no key", 401, "no-key", "/v1/jobs", Authorization=""),
+    got("a key of nonsense", 401, "bad-key", "/v1/jobs", Authorization="Bearer ' OR 1=1 --"),
+    got("a key of a megabyte", 401, "bad-key", "/v1/jobs", Authorization="Bearer hpsf_" + "a" * MIB),
+    got("a password that is no base64", 401, "bad-key", "/v1/jobs", Authorization="Basic %%%"),
+    got("another's name", 403, "scope-missing", "/v1/jobs", X_Owner="bob"),
+    got("the metrics", 403, "scope-missing", "/metrics"),
+]  # fmt: skip
+
+BOMBS = [*FILES, *ARCHIVES]
+TABLE = [*REQUESTS, *BOMBS]

@@ -1,0 +1,358 @@
+"""PSFs in versions over HTTP: certified, looked up, pinned, followed by others; what that means for images and products."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from httpx import Response
+
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.service.conftest import upload
+
+SEEN = {"TELESCOP": "SOLO/EUI/HRI_EUV", "DETECTOR": "HRI_EUV", "WAVELNTH": 174.0}
+
+
+@pytest.fixture
+def psfs(api: TestClient, tmp_path: Path) -> list[str]:
+    """Ids of three drafts of one line, uploaded, and of one of another."""
+    ids = []
+    for size, channel in ((32, "174"), (48, "174"), (64, "174"), (80, "304")):
+        write_psf(tmp_path / f"p{size}.fits", size=size)
+        query = {"name": f"p{size}", "instrument": "hri_euv", "channel": channel, "kind": "total"}
+        content = (tmp_path / f"p{size}.fits").read_bytes()
+        answer = api.post("/v1/psfs", params=query, content=content)
+        assert answer.status_code == 201, answer.text
+        ids.append(answer.json()["id"])
+    return ids
+
+
+def certify(api: TestClient, psf_id: str, version: str | None, *years: int | None, **more: Any) -> Response:
+    times = [None if year is None else f"{year}-01-01T00:00:00Z" for year in years]
+    given = dict(zip(("valid_from", "valid_to"), times, strict=False))
+    return api.post(
+        f"/v1/psfs/{psf_id}/status", json={"status": "certified", "version": version, **given, **more}
+    )
+
+
+def problem(answer: Response, status: int, code: str) -> str:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert answer.json()["type"] == f"urn:heliopsf:{code}", answer.text
+    return str(answer.json()["detail"])
+
+
+def test_a_psf_s_life(api: TestClient, psfs: list[str]) -> None:
+    first, second, *_ = psfs
+    before = api.get(f"/v1/psfs/{first}/status").json()
+    assert (before["status"], before["may_become"], before["next_version"]) == (
+        "draft",
+        ["certified"],
+        "1.0.0",
+    )
+    assert before["line"] == "hri_euv/174/total" and before["history"] == []
+
+    answer = certify(api, first, "1.0.0", 2020, None, reason="the first good one")
+    assert answer.status_code == 200, answer.text
+    said = answer.json()
+    assert (said["status"], said["version"], said["valid_from"], said["valid_to"]) == (
+        "certified", "1.0.0", "2020-01-01T00:00:00Z", None,
+    )  # fmt: skip
+    assert said["next_version"] == "1.1.0"
+    seen = api.get(f"/v1/psfs/{first}").json()
+    assert (seen["status"], seen["version"], seen["kind"]) == ("certified", "1.0.0", "total")
+
+    detail = problem(certify(api, second, "1.1.0", 2021, None), 409, "ranges-overlap")
+    assert first in detail and "[2020-01-01T00:00:00Z, open)" in detail
+    assert certify(api, second, "2.0.0", 2020, None, supersedes=[first], reason="better").status_code == 200
+    old = api.get(f"/v1/psfs/{first}/status").json()
+    assert (old["status"], old["successor"]) == ("deprecated", second)
+    assert [(one["status_before"], one["status"], one["reason"]) for one in old["history"]] == [
+        ("draft", "certified", "the first good one"),
+        ("certified", "deprecated", "better"),
+    ]
+    assert all(one["by"] and one["at"] > 1e9 for one in old["history"])
+
+
+CHANGES = [
+    ({"status": "deprecated"}, 409, "wrong-transition"),
+    ({"status": "draft"}, 409, "wrong-transition"),
+    ({"status": "certified"}, 422, "version-missing"),
+    ({"status": "certified", "version": "1"}, 422, "bad-version"),
+    ({"status": "certified", "version": "1.0.0", "valid_from": "2021-01-01", "valid_to": "2020-01-01"}, 422, "empty-range"),
+    ({"status": "certified", "version": "1.0.0", "valid_from": "2021-13-01"}, 422, "bad-time"),
+    ({"status": "certified", "version": "1.0.0", "valid_from": "last year"}, 422, "invalid-request"),
+    ({"status": "certified", "version": "1.0.0", "valid_from": 2021}, 422, "invalid-request"),
+    ({"status": "certified", "version": "1.0.0", "successor": "0" * 64}, 422, "not-of-this-change"),
+    ({"status": "certified", "version": "1.0.0", "supersedes": ["0" * 64]}, 409, "not-to-supersede"),
+    ({"status": "certified", "version": "1.0.0", "supersedes": ["x"]}, 422, "invalid-request"),
+    ({"status": "certified", "version": "1.0.0", "channel": "304"}, 409, "line-known"),
+    ({"status": "certified", "version": "1.0.0", "kind": "A B"}, 422, "invalid-request"),
+    ({"status": "certified", "version": "1.0.0", "reason": "x" * 401}, 422, "invalid-request"),
+    ({"status": "certified", "version": "1.0.0", "reason": "a\x00b"}, 422, "invalid-request"),
+    ({"status": "certified", "version": "1.0.0", "valid_from": "0001-01-01T00:00+23:59"}, 422, "bad-time"),
+    ({"status": "certified", "version": "1.0.0", "valid_to": "9999-12-31T23:59:59.999999999"}, 422, "bad-time"),
+    ({"status": "released", "version": "1.0.0"}, 422, "invalid-request"),
+    ({"status": "certified", "version": "1.0.0", "approved_by": "me"}, 422, "invalid-request"),
+    ({"version": "1.0.0"}, 422, "invalid-request"),
+    ([], 422, "invalid-request"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "status", "code"), CHANGES, ids=[json.dumps(c[0])[:60] for c in CHANGES])
+def test_changes_that_cannot_be(api: TestClient, psfs: list[str], body: Any, status: int, code: str) -> None:
+    problem(api.post(f"/v1/psfs/{psfs[0]}/status", json=body), status, code)
+    now = api.get(f"/v1/psfs/{psfs[0]}/status").json()
+    assert now["status"] == "draft" and now["history"] == []
+
+
+def test_a_psf_that_is_not_there(api: TestClient) -> None:
+    for tail in ("status", "lineage", "affected"):
+        problem(api.get(f"/v1/psfs/{'0' * 64}/{tail}"), 404, "no-such-psf")
+    problem(certify(api, "0" * 64, "1.0.0"), 404, "no-such-psf")
+    problem(api.post(f"/v1/psfs/{'0' * 64}/rerun"), 404, "no-such-psf")
+    problem(api.get(f"/v1/products/{'0' * 64}/lineage"), 404, "no-such-product")
+    problem(api.get(f"/v1/images/{'0' * 64}/psf"), 404, "no-such-image")
+
+
+def test_lists_by_what_psfs_are_and_when_they_hold(api: TestClient, psfs: list[str]) -> None:
+    certify(api, psfs[0], "1.0.0", 2020, 2021)
+    certify(api, psfs[1], "1.1.0", 2021, 2022)
+    certify(api, psfs[3], "1.0.0", 2020, None)
+
+    def ids(**query: str) -> list[str]:
+        answer = api.get("/v1/psfs", params=query)
+        assert answer.status_code == 200, answer.text
+        return [item["id"] for item in answer.json()["items"]]
+
+    assert ids() == psfs[::-1]
+    assert ids(status="draft") == [psfs[2]]
+    assert ids(channel="304") == [psfs[3]]
+    assert ids(instrument="hri_euv", channel="174", kind="total", status="certified") == [psfs[1], psfs[0]]
+    assert ids(version="1.0.0") == [psfs[3], psfs[0]]
+    assert ids(valid_at="2020-12-31T23:59:59Z") == [psfs[3], psfs[0]]
+    assert ids(valid_at="2021-01-01", channel="174") == [psfs[1]]
+    assert ids(name="p64") == [psfs[2]] and ids(instrument="aia") == []
+    api.post("/v1/contexts", json={"name": "c"})
+    certify(api, psfs[2], "1.2.0", 2022, 2023)
+    assert ids(context="c") == [psfs[3], psfs[1], psfs[0]]
+    assert ids(context="now") == psfs[::-1]
+    assert ids(context="c", valid_at="2021-06-01") == [psfs[3], psfs[1]]
+    problem(api.get("/v1/psfs", params={"context": "d"}), 404, "no-such-context")
+    for query in (
+        {"valid_at": "2020"},
+        {"valid_at": "5"},
+        {"status": "released"},
+        {"valid_at": "2020-01-01", "status": "draft"},
+    ):
+        assert api.get("/v1/psfs", params=query).status_code == 422, query
+    first = api.get("/v1/psfs", params={"channel": "174", "limit": 2}).json()
+    assert [item["id"] for item in api.get(first["next"]).json()["items"]] == [psfs[0]]
+
+
+def test_the_best_is_one_or_says_why_not(api: TestClient, psfs: list[str]) -> None:
+    certify(api, psfs[0], "1.0.0", 2020, 2021)
+    certify(api, psfs[1], "1.1.0", 2021, 2022)
+    line = {"instrument": "hri_euv", "channel": "174", "kind": "total"}
+    one = api.get("/v1/psfs/best", params={**line, "valid_at": "2021-06-01T00:00"}).json()
+    assert (one["psf"]["id"], one["context"], one["valid_at"]) == (psfs[1], None, "2021-06-01T00:00:00Z")
+    several = api.get("/v1/psfs/best", params=line)
+    detail = problem(several, 409, "several-psfs-fit")
+    assert {one["id"] for one in several.json()["candidates"]} == set(psfs[:2])
+    assert psfs[0] in detail and psfs[1] in detail and "narrow it" in detail
+    detail = problem(api.get("/v1/psfs/best", params={**line, "valid_at": "2030-01-01"}), 404, "no-psf-fits")
+    assert (
+        "of those with instrument hri_euv, channel 174, kind total, status certified none has valid_at 2030"
+        in detail
+    )
+    detail = problem(api.get("/v1/psfs/best", params={**line, "channel": "193"}), 404, "no-psf-fits")
+    assert "none has channel 193" in detail
+    assert (
+        api.get("/v1/psfs/best", params={"status": "draft", "channel": "304"}).json()["psf"]["id"] == psfs[3]
+    )
+    problem(api.get("/v1/psfs/best", params={"context": "none"}), 404, "no-such-context")
+
+
+def test_contexts_and_the_default(api: TestClient, psfs: list[str]) -> None:
+    problem(api.post("/v1/contexts", json={"name": "early"}), 409, "nothing-to-pin")
+    certify(api, psfs[0], "1.0.0", 2020, None)
+    made = api.post("/v1/contexts", json={"name": "early", "reason": "as delivered"})
+    assert made.status_code == 201
+    context = made.json()
+    assert context["size"] == 1 and context["pins"][0] == {
+        "line": "hri_euv/174/total",
+        "valid_from": "2020-01-01T00:00:00Z",
+        "valid_to": None,
+        "psf_id": psfs[0],
+        "version": "1.0.0",
+    }
+    again = api.post("/v1/contexts", json={"name": "early"})
+    assert again.status_code == 200 and again.json() == context
+    certify(api, psfs[1], "2.0.0", 2020, None, supersedes=[psfs[0]])
+    problem(api.post("/v1/contexts", json={"name": "early"}), 409, "name-taken")
+    pins = [{"psf_id": psfs[2], "valid_from": "2020-01-01", "valid_to": "2021-01-01"}, {"psf_id": psfs[3]}]
+    assert api.post("/v1/contexts", json={"name": "mine", "pins": pins}).status_code == 201
+    for name in (context["id"], "early"):
+        assert api.get(f"/v1/contexts/{name}").json() == context
+    assert [one["name"] for one in api.get("/v1/contexts").json()["items"]] == ["mine", "early"]
+    problem(api.get("/v1/contexts/late"), 404, "no-such-context")
+
+    assert api.get("/v1/contexts/default").json() == {"context": None, "history": []}
+    moved = api.put("/v1/contexts/default", json={"context": "early", "reason": "go"}).json()
+    assert moved["context"]["id"] == context["id"]
+    assert api.get("/v1/psfs/best", params={"instrument": "hri_euv"}).json()["psf"]["id"] == psfs[0]
+    best_now = api.get("/v1/psfs/best", params={"instrument": "hri_euv", "context": "now"}).json()
+    assert best_now["psf"]["id"] == psfs[1] and best_now["context"] is None
+    api.put("/v1/contexts/default", json={"context": None})
+    history = api.get("/v1/contexts/default").json()["history"]
+    assert [(one["context"], one["reason"]) for one in history] == [(None, ""), (context["id"], "go")]
+    problem(api.put("/v1/contexts/default", json={"context": "late"}), 404, "no-such-context")
+    for body in (
+        {"name": "now"},
+        {"name": "a b"},
+        {"name": ""},
+        {"name": "x", "pins": []},
+        {},
+        {"name": "x", "of": 1},
+    ):
+        assert api.post("/v1/contexts", json=body).status_code in (409, 422), body
+    overlapping = [{"psf_id": psfs[0]}, {"psf_id": psfs[1]}]
+    problem(api.post("/v1/contexts", json={"name": "x", "pins": overlapping}), 409, "ranges-overlap")
+
+
+def test_an_image_is_deconvolved_with_the_psf_of_its_time(
+    api: TestClient, psfs: list[str], tmp_path: Path
+) -> None:
+    write_image(tmp_path / "i.fits", **SEEN, **{"DATE-BEG": "2020-06-01T00:00:00.000"})
+    write_image(tmp_path / "far.fits", **SEEN, **{"DATE-BEG": "2030-06-01T00:00:00.000"})
+    image, far = upload(api, tmp_path / "i.fits"), upload(api, tmp_path / "far.fits")
+
+    def asked(image_id: str, **more: Any) -> Response:
+        body = {"kind": "deconvolve", "parameters": {"image_id": image_id, **more}}
+        return api.post("/v1/jobs", json=body)
+
+    before = asked(image).json()["parameters"]
+    assert before["psf_recipe"]["instrument"] == "hri_euv", "nothing is certified: as it was before"
+    detail = problem(api.get(f"/v1/images/{image}/psf"), 404, "no-psf-fits")
+    assert "none has status certified" in detail
+
+    certify(api, psfs[0], "1.0.0", 2020, 2021)
+    found = api.get(f"/v1/images/{image}/psf").json()
+    assert (found["psf"]["id"], found["valid_at"]) == (psfs[0], "2020-06-01T00:00:00Z")
+    now = asked(image).json()["parameters"]
+    assert (now["psf_id"], now["psf_recipe"], now["picked_for"]) == (psfs[0], None, "hri_euv")
+    detail = problem(asked(far), 409, "no-psf-fits")
+    assert "2030-06-01" in detail and "hri_euv" in detail
+
+    api.post("/v1/contexts", json={"name": "c", "pins": [{"psf_id": psfs[2]}]})
+    pinned = asked(far, context="c").json()["parameters"]
+    assert pinned["psf_id"] == psfs[2] and pinned["context_id"] == api.get("/v1/contexts/c").json()["id"]
+    assert api.get(f"/v1/images/{far}/psf", params={"context": "c"}).json()["psf"]["id"] == psfs[2]
+    problem(asked(far, context="d"), 404, "no-such-context")
+    assert asked(far, context="c", psf_id=psfs[0]).status_code == 422
+    named = asked(image, psf_id=psfs[1]).json()["parameters"]
+    assert named["psf_id"] == psfs[1] and named["picked_for"] is None
+
+
+def test_products_of_a_psf_that_was_followed_by_another_are_told(
+    api: TestClient, run_jobs: Callable[[], None], psfs: list[str], tmp_path: Path
+) -> None:
+    old, new, *_ = psfs
+    certify(api, old, "1.0.0")
+    for seed in range(3):
+        write_image(tmp_path / f"{seed}.fits", seed=seed, **SEEN)
+        body = {"image_id": upload(api, tmp_path / f"{seed}.fits"), "method": {"name": "linear", "steps": 1}}
+        assert api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": body}).status_code == 202
+    run_jobs()
+    assert api.get("/v1/affected").json()["items"] == []
+    assert len(api.get(f"/v1/psfs/{old}/affected").json()["items"]) == 3
+
+    api.post(f"/v1/psfs/{old}/status", json={"status": "deprecated", "reason": "wrong"})
+    assert len(api.get("/v1/affected").json()["items"]) == 3
+    assert api.get("/v1/affected", params={"superseded": True}).json()["items"] == []
+    certify(api, new, "1.1.0")
+    api.post(f"/v1/psfs/{old}/status", json={"status": "deprecated", "successor": new})
+    seen: list[str] = []
+    address: str | None = "/v1/affected?superseded=true&limit=2"
+    while address:
+        page = api.get(address).json()
+        for item in page["items"]:
+            assert (item["psf_id"], item["successor"], item["redo_with"]) == (old, new, new)
+            assert item["psf_version"] == "1.0.0" and item["psf_status"] == "deprecated"
+        seen += [item["product_id"] for item in page["items"]]
+        address = page["next"]
+    assert len(seen) == len(set(seen)) == 3
+    certify(api, psfs[2], "2.0.0", supersedes=[new])
+    items = api.get(f"/v1/psfs/{old}/affected", params={"limit": 1}).json()["items"]
+    assert (items[0]["successor"], items[0]["redo_with"]) == (new, psfs[2])
+    for place in ("nonsense", f"{new} 1.0", f"{new} soon {old}", f"{new}\x00 1.0 {old}", f"{new} nan {old}"):
+        cursor = base64.urlsafe_b64encode(place.encode()).decode()
+        assert api.get("/v1/affected", params={"cursor": cursor}).status_code == 422, place
+
+
+def test_lineage_and_rerun_of_what_was_built_here(
+    api: TestClient, run_jobs: Callable[[], None], image_file: Path
+) -> None:
+    build = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 64}}
+    api.post("/v1/jobs", json=build)
+    run_jobs()
+    (psf,) = api.get("/v1/psfs").json()["items"]
+    assert (psf["channel"], psf["kind"]) == ("171", "total")
+    body = {"image_id": upload(api, image_file), "psf_id": psf["id"]}
+    api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": body})
+    run_jobs()
+    (product,) = api.get("/v1/products").json()["items"]
+
+    told = api.get(f"/v1/products/{product['id']}/lineage").json()
+    assert told["made"]["job_id"] == product["details"]["job_id"]
+    assert told["made"]["parameters"]["psf_id"] == psf["id"] and "numpy" in told["made"]["libraries"]
+    image, parent = told["parents"]
+    assert (image["type"], image["id"], image["there"]) == ("image", body["image_id"], True)
+    assert (parent["type"], parent["id"]) == ("psf", psf["id"])
+    assert parent == api.get(f"/v1/psfs/{psf['id']}/lineage").json()
+    assert parent["parents"][0]["type"] == "instrument-file"
+
+    for of, identity in (("products", product["id"]), ("psfs", psf["id"])):
+        asked = api.post(f"/v1/{of}/{identity}/rerun")
+        assert asked.status_code == 202, asked.text
+        assert api.post(f"/v1/{of}/{identity}/rerun").json()["id"] != asked.json()["id"]
+        run_jobs()
+        job = api.get(asked.headers["Location"]).json()
+        assert job["phase"] == "COMPLETED", job
+        report = api.get(job["result"]).json()
+        assert report["details"]["same"] is True and report["about_id"] == identity
+        written = api.get(report["file"]).json()
+        assert written["largest_relative_difference"] == 0.0 and written["sentence"]
+        assert api.get(report["output"]).content[:9] == b"SIMPLE  ="
+        listed = api.get("/v1/reports", params={"about_id": identity}).json()["items"]
+        assert len(listed) == 2
+    assert len(api.get("/v1/products").json()["items"]) == len(api.get("/v1/psfs").json()["items"]) == 1
+    assert api.get(f"/v1/reports/{'0' * 64}/output").status_code == 404
+
+
+def test_an_upload_is_not_made_again(api: TestClient, psfs: list[str]) -> None:
+    problem(api.post(f"/v1/psfs/{psfs[0]}/rerun"), 409, "not-made-here")
+    told = api.get(f"/v1/psfs/{psfs[0]}/lineage").json()
+    assert told["parents"] == [] and told["made"]["origin"] == "uploaded"
+
+
+def test_an_uploaded_psf_says_its_line_or_is_told_it(api: TestClient, tmp_path: Path) -> None:
+    write_psf(tmp_path / "p.fits")
+    content = (tmp_path / "p.fits").read_bytes()
+    for query in ({"instrument": "A B"}, {"channel": ""}, {"kind": "-"}, {"kind": "x" * 41}):
+        assert api.post("/v1/psfs", params=query, content=content).status_code == 422, query
+    psf = api.post("/v1/psfs", content=content).json()
+    assert (psf["instrument"], psf["channel"], psf["kind"], psf["status"]) == (
+        None,
+        None,
+        "uploaded",
+        "draft",
+    )
+    problem(certify(api, psf["id"], "1.0.0"), 409, "no-line")
+    said = certify(api, psf["id"], "1.0.0", instrument="aia_3", channel="193", kind="total").json()
+    assert said["line"] == "aia_3/193/total"

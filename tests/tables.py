@@ -1,0 +1,41 @@
+"""A database with this version's tables, made once and copied: the revisions themselves have tests of their own."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from workers.catalogue import Catalogue
+from workers.schema import Schema
+
+RUN_REVISIONS = Schema.upgrade
+
+
+@contextmanager
+def copied_tables(folder: Path) -> Iterator[None]:
+    """While it lasts, a SQLite database that this process is to make starts as a copy of one in ``folder``."""
+    made, one_at_a_time = folder / "made.sqlite", threading.Lock()
+
+    def upgrade(schema: Schema) -> None:
+        database = schema._database.engine.url.database
+        if schema._database.sqlite and database not in (None, ":memory:"):
+            with one_at_a_time:
+                if not made.exists():
+                    first = Catalogue(f"sqlite:///{made}")
+                    RUN_REVISIONS(first.schema)
+                    first.close()  # with it goes the write-ahead log: the file is all there is
+                target = Path(str(database))
+                if not target.exists() and target.parent.is_dir():
+                    partial = target.with_suffix(".partial")
+                    partial.write_bytes(made.read_bytes())
+                    os.replace(partial, target)
+        RUN_REVISIONS(schema)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Schema, "upgrade", upgrade)
+        yield

@@ -1,0 +1,88 @@
+"""Rows of PSFs and products for tests of the catalogue, without files."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from typing import Any
+
+from workers.catalogue import Catalogue
+from workers.psf_lines import line_of
+from workers.psf_rows import StatusAsked
+from workers.psf_status import PsfStatus
+from workers.tables import ProductRow, PsfRow
+from workers.validity import Validity
+
+OWNER = "local"
+ALWAYS = Validity()
+
+
+def identity(name: str) -> str:
+    """An id that a test can name."""
+    return hashlib.sha256(name.encode()).hexdigest()
+
+
+def psf(
+    name: str,
+    *,
+    instrument: str | None = "hri_euv",
+    channel: str | None = "174",
+    kind: str = "total",
+    owner: str = OWNER,
+    **values: Any,
+) -> PsfRow:
+    """A draft."""
+    given = {
+        "created_at": time.time(),
+        "name": name,
+        "version": f"0.1.0+{name}",
+        "status": PsfStatus.DRAFT,
+        "origin": "built",
+        "file_sha256": identity(f"file of {name}"),
+        "bytes": 1,
+        "preview_sha256": None,
+        "details": {},
+        **values,
+    }
+    line = line_of(instrument, channel, kind)
+    return PsfRow(
+        owner=owner, id=identity(name), instrument=instrument, channel=channel, kind=kind, line=line, **given
+    )
+
+
+def product(name: str, psf_name: str, *, owner: str = OWNER, **values: Any) -> ProductRow:
+    """A product of an image of the same name."""
+    given = {"created_at": time.time(), "details": {}, **values}
+    return ProductRow(
+        owner=owner,
+        id=identity(f"product {name}"),
+        kind="deconvolved-image",
+        image_id=identity(f"image {name}"),
+        psf_id=identity(psf_name),
+        psf_version="0.1.0",
+        file_sha256=identity(f"file {name}"),
+        bytes=1,
+        preview_sha256=identity("preview"),
+        **given,
+    )
+
+
+def certify(
+    catalogue: Catalogue, name: str, version: str, validity: Validity | None = None, **asked: Any
+) -> PsfRow:
+    """Certify the PSF of this name."""
+    wanted = StatusAsked(PsfStatus.CERTIFIED, "tested", version=version, validity=validity, **asked)
+    return catalogue.psfs.change(identity(name), OWNER, wanted, "tester")
+
+
+def deprecate(catalogue: Catalogue, name: str, successor: str | None = None) -> PsfRow:
+    """Deprecate the PSF of this name."""
+    wanted = StatusAsked(
+        PsfStatus.DEPRECATED, "worse", successor_id=None if successor is None else identity(successor)
+    )
+    return catalogue.psfs.change(identity(name), OWNER, wanted, "tester")
+
+
+def years(start: int | None, end: int | None) -> Validity:
+    """From the first of January of a year to that of another."""
+    return Validity.of(*(None if year is None else f"{year}-01-01" for year in (start, end)))

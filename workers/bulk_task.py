@@ -1,0 +1,171 @@
+"""The task ``bulk``: a turn at the images of a bulk, one after the other, until none is left or others wait.
+
+What is done is done: a product that is there, made by whatever asked for it, is not made again. An image that cannot
+be deconvolved is put apart with the reason, and stops nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator, Mapping
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+from psfcore.errors import DataError
+from workers import archive_files
+from workers.bulk_contract import BulkPhase, BulkWork
+from workers.bulk_image import Outcome, treat
+from workers.bulk_rows import Listed, Taken
+from workers.bulk_tables import BulkRow
+from workers.context import Context, TurnOver
+from workers.contract import Fault, JobError
+from workers.job_rows import Lease
+from workers.stage_times import STARTING
+
+LIST_AT_ONCE = 200
+MOST_IMAGES = 1_000_000
+TELL_EVERY_S = 1.0  # how far a turn is, and whether it is to stop: nobody waits for a single image of many
+BETWEEN = "between images"  # noting what one became, and taking the next
+TURN_S = 60.0  # then the turn of another bulk may come; far below what one attempt of a job may last
+
+
+def bulk_turn(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Do images of a bulk; returns its id. Raises ``TurnOver`` where some are left, and others wait."""
+    bulk_id: str = parameters["bulk_id"]
+    ends_at = time.monotonic() + TURN_S
+    assert context.lease is not None
+    while True:
+        bulk = context.catalogue.bulks.get(bulk_id)
+        if bulk is None:
+            return bulk_id
+        if bulk.phase == BulkPhase.LISTING:
+            if not _list(context, bulk, context.lease):
+                return bulk_id
+            continue
+        if _no_room(context, bulk):
+            return bulk_id
+        taken = context.catalogue.bulks.take(bulk_id, context.lease, context.settings.max_attempts)
+        if taken is None:
+            return bulk_id
+        _do(context, bulk, taken)
+        if time.monotonic() > ends_at or context.others_wait():
+            raise TurnOver
+
+
+def work_of(bulk: BulkRow) -> BulkWork:
+    """What was asked for."""
+    return BulkWork.model_validate(bulk.request)
+
+
+def _no_room(context: Context, bulk: BulkRow) -> bool:
+    """Whether the owner may keep nothing more; the bulk then stops, to be resumed once there is room."""
+    output = work_of(bulk).output
+    usage = context.catalogue.owners.usage(context.owner, context.settings.quota_mib)
+    if not usage.full or (output is not None and output.only):
+        return False
+    message = f"expected room for products: {usage.used_bytes} of {usage.limit_bytes} bytes are used"
+    context.catalogue.bulks.stop_with(
+        bulk.id, JobError(fault=Fault.USER, code="quota-exceeded", message=message)
+    )
+    return True
+
+
+def _do(context: Context, bulk: BulkRow, taken: Taken) -> None:
+    """One image, to its end; what concerns the turn gives it back."""
+    bulks, done = context.catalogue.bulks, bulk.done + bulk.failed
+
+    told_s = told_at = 0.0
+
+    def report(stage: str, step: int, _steps: int) -> None:
+        nonlocal told_s, told_at
+        with context.times.step(stage, step):
+            began = time.perf_counter()
+            if began - told_at >= TELL_EVERY_S:
+                context.report("images", done, bulk.total)
+                told_at = time.perf_counter()
+                told_s += told_at - began
+
+    # What an image becomes is the bulk's; a turn is gone soon.
+    of_image = dataclasses.replace(context, report=report, job_id=bulk.id)
+    found: list[Outcome] = []
+    context.times.begin(STARTING)
+    started = time.perf_counter()
+    try:
+        error = context.guarded(lambda: found.append(treat(of_image, bulk, work_of(bulk), taken)))
+    except BaseException:
+        bulks.release(taken)
+        raise
+    finally:
+        context.times.begin(BETWEEN)
+    if error is not None:
+        bulks.fail(taken, error)
+        return
+    values = vars(found[0])
+    statistics = {**values["statistics"], "seconds": round(time.perf_counter() - started, 3)}
+    if "kernel_seconds" in statistics:  # saying how far it is is no work on the image
+        statistics["kernel_seconds"] = round(statistics["kernel_seconds"] - told_s, 3)
+    bulks.finish(taken, **{**values, "statistics": statistics})
+
+
+# Listing ---------------------------------------------------------------------------------------------
+
+
+def _list(context: Context, bulk: BulkRow, lease: Lease) -> bool:
+    """Make the files that were asked for images of the bulk; what is wrong with all of them stops it.
+
+    False where this turn has nothing more to do.
+    """
+    bulks = context.catalogue.bulks
+    if not bulks.begin_listing(bulk.id, lease):
+        return False
+    try:
+        listed = _listed(context, work_of(bulk))
+        while batch := list(islice(listed, LIST_AT_ONCE)):
+            if not bulks.add_listed(bulk.id, lease, batch):
+                return False
+        there = bulks.get(bulk.id)
+        if there is not None and there.total == 0:
+            raise DataError(
+                "no-images", "expected files that the patterns and the headers asked for; got none"
+            )
+    except DataError as error:
+        bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code=error.code, message=error.message))
+        return False
+    return bulks.end_listing(bulk.id, lease)
+
+
+def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
+    """Files once each, though several patterns may find them."""
+    allowed = archive_files.roots(context.settings.bulk_roots)
+    found = chain.from_iterable(
+        ((path, files.where) for path in archive_files.find(files.glob, allowed)) for files in request.files
+    )
+    seen: set[Path] = set()
+    looked_at = 0
+    for path, where in found:
+        looked_at += 1
+        context.report("listing", len(seen), max(looked_at, len(seen) + 1))
+        if path in seen:
+            continue
+        error = None
+        try:
+            if not archive_files.matches(path, where, context.limits):
+                continue
+        except DataError as unreadable:
+            error = JobError(fault=Fault.USER, code=unreadable.code, message=unreadable.message)
+        except OSError as unreadable:
+            error = unreadable_file(unreadable)
+        seen.add(path)
+        if len(seen) > MOST_IMAGES:
+            raise DataError("too-many-images", f"expected at most {MOST_IMAGES} images in a bulk; got more")
+        yield Listed(str(path), uploaded=False, error=error)
+
+
+def unreadable_file(error: OSError) -> JobError:
+    """Why a file cannot be read, without its place."""
+    reason = error.strerror or type(error).__name__
+    return JobError(
+        fault=Fault.USER, code="unreadable-file", message=f"expected a file that can be read: {reason}"
+    )

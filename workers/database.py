@@ -1,0 +1,113 @@
+"""The database as the catalogue reaches it: an engine set up for many small writers, and two kinds of transactions."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from typing import Any
+
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Double,
+    Engine,
+    MetaData,
+    Update,
+    create_engine,
+    event,
+    literal_column,
+)
+from sqlalchemy.engine import CursorResult
+from sqlalchemy.orm import Session, sessionmaker
+
+PATIENCE_S = 30.0  # with others that write to SQLite
+
+
+class Database:
+    """An engine, and sessions on it: ``writing`` holds SQLite's write lock from the start, ``reading`` needs no lock."""
+
+    def __init__(self, url: str) -> None:
+        self.engine = open_engine(url)
+        self.writing: sessionmaker[Session] = sessionmaker(self.engine, expire_on_commit=False)
+        self.reading: sessionmaker[Session] = sessionmaker(
+            self.engine.execution_options(read_only=True), expire_on_commit=False
+        )
+
+    @property
+    def sqlite(self) -> bool:
+        """True where the database is SQLite."""
+        return self.engine.dialect.name == "sqlite"
+
+    @property
+    def now(self) -> ColumnElement[float]:
+        """Seconds since 1970 by the database's clock, as an expression: the one clock that all machines share.
+
+        It is that of the statement it stands in, and on SQLite, whose processes share a machine anyway, whole ms.
+        """
+        # Of PostgreSQL's clocks the one by which indexes can be searched.
+        now = (
+            "(julianday('now') - 2440587.5) * 86400.0"
+            if self.sqlite
+            else "CAST(extract(epoch FROM statement_timestamp()) AS double precision)"
+        )
+        return literal_column(f"({now})", Double)
+
+    def change(self, statement: Update) -> int:
+        """One UPDATE in a transaction of its own; returns how many rows it changed."""
+        with self.writing.begin() as session:
+            result = session.execute(statement)
+            assert isinstance(result, CursorResult)
+            return result.rowcount
+
+
+def open_engine(url: str) -> Engine:
+    """An engine with the settings each database needs for many small concurrent writers."""
+    if not url.startswith("sqlite"):
+        # Without a limit, a database that is cut off would hold whoever asks for minutes.
+        patience = {"connect_timeout": 5} if url.startswith("postgresql") else {}
+        return create_engine(url, pool_pre_ping=True, connect_args=patience, json_serializer=_strict_json)
+    engine = create_engine(url, connect_args={"timeout": PATIENCE_S}, json_serializer=_strict_json)
+
+    @event.listens_for(engine, "connect")
+    def _pragmas(connection: Any, _record: Any) -> None:
+        # The driver's own BEGIN comes too late for compare-and-set; see _begin.
+        connection.isolation_level = None
+        _write_ahead(connection)
+        connection.execute("PRAGMA synchronous=FULL")
+        connection.execute("PRAGMA foreign_keys=ON")
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Any) -> None:
+        # IMMEDIATE waits for the write lock at the start; a deferred transaction that reads first and
+        # writes later would fail with "database is locked" instead of waiting. Readers need no lock.
+        reads = connection.get_execution_options().get("read_only", False)
+        connection.exec_driver_sql("BEGIN" if reads else "BEGIN IMMEDIATE")
+
+    return engine
+
+
+def _write_ahead(connection: sqlite3.Connection) -> None:
+    """Have SQLite keep a write-ahead log. Of several that make a database at once all but one are told to try again."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode=WAL")
+            return
+        except sqlite3.OperationalError as error:  # the connection's own patience does not cover this change
+            if "locked" not in str(error) or time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)
+
+
+def _strict_json(value: Any) -> str:
+    """JSON without NaN and infinity, which PostgreSQL refuses and clients cannot read."""
+    return json.dumps(value, allow_nan=False)
+
+
+def make_missing(metadata: MetaData, connection: Connection) -> None:
+    """Make those of the tables and indexes that are not there."""
+    metadata.create_all(connection)
+    for table in metadata.sorted_tables:
+        for index in table.indexes:
+            index.create(connection, checkfirst=True)

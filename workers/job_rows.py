@@ -1,0 +1,287 @@
+"""Jobs in the catalogue: asked for, claimed, at work, ended.
+
+The job table is the only truth about jobs; the broker may lose what it likes. Every change of a job's phase
+is a compare-and-set on the row, so that any number of workers, servers and reconcilers may try at once. What they
+compare of each other's times, as heartbeats, is written and read by the database's clock.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, and_, case, literal, or_, select, update
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import aliased
+
+from workers.contract import LIVE, Fault, JobError, Phase
+from workers.database import Database
+from workers.tables import JobRow
+from workers.urgency import Queue, queue_of
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to work on a job: changes made under a lost lease do nothing."""
+
+    job_id: str
+    token: str
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A job to be given to the broker."""
+
+    id: str
+    queue: Queue
+
+
+class Jobs:
+    """The table of jobs; each method is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def submit(
+        self,
+        kind: str,
+        parameters: dict[str, Any],
+        request_key: str,
+        owner: str,
+        *,
+        queue: Queue | None = None,
+        estimate: dict[str, Any] | None = None,
+    ) -> tuple[JobRow, bool]:
+        """A new queued job, or the live one of an equal request, which goes up where it waits in a less urgent queue.
+
+        Also whether it is new. ``queue``: none is that of its kind.
+        """
+        queue = queue or queue_of(kind)
+        live = select(JobRow).where(
+            JobRow.owner == owner, JobRow.request_key == request_key, JobRow.phase.in_(LIVE)
+        )
+        for _ in range(3):  # the equal job may end badly between the two statements
+            with self._database.reading() as session:
+                existing = session.scalars(live).first()
+            if existing is not None:
+                return self._moved_up(existing, queue), False
+            row = JobRow(
+                id=uuid.uuid4().hex,
+                owner=owner,
+                kind=kind,
+                parameters=parameters,
+                request_key=request_key,
+                work_key=request_key,
+                phase=Phase.QUEUED,
+                queue=queue,
+                created_at=time.time(),
+                estimate=estimate,
+            )
+            try:
+                with self._database.writing.begin() as session:
+                    session.add(row)
+                return row, True
+            except IntegrityError:
+                continue
+        raise RuntimeError(f"job for request {request_key} neither inserted nor found")
+
+    def _moved_up(self, row: JobRow, queue: Queue) -> JobRow:
+        order = list(Queue)
+        if row.phase == Phase.QUEUED and order.index(queue) < order.index(Queue(row.queue)):
+            waiting = [JobRow.id == row.id, JobRow.phase == Phase.QUEUED]
+            if self._set(waiting, queue=queue, submitted_at=None, submissions=0):
+                row.queue, row.submitted_at = queue, None
+        return row
+
+    def get(self, job_id: str) -> JobRow | None:
+        """The job's row, or None."""
+        with self._database.reading() as session:
+            return session.get(JobRow, job_id)
+
+    def mark_submitted(self, *job_ids: str) -> None:
+        """Note that the broker has been given the jobs' ids."""
+        self._set(
+            [JobRow.id.in_(job_ids)], submitted_at=self._database.now, submissions=JobRow.submissions + 1
+        )
+
+    def forget_submission(self, job_id: str) -> None:
+        """Note that a queued job's message was taken from the broker, but not the job."""
+        self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
+
+    def claim(self, job_id: str, worker: str) -> Lease | None:
+        """QUEUED -> EXECUTING, for exactly one of those that try; None for all others.
+
+        None too, and the job is submitted again later, while another that makes the same is at work.
+        """
+        lease = Lease(job_id, uuid.uuid4().hex)
+        now = self._database.now
+        try:
+            claimed = self._set(
+                [JobRow.id == job_id, JobRow.phase == Phase.QUEUED],
+                phase=Phase.EXECUTING,
+                attempt=JobRow.attempt + 1,
+                lease=lease.token,
+                started_at=now,
+                heartbeat_at=now,
+                worker=worker,
+                step=0,
+                steps=0,
+                stage="",
+            )
+        except IntegrityError:  # one_at_work_a_result
+            self.forget_submission(job_id)
+            return None
+        return lease if claimed else None
+
+    def heartbeat(self, lease: Lease) -> bool:
+        """Say that the job is alive; False where the lease is lost or the job was cancelled."""
+        return self._set([*_held(lease), JobRow.cancel_requested.is_(False)], heartbeat_at=self._database.now)
+
+    def progress(self, lease: Lease, stage: str, step: int, steps: int) -> bool:
+        """Write how far the job is, which is a heartbeat too; False as for ``heartbeat``."""
+        return self._set(
+            [*_held(lease), JobRow.cancel_requested.is_(False)],
+            stage=stage,
+            step=step,
+            steps=steps,
+            heartbeat_at=self._database.now,
+        )
+
+    def complete(self, lease: Lease, result_id: str) -> bool:
+        """EXECUTING -> COMPLETED under the lease."""
+        return self._set(
+            _held(lease), phase=Phase.COMPLETED, ended_at=self._database.now, result_id=result_id, lease=None
+        )
+
+    def fail(self, lease: Lease, error: JobError) -> bool:
+        """EXECUTING -> ERROR under the lease."""
+        return self._set(
+            _held(lease),
+            phase=Phase.ERROR,
+            ended_at=self._database.now,
+            error=error.model_dump(mode="json"),
+            lease=None,
+        )
+
+    def requeue(self, lease: Lease) -> bool:
+        """EXECUTING -> QUEUED under the lease, after a passing failure: submitted again after the usual wait."""
+        return self._set(
+            _held(lease),
+            phase=Phase.QUEUED,
+            submitted_at=self._database.now,
+            submissions=JobRow.attempt,
+            lease=None,
+        )
+
+    def abort(self, lease: Lease) -> bool:
+        """EXECUTING -> ABORTED under the lease, once the worker has stopped."""
+        return self._set(
+            [*_held(lease), JobRow.cancel_requested.is_(True)],
+            phase=Phase.ABORTED,
+            ended_at=self._database.now,
+            lease=None,
+        )
+
+    def cancel(self, job_id: str) -> None:
+        """PENDING, QUEUED -> ABORTED at once; an executing job is asked to stop; an ended one stays as it is."""
+        waiting = [JobRow.id == job_id, JobRow.phase.in_((Phase.PENDING, Phase.QUEUED))]
+        if not self._set(waiting, phase=Phase.ABORTED, ended_at=self._database.now, cancel_requested=True):
+            self._set([JobRow.id == job_id, JobRow.phase == Phase.EXECUTING], cancel_requested=True)
+
+    def hand_back(self, lease: Lease) -> bool:
+        """EXECUTING -> QUEUED under the lease: the worker stops, the job is not to blame, the attempt not counted."""
+        return self._set(
+            [*_held(lease), JobRow.cancel_requested.is_(False)],
+            phase=Phase.QUEUED,
+            attempt=JobRow.attempt - 1,
+            submitted_at=None,
+            submissions=0,
+            lease=None,
+        )
+
+    def give_up_silent(self, lease_s: float, max_attempts: int) -> list[str]:
+        """Take back jobs whose worker fell silent; returns the ids of those queued again.
+
+        A job that was cancelled is aborted, and one that was started ``max_attempts`` times is an error.
+        """
+        silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
+        self._set(
+            [*silent, JobRow.cancel_requested.is_(True)],
+            phase=Phase.ABORTED,
+            ended_at=self._database.now,
+            lease=None,
+        )
+        error = JobError(
+            fault=Fault.INTERNAL,
+            code="worker-lost",
+            message=f"the worker was lost {max_attempts} times while it ran this job; it is not tried again",
+        )
+        self._set(
+            [*silent, JobRow.attempt >= max_attempts],
+            phase=Phase.ERROR,
+            ended_at=self._database.now,
+            lease=None,
+            error=error.model_dump(mode="json"),
+        )
+        with self._database.writing.begin() as session:
+            back = update(JobRow).where(*silent).values(phase=Phase.QUEUED, submitted_at=None, lease=None)
+            return list(session.scalars(back.returning(JobRow.id)))
+
+    def unsubmitted(self, resubmit_s: float, limit: int = 1000) -> list[Waiting]:
+        """Queued jobs that the broker was never given, or seems to have lost: the most urgent first, then the oldest.
+
+        The wait doubles with each submission of a job, so that a long queue is not submitted over and over.
+        """
+        waits = {number: resubmit_s * 2 ** (number - 1) for number in range(2, 9)}
+        wait_s = case(
+            (JobRow.submissions <= 1, resubmit_s),
+            *((JobRow.submissions == number, wait) for number, wait in waits.items()),
+            else_=resubmit_s * 2**8,
+        )
+        due = or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < self._database.now - wait_s)
+        query = select(JobRow.id, JobRow.queue).where(JobRow.phase == Phase.QUEUED, due, no_equal_at_work())
+        found: list[Waiting] = []
+        with self._database.reading() as session:
+            for queue in Queue:
+                of_queue = query.where(JobRow.queue == queue).order_by(JobRow.created_at)
+                rows = session.execute(of_queue.limit(limit - len(found)))
+                found += [Waiting(job_id, Queue(name)) for job_id, name in rows]
+        return found
+
+    def of_kind(self, kind: str) -> Sequence[JobRow]:
+        """All jobs of a kind that has few, in whatever phase."""
+        with self._database.reading() as session:
+            return session.scalars(select(JobRow).where(JobRow.kind == kind)).all()
+
+    def others_wait(self, kind: str) -> bool:
+        """Whether a job of another kind waits to be started, and could be."""
+        query = select(JobRow.id).where(JobRow.phase == Phase.QUEUED, JobRow.kind != kind, no_equal_at_work())
+        with self._database.reading() as session:
+            return session.scalars(query.limit(1)).first() is not None
+
+    def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
+        """One UPDATE; True where it changed a row."""
+        return bool(self._database.change(update(JobRow).where(and_(*conditions)).values(**values)))
+
+
+def no_equal_at_work() -> ColumnElement[bool]:
+    """True of a queued job unless another that makes the same is at work, whose end it waits for."""
+    other = aliased(JobRow)
+    at_work = select(other.id).where(
+        other.owner == JobRow.owner,
+        other.work_key == JobRow.work_key,
+        # In the statement's text, where the databases see that the partial index has all such jobs.
+        other.phase == literal(Phase.EXECUTING.value, literal_execute=True),
+    )
+    return ~at_work.exists()
+
+
+def _held(lease: Lease) -> list[Any]:
+    return [
+        JobRow.id == lease.job_id,
+        JobRow.lease == lease.token,
+        JobRow.phase == Phase.EXECUTING,
+    ]

@@ -1,0 +1,15 @@
+"""The queue that a job waits in. Those that wait already do so for a person."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0004"
+down_revision = "0003"
+
+
+def upgrade() -> None:
+    """Add the column, and the index that what waits is read from in its order."""
+    op.add_column("jobs", sa.Column("queue", sa.String(16), nullable=False, server_default="interactive"))
+    op.create_index("jobs_waiting", "jobs", ["phase", "queue", "created_at", "submitted_at"])

@@ -1,0 +1,20 @@
+"""How long jobs spent in each stage, by kind: sums that outlive the jobs."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0008"
+down_revision = "0007"
+
+
+def upgrade() -> None:
+    """Make the table; jobs that are there already left no times."""
+    op.create_table(
+        "stage_times",
+        sa.Column("kind", sa.String(32), primary_key=True),
+        sa.Column("stage", sa.String(64), primary_key=True),
+        sa.Column("seconds", sa.Double, nullable=False),
+        sa.Column("steps", sa.BigInteger, nullable=False),
+    )

@@ -1,0 +1,25 @@
+"""What a job makes, beside the key that it runs under: of two jobs that make the same, one is at work at a time."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0009"
+down_revision = "0008"
+
+
+def upgrade() -> None:
+    """Add the column and its index; of jobs that are there already the key says what they make."""
+    op.add_column("jobs", sa.Column("work_key", sa.String(64), nullable=True))
+    jobs = sa.table("jobs", sa.column("work_key"), sa.column("request_key"))
+    op.execute(jobs.update().where(jobs.c.request_key != "").values(work_key=jobs.c.request_key))
+    executing = sa.text("phase = 'EXECUTING'")
+    op.create_index(
+        "one_at_work_a_result",
+        "jobs",
+        ["owner", "work_key"],
+        unique=True,
+        sqlite_where=executing,
+        postgresql_where=executing,
+    )

@@ -1,0 +1,73 @@
+"""Times of observation, and the ranges of them that a PSF is valid for.
+
+In the database times are seconds since 1970 (UTC) and an open end is an infinity, so that ranges compare as numbers.
+Outside they are ISO 8601, and an open end is none.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from psfcore.errors import DataError
+
+TIME = r"^\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d{1,9})?)?(Z|[+-]\d\d:\d\d)?)?$"
+_TIME = re.compile(TIME, re.ASCII)
+
+
+def seconds(text: str, name: str = "time") -> float:
+    """Seconds since 1970 of a time as 2024-03-01T12:00:00Z, or of a day's start; without a zone it is UTC.
+
+    Raises ``DataError`` "bad-time".
+    """
+    try:
+        if not _TIME.fullmatch(text):
+            raise ValueError
+        when = datetime.fromisoformat(text)
+        at = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+        iso(at)  # what cannot be said again, at the end of all years, is none either
+        return at
+    except (ValueError, OverflowError) as error:
+        raise DataError(
+            "bad-time", f"{name}: expected a time as 2024-03-01T12:00:00Z, got {ascii(text)[:60]}"
+        ) from error
+
+
+def iso(at: float) -> str | None:
+    """The time in ISO 8601, UTC, to the microsecond; none for an infinity."""
+    if math.isinf(at):
+        return None
+    text = datetime.fromtimestamp(at, UTC).replace(tzinfo=None).isoformat()
+    return f"{text}Z"
+
+
+@dataclass(frozen=True)
+class Validity:
+    """The times from ``start`` on, before ``end``."""
+
+    start: float = -math.inf
+    end: float = math.inf
+
+    @classmethod
+    def of(cls, start: str | None, end: str | None) -> Validity:
+        """Of texts; none is an open end. Raises ``DataError`` "bad-time" or "empty-range"."""
+        made = cls(
+            -math.inf if start is None else seconds(start, "valid_from"),
+            math.inf if end is None else seconds(end, "valid_to"),
+        )
+        if not made.start < made.end:
+            raise DataError("empty-range", f"expected valid_from before valid_to, got {made}")
+        return made
+
+    def holds(self, at: float) -> bool:
+        """Whether the time is in the range."""
+        return self.start <= at < self.end
+
+    def overlaps(self, other: Validity) -> bool:
+        """Whether some time is in both."""
+        return self.start < other.end and other.start < self.end
+
+    def __str__(self) -> str:
+        return f"[{iso(self.start) or 'any time'}, {iso(self.end) or 'open'})"
