@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from psfcore.compiled import compiled
 from psfcore.errors import DataError
 from psfcore.fft_kernels import LANES, Plan, forward, good_length, inverse, make_plan
 from psfcore.fourier import needed_kernel
@@ -254,7 +254,7 @@ def _numbers(plan: Plan) -> tuple[Any, ...]:
 # Kernels: each works on the blocks [start, stop) ---------------------------------------------------------
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
     """A block of rows, transformed two to a complex signal, taken apart into the spectra of its 32 rows.
 
@@ -284,7 +284,7 @@ def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # typ
                     spectrum[group, row, 1, kk] = corner[kk, 2 * side + 1, w]
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
     """The inverse of ``spectrum_from_buffer``: Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k]."""
     z = buffer.reshape((-1, 2, LANES))
@@ -309,7 +309,7 @@ def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # typ
                 z[p, 1, w] = ai + br
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _rows_forward(lanes, spectrum, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]
     filled = lanes.shape[1] * 2 * LANES
     for block in range(start, stop):
@@ -319,7 +319,7 @@ def _rows_forward(lanes, spectrum, buffer, corner, start, stop, length, radices,
         spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]
     filled = lanes.shape[1] * 2 * LANES
     for block in range(start, stop):
@@ -328,7 +328,7 @@ def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, radices,
         lanes[block].reshape(-1)[:] = buffer[:filled]
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
     # Rows of padding that the transform is too short for are zero and stay so.
     filled = min(spectrum.shape[1], length) * 2 * LANES
@@ -347,7 +347,7 @@ def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radice
         column[:filled] = buffer[:filled]
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
     """As ``_columns_real`` for a PSF without symmetry; ``sign`` -1 takes the conjugate: the adjoint."""
     # Rows of padding that the transform is too short for are zero and stay so.

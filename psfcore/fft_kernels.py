@@ -26,6 +26,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from psfcore.compiled import compiled
+
 LANES = 16
 LARGEST_LENGTH = 16384
 _ODD_FACTORS = (1, 3, 9)
@@ -135,7 +137,7 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
     # Real and imaginary parts change places for the inverse.
     R, I = (np.uint64(LANES), np.uint64(0)) if inverse else (np.uint64(0), np.uint64(LANES))  # noqa: E741
 
-    @njit(nogil=True, cache=True, fastmath=_FAST)
+    @compiled(fastmath=_FAST)
     def forward(x, tw, length):  # type: ignore[no-untyped-def]
         for base in range(0, length, n):
             for p in range(m):
@@ -168,7 +170,7 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
                     x[r + M6], x[i + M6] = _times(y6r, y6i, w6r, w6i)
                     x[r + M7], x[i + M7] = _times(y7r, y7i, w7r, w7i)
 
-    @njit(nogil=True, cache=True, fastmath=_FAST)
+    @compiled(fastmath=_FAST)
     def backward(x, tw, length):  # type: ignore[no-untyped-def]
         for base in range(0, length, n):
             for p in range(m):
@@ -204,7 +206,7 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
     return backward if inverse else forward
 
 
-@njit(nogil=True, cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _forward3(x, tw, length, n):  # type: ignore[no-untyped-def]
     m = n // 3
     for base in range(0, length, n):
@@ -223,7 +225,7 @@ def _forward3(x, tw, length, n):  # type: ignore[no-untyped-def]
                 c[r], c[i] = _times(tr - dr, ti - di, w2r, w2i)
 
 
-@njit(nogil=True, cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _backward3(x, tw, length, n):  # type: ignore[no-untyped-def]
     m = n // 3
     for base in range(0, length, n):
@@ -244,7 +246,7 @@ def _backward3(x, tw, length, n):  # type: ignore[no-untyped-def]
                 c[r], c[i] = tr - dr, ti - di
 
 
-@njit(nogil=True, cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _last4(x, length, swap):  # type: ignore[no-untyped-def]
     """The pass of radix 4 on blocks of 4, which has no twiddles and is its own direction."""
     R, I = (_W, np.uint64(0)) if swap else (np.uint64(0), _W)  # noqa: E741
@@ -260,7 +262,7 @@ def _last4(x, length, swap):  # type: ignore[no-untyped-def]
             b[r + s + s], b[i + s + s], b[r + s + s + s], b[i + s + s + s] = y[4], y[5], y[6], y[7]
 
 
-@njit(nogil=True, cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _last2(x, length):  # type: ignore[no-untyped-def]
     for base in range(0, length, 2):
         b = x[base * 2 * LANES : (base + 2) * 2 * LANES]
@@ -283,7 +285,7 @@ _forward_8192, _backward_8192 = _radix8(8192, False), _radix8(8192, True)
 _forward_16384, _backward_16384 = _radix8(16384, False), _radix8(16384, True)
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def forward(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
     """Eq. (1) of sixteen lanes in place; the result is in the order ``Plan.frequency``."""
     for stage in range(len(radices)):
@@ -320,7 +322,7 @@ def forward(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-
             _forward_16384(x, tw, length)
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def inverse(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
     """``length`` times the inverse of ``forward``, in place, from its order back to the natural one."""
     for stage in range(len(radices) - 1, -1, -1):

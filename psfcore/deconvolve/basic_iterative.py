@@ -22,8 +22,8 @@ image times sum over j = 0 .. n of (1 - T)^j; where abs(1 - T) > 1 that grows wi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from psfcore.compiled import compiled
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.frequencies import check_converges, noise_amplification, transfer_sample
@@ -93,7 +93,7 @@ class _BasicIterative(Iteration):
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """new <- Eq. (1), and its rows; sums of (change)^2, x^2, and (y - H x)^2 / variance over judged pixels."""
     nx = x.shape[1]

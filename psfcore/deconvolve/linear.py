@@ -21,9 +21,9 @@ A masked pixel (w = 0) does not pull; its own estimate follows its neighbours'.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from psfcore.compiled import compiled
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.frequencies import noise_amplification, transfer_sample
@@ -102,7 +102,7 @@ def inverse_filter(engine: Engine) -> NDArray[np.float32]:
     return g
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """H x <- w (y - H x); sums of (y - H x)^2 / variance over judged pixels. y is NaN where w is 0."""
     nx = observed.shape[1]
@@ -129,7 +129,7 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
         spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """x <- x + G w (y - H x), Eq. (1); sums of (change)^2 and x^2 for each block."""
     nx = x.shape[1]

@@ -18,9 +18,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from psfcore.compiled import compiled
 from psfcore.deconvolve.problem import Problem, first_estimate
 from psfcore.engine import buffer_from_spectrum, spectrum_from_buffer
 from psfcore.errors import DataError
@@ -65,7 +65,7 @@ class Ratio:
         self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, *self.judgement.numbers)
 
 
-@njit(nogil=True, cache=True, fastmath=_SUMS)
+@compiled(fastmath=_SUMS)
 def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """H x <- Eq. (1), H x not below the floor; sums of (y - H x)^2 / variance over judged pixels."""
     nx = light.shape[1]

@@ -27,9 +27,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from psfcore.compiled import compiled
 from psfcore.deconvolve.conditions import Conditions, Progress
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
@@ -114,7 +114,7 @@ def agreed(problem: Problem) -> Single:
     return np.asarray(1 / np.maximum(problem.engine.adjoint(ones), np.finfo(np.float32).eps))
 
 
-@njit(nogil=True, cache=True, fastmath=_SUMS)
+@compiled(fastmath=_SUMS)
 def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """x <- x * correction, Eq. (1), zero below `dark`; sums of (change)^2 and x^2 for each block."""
     nx = estimate.shape[1]

@@ -17,8 +17,8 @@ estimate as fast, so that stopping by discrepancy is worth its while.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from psfcore.compiled import compiled
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
@@ -127,7 +127,7 @@ class _Accelerated(Iteration):
         self._engine.run(work, self._engine.row_blocks)
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _correct(new, prediction, correction, x, gradient, dark, sums, start, stop):  # type: ignore[no-untyped-def]
     """new <- prediction * correction, gradient <- new - prediction; sums for Eq. (3) and of the change."""
     zero = np.float32(0.0)
@@ -147,7 +147,7 @@ def _correct(new, prediction, correction, x, gradient, dark, sums, start, stop):
         sums[block, 0], sums[block, 1], sums[block, 2], sums[block, 3] = alike, length, moved, total
 
 
-@njit(nogil=True, cache=True, fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _predict(prediction, x, before, earlier, a, curvature, dark, start, stop):  # type: ignore[no-untyped-def]
     """Eq. (1), above 0 where x is."""
     two = np.float32(2.0)

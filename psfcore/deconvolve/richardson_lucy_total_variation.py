@@ -22,8 +22,8 @@ up into a pattern of k times 4, for the step overshoots where differences are sm
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from psfcore.compiled import compiled
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
@@ -110,7 +110,7 @@ class _TotalVariation(Iteration):
             self._engine.rows_forward(self._lanes)
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
     """grad x / |grad x| at a pixel, (along y, along x); differences across the far edges are 0."""
     zero = np.float32(0.0)
@@ -124,7 +124,7 @@ def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
     return dy / length, dx / length
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _smooth_rows(x, correction, new, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
     """new <- Eq. (1) on rows [start, stop), zero below `dark`; sums of (change)^2 and x^2 for each row."""
     zero, one = np.float32(0.0), np.float32(1.0)

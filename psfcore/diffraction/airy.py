@@ -26,10 +26,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson
 from scipy.special import j0, j1, jn_zeros
+
+from psfcore.compiled import compiled
 
 _MM_PER_ANGSTROM = 1e-7
 _UM_PER_MM = 1e3
@@ -85,7 +86,7 @@ def first_dark_ring_v() -> float:
     return float(jn_zeros(1, 1)[0])
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _edge_fluxes(table, steps_per_px, half, near, far):  # type: ignore[no-untyped-def]
     """Flux of B / (2 pi r) in +x through the right edge of each pixel [x, y] of a quadrant."""
     flux = np.empty((half + 1, half + 1))

@@ -44,9 +44,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from psfcore.compiled import compiled
 from psfcore.diffraction.pupil import MaskGrid, Pupil
 from psfcore.fourier import transform_axis
 
@@ -275,7 +275,7 @@ def _blocks(size: int, threads: int) -> list[slice]:
     return [slice(first, min(first + step, size)) for first in range(0, size, step)]
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _fold_strip(strip, within, of_period, folded):  # type: ignore[no-untyped-def]
     """folded[y, m] = sum over k of c[y, m + k n] exp(-2 pi i turns (m + k n) / n)."""
     rows, cells = strip.shape
@@ -294,7 +294,7 @@ def _fold_strip(strip, within, of_period, folded):  # type: ignore[no-untyped-de
             folded[y, m] = within[m] * complex(real[m], imaginary[m])
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _fold_block(spectra, cells, within, of_period, field, start, stop):  # type: ignore[no-untyped-def]
     """field[m] = sum over k of spectra[m + k n] exp(-2 pi i turns (m + k n) / n); rows left out are mirrored."""
     rows, columns = spectra.shape
@@ -310,7 +310,7 @@ def _fold_block(spectra, cells, within, of_period, field, start, stop):  # type:
                     field[m, x] += factor * source[x]
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _add_intensity(field, total, weight):  # type: ignore[no-untyped-def]
     rows, columns = field.shape
     for y in range(rows):

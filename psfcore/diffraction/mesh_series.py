@@ -35,9 +35,10 @@ are fractions of the light over the whole plane, so what falls off the array is 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import sici
+
+from psfcore.compiled import compiled
 
 _UM_PER_ANGSTROM = 1e-4
 _UM_PER_MM = 1e3
@@ -182,7 +183,7 @@ def _intensity(
     return np.asarray((np.sinc(open_share * x / spacing_px) * grating) ** 2)  # Eq. (1); sinc(t) has sin(pi t)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _share_out(
     kernel: NDArray[np.float64],
     where_px: NDArray[np.float64],

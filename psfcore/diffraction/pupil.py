@@ -28,9 +28,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from psfcore.compiled import compiled
 from psfcore.errors import DataError
 from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount
 
@@ -224,7 +224,7 @@ def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
     ]
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
     """For each row of cells the edges that pass it: entries[first[row] : first[row + 1]], in their order."""
     first = np.zeros(rows + 1, dtype=np.int64)
@@ -245,7 +245,7 @@ def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
     return first, entries
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
     """Write open shares into `strip`: mesh, times the opening (outline 0), times what others leave open."""
     rows, cells = strip.shape
@@ -280,7 +280,7 @@ def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries)
             area[cells:] = 0.0
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
     """Put a range of cells into a list sorted by where they begin."""
     j = count
@@ -290,7 +290,7 @@ def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
     begins[j], ends[j] = begin, end
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]
     """Open (outline 0) or close the cells from start to stop by the share that lies inside an outline."""
     covered = np.float32(min(abs(inside), 1.0))
@@ -303,7 +303,7 @@ def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-
             row[i] *= np.float32(1.0) - covered
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
     """Add an edge's part in a row, Eq. (1), to `area`, whose running sum is the covered share of each cell.
 
@@ -341,7 +341,7 @@ def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
     return begin, end
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-untyped-def]
     """Multiply `strip` by a picture's mean over each cell; outside the picture nothing is open."""
     rows, cells = strip.shape
@@ -365,7 +365,7 @@ def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-un
             before = upto
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _running_at(running, x):  # type: ignore[no-untyped-def]
     """Running sum at a place between pixels."""
     last = len(running) - 1

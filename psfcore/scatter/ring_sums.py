@@ -28,9 +28,9 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from psfcore.compiled import compiled
 from psfcore.errors import DataError
 from psfcore.scatter.segments import Runs, Segments
 
@@ -110,7 +110,7 @@ def _parts(strips: int, threads: int, largest: int) -> list[slice]:
     return [slice(start, stop) for start, stop in pairwise(bounds)]
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _strips(targets):  # type: ignore[no-untyped-def]
     """Strip of each target, and (y, x) of each strip's first pixel; targets are sorted by y, then x."""
     strip = np.empty(len(targets), np.int64)
@@ -141,7 +141,7 @@ def _sum_strips(
     _accumulate(image, strip_yx, *of_row, places.start, running, sums)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
     """Eq. (2) for four rows from `top` on, at places from `first` on; constant beyond the image's columns.
 
@@ -164,7 +164,7 @@ def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
     running[0, beyond:], running[1, beyond:], running[2, beyond:], running[3, beyond:] = t0, t1, t2, t3
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _accumulate(image, strip_yx, first_dy, row, dx_start, dx_stop, segment, first, running, sums):  # type: ignore[no-untyped-def]
     ny, lanes = image.shape[0], sums.shape[2]
     rows_of_runs = len(row) - 1

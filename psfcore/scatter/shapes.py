@@ -32,9 +32,9 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from psfcore.compiled import compiled
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, squared_radii
 
@@ -293,7 +293,7 @@ def _by_radius(size: int, falloff: Callable[[Vector], Vector]) -> Kernel:
     return np.asarray(falloff(_radii(size)[0])[_radius_index(size)])
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _power_law_of_ellipses(size, b, c, p, q):  # type: ignore[no-untyped-def]
     """Eq. (2) of the radius of Eq. (3) on (size, size)."""
     out = np.empty((size, size))

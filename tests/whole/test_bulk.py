@@ -95,8 +95,9 @@ def test_killed_and_gone_on_with_nothing_is_done_twice(stack: Stack, psf_file: P
         for _ in range(own_workers):
             stack.start_worker()
     end = stack.client.wait_for_bulk(bulk["id"])
-    assert end["phase"] == "COMPLETED" and end["images"]["done"] == IMAGES
     rows = items(stack)
+    assert end["phase"] == "COMPLETED" and [row.error for row in rows if row.error] == []
+    assert end["images"]["done"] == IMAGES
     for row in rows:
         if row.position in before:
             assert row.ended_at == before[row.position].ended_at, "done stays done"
