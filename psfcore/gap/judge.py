@@ -143,6 +143,8 @@ def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
     before = hold_out(model, (), scheme)
     if found.best is None or before is None:
         return False
+    if model.evidence.whole_lit.freedom and not before.lit_expected.any():
+        return False  # few images: no two neighbours in one fold, so that nothing is asked of what the lit blocks show
     linear = hold_out(model, found.best.step.columns[len(model.evidence.base) :], scheme)
     if linear is not None and fall(before, linear) > 0:
         return False

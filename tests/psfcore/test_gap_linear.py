@@ -191,17 +191,24 @@ def test_the_interval_of_closure_holds_what_the_cause_would_close() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "offset_dn", "worse"), [("dark_offset", 3.0, False), ("flat_field_residual", 0.0, True)]
+    ("images", "name", "offset_dn", "worse"),
+    [
+        (15, "dark_offset", 3.0, False),
+        (15, "flat_field_residual", 0.0, True),
+        # No two neighbours in one fold: what the lit blocks show so surely is not asked held out.
+        (9, "dark_offset", 3.0, False),
+    ],
 )
 def test_what_fits_by_its_freedom_predicts_held_out_images_worse_than_nothing(
-    clean: Transit, name: str, offset_dn: float, worse: bool
+    images: int, name: str, offset_dn: float, worse: bool
 ) -> None:
     """An offset that is there, and five numbers fitted to noise."""
-    frames = tuple(replace(f, pixels=f.pixels + np.float32(offset_dn / f.exposure_s)) for f in clean.frames)
+    plan = default_plan(images, 160, oversampling=1, brightness=4.0)
+    transit = simulate(plan, TRUTH, diffraction(), seed=5).transit
+    frames = tuple(replace(f, pixels=f.pixels + np.float32(offset_dn / f.exposure_s)) for f in transit.frames)
     effects = [effect for effect in EFFECTS if effect.name == name]
-    model = LinearModel(gather(invert(replace(clean, frames=frames)), effects), FLOOR)
+    model = LinearModel(gather(invert(replace(transit, frames=frames)), effects), FLOOR)
     best = fitted(model, effects)
     assert best.gain > 0
-    assert (
-        _worse_held_out(model, Judgement("attributed", best.names, 0.0, (best,), (), best), no_refit) is worse
-    )
+    answer = Judgement("attributed", best.names, 0.0, (best,), (), best)
+    assert _worse_held_out(model, answer, no_refit) is worse
