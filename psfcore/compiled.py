@@ -1,9 +1,10 @@
 """Kernels compiled by numba, kept on disk so that processes that start at the same moment cannot mix them up.
 
-numba numbers the machine code of a function in an index that is read, changed and written without a lock. Two
-processes that compile two kernels of one name at once, as passes of two lengths are (``fft_kernels``), can
-both write number 1, and either is then loaded for the other's: transforms come out wrong, and nothing says so. Here
-a file is named after what was compiled, and there is no index.
+numba numbers the machine code of a function in an index that is read, changed and written without a lock, and names its
+symbols by a counter of the process. Two processes that compile two kernels of one name at once, as passes of two
+lengths are (``fft_kernels``), can both write number 1, and give two kernels one symbol. Either is then called for the
+other: transforms come out wrong, and nothing says so. Here a file is named after what was compiled, without an index,
+and functions that a function makes have names of their own.
 """
 
 from __future__ import annotations
@@ -18,10 +19,18 @@ from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
 
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: ``numba.njit`` with these options, without the interpreter's lock, and kept on disk."""
+def compiled(
+    *, name: str | None = None, **options: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator: ``numba.njit`` with these options, without the interpreter's lock, and kept on disk.
+
+    name: for functions that hold constants of the function around them, another for each set of constants.
+    """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        if function.__closure__ is not None and name is None:
+            raise TypeError(f"expected a name of its own for {function.__qualname__}, which holds constants")
+        function.__qualname__ = name or function.__qualname__
         kernel: Any = njit(nogil=True, cache=True, **options)(function)
         if isinstance(kernel, Dispatcher):  # a plain function where compiling is switched off
             cache = kernel._cache  # type: ignore[attr-defined]

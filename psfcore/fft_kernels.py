@@ -137,7 +137,7 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
     # Real and imaginary parts change places for the inverse.
     R, I = (np.uint64(LANES), np.uint64(0)) if inverse else (np.uint64(0), np.uint64(LANES))  # noqa: E741
 
-    @compiled(fastmath=_FAST)
+    @compiled(name=f"forward_{n}", fastmath=_FAST)
     def forward(x, tw, length):  # type: ignore[no-untyped-def]
         for base in range(0, length, n):
             for p in range(m):
@@ -170,7 +170,7 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
                     x[r + M6], x[i + M6] = _times(y6r, y6i, w6r, w6i)
                     x[r + M7], x[i + M7] = _times(y7r, y7i, w7r, w7i)
 
-    @compiled(fastmath=_FAST)
+    @compiled(name=f"backward_{n}", fastmath=_FAST)
     def backward(x, tw, length):  # type: ignore[no-untyped-def]
         for base in range(0, length, n):
             for p in range(m):

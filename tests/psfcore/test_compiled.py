@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
+from psfcore import fft_kernels
 from psfcore.compiled import KernelFiles, compiled
 
 ROOT = Path(__file__).parents[2]
@@ -42,47 +41,68 @@ def test_code_of_a_source_that_has_changed_is_not_loaded(tmp_path: Path) -> None
     assert len(list(tmp_path.iterdir())) == 1, "and the old code's file is gone"
 
 
-def _adding(amount: int) -> Callable[..., Any]:
-    @compiled()
-    def add(x):  # type: ignore[no-untyped-def]
-        return x + amount
+# Two kernels that one function makes, and a third that calls both.
+MODULE = """
+import sys
+import numpy as np
+from psfcore import fft_kernels
+from psfcore.compiled import compiled
 
+def adding(amount):
+    @compiled(name=f"add_{amount}")
+    def add(x):
+        for k in range(x.size):
+            x[k] += amount
     return add
 
+add_1, add_20 = adding(1), adding(20)
 
-def test_closures_of_one_name_are_kernels_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for amount in (1, 2, 1, 2):
-        add = _adding(amount)
-        add._cache._cache_file._cache_path = str(tmp_path)
-        assert add(10) == 10 + amount
-        assert add(np.float32(0.5)) == 0.5 + amount
-        hits = sum(add.stats.cache_hits.values())
-    assert hits == 2, "the last was not compiled again"
-    assert len(list(tmp_path.iterdir())) == 4
+@compiled()
+def add_both(x):
+    add_1(x)
+    add_20(x)
+
+def run(kernel):
+    x = np.zeros(3)
+    kernel(x)
+    print(*x, sum(kernel.stats.cache_hits.values()))
+"""
 
 
-def test_a_new_process_finds_every_kernel(tmp_path: Path) -> None:
-    """A key that told a place in memory would be another in each process, and all would be compiled again."""
-    script = (
-        "import numpy as np\n"
-        "from psfcore.fft_kernels import make_plan\n"
-        "from psfcore import fft_kernels as k\n"
-        "plan = make_plan(64)\n"
-        "buffer = np.zeros(64 * 32, dtype=np.float32)\n"
-        "k.forward(buffer, 64, plan.radices, plan.lengths, plan.twiddles, plan.offsets)\n"
-    )
-    counts = []
-    for _ in range(2):
+def test_kernels_that_two_processes_compiled_each_as_its_first_are_not_mixed_up(tmp_path: Path) -> None:
+    """A symbol has a number that counts what its process compiled: both are first, and a third process links both."""
+    (tmp_path / "kernels.py").write_text(MODULE)
+    said = [
         subprocess.run(
-            [sys.executable, "-c", script],
+            [sys.executable, "-c", f"import kernels; kernels.run(kernels.{kernel})"],
             check=True,
-            cwd=ROOT,
-            env={"NUMBA_CACHE_DIR": str(tmp_path), "PATH": ""},
-        )
-        counts.append(sorted(path.name for path in tmp_path.rglob("*.nbc")))
-    assert counts[0] and counts[0] == counts[1]
+            cwd=tmp_path,
+            env={"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+        ).stdout.split()
+        for kernel in ("add_1", "add_20", "add_both", "add_1")
+    ]
+    assert said == [
+        ["1.0", "1.0", "1.0", "0"],
+        ["20.0", "20.0", "20.0", "0"],
+        ["21.0", "21.0", "21.0", "0"],
+        ["1.0", "1.0", "1.0", "1"],
+    ], "the last is not compiled again"
+
+
+def test_every_pass_of_the_transforms_has_a_name_of_its_own() -> None:
+    passes = [kernel for name, kernel in vars(fft_kernels).items() if re.match(r"_(for|back)ward_\d+$", name)]
+    assert len({kernel.__qualname__ for kernel in passes}) == len(passes) > 20
+
+
+def test_a_function_that_holds_constants_needs_a_name_for_them() -> None:
+    amount = 3
+    with pytest.raises(TypeError, match=r"a name of its own for .*add, which holds constants"):
+
+        @compiled()
+        def add(x):  # type: ignore[no-untyped-def]
+            return x + amount
 
 
 def test_no_kernel_is_kept_in_another_way() -> None:
