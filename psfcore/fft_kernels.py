@@ -6,8 +6,10 @@ between the two, so nothing is ever put in order (``Plan.frequency`` says which 
 
 Sixteen signals ("lanes") lie side by side, so that each butterfly is the same operation on sixteen neighbours:
 a buffer is flat float32, [index][re, im][lane]. The compiler turns the innermost loop over lanes into vector
-instructions, which needs the distances between the legs of a butterfly as constants: hence one compiled function
-for each length of a radix-8 pass. Unsigned indices spare the check for negative ones, which would prevent it.
+instructions, which needs the distances between more than three legs of a butterfly as constants: hence one compiled
+function for each length of a pass of radix 8 or 4. The pass of radix 4 or 2 comes before those of 8, so that these
+lengths are few: compiling is what a first run waits for. Unsigned indices spare the check for negative ones, which
+would prevent it.
 
     X[k] = sum_j x[j] exp(-2 pi i j k / L)                                                          Eq. (1)
 
@@ -99,19 +101,20 @@ def make_plan(length: int) -> Plan:
 
 
 def _radices(length: int) -> list[int]:
-    """Threes first, then eights, and the four or two that is left over last."""
+    """Threes first, then the four or two that is left beside eights, so that passes of eight have few lengths."""
     radices, rest = [], length
     while rest % 3 == 0:
         radices.append(3)
         rest //= 3
+    eights = 0
     while rest % 8 == 0:
-        radices.append(8)
+        eights += 1
         rest //= 8
     if rest > 1:
         radices.append(rest)
-    if np.prod(radices) != length or rest not in (1, 2, 4):
+    if rest not in (1, 2, 4):
         raise ValueError(f"length {length} is not 2^a, 3 2^a or 9 2^a")
-    return radices
+    return radices + [8] * eights
 
 
 # Butterflies on scalars, which the compiler sees as lanes --------------------------------------------
@@ -246,43 +249,87 @@ def _backward3(x, tw, length, n):  # type: ignore[no-untyped-def]
                 c[r], c[i] = tr - dr, ti - di
 
 
-@compiled(fastmath=_FAST)
-def _last4(x, length, swap):  # type: ignore[no-untyped-def]
-    """The pass of radix 4 on blocks of 4, which has no twiddles and is its own direction."""
-    R, I = (_W, np.uint64(0)) if swap else (np.uint64(0), _W)  # noqa: E741
-    for base in range(0, length, 4):
-        b = x[base * 2 * LANES : (base + 4) * 2 * LANES]
-        for w in range(LANES):
-            r, i = np.uint64(w) + R, np.uint64(w) + I
-            s = np.uint64(2 * LANES)
-            y = _dft4(
-                b[r], b[i], b[r + s], b[i + s], b[r + s + s], b[i + s + s], b[r + s + s + s], b[i + s + s + s]
-            )
-            b[r], b[i], b[r + s], b[i + s] = y[0], y[1], y[2], y[3]
-            b[r + s + s], b[i + s + s], b[r + s + s + s], b[i + s + s + s] = y[4], y[5], y[6], y[7]
+def _radix4(n: int, inverse: bool) -> Callable[..., None]:
+    """The radix-4 pass for blocks of length n, which is a constant for the compiler."""
+    m = n // 4
+    M1, M2, M3 = (np.uint64(q * m * 2 * LANES) for q in range(1, 4))
+    R, I = (np.uint64(LANES), np.uint64(0)) if inverse else (np.uint64(0), np.uint64(LANES))  # noqa: E741
+
+    @compiled(name=f"forward4_{n}", fastmath=_FAST)
+    def forward(x, tw, length):  # type: ignore[no-untyped-def]
+        for base in range(0, length, n):
+            for p in range(m):
+                o = np.uint64((base + p) * 2 * LANES)
+                t = p * 6
+                w1r, w1i, w2r, w2i, w3r, w3i = tw[t], tw[t + 1], tw[t + 2], tw[t + 3], tw[t + 4], tw[t + 5]
+                for w in range(LANES):
+                    r = o + np.uint64(w) + R
+                    i = o + np.uint64(w) + I
+                    y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = _dft4(
+                        x[r], x[i], x[r + M1], x[i + M1], x[r + M2], x[i + M2], x[r + M3], x[i + M3]
+                    )
+                    x[r], x[i] = y0r, y0i
+                    x[r + M1], x[i + M1] = _times(y1r, y1i, w1r, w1i)
+                    x[r + M2], x[i + M2] = _times(y2r, y2i, w2r, w2i)
+                    x[r + M3], x[i + M3] = _times(y3r, y3i, w3r, w3i)
+
+    @compiled(name=f"backward4_{n}", fastmath=_FAST)
+    def backward(x, tw, length):  # type: ignore[no-untyped-def]
+        for base in range(0, length, n):
+            for p in range(m):
+                o = np.uint64((base + p) * 2 * LANES)
+                t = p * 6
+                w1r, w1i, w2r, w2i, w3r, w3i = tw[t], tw[t + 1], tw[t + 2], tw[t + 3], tw[t + 4], tw[t + 5]
+                for w in range(LANES):
+                    r = o + np.uint64(w) + R
+                    i = o + np.uint64(w) + I
+                    br, bi = _times(x[r + M1], x[i + M1], w1r, w1i)
+                    cr, ci = _times(x[r + M2], x[i + M2], w2r, w2i)
+                    dr, di = _times(x[r + M3], x[i + M3], w3r, w3i)
+                    y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = _dft4(x[r], x[i], br, bi, cr, ci, dr, di)
+                    x[r], x[i], x[r + M1], x[i + M1] = y0r, y0i, y1r, y1i
+                    x[r + M2], x[i + M2], x[r + M3], x[i + M3] = y2r, y2i, y3r, y3i
+
+    return backward if inverse else forward
 
 
 @compiled(fastmath=_FAST)
-def _last2(x, length):  # type: ignore[no-untyped-def]
-    for base in range(0, length, 2):
-        b = x[base * 2 * LANES : (base + 2) * 2 * LANES]
-        for w in range(2 * LANES):
-            j, k = np.uint64(w), np.uint64(w + 2 * LANES)
-            b[j], b[k] = b[j] + b[k], b[j] - b[k]
+def _forward2(x, tw, length, n):  # type: ignore[no-untyped-def]
+    m = n // 2
+    for base in range(0, length, n):
+        for p in range(m):
+            a = x[(base + p) * 2 * LANES :]
+            b = x[(base + p + m) * 2 * LANES :]
+            wr, wi = tw[2 * p], tw[2 * p + 1]
+            for w in range(LANES):
+                r, i = np.uint64(w), np.uint64(w) + _W
+                dr, di = a[r] - b[r], a[i] - b[i]
+                a[r], a[i] = a[r] + b[r], a[i] + b[i]
+                b[r], b[i] = _times(dr, di, wr, wi)
 
 
+@compiled(fastmath=_FAST)
+def _backward2(x, tw, length, n):  # type: ignore[no-untyped-def]
+    m = n // 2
+    for base in range(0, length, n):
+        for p in range(m):
+            a = x[(base + p) * 2 * LANES :]
+            b = x[(base + p + m) * 2 * LANES :]
+            wr, wi = tw[2 * p], tw[2 * p + 1]
+            for w in range(LANES):
+                r, i = np.uint64(w) + _W, np.uint64(w)
+                br, bi = _times(b[r], b[i], wr, wi)
+                a[r], a[i], b[r], b[i] = a[r] + br, a[i] + bi, a[r] - br, a[i] - bi
+
+
+_forward4_32, _backward4_32 = _radix4(32, False), _radix4(32, True)
+_forward4_256, _backward4_256 = _radix4(256, False), _radix4(256, True)
+_forward4_2048, _backward4_2048 = _radix4(2048, False), _radix4(2048, True)
+_forward4_16384, _backward4_16384 = _radix4(16384, False), _radix4(16384, True)
 _forward_8, _backward_8 = _radix8(8, False), _radix8(8, True)
-_forward_16, _backward_16 = _radix8(16, False), _radix8(16, True)
-_forward_32, _backward_32 = _radix8(32, False), _radix8(32, True)
 _forward_64, _backward_64 = _radix8(64, False), _radix8(64, True)
-_forward_128, _backward_128 = _radix8(128, False), _radix8(128, True)
-_forward_256, _backward_256 = _radix8(256, False), _radix8(256, True)
 _forward_512, _backward_512 = _radix8(512, False), _radix8(512, True)
-_forward_1024, _backward_1024 = _radix8(1024, False), _radix8(1024, True)
-_forward_2048, _backward_2048 = _radix8(2048, False), _radix8(2048, True)
 _forward_4096, _backward_4096 = _radix8(4096, False), _radix8(4096, True)
-_forward_8192, _backward_8192 = _radix8(8192, False), _radix8(8192, True)
-_forward_16384, _backward_16384 = _radix8(16384, False), _radix8(16384, True)
 
 
 @compiled()
@@ -292,34 +339,24 @@ def forward(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-
         tw, n = twiddles[offsets[stage] :], lengths[stage]
         if radices[stage] == 3:
             _forward3(x, tw, length, n)
-        elif radices[stage] == 4:
-            _last4(x, length, False)
         elif radices[stage] == 2:
-            _last2(x, length)
+            _forward2(x, tw, length, n)
+        elif n == 32:
+            _forward4_32(x, tw, length)
+        elif n == 256:
+            _forward4_256(x, tw, length)
+        elif n == 2048:
+            _forward4_2048(x, tw, length)
+        elif n == 16384:
+            _forward4_16384(x, tw, length)
         elif n == 8:
             _forward_8(x, tw, length)
-        elif n == 16:
-            _forward_16(x, tw, length)
-        elif n == 32:
-            _forward_32(x, tw, length)
         elif n == 64:
             _forward_64(x, tw, length)
-        elif n == 128:
-            _forward_128(x, tw, length)
-        elif n == 256:
-            _forward_256(x, tw, length)
         elif n == 512:
             _forward_512(x, tw, length)
-        elif n == 1024:
-            _forward_1024(x, tw, length)
-        elif n == 2048:
-            _forward_2048(x, tw, length)
         elif n == 4096:
             _forward_4096(x, tw, length)
-        elif n == 8192:
-            _forward_8192(x, tw, length)
-        elif n == 16384:
-            _forward_16384(x, tw, length)
 
 
 @compiled()
@@ -329,31 +366,21 @@ def inverse(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-
         tw, n = twiddles[offsets[stage] :], lengths[stage]
         if radices[stage] == 3:
             _backward3(x, tw, length, n)
-        elif radices[stage] == 4:
-            _last4(x, length, True)
         elif radices[stage] == 2:
-            _last2(x, length)
+            _backward2(x, tw, length, n)
+        elif n == 32:
+            _backward4_32(x, tw, length)
+        elif n == 256:
+            _backward4_256(x, tw, length)
+        elif n == 2048:
+            _backward4_2048(x, tw, length)
+        elif n == 16384:
+            _backward4_16384(x, tw, length)
         elif n == 8:
             _backward_8(x, tw, length)
-        elif n == 16:
-            _backward_16(x, tw, length)
-        elif n == 32:
-            _backward_32(x, tw, length)
         elif n == 64:
             _backward_64(x, tw, length)
-        elif n == 128:
-            _backward_128(x, tw, length)
-        elif n == 256:
-            _backward_256(x, tw, length)
         elif n == 512:
             _backward_512(x, tw, length)
-        elif n == 1024:
-            _backward_1024(x, tw, length)
-        elif n == 2048:
-            _backward_2048(x, tw, length)
         elif n == 4096:
             _backward_4096(x, tw, length)
-        elif n == 8192:
-            _backward_8192(x, tw, length)
-        elif n == 16384:
-            _backward_16384(x, tw, length)

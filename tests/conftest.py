@@ -13,10 +13,11 @@ REPOSITORY = Path(__file__).parents[1]
 
 # The files that take longest, so that they are begun first: begun last, one of them would leave a core idle.
 LONGEST_FIRST = (
-    "whole/test_bulk.py",
     "psfcore/test_gap.py",
-    "whole/test_service.py",
     "psfcore/test_deconvolve_methods.py",
+    # Not first: its workers, killed while they compile kernels, would compile them again and again.
+    "whole/test_bulk.py",
+    "whole/test_service.py",
     "psfcore/test_build.py",
     "whole/test_real_data.py",
     "service/test_bulk.py",
