@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from sqlalchemy import create_engine, text
+from sqlalchemy import create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 
 from service.client import Heliopsf
@@ -201,12 +201,14 @@ class Redis:
 
 
 @contextmanager
-def postgres_database() -> Iterator[str]:
+def postgres_database(template: str | None = None) -> Iterator[str]:
+    """The URL of a database that is there for as long as this lasts: empty, or a copy of the one with this URL."""
     admin = create_engine(POSTGRES, isolation_level="AUTOCOMMIT", connect_args={"connect_timeout": 3})
     name = f"heliopsf_test_{uuid.uuid4().hex[:12]}"
     try:
         with admin.connect() as connection:
-            connection.execute(text(f"CREATE DATABASE {name}"))
+            like = "" if template is None else f" TEMPLATE {make_url(template).database}"
+            connection.execute(text(f"CREATE DATABASE {name}{like}"))
     except OperationalError as error:
         raise Missing(
             f"no PostgreSQL at {admin.url} (HELIOPSF_TEST_POSTGRES names one): {error.orig}"

@@ -33,6 +33,20 @@ def local(settings: Settings) -> Iterator[LocalService]:
     service.close()
 
 
+@pytest.fixture(scope="session")
+def postgres_tables() -> Iterator[str]:
+    """A PostgreSQL database with this version's tables, to be copied."""
+    with ExitStack() as resources:
+        try:
+            url = resources.enter_context(postgres_database())
+        except Missing as missing:
+            pytest.skip(str(missing))
+        catalogue = Catalogue(Settings(database_url=url).catalogue_url)
+        catalogue.upgrade()
+        catalogue.close()
+        yield url
+
+
 @pytest.fixture(params=["sqlite", "postgresql"])
 def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalogue]:
     if request.param == "sqlite":
@@ -41,11 +55,7 @@ def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalo
         yield catalogue
         catalogue.close()
         return
-    with ExitStack() as resources:
-        try:
-            url = resources.enter_context(postgres_database())
-        except Missing as missing:
-            pytest.skip(str(missing))
+    with postgres_database(template=request.getfixturevalue("postgres_tables")) as url:
         catalogue = Catalogue(Settings(database_url=url).catalogue_url)
         catalogue.upgrade()
         yield catalogue
