@@ -5,18 +5,28 @@ symbols by a counter of the process. Two processes that compile two kernels of o
 lengths are (``fft_kernels``), can both write number 1, and give two kernels one symbol. Either is then called for the
 other: transforms come out wrong, and nothing says so. Here a file is named after what was compiled, without an index,
 and functions that a function makes have names of their own.
+
+Nor does numba see that a function in another file, which a kernel calls and holds, has changed: here kernels go by all
+files that define any. A file that a loss of power has cut is none.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
+import pickle
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
-import numba
 from numba import njit
 from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
+
+HEAD_BYTES = 2 * hashlib.sha256().digest_size
+MARK = b"@compiled("
+log = logging.getLogger(__name__)
 
 
 def compiled(
@@ -43,23 +53,41 @@ def compiled(
 
 
 class KernelFiles(IndexDataCacheFile):
-    """The files of a function's kernels: each named after its key, with the source that it was compiled from inside.
+    """The files of a function's kernels, each named after its key; inside, what it was compiled from and its hash.
 
     A key tells the types of the arguments, the processor, and the constants that a closure holds.
     """
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep a kernel; whoever looks sees all of its file, or none."""
-        self._save_data(self._name(key), (self._source_stamp, data))
+        """Keep a kernel; whoever looks sees all of its file, or none. Where it cannot be kept, it is used all the same."""
+        payload = self._dump(data)
+        path = self._data_path(self._name(key))
+        try:
+            with self._open_for_write(path) as file:
+                file.write(self._head(payload) + payload)
+        except OSError as error:
+            log.warning("a compiled kernel cannot be kept, and is compiled again by each process: %s", error)
 
     def load(self, key: Any) -> Any:
-        """The kernel of this key and of the source as it is now; None where it was not compiled yet."""
+        """The kernel of this key and of the sources as they are now; None where it was not compiled yet."""
         try:
-            stamp, data = self._load_data(self._name(key))
+            kept = Path(self._data_path(self._name(key))).read_bytes()
         except FileNotFoundError:
             return None
-        return data if stamp == self._source_stamp else None
+        head, payload = kept[:HEAD_BYTES], kept[HEAD_BYTES:]
+        return pickle.loads(payload) if head == self._head(payload) else None
+
+    def _head(self, payload: bytes) -> bytes:
+        stamp = repr((self._version, self._source_stamp, sources_sha256()))
+        return hashlib.sha256(stamp.encode()).digest() + hashlib.sha256(payload).digest()
 
     def _name(self, key: Any) -> str:
-        told = repr((numba.__version__, key))
+        told = repr((self._version, key))
         return self._index_name.removesuffix("nbi") + hashlib.sha256(told.encode()).hexdigest()[:24] + ".nbc"
+
+
+@cache
+def sources_sha256() -> str:
+    """The SHA-256 of all files of this package that define kernels."""
+    sources = sorted(path.read_bytes() for path in Path(__file__).parent.rglob("*.py"))
+    return hashlib.sha256(b"".join(source for source in sources if MARK in source)).hexdigest()

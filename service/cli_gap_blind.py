@@ -78,13 +78,13 @@ def blind(
     make_only: bool,
 ) -> None:
     """Judge the diagnosis on cases whose effect it does not know. Goes on where an earlier run was stopped."""
-    from psfcore.blind.blind_set import SetPlan, make_set
+    from psfcore.blind.blind_set import SetPlan, alone_in, make_set
     from psfcore.blind.running import run_set
 
     def say(line: str) -> None:
         click.echo(line, err=True)
 
-    with user_errors():
+    with user_errors(), alone_in(output):
         plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct)
         made = make_set(output, plan, scenes=_planes(scenes), processes=processes, progress=say)
         if make_only:

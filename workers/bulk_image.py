@@ -24,7 +24,7 @@ from workers.context import Context
 from workers.contract import Deconvolve, ResolvedDeconvolve, product_identity
 from workers.intake import resolved_deconvolution
 from workers.psf_task import psf_of
-from workers.store import sha256_of
+from workers.store import sha256_of, sync
 from workers.tables import ImageRow, ProductRow
 
 # The structures that stand for an image, of all that its effects tell: blocks of 4 px, tails of 1 %.
@@ -235,6 +235,7 @@ def _put(source: Path, target: Path) -> None:
                 copy.flush()
                 os.fsync(copy.fileno())
             partial.replace(target)
+            sync(target.parent)  # its name too, before the image counts as done
         finally:
             partial.unlink(missing_ok=True)
     except OSError as error:

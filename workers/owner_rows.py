@@ -81,7 +81,9 @@ class Owners:
                     wrong.append(row.owner)
                     row.bytes = right
             for owner, total in truth.items():
-                add_bytes(session, owner, total)
+                # It came while this waited, and may have been counted already.
+                add_bytes(session, owner, 0)
+                session.execute(update(OwnerRow).where(OwnerRow.owner == owner).values(bytes=total))
                 wrong.append(owner)
         return sorted(wrong)
 

@@ -17,7 +17,7 @@ import aiohttp
 import s3fs
 from botocore.exceptions import BotoCoreError
 
-from workers.store import Blob, Store, StoreAway, sha256_of
+from workers.store import Blob, Store, StoreAway, sha256_of, sync
 
 LOOK_AFTER_S = 10.0  # how often the copies are counted, at most
 IN_USE_S = 60.0  # a copy that was asked for is about to be opened
@@ -98,6 +98,7 @@ class RemoteStore(Store):
     def _keep_copy(self, temporary: Path, copy: Path) -> None:
         copy.parent.mkdir(exist_ok=True)
         os.utime(temporary)
+        sync(temporary)  # a copy is not looked into again
         os.replace(temporary, copy)
         if time.monotonic() - self._counted_at > LOOK_AFTER_S:
             self._make_room()

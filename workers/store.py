@@ -83,9 +83,9 @@ class Store:
         digest = digest or sha256_of(temporary)
         target = self.path(digest)
         target.parent.mkdir(exist_ok=True)
-        _sync(temporary)
+        sync(temporary)
         os.replace(temporary, target)
-        _sync(target.parent)
+        sync(target.parent)
         return digest
 
     def blobs(self) -> Iterator[Blob]:
@@ -129,7 +129,8 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Have a file, or a folder's names, on the disk before anything is said of it."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

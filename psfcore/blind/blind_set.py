@@ -9,6 +9,7 @@ DIR/seals.jsonl               {"case", "sha256"}, a line a case
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -16,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context, parent_process
 from pathlib import Path
@@ -84,7 +86,8 @@ class BlindSet:
         if not self.seals_file.is_file():
             return {}
         found: dict[int, str] = {}
-        for line in self.seals_file.read_text("utf-8").splitlines():
+        # What stands behind the last end of a line was cut when the power went; its case is made again.
+        for line in self.seals_file.read_text("utf-8").rpartition("\n")[0].splitlines():
             try:
                 entry = json.loads(line)
                 number, seal = int(entry["case"]), str(entry["sha256"])
@@ -138,8 +141,11 @@ def make_set(
     for number in missing:
         shutil.rmtree(made.case_folder(number), ignore_errors=True)  # half made
     for done, (number, seal, seconds) in enumerate(_made(made, plan, missing, scenes, processes), 1):
+        _end_cut_line(made.seals_file)
         with made.seals_file.open("a", encoding="utf-8") as seals:
             seals.write(json.dumps({"case": number, "sha256": seal}) + "\n")
+            seals.flush()
+            os.fsync(seals.fileno())
         progress(f"made case {number:04d} in {seconds:.1f} s ({done} of {len(missing)})")
     return made
 
@@ -156,7 +162,37 @@ def _remember(made: BlindSet, plan: SetPlan) -> None:
                 "other-set", f"expected a folder for {about}; {made.folder} holds a set made with {before}"
             )
     made.folder.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(about, indent=1) + "\n", "utf-8")
+    write_whole(file, json.dumps(about, indent=1) + "\n")
+
+
+def write_whole(file: Path, text: str) -> None:
+    """Write a file of which there is all or nothing, whatever is killed."""
+    part = file.with_suffix(".part")
+    with part.open("w", encoding="utf-8") as unfinished:
+        unfinished.write(text)
+        unfinished.flush()
+        os.fsync(unfinished.fileno())
+    os.replace(part, file)
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """While it lasts, no other process works on the set in this folder. Raises DataError "set-in-use"."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as held:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise DataError(
+                "set-in-use", f"expected a folder that no other run works on; {folder} is in use"
+            ) from error
+        yield
+
+
+def _end_cut_line(file: Path) -> None:
+    """Take away what a loss of power left of a last line."""
+    if file.is_file() and not (text := file.read_text("utf-8")).endswith("\n"):
+        file.write_text(text.rpartition("\n")[0] + "\n" if "\n" in text else "", "utf-8")
 
 
 def _made(
@@ -202,7 +238,5 @@ def _make_one(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane
     result = make(case, scenes)
     write_transit(result, case.plan, made.transit(number))
     seal, kept = sealed(result.truth)
-    unfinished = made.truth_file(number).with_suffix(".part")
-    unfinished.write_text(json.dumps(kept, allow_nan=False), "utf-8")
-    os.replace(unfinished, made.truth_file(number))
+    write_whole(made.truth_file(number), json.dumps(kept, allow_nan=False))
     return number, seal, time.perf_counter() - started

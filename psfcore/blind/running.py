@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from psfcore.blind.blind_set import BlindSet
+from psfcore.blind.blind_set import BlindSet, write_whole
 from psfcore.blind.scoring import Judged
 from psfcore.errors import DataError
 
@@ -150,9 +150,9 @@ def _diagnose(made: BlindSet, number: int, command: Sequence[str], longest_s: fl
                 error = problem.message
         run = Run(number, wall_s, peak_mib, status, error)
         folder = made.case_folder(number)
-        _write(folder / "run.json", json.dumps(asdict(run), indent=1))
+        write_whole(folder / "run.json", json.dumps(asdict(run), indent=1))
         if not run.failed:
-            _write(made.report(number), report.read_text("utf-8"))
+            write_whole(made.report(number), report.read_text("utf-8"))
         return run
 
 
@@ -173,10 +173,3 @@ def _watched(command: Sequence[str], folder: Path, longest_s: float) -> tuple[in
     if wall_s >= longest_s:
         text = f"killed after {longest_s:.0f} s. {text}"
     return child.returncode, wall_s, usage.ru_maxrss / _KIB, text or "nothing was said"
-
-
-def _write(file: Path, text: str) -> None:
-    """Whole or not at all."""
-    part = file.with_suffix(".part")
-    part.write_text(text, "utf-8")
-    os.replace(part, file)

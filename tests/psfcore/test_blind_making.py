@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.blind.blind_set import BlindSet, SetPlan, make_set
+from psfcore.blind.blind_set import BlindSet, SetPlan, _end_cut_line, alone_in, make_set
 from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE, case_scenes, draw_case
 from psfcore.blind.effects import EFFECTS, KNOWN
 from psfcore.blind.making import make
@@ -149,6 +149,30 @@ def test_seals_catch_a_changed_truth(made: BlindSet, tmp_path: Path) -> None:
     copy.seals_file.write_text(made.seals_file.read_text() + '{"case": 0, "sha256": "00"}\n')
     with pytest.raises(DataError, match="bad-seals"):
         copy.seals()
+
+
+def test_a_last_seal_that_was_cut_when_the_power_went_is_none(tmp_path: Path) -> None:
+    made = BlindSet(tmp_path)
+    whole = json.dumps({"case": 0, "sha256": "ab"}) + "\n"
+    for cut in ("", '{"case": 1, "sha', '{"case": 1, "sha256": "cd"}'):
+        made.seals_file.write_text(whole + cut)
+        assert made.seals() == {0: "ab"}
+        _end_cut_line(made.seals_file)
+        assert made.seals_file.read_text() == whole
+    made.seals_file.write_text('{"case"')
+    _end_cut_line(made.seals_file)
+    assert made.seals_file.read_text() == ""
+
+
+def test_one_run_at_a_time_works_on_a_set(tmp_path: Path) -> None:
+    with (
+        alone_in(tmp_path / "set"),
+        pytest.raises(DataError, match="set-in-use: expected a folder that no other run works on"),
+        alone_in(tmp_path / "set"),
+    ):
+        pass
+    with alone_in(tmp_path / "set"):
+        pass
 
 
 def test_made_cases_are_not_made_again(made: BlindSet) -> None:

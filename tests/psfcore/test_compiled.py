@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 
 from psfcore import fft_kernels
-from psfcore.compiled import KernelFiles, compiled
+from psfcore.compiled import MARK, KernelFiles, compiled
 
 ROOT = Path(__file__).parents[2]
 
@@ -19,13 +20,13 @@ ROOT = Path(__file__).parents[2]
 def test_two_processes_that_compile_at_once_keep_both_kernels(tmp_path: Path) -> None:
     """The second writes its kernel while the first, which found nothing there before, is about to write its own."""
     first, second = (KernelFiles(str(tmp_path), "f.py311", "source") for _ in range(2))
-    write = first._save_data
+    write = first._open_for_write
 
-    def late(name: str, data: Any) -> None:
+    def late(path: str) -> Any:
         second.save(("length 512",), "code for 512")
-        write(name, data)
+        return write(path)
 
-    first._save_data = late
+    first._open_for_write = late
     first.save(("length 64",), "code for 64")
     third = KernelFiles(str(tmp_path), "f.py311", "source")
     assert (third.load(("length 64",)), third.load(("length 512",))) == ("code for 64", "code for 512")
@@ -39,6 +40,61 @@ def test_code_of_a_source_that_has_changed_is_not_loaded(tmp_path: Path) -> None
     now.save(("float32",), "new code")
     assert now.load(("float32",)) == "new code"
     assert len(list(tmp_path.iterdir())) == 1, "and the old code's file is gone"
+
+
+def test_code_that_holds_a_changed_function_of_another_file_is_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = KernelFiles(str(tmp_path), "f.py311", "the same")
+    files.save(("float32",), "code")
+    assert files.load(("float32",)) == "code"
+    monkeypatch.setattr("psfcore.compiled.sources_sha256", lambda: "another")
+    assert files.load(("float32",)) is None
+
+
+@pytest.mark.parametrize("left", [0, 10, 64, -1])
+def test_a_file_that_was_cut_when_the_power_went_is_compiled_again(tmp_path: Path, left: int) -> None:
+    files = KernelFiles(str(tmp_path), "f.py311", "source")
+    files.save(("float32",), "code")
+    (kept,) = tmp_path.iterdir()
+    kept.write_bytes(kept.read_bytes()[:left])
+    assert files.load(("float32",)) is None
+    files.save(("float32",), "code")
+    assert files.load(("float32",)) == "code"
+
+
+def test_a_kernel_that_cannot_be_kept_is_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    KernelFiles(str(tmp_path / "gone"), "f.py311", "source").save(("float32",), "code")
+    assert "cannot be kept" in caplog.text
+
+
+def kernel_names(source: ast.Module) -> set[str]:
+    """What the bodies of a file's kernels name."""
+    kernels = [
+        node
+        for node in ast.walk(source)
+        if isinstance(node, ast.FunctionDef)
+        and any("compiled(" in ast.unparse(d) for d in node.decorator_list)
+    ]
+    return {one.id for kernel in kernels for one in ast.walk(kernel) if isinstance(one, ast.Name)}
+
+
+def test_kernels_hold_nothing_of_files_that_define_none() -> None:
+    """What they hold of others must change the hash that they go by."""
+    sources = {path: path.read_bytes() for path in (ROOT / "psfcore").rglob("*.py")}
+    looked_at = 0
+    for path, content in sources.items():
+        if MARK not in content or path.name == "compiled.py":
+            continue
+        tree = ast.parse(content)
+        names = kernel_names(tree)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("psfcore"):
+                used = names & {alias.asname or alias.name for alias in node.names}
+                looked_at += len(used)
+                origin = ROOT / (node.module.replace(".", "/") + ".py")
+                assert not used or MARK in sources[origin], f"{path.name} holds {used} of {node.module}"
+    assert looked_at > 5
 
 
 # Two kernels that one function makes, and a third that calls both.

@@ -8,12 +8,13 @@ from queue import Empty
 
 import pytest
 from click.testing import CliRunner
+from kombu import pools
 from pydantic import ValidationError
 from sqlalchemy import update
 
 from service.cli import main
 from workers import queue
-from workers.broker_order import MostUrgentFirst
+from workers.broker_order import FolderTransport, MostUrgentFirst
 from workers.catalogue import Catalogue
 from workers.reconciler import AT_ONCE, reconcile
 from workers.settings import Settings
@@ -117,3 +118,29 @@ def test_the_folder_s_messages_come_in_our_order(tmp_path: Path) -> None:
             channel.drain_events(timeout=1)
     assert len(set(taken)) == AT_ONCE + 12
     catalogue.close()
+
+
+def test_what_was_cut_in_the_folder_when_the_power_went_stops_nobody(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://")
+    broker = settings.data_dir / "broker"
+
+    def take() -> list[str]:
+        taken: list[str] = []
+        with queue.make_app(settings).connection_for_read() as connection:
+            channel = connection.default_channel
+            name = broker_name(Queue.BULK)
+            channel.basic_consume(name, True, lambda message: taken.append(message.payload[0][0]), "tag")
+            channel.drain_events(timeout=1)
+        return taken
+
+    assert queue.submit(queue.make_app(settings), "first", Queue.BULK)
+    assert take() == ["first"]
+    for content in ("", "[["):
+        (broker / "control" / f"{broker_name(Queue.INTERACTIVE)}.exchange").write_text(content)
+        # As in a process that has just started.
+        FolderTransport.global_state.clear()
+        pools.reset()
+        # A message that is being written is not taken.
+        (broker / "queue" / f"1_x.{broker_name(Queue.BULK)}.msg.ab.part").write_text("")
+        assert queue.submit(queue.make_app(settings), "second", Queue.BULK)
+        assert take() == ["second"]
