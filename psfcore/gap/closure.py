@@ -3,6 +3,10 @@
     closure = 1 - (chi2_after - nu) / (chi2_before - nu)                                 Eq. (1)
     nu = cells + trace(J Cov J^T)      noise, and the error of the fit that they were held out of      Eq. (2)
     gap = sqrt(mean(residual^2 - noise^2))     of the discs' means, in percent                Eq. (3)
+    deviance = r^T S^-1 r + ln det S,  S = 1 + J Cov J^T       r in units of the noise          Eq. (4)
+
+Eq. (4), of all images of a fold at once, is -2 ln of how likely they are as the fit predicts them, with what it does not
+know of its own parameters: a fit that says how little it knows is not punished for being far out.
 
 Two schemes: blocks of time with a guard, and one pointing left out. chi2 is that of the discs' cells; where the lit blocks
 show more of a gap that is the effect's, as with a gain that differs between images, theirs is added. Intervals hold what the cause closes, not
@@ -14,8 +18,8 @@ FORM_ERROR.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -50,7 +54,7 @@ class HeldOut:
     """Every image with a disc, held out: its cells' chi2, the lit blocks', what is expected of both, its residual.
 
     residual_pct, noise_pct: of the disc's mean, simulated minus observed over observed; noise with the fit's error.
-    Images that no fold holds out are not among them.
+    Images that no fold holds out are not among them. deviance: Eq. (4) of each fold, by the images that it holds out.
     """
 
     images: tuple[int, ...]
@@ -60,6 +64,7 @@ class HeldOut:
     lit_expected: Vector
     residual_pct: Vector
     noise_pct: Vector
+    deviance: Mapping[tuple[int, ...], float] = field(default_factory=dict)
 
     def of(self, images: Sequence[int]) -> HeldOut:
         """Some of the images."""
@@ -73,6 +78,7 @@ class HeldOut:
             self.lit_expected[here],
             self.residual_pct[here],
             self.noise_pct[here],
+            self.deviance,
         )
 
 
@@ -99,6 +105,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
     by_index = {disc.index: k for k, disc in enumerate(evidence.discs)}
     rows: list[tuple[float, ...]] = []
     images: list[int] = []
+    deviance: dict[tuple[int, ...], float] = {}
     base = len(evidence.base)
     for fold in scheme:
         fitted = [n for n in fold.fitted if n in by_index]
@@ -107,13 +114,18 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             continue
         step = model.fit(columns, model.equations(fitted))
         here = list(step.columns)
+        everything: list[tuple[Vector, Vector]] = []
         for n in held:
             disc, white = evidence.discs[by_index[n]], model.discs[by_index[n]]
             left = white.residual - white.answers[here].T @ step.values
             error = float(np.einsum("ki,kl,li->", white.answers[here], step.covariance, white.answers[here]))
-            lit, of_lit = evidence.lit.held_out_chi2(
-                columns, step.values[base:], step.covariance[base:, base:], [n], fitted
-            )
+            of_blocks, answers = evidence.lit.held_out(columns, [n], fitted)
+            of_blocks = (of_blocks - step.values[base:] @ answers) / math.sqrt(model.lit_scale)
+            errors = step.covariance[base:, base:]
+            of_lit = max(of_blocks.size - 1, 0) + float(np.einsum("kb,kl,lb->", answers, errors, answers))
+            base_answers = np.zeros((base, of_blocks.size))
+            everything.append((left, white.answers[here]))
+            everything.append((of_blocks, np.vstack([base_answers, answers]) / math.sqrt(model.lit_scale)))
             answer = disc.answers[here] @ disc.share
             mean = float(disc.share @ disc.residual - answer @ step.values)
             noise = math.sqrt(disc.mean_noise**2 + float(answer @ step.covariance @ answer))
@@ -122,16 +134,27 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
                 (
                     float(left @ left),
                     left.size + error,
-                    lit / model.lit_scale,
+                    float(of_blocks @ of_blocks),
                     of_lit,
                     -100 * mean / disc.observed,
                     100 * noise / disc.observed,
                 )
             )
+        residuals, answered = (np.concatenate(parts, axis=-1) for parts in zip(*everything, strict=True))
+        deviance[tuple(held)] = _deviance(residuals, answered, step.covariance)
     if not rows:
         return None
     chi2, expected, lit_chi2, lit_expected, residual, noise_pct = np.array(rows).T
-    return HeldOut(tuple(images), chi2, expected, lit_chi2, lit_expected, residual, noise_pct)
+    return HeldOut(tuple(images), chi2, expected, lit_chi2, lit_expected, residual, noise_pct, deviance)
+
+
+def _deviance(left: Vector, answers: Vector, covariance: Vector) -> float:
+    """Eq. (4): left (n,) in units of the noise, answers (parameters, n), their covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    along = (np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ answers
+    inner = np.eye(values.size) + along @ along.T
+    projected = along @ left
+    return float(left @ left - projected @ np.linalg.solve(inner, projected) + np.linalg.slogdet(inner)[1])
 
 
 def _in_both(before: HeldOut, after: HeldOut) -> tuple[HeldOut, HeldOut] | None:
@@ -177,12 +200,10 @@ def closure(
 
 
 def fall(before: HeldOut, after: HeldOut) -> float:
-    """How far chi2 of discs and lit blocks falls, held out, in the images that both hold out."""
-    both = _in_both(before, after)
-    if both is None:
-        return 0.0
-    before, after = both
-    return float((before.chi2 - after.chi2 + before.lit_chi2 - after.lit_chi2).sum())
+    """How far Eq. (4) of discs and lit blocks falls, in the folds that both have: how much better one predicts them."""
+    return sum(
+        before.deviance[one] - after.deviance[one] for one in before.deviance.keys() & after.deviance.keys()
+    )
 
 
 def gap(held_out: HeldOut, rng: np.random.Generator) -> Interval:

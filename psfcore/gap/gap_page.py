@@ -295,7 +295,7 @@ def _effects_table(report: Report) -> Table:
         ["effect", "parameters", "score", "delta chi2, held out", "closure (%)", "90 % interval", "p-value"],
         [_effect_row(effect) for effect in report["effects"]],
         "Every effect that was tried, fitted beside the PSF. Errors are one standard deviation. Of the answer the parameters are those of "
-        "the real refit. Delta chi2: by how much it falls on images held out.",
+        "the real refit. Delta chi2: by how much likelier it makes images held out (-2 ln), its parameters' errors counted.",
     )
 
 

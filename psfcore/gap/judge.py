@@ -12,8 +12,8 @@ TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival co
 sky's. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
 model for real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
 Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
-where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better,
-or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
+where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better
+and explains more, or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
 the floor; where it flips, the answer holds both, or is inconclusive. So it is where the answer predicts images held out of
 its fit worse than nothing does.
 """
@@ -193,7 +193,9 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit) -> Judgement:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
     if probes and probes[0].score > winner.score + (CLEAR if pair is None else -CLEAR):
         return Judgement("unknown", (), p_gap, tuple(named), probes, winner)
-    if pair is None and (best.p_value * len(named) > CONFIDENT or (probes and probes[0].score > best.score)):
+    if pair is None and (
+        best.p_value * len(named) > CONFIDENT or (probes and _explains_more(probes[0], best))
+    ):
         return Judgement("inconclusive", (), p_gap, tuple(named), probes, best)
     if pair is not None:
         return Judgement("attributed", tuple(sorted(pair.names)), p_gap, (pair, *named), probes, pair)
@@ -256,6 +258,11 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
     pair = replace(pair, left_p_value=second.best.left_p_value, left_share=second.best.left_share)
     answer = tuple(sorted({*best.names, *second.answer}))
     return Judgement(second.verdict, answer, second.p_value, (pair,), (), pair)
+
+
+def _explains_more(probe: Tried, best: Tried) -> bool:
+    """A probe that is ahead by having fewer numbers alone is a simpler form of the effect: it explains nothing more."""
+    return probe.score > best.score and probe.gain > best.gain + TIE
 
 
 def _freer(tried: Tried, best: Tried, measured: set[str]) -> bool:

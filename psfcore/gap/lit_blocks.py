@@ -122,19 +122,15 @@ class LitBlocks:
     def _variance(self, images: NDArray[np.intp]) -> Matrix:
         return np.asarray(self.variance[images] + (FLOOR * self.levels[images]) ** 2)
 
-    def held_out_chi2(
-        self,
-        columns: Sequence[int],
-        theta: Vector,
-        covariance: Matrix,
-        images: Sequence[int],
-        fitted: Sequence[int],
-    ) -> tuple[float, float]:
-        """chi2 of images against the scene of others, the effect's step taken out of both, and what is expected of it:
-        the degrees of freedom, and what the step's own errors (covariance) add."""
-        chi2, expected = 0.0, 0.0
+    def held_out(
+        self, columns: Sequence[int], images: Sequence[int], fitted: Sequence[int]
+    ) -> tuple[Vector, Matrix]:
+        """Images against the scene of others, in units of the noise, and what a unit of each column takes from that.
+
+        (n,) and (columns, n): the blocks of each image, and its brightness in units of how much this spreads.
+        """
         errors = self.errors[list(columns)]
-        level = self.levels - (np.tensordot(theta, errors, axes=1) if len(columns) else 0.0)
+        residuals, answered = [np.zeros(0)], [np.zeros((len(columns), 0))]
         for n in images:
             others = [k for k in fitted if self.fov[k] == self.fov[n] and self.part[k]]
             if not self.part[n] or len(others) < LEAST_IMAGES - 1:
@@ -145,17 +141,20 @@ class LitBlocks:
             use = self.free[n] & ((weight > 0).sum(axis=0) >= LEAST_IMAGES - 1)
             if not use.any():
                 continue
-            scene = (level[here] * weight).sum(axis=0)[use] / total[use]
             w = 1 / (self._variance(np.array([n]))[0, use] + 1 / total[use])
-            left = level[n, use] - scene
             mean = self.means[n, use]
-            gain = float((w * mean * left).sum() / ((w * mean**2).sum() + 1 / self.gain_width**2))
-            chi2 += float((w * (left - gain * mean) ** 2).sum()) + (gain / self.gain_width) ** 2
-            answers = errors[:, n, use] - (errors[:, here] * weight).sum(axis=1)[:, use] / total[use]
-            along = (w * mean * answers).sum(axis=1) / ((w * mean**2).sum() + 1 / self.gain_width**2)
-            answers = answers - along[:, None] * mean
-            expected += float(use.sum()) + float(np.einsum("kb,kl,lb,b->", answers, covariance, answers, w))
-        return chi2, expected
+
+            def in_noise(differing: Matrix, w: Vector = w, mean: Vector = mean) -> Matrix:
+                along = (w * mean * differing).sum(axis=-1) / ((w * mean**2).sum() + 1 / self.gain_width**2)
+                steady = np.sqrt(w) * (differing - along[..., None] * mean)
+                return np.concatenate([steady, along[..., None] / self.gain_width], axis=-1)
+
+            scene = (self.levels[here] * weight).sum(axis=0)[use] / total[use]
+            residuals.append(in_noise(self.levels[n, use] - scene))
+            answered.append(
+                in_noise(errors[:, n, use] - (errors[:, here] * weight).sum(axis=1)[:, use] / total[use])
+            )
+        return np.concatenate(residuals), np.concatenate(answered, axis=1)
 
 
 @dataclass(frozen=True, eq=False)

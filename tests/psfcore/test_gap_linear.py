@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.stats import multivariate_normal
 
 from psfcore.gap.cells import cells_of, disc_cells, sensitivities
-from psfcore.gap.closure import HeldOut, closure, gap
+from psfcore.gap.closure import HeldOut, _deviance, closure, fall, gap
 from psfcore.gap.detector_effects import EFFECTS
 from psfcore.gap.effect import View
 from psfcore.gap.evidence import Evidence, gather
-from psfcore.gap.judge import Judgement, _worse_held_out, fitted, no_refit
-from psfcore.gap.linear_model import FLOOR, UNLIKELY, LinearModel
+from psfcore.gap.judge import Judgement, Tried, _explains_more, _worse_held_out, fitted, no_refit
+from psfcore.gap.linear_model import FLOOR, UNLIKELY, LinearModel, Step
 from psfcore.gap.search import PlaceSearch, displaced
 from psfcore.gap.where import _shapley
 from psfcore.scatter.inversion import Solution, invert
@@ -188,6 +189,36 @@ def test_the_interval_of_closure_holds_what_the_cause_would_close() -> None:
             held_out(110.0, 10.0, lit_before), held_out(110.0, 10.0, lit_after), np.random.default_rng(1)
         )
         assert found is not None and found.value == pytest.approx(closed)
+
+
+def test_deviance_is_how_likely_a_fold_is_as_the_fit_predicts_it() -> None:
+    rng = np.random.default_rng(2)
+    left, answers, root = rng.normal(size=7), rng.normal(size=(3, 7)), rng.normal(size=(3, 3))
+    covariance = root @ root.T
+    spread = np.eye(7) + answers.T @ covariance @ answers
+    expected = -2 * multivariate_normal(cov=spread).logpdf(left) - 7 * np.log(2 * np.pi)
+    assert _deviance(left, answers, covariance) == pytest.approx(expected)
+    assert _deviance(left, answers[:0], covariance[:0, :0]) == pytest.approx(left @ left)
+
+
+def test_a_fall_is_of_the_folds_that_both_have() -> None:
+    ones = np.ones(2)
+    before, after = (
+        HeldOut((0, 1), ones, ones, ones, ones, ones, ones, of_folds)
+        for of_folds in ({(0,): 30.0, (1,): 20.0}, {(0,): 12.0, (2,): 1.0})
+    )
+    assert fall(before, after) == 18.0
+
+
+def test_a_probe_counts_where_it_explains_more_and_not_where_it_has_fewer_numbers() -> None:
+    def tried(gain: float, numbers: int) -> Tried:
+        step = Step((), np.zeros(0), np.zeros((0, 0)), gain)
+        return Tried(("x",), True, {}, gain, gain - 2 * numbers, 0.0, step)
+
+    effect = tried(45.0, 3)
+    assert not _explains_more(tried(45.5, 1), effect)
+    assert not _explains_more(tried(60.0, 12), effect)
+    assert _explains_more(tried(60.0, 2), effect)
 
 
 @pytest.mark.parametrize(
