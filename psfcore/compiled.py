@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import pickle
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -24,7 +23,7 @@ from numba import njit
 from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
-HEAD_BYTES = 2 * hashlib.sha256().digest_size
+SEAL_BYTES = 2 * hashlib.sha256().digest_size
 MARK = b"@compiled("
 log = logging.getLogger(__name__)
 
@@ -61,23 +60,29 @@ class KernelFiles(IndexDataCacheFile):
     def save(self, key: Any, data: Any) -> None:
         """Keep a kernel; whoever looks sees all of its file, or none. Where it cannot be kept, it is used all the same."""
         payload = self._dump(data)
-        path = self._data_path(self._name(key))
         try:
-            with self._open_for_write(path) as file:
-                file.write(self._head(payload) + payload)
+            with self._open_for_write(self._data_path(self._name(key))) as file:
+                file.write(payload + self._seal(payload))
         except OSError as error:
             log.warning("a compiled kernel cannot be kept, and is compiled again by each process: %s", error)
 
     def load(self, key: Any) -> Any:
         """The kernel of this key and of the sources as they are now; None where it was not compiled yet."""
-        try:
-            kept = Path(self._data_path(self._name(key))).read_bytes()
-        except FileNotFoundError:
+        name = self._name(key)
+        if not self._is_good(name):
             return None
-        head, payload = kept[:HEAD_BYTES], kept[HEAD_BYTES:]
-        return pickle.loads(payload) if head == self._head(payload) else None
+        data = self._load_data(name)
+        # A process of another version may have put its own there meanwhile.
+        return data if self._is_good(name) else None
 
-    def _head(self, payload: bytes) -> bytes:
+    def _is_good(self, name: str) -> bool:
+        try:
+            kept = Path(self._data_path(name)).read_bytes()
+        except FileNotFoundError:
+            return False
+        return kept[-SEAL_BYTES:] == self._seal(kept[:-SEAL_BYTES])
+
+    def _seal(self, payload: bytes) -> bytes:
         stamp = repr((self._version, self._source_stamp, sources_sha256()))
         return hashlib.sha256(stamp.encode()).digest() + hashlib.sha256(payload).digest()
 
