@@ -157,7 +157,8 @@ def test_who_goes_away_gives_the_place_back(live: Live, monkeypatch: pytest.Monk
     monkeypatch.setattr(events, "ALIVE_EVERY_S", 0.1)
     job_id, _ = live.job()
     with httpx.stream("GET", f"{live.url}/v1/jobs/{job_id}/events") as answer:
-        next(answer.iter_lines())
+        lines = answer.iter_lines()  # let go of, it would close the connection
+        next(lines)
         assert live.streams() == 1
     wait_for(lambda: live.streams() == 0, "the place is free", timeout_s=10)
 
