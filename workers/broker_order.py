@@ -8,7 +8,6 @@ whatever is more urgent then waits for two jobs instead of one.
 from __future__ import annotations
 
 import fcntl
-import os
 import time
 import uuid
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from kombu.transport import filesystem
 from kombu.utils.json import dumps
 from kombu.utils.scheduling import FairCycle, priority_cycle
 
+from psfcore.whole_files import write_whole
 from workers.urgency import by_urgency
 
 
@@ -76,16 +76,8 @@ class _FolderChannel(filesystem.Channel):
 
 def _write_whole(file: Path, content: Any) -> None:
     """Write a file that nobody sees before all of it is there. Raises ``ChannelError``."""
-    partial = file.with_name(f"{file.name}.{uuid.uuid4().hex}.part")
     try:
-        try:
-            with partial.open("w", encoding="utf-8") as unfinished:
-                unfinished.write(dumps(content))
-                unfinished.flush()
-                os.fsync(unfinished.fileno())
-            partial.replace(file)
-        finally:
-            partial.unlink(missing_ok=True)
+        write_whole(file, dumps(content))
     except OSError as error:
         raise ChannelError(f"cannot write {file}: {error}") from error
 

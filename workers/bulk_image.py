@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import glob
-import os
 import shutil
 import time
-import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +13,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.header import read_summary
+from psfcore.whole_files import partials, whole_file
 from workers import archive_files, deconvolve_task, estimates
 from workers.bulk_contract import BulkWork
 from workers.bulk_rows import Taken
@@ -29,7 +27,6 @@ from workers.tables import ImageRow, ProductRow
 
 # The structures that stand for an image, of all that its effects tell: blocks of 4 px, tails of 1 %.
 BLOCK_PX, TAIL_PCT = 4, 1.0
-PARTIAL = ".part"
 
 
 @dataclass(frozen=True)
@@ -217,7 +214,7 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
 def _sweep(target: Path) -> None:
     """Remove what a worker that was killed left of this file."""
     if target.parent.is_dir():
-        for partial in target.parent.glob(f".{glob.escape(target.name)}.*{PARTIAL}"):
+        for partial in partials(target):
             partial.unlink(missing_ok=True)
 
 
@@ -226,18 +223,11 @@ def _put(source: Path, target: Path) -> None:
 
     Raises DataError "output-not-written".
     """
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with source.open("rb") as file, partial.open("wb") as copy:
-                shutil.copyfileobj(file, copy, 2**20)
-                copy.flush()
-                os.fsync(copy.fileno())
-            partial.replace(target)
-            sync(target.parent)  # its name too, before the image counts as done
-        finally:
-            partial.unlink(missing_ok=True)
+        with source.open("rb") as file, whole_file(target) as copy:
+            shutil.copyfileobj(file, copy, 2**20)
+        sync(target.parent)  # its name too, before the image counts as done
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise DataError(

@@ -148,9 +148,9 @@ def _save(
         cross_validation_png(found, fits, [frame.fov for frame in transit.frames], picture)
         keep_report(
             context,
-            request,
             identity,
             "cross-validation",
+            transit_id=request.transit_id,
             text=text,
             picture=picture,
             details={"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},

@@ -64,9 +64,9 @@ def _save(context: Context, request: ResolvedEvaluate, identity: str, report: Ps
         evaluation_png(report.evaluation, picture, title=report.how_judged, study=report.study)
         keep_report(
             context,
-            request,
             identity,
             KIND,
+            transit_id=request.transit_id,
             text=text,
             page=page,
             picture=picture,

@@ -143,9 +143,9 @@ def _save(
         picture.write_bytes(gap_png(found, said))
         keep_report(
             context,
-            request,
             identity,
             KIND,
+            transit_id=request.transit_id,
             text=text,
             page=page,
             picture=picture,

@@ -1,4 +1,4 @@
-"""Reports on transits: what made them, and their way into the store and the catalogue."""
+"""Reports: what made them, and their way into the store and the catalogue."""
 
 from __future__ import annotations
 
@@ -28,14 +28,15 @@ def provenance_of(context: Context, request: ResolvedOnTransit) -> dict[str, Any
 
 def keep_report(
     context: Context,
-    request: ResolvedOnTransit,
     identity: str,
     kind: str,
     *,
     text: Path,
-    picture: Path,
     details: Mapping[str, Any],
+    picture: Path | None = None,
     page: Path | None = None,
+    transit_id: str | None = None,
+    about_id: str | None = None,
 ) -> None:
     """A report's files, written already, into the store; its row, with these details, into the catalogue."""
     file_sha256 = context.store.keep(text)
@@ -46,10 +47,11 @@ def keep_report(
             id=identity,
             created_at=time.time(),
             kind=kind,
-            transit_id=request.transit_id,
+            transit_id=transit_id,
+            about_id=about_id,
             file_sha256=file_sha256,
             bytes=context.store.path(file_sha256).stat().st_size,
-            preview_sha256=context.store.keep(picture),
+            preview_sha256=None if picture is None else context.store.keep(picture),
             details={**details, **of_page},
         )
     )

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -22,7 +21,7 @@ from workers.context import Context
 from workers.contract import ResolvedRerun, rerun_identity
 from workers.deconvolve_task import deconvolve
 from workers.gap_task import gap_diagnose
-from workers.kept_reports import write_json
+from workers.kept_reports import keep_report, write_json
 from workers.lineage import Made, lineage
 from workers.psf_fit_task import psf_fit
 from workers.psf_task import named_psf, psf_build
@@ -138,26 +137,10 @@ def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing,
     }
     with context.store.temporary() as text:
         write_json(text, said)
-        file_sha256 = context.store.keep(text)
-    context.report("comparing", 1, 1)
-    context.catalogue.add(
-        ReportRow(
-            owner=context.owner,
-            id=identity,
-            created_at=time.time(),
-            kind=KIND,
-            transit_id=None,
-            about_id=request.id,
-            file_sha256=file_sha256,
-            bytes=context.store.path(file_sha256).stat().st_size,
-            preview_sha256=None,
-            details={
-                name: said[name]
-                for name in ("of", "sentence", "same", "same_file", "largest_relative_difference")
-            }
-            | {"output_sha256": again.file_sha256},
-        )
-    )
+        named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
+        details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
+        context.report("comparing", 1, 1)  # whoever cancelled keeps nothing
+        keep_report(context, identity, KIND, text=text, details=details, about_id=request.id)
 
 
 def _made(context: Context, row: Thing) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from psfcore.blind.cases import draw_case
 from psfcore.blind.making import make, seal_of, sealed, write_transit
 from psfcore.errors import DataError
+from psfcore.whole_files import write_whole
 
 Plane = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -163,16 +164,6 @@ def _remember(made: BlindSet, plan: SetPlan) -> None:
             )
     made.folder.mkdir(parents=True, exist_ok=True)
     write_whole(file, json.dumps(about, indent=1) + "\n")
-
-
-def write_whole(file: Path, text: str) -> None:
-    """Write a file of which there is all or nothing, whatever is killed."""
-    part = file.with_suffix(".part")
-    with part.open("w", encoding="utf-8") as unfinished:
-        unfinished.write(text)
-        unfinished.flush()
-        os.fsync(unfinished.fileno())
-    os.replace(part, file)
 
 
 @contextmanager

@@ -19,9 +19,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from psfcore.blind.blind_set import BlindSet, write_whole
+from psfcore.blind.blind_set import BlindSet
 from psfcore.blind.scoring import Judged
 from psfcore.errors import DataError
+from psfcore.whole_files import write_whole
 
 REPORT_SCHEMA = "gap/1"
 LONGEST_S = 1800.0

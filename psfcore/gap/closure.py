@@ -67,7 +67,7 @@ class HeldOut:
     deviance: Mapping[tuple[int, ...], float] = field(default_factory=dict)
 
     def of(self, images: Sequence[int]) -> HeldOut:
-        """Some of the images."""
+        """Some of the images, whatever the folds."""
         at = {image: k for k, image in enumerate(self.images)}
         here = [at[image] for image in images]
         return HeldOut(
@@ -78,7 +78,6 @@ class HeldOut:
             self.lit_expected[here],
             self.residual_pct[here],
             self.noise_pct[here],
-            self.deviance,
         )
 
 
@@ -107,6 +106,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
     images: list[int] = []
     deviance: dict[tuple[int, ...], float] = {}
     base = len(evidence.base)
+    lit_noise = math.sqrt(model.lit_scale)
     for fold in scheme:
         fitted = [n for n in fold.fitted if n in by_index]
         held = [n for n in fold.held_out if n in by_index]
@@ -120,12 +120,12 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             left = white.residual - white.answers[here].T @ step.values
             error = float(np.einsum("ki,kl,li->", white.answers[here], step.covariance, white.answers[here]))
             of_blocks, answers = evidence.lit.held_out(columns, [n], fitted)
-            of_blocks = (of_blocks - step.values[base:] @ answers) / math.sqrt(model.lit_scale)
+            of_blocks = (of_blocks - step.values[base:] @ answers) / lit_noise
             errors = step.covariance[base:, base:]
             of_lit = max(of_blocks.size - 1, 0) + float(np.einsum("kb,kl,lb->", answers, errors, answers))
-            base_answers = np.zeros((base, of_blocks.size))
-            everything.append((left, white.answers[here]))
-            everything.append((of_blocks, np.vstack([base_answers, answers]) / math.sqrt(model.lit_scale)))
+            of_all = np.zeros((len(here), of_blocks.size))  # to the PSF the lit blocks do not answer
+            of_all[base:] = answers / lit_noise
+            everything += [(left, white.answers[here]), (of_blocks, of_all)]
             answer = disc.answers[here] @ disc.share
             mean = float(disc.share @ disc.residual - answer @ step.values)
             noise = math.sqrt(disc.mean_noise**2 + float(answer @ step.covariance @ answer))
