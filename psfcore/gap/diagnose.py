@@ -168,10 +168,8 @@ def diagnose_solution(
 
 
 def _likely(found: Judgement) -> tuple[str, ...]:
-    """The answer's effects; where a gap has no sure answer, those of what explains most of it."""
-    if found.answer or found.verdict == "none" or found.best is None:
-        return found.answer
-    return found.best.names
+    """The effects that explain most of a gap: with a tie the best of it."""
+    return () if found.verdict == "none" or found.best is None else found.best.names
 
 
 def _shrinking(

@@ -53,6 +53,8 @@ CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effec
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
 TESTS = 4
+LENIENT = 5.0  # times likelier: what shows a gap, and names its cause, may be so under the other floors
+BY_CHANCE = 0.01  # a probe's greater gain is less likely than this to come of its further numbers alone
 LEAST_IMAGES = 6  # with fewer nothing can be held out, and that nothing shows says nothing
 
 
@@ -122,7 +124,7 @@ def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit)
         return replace(found, verdict="inconclusive")
     if found.verdict in ("none", "inconclusive"):
         return found
-    others = [_judge(replace(model, floor=model.floor * factor), once, further) for factor in FLOORS]
+    others = [_judge(replace(model, floor=model.floor * factor), once, further, LENIENT) for factor in FLOORS]
     if any(other.verdict in ("none", "inconclusive") for other in others):
         return replace(found, verdict="inconclusive")
     if any((other.verdict == "unknown") != (found.verdict == "unknown") for other in others):
@@ -167,19 +169,23 @@ def _once(ask: Refit) -> Refit:
     return once
 
 
-def _judge(model: LinearModel, refit: Refit, beyond: Refit) -> Judgement:
+def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0) -> Judgement:
+    """lenient: how many times likelier than usual a gap and an effect may be to come by chance."""
     evidence = model.evidence
     every = [fitted(model, (effect,)) for effect in evidence.effects]
     named = sorted((t for t in every if t.named), key=lambda t: -t.score)
     probes = tuple(sorted((t for t in every if not t.named), key=lambda t: -t.score))
     before = _left(model, model.base, np.zeros(len(model.base.columns)))
     p_gap = _p_of_gap(before, named)
-    if p_gap > ALARM or not named:
+    if p_gap > lenient * ALARM or not named:
         return Judgement("none", (), p_gap, tuple(named), probes, named[0] if named else None)
-    named, failed = _held_out_first(model, named)
-    best = named[0] = _with_left(model, named[0], before, refit)
     # What was measured in the lit parts fits them whatever the cause: it is behind where its score is.
     measured = {t.label for t in named if evidence.numbers_of(t.step.columns)}
+    outdone = measured if _few_numbers_do(named, measured) else set()
+    others, failed = _held_out_first(model, [t for t in named if t.label not in outdone])
+    named = [*others, *(t for t in named if t.label in outdone)]
+    failed |= outdone
+    best = named[0] = _with_left(model, named[0], before, refit)
     behind = measured | failed
     rivals = max((t.score for t in (*named[1:], *probes) if t.label not in behind), default=0.0)
     enough = _is_enough(best, rivals)
@@ -189,12 +195,12 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit) -> Judgement:
             return replace(second, p_value=p_gap, tried=(*second.tried, *named), probes=probes)
     pair = None if enough else _best_pair(model, best, before, refit)
     winner = pair or best
-    if (not enough and pair is None) or best.p_value * len(named) > ALARM:
+    if (not enough and pair is None) or best.p_value * len(named) > lenient * ALARM:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
     if probes and probes[0].score > winner.score + (CLEAR if pair is None else -CLEAR):
         return Judgement("unknown", (), p_gap, tuple(named), probes, winner)
     if pair is None and (
-        best.p_value * len(named) > CONFIDENT or (probes and _explains_more(probes[0], best))
+        best.p_value * len(named) > lenient * CONFIDENT or (probes and _explains_more(probes[0], best))
     ):
         return Judgement("inconclusive", (), p_gap, tuple(named), probes, best)
     if pair is not None:
@@ -212,6 +218,14 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit) -> Judgement:
     if probes and _searched(best, evidence) and best.score - probes[0].score < alike:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
     return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
+
+
+def _few_numbers_do(named: Sequence[Tried], measured: set[str]) -> bool:
+    """Whether an effect of few numbers gains nearly as much as the best, which was measured in the lit parts: it would
+    not unless it were the cause."""
+    best = named[0]
+    rivals = (t.gain for t in named if t.label not in measured)
+    return best.label in measured and max(rivals, default=0.0) >= (1 - LEFT_SHARE) * best.gain
 
 
 def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tried], set[str]]:
@@ -261,8 +275,11 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
 
 
 def _explains_more(probe: Tried, best: Tried) -> bool:
-    """A probe that is ahead by having fewer numbers alone is a simpler form of the effect: it explains nothing more."""
-    return probe.score > best.score and probe.gain > best.gain + TIE
+    """A probe that is ahead by having fewer numbers alone is a simpler form of the effect: it explains nothing more. Nor
+    does one of many numbers that gains by them no more than noise lets it."""
+    more = probe.gain - best.gain
+    numbers = max(len(probe.values) - len(best.values), 1)
+    return probe.score > best.score and more > TIE and float(chdtrc(numbers, more)) < BY_CHANCE
 
 
 def _freer(tried: Tried, best: Tried, measured: set[str]) -> bool:

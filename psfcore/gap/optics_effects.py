@@ -19,6 +19,9 @@ from psfcore.scatter.total_psf import TotalPsf
 
 Kernel = NDArray[np.float64]
 Steps = tuple[tuple[int, int], ...]
+Halo = Callable[[int], Kernel]  # of a size: weights [y, x], sum 1 on the plane, the centre at size // 2
+HALO_SCALES_PX = (20.0, 40.0, 80.0, 160.0, 320.0)
+MOFFAT = 1.5  # exponent of a halo that falls off as r^-3
 GHOST_TRIALS = 300  # a field of 512 px holds about that many copies that differ
 ANGLES_DEG = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
 PITCHES_PCT = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
@@ -92,7 +95,46 @@ def _anisotropic(view: View) -> Sequence[Change]:
 
 
 def _halo(view: View) -> Sequence[Change]:
-    return [by_psf(view, blur) for blur in shape_slopes(view, "two-power-laws", (3,))]
+    return _as_halo(view, _sought_halo(view))
+
+
+def _exponential(scale_px: float) -> Halo:
+    return lambda size: np.exp(-_radius(size) / scale_px) / (2 * np.pi * scale_px**2)
+
+
+def _moffat(scale_px: float) -> Halo:
+    area = np.pi * scale_px**2 / (MOFFAT - 1)
+    return lambda size: (1 + (_radius(size) / scale_px) ** 2) ** -MOFFAT / area
+
+
+def _radius(size: int) -> Kernel:
+    d = np.arange(size) - size // 2
+    return np.asarray(np.hypot(d[:, None], d[None, :]))
+
+
+HALOS: tuple[Halo, ...] = tuple(form(scale) for scale in HALO_SCALES_PX for form in (_exponential, _moffat))
+
+
+def _as_halo(view: View, halo: Halo) -> Sequence[Change]:
+    """A share of the scattered light in a halo instead."""
+    solution, size = view.solution, view.solution.total.size
+    scatter = solution.inversion.shape.kernel(solution.inversion.coordinates, size)
+    through = Convolver(
+        solution.transit.diffraction, (size, size), dtype=np.float64, threads=solution.threads
+    )
+    return [by_psf(view, _blur(view, np.asarray(through.apply(halo(size) - scatter), dtype=np.float64)))]
+
+
+def _sought_halo(view: View) -> Halo:
+    """The halo that explains most."""
+    size = view.solution.total.size
+    return HALOS[place_search(view).wide_kernel([halo(size) for halo in HALOS])]
+
+
+def _held_halo(view: View) -> Effect:
+    halo = _sought_halo(view)
+    wide = next(effect for effect in EFFECTS if effect.name == "wide_halo")
+    return replace(wide, changes=lambda view: _as_halo(view, halo), held=None)
 
 
 def _field_dependent(view: View) -> Sequence[Change]:
@@ -227,7 +269,7 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _field_dependent, not_a_power_law),
     Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "A second, wide component of scatter.",
            "an eclipse or a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,
-           not_a_power_law),
+           trials=len(HALOS), held=_held_halo),
     Effect("core_blur", "optics", (_p("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
            "a sharp limb, or a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur, trials=len(BLURS),
            held=_held_blur),

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from psfcore.fourier import Convolver
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
 from psfcore.gap.lit_blocks import FREE_OF_DISC_PX, blocks
+from psfcore.gap.search import coarse_kernel
 from psfcore.transit.occulter import coverage, disc_distance
 from psfcore.transit.transit import Place
 
@@ -35,7 +36,7 @@ def _beyond_field(view: View) -> Sequence[Change]:
     solution = view.solution
     ny, nx = (-(-n // COARSE_PX) for n in solution.transit.shape)
     pad_y, pad_x = ny // 2, nx // 2
-    kernel = _coarse_kernel(view.kernel)
+    kernel = coarse_kernel(view.kernel, COARSE_PX)
     through = Convolver(kernel, (ny + 2 * pad_y, nx + 2 * pad_x), dtype=np.float32, threads=solution.threads)
     y, x = np.indices((ny + 2 * pad_y, nx + 2 * pad_x))
     low_y, high_y, low_x, high_x = y < pad_y, y >= pad_y + ny, x < pad_x, x >= pad_x + nx
@@ -64,17 +65,6 @@ def _coarse(plane: Field) -> Field:
     whole = np.pad(plane, ((0, -ny % COARSE_PX), (0, -nx % COARSE_PX)), mode="edge")
     rows, columns = (n // COARSE_PX for n in whole.shape)
     return np.asarray(whole.reshape(rows, COARSE_PX, columns, COARSE_PX).mean(axis=(1, 3)))
-
-
-def _coarse_kernel(kernel: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Light by displacement in coarse pixels, the middle of the kernel in the middle of one: sums of squares."""
-    middle = kernel.shape[0] // 2
-    reach = (middle + COARSE_PX // 2) // COARSE_PX
-    at = (np.arange(kernel.shape[0]) - middle + COARSE_PX // 2) // COARSE_PX + reach
-    out = np.zeros((2 * reach + 1,) * 2)
-    keep = at <= 2 * reach
-    np.add.at(out, np.ix_(at[keep], at[keep]), kernel[np.ix_(keep, keep)])
-    return out
 
 
 def _motion(view: View) -> Sequence[Change]:

@@ -56,7 +56,7 @@ class PlaceSearch:
     def __init__(self, view: View) -> None:
         solution, self._expected = view.solution, view.expected
         self._planes, self._fine = {}, {}
-        to_displacements = []
+        to_displacements, to_far = [], []
         for n in solution.part:
             dark = solution.sky.dark[n]
             (plane,) = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
@@ -64,7 +64,10 @@ class PlaceSearch:
             self._fine[n] = _binned(plane, FINE_PX) * FINE_PX**2
             scene = solution.optics.field(view.lit_scene(n))
             to_displacements.append(_correlation(plane, scene, KERNEL_REACH_PX))
+            reach = max(self._planes[n].shape) - 2
+            to_far.append(_correlation(self._planes[n], _binned(scene, STEP_PX), reach))
         self._to_displacements = np.array(to_displacements, dtype=np.float32)
+        self._to_far = np.array(to_far)
         frames = solution.inversion.frames
         self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
         self._absorbed = np.linalg.qr(np.array([f.answer for f in frames]) / self._sigma[:, None])[0]
@@ -73,10 +76,17 @@ class PlaceSearch:
 
     def kernel(self, kernels: Sequence[Plane]) -> int:
         """Which of some changes of the PSF [y, x], their centres at n//2, explains most as it stands, Eq. (2) and (3)."""
+        return self._best(self._to_displacements, kernels)
+
+    def wide_kernel(self, kernels: Sequence[Plane]) -> int:
+        """The same of changes that are smooth and may reach across the field; looked at on coarse pixels."""
+        return self._best(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
+
+    def _best(self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane]) -> int:
         gains = []
         for kernel in kernels:
-            seen = crop_or_pad(kernel, self._to_displacements.shape[1]).astype(np.float32)
-            answer = np.einsum("nyx,yx->n", self._to_displacements, seen).astype(np.float64) / self._sigma
+            seen = crop_or_pad(kernel, to_displacements.shape[1]).astype(to_displacements.dtype)
+            answer = np.einsum("nyx,yx->n", to_displacements, seen).astype(np.float64) / self._sigma
             left = self._left(answer)
             along = float(self._residual @ left)
             gains.append(along**2 / max(float(left @ left), 1e-300) if along > 0 else 0.0)
@@ -165,6 +175,17 @@ def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach
     # Of lines of even length the convolution's middle is a displacement of one.
     y, x = (reach_px + 1 - (n + 1) % 2 for n in plane.shape)
     return wide[y - reach_px : y + reach_px + 1, x - reach_px : x + reach_px + 1]
+
+
+def coarse_kernel(kernel: Plane, step: int) -> Plane:
+    """Light by displacement in coarse pixels, the middle of the kernel in the middle of one: sums of squares of `step` px."""
+    middle = kernel.shape[0] // 2
+    reach = (middle + step // 2) // step
+    at = (np.arange(kernel.shape[0]) - middle + step // 2) // step + reach
+    out = np.zeros((2 * reach + 1,) * 2)
+    keep = at <= 2 * reach
+    np.add.at(out, np.ix_(at[keep], at[keep]), kernel[np.ix_(keep, keep)])
+    return out
 
 
 def _displacements(count: int) -> NDArray[np.intp]:

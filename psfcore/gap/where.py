@@ -27,7 +27,7 @@ Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 DRAWS = 999
-AS_GOOD = 0.6  # of the best axis' own fall: an axis that explains so much may be the strongest
+AS_GOOD = 0.3  # of the best axis' own fall: an axis of the effect that was found may be the strongest if it explains so much
 SIGNIFICANT = 0.05  # an axis that chance explains does not come before one that it does not
 SUSPECT = 2  # pointings that are named
 
