@@ -27,6 +27,7 @@ from workers.tables import ImageRow, ProductRow
 
 # The structures that stand for an image, of all that its effects tell: blocks of 4 px, tails of 1 %.
 BLOCK_PX, TAIL_PCT = 4, 1.0
+LOOK_AGAIN_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class _Source:
 
 
 def treat(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Outcome:
-    """Deconvolve an image as the bulk asks, unless that was done before."""
+    """Deconvolve an image as the bulk asks, unless that was done before, or a job is at it: then when that has ended."""
     with _source(context, taken) as source:
         wanted = _resolved(context, bulk, request, source)
         identity = product_identity(wanted)
@@ -64,7 +65,25 @@ def treat(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> O
         if target is not None and taken.attempt > 1:
             _sweep(target)
         before = _done_before(context, wanted, identity, request, target)
+        if before is None and _waited(context, request, identity):
+            before = _done_before(context, wanted, identity, request, target)
         return before or _done_now(context, wanted, request, source, target)
+
+
+def _waited(context: Context, request: BulkWork, identity: str) -> bool:
+    """Wait while a job makes the very product; whether one did. Where the service keeps none, nobody else makes it."""
+    waited = False
+    if request.output is not None and request.output.only:
+        return False
+    while context.catalogue.jobs.at_work_on(context.owner, identity):
+        waited = True
+        context.report("waiting for an equal job", 0, 1)  # raises where the bulk is to stop
+        _rest()
+    return waited
+
+
+def _rest() -> None:
+    time.sleep(LOOK_AGAIN_S)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Files that no row names any more, found and removed: what a job left that was killed between keeping and writing down.
 
-What was kept of late is left alone: an upload keeps its file before it writes its row.
+What was kept of late is left alone: an upload keeps its file before it writes its row. A file that is kept at the very
+moment it is removed has its row a little later, so the rows are looked at a second time before it is gone for good.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from dataclasses import dataclass
 from psfcore.errors import DataError
 from workers.catalogue import Catalogue
 from workers.store import Blob, Store
+
+SECOND_LOOK_AFTER_S = 10.0  # uploads write their rows at once after their files, jobs in seconds
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,15 @@ class Collected:
         return sum(blob.bytes for blob in self.removed)
 
 
-def collect(catalogue: Catalogue, store: Store, older_than_s: float, *, dry_run: bool = False) -> Collected:
-    """Remove files that were kept last before so many seconds, and that nothing names.
+def collect(
+    catalogue: Catalogue,
+    store: Store,
+    older_than_s: float,
+    *,
+    dry_run: bool = False,
+    second_look_after_s: float = SECOND_LOOK_AFTER_S,
+) -> Collected:
+    """Remove files that were kept last before so many seconds, and that nothing names; one collection at a time.
 
     Raises DataError "nothing-named" where no file at all is named: then the database is another one.
     """
@@ -42,9 +52,18 @@ def collect(catalogue: Catalogue, store: Store, older_than_s: float, *, dry_run:
             "nothing-named",
             f"expected a database that names some of the {len(there)} files; this one names none: is it the right one?",
         )
-    gone = tuple(
-        blob
-        for blob in left.values()
-        if blob.kept_at < kept_before and (dry_run or store.remove(blob.digest, kept_before))
-    )
-    return Collected(len(there), sum(blob.bytes for blob in there.values()), gone)
+    old = [blob for blob in left.values() if blob.kept_at < kept_before]
+    if not dry_run:
+        old = _removed(old, catalogue, store, kept_before, second_look_after_s)
+    return Collected(len(there), sum(blob.bytes for blob in there.values()), tuple(old))
+
+
+def _removed(
+    old: list[Blob], catalogue: Catalogue, store: Store, kept_before: float, second_look_after_s: float
+) -> list[Blob]:
+    """Those of the files that were removed, and that nothing named even then."""
+    # First: what a killed collection left aside is missing until here, where it is named.
+    store.settle(catalogue.named_files.all())
+    gone = [blob for blob in old if store.remove(blob.digest, kept_before)]
+    put_back = store.settle(catalogue.named_files.all(), after_s=second_look_after_s)
+    return [blob for blob in gone if blob.digest not in put_back]

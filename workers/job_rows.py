@@ -15,7 +15,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, and_, case, literal, or_, select, update
 from sqlalchemy.exc import IntegrityError
-from sqlalchemy.orm import aliased
+from sqlalchemy.orm import InstrumentedAttribute, aliased
 
 from workers.contract import LIVE, Fault, JobError, Phase
 from workers.database import Database
@@ -262,6 +262,14 @@ class Jobs:
         with self._database.reading() as session:
             return session.scalars(query.limit(1)).first() is not None
 
+    def at_work_on(self, owner: str, work_key: str) -> bool:
+        """Whether a job that makes this is at work."""
+        query = select(JobRow.id).where(
+            JobRow.owner == owner, JobRow.work_key == work_key, _is_at_work(JobRow.phase)
+        )
+        with self._database.reading() as session:
+            return session.scalars(query.limit(1)).first() is not None
+
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
         """One UPDATE; True where it changed a row."""
         return bool(self._database.change(update(JobRow).where(and_(*conditions)).values(**values)))
@@ -273,10 +281,14 @@ def no_equal_at_work() -> ColumnElement[bool]:
     at_work = select(other.id).where(
         other.owner == JobRow.owner,
         other.work_key == JobRow.work_key,
-        # In the statement's text, where the databases see that the partial index has all such jobs.
-        other.phase == literal(Phase.EXECUTING.value, literal_execute=True),
+        _is_at_work(other.phase),
     )
     return ~at_work.exists()
+
+
+def _is_at_work(phase: InstrumentedAttribute[str]) -> ColumnElement[bool]:
+    # In the statement's text, where the databases see that the partial index has all such jobs.
+    return phase == literal(Phase.EXECUTING.value, literal_execute=True)
 
 
 def _held(lease: Lease) -> list[Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -72,20 +72,56 @@ class RemoteStore(Store):
                 yield Blob(name.rsplit("/", 1)[1], int(about["size"]), about["LastModified"].timestamp())
 
     def remove(self, digest: str, kept_before: float) -> bool:
-        """Remove a file, unless it is gone or was kept again since; whether it was removed. Raises ``StoreAway``."""
+        """Remove a file, unless it is gone or was kept again since; whether it was removed. Raises ``StoreAway``.
+
+        S3 cannot look and remove at once: a copy stays aside until ``settle``, for a file that is kept in between.
+        """
         with _answering():
+            if not self._is_old(digest, kept_before):
+                return False
             try:
-                about = self._s3.info(self._key(digest), refresh=True)
+                self._s3.cp_file(self._key(digest), self._key_aside(digest))
             except FileNotFoundError:
                 return False
-            if about["LastModified"].timestamp() >= kept_before:
+            if not self._is_old(digest, kept_before):  # copying takes long where the file is large
                 return False
             self._s3.rm_file(self._key(digest))
         super().path(digest).unlink(missing_ok=True)
         return True
 
+    def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
+        """As in a folder; also what a process left aside that ended before it could settle. Raises ``StoreAway``."""
+        with _answering():
+            aside = {name.rsplit("/", 1)[1] for name in self._s3.find(f"{self._root}/aside")}
+        if not aside:
+            return set()
+        time.sleep(after_s)
+        wanted = aside.intersection(named)  # read after the listing: what was put aside since is left alone
+        put_back = set()
+        with _answering():
+            for digest in wanted:
+                if not self._s3.exists(self._key(digest)):
+                    self._s3.cp_file(self._key_aside(digest), self._key(digest))
+                    put_back.add(digest)
+            # Not before all are back: whatever ends this early leaves the copies to the next.
+            for digest in aside:
+                self._s3.rm_file(self._key_aside(digest))
+        return put_back
+
+    def _is_old(self, digest: str, kept_before: float) -> bool:
+        """Whether a file is there and was kept last before this time."""
+        try:
+            about = self._s3.info(self._key(digest), refresh=True)
+        except FileNotFoundError:
+            return False
+        kept_at: float = about["LastModified"].timestamp()
+        return kept_at < kept_before
+
     def _key(self, digest: str) -> str:
         return f"{self._root}/blobs/{digest[:2]}/{digest}"
+
+    def _key_aside(self, digest: str) -> str:
+        return f"{self._root}/aside/{digest}"
 
     def _fetch(self, digest: str, copy: Path) -> None:
         with self.temporary() as partial:

@@ -11,7 +11,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,6 +111,13 @@ class Store:
             return False
         aside.unlink()
         return True
+
+    def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
+        """End what ``remove`` began: of the files it left aside, those that are named go back, the others for good.
+
+        ``named`` is read where something is aside, so many seconds later. Returns what was put back.
+        """
+        return set()  # in a folder, what is aside is looked at there and then
 
 
 def open_store(settings: Settings) -> Store:

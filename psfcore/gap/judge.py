@@ -14,8 +14,9 @@ model for real, and what that leaves is looked at. Pairs are searched exhaustive
 Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
 where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better
 and explains more, or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
-the floor; where it flips, the answer holds both, or is inconclusive. So it is where the answer predicts images held out of
-its fit worse than nothing does.
+the floor, where gap and effect may be LENIENT times likelier; where it flips, the answer holds both, or is inconclusive.
+So it is where the answer predicts images held out of its fit worse than nothing does. What was measured in the lit parts
+fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it.
 """
 
 from __future__ import annotations

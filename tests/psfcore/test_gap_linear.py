@@ -14,7 +14,15 @@ from psfcore.gap.closure import HeldOut, _deviance, closure, fall, gap
 from psfcore.gap.detector_effects import EFFECTS
 from psfcore.gap.effect import View
 from psfcore.gap.evidence import Evidence, gather
-from psfcore.gap.judge import Judgement, Tried, _explains_more, _worse_held_out, fitted, no_refit
+from psfcore.gap.judge import (
+    Judgement,
+    Tried,
+    _explains_more,
+    _few_numbers_do,
+    _worse_held_out,
+    fitted,
+    no_refit,
+)
 from psfcore.gap.linear_model import FLOOR, UNLIKELY, LinearModel, Step
 from psfcore.gap.search import PlaceSearch, displaced
 from psfcore.gap.where import _shapley
@@ -213,12 +221,29 @@ def test_a_fall_is_of_the_folds_that_both_have() -> None:
 def test_a_probe_counts_where_it_explains_more_and_not_where_it_has_fewer_numbers() -> None:
     def tried(gain: float, numbers: int) -> Tried:
         step = Step((), np.zeros(0), np.zeros((0, 0)), gain)
-        return Tried(("x",), True, {}, gain, gain - 2 * numbers, 0.0, step)
+        values = {str(k): (1.0, 1.0, "") for k in range(numbers)}
+        return Tried(("x",), True, values, gain, gain - 2 * numbers, 0.0, step)
 
     effect = tried(45.0, 3)
     assert not _explains_more(tried(45.5, 1), effect)
     assert not _explains_more(tried(60.0, 12), effect)
     assert _explains_more(tried(60.0, 2), effect)
+    # Eight numbers more gain 17.5 from noise once in forty times, and 30 hardly ever.
+    assert tried(62.5, 11).score > effect.score
+    assert not _explains_more(tried(62.5, 11), effect)
+    assert _explains_more(tried(75.0, 11), effect)
+
+
+def test_few_numbers_that_gain_nearly_as_much_go_before_what_was_measured_in_the_lit_parts() -> None:
+    def tried(name: str, gain: float) -> Tried:
+        step = Step((), np.zeros(0), np.zeros((0, 0)), gain)
+        return Tried((name,), True, {}, gain, gain, 0.0, step)
+
+    measured, few, other = tried("measured", 1000.0), tried("few", 870.0), tried("other", 800.0)
+    assert _few_numbers_do([measured, few, other], {"measured"})
+    assert not _few_numbers_do([measured, other], {"measured"})
+    assert not _few_numbers_do([measured], {"measured"})
+    assert not _few_numbers_do([few, other], {"measured"})
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,19 @@ from psfcore.gap.evidence import gather
 from psfcore.gap.judge import fitted
 from psfcore.gap.library import LIBRARY
 from psfcore.gap.linear_model import FLOOR, LinearModel
-from psfcore.gap.optics_effects import ANGLES_DEG, BLURS, DIRECTIONS, _blurred, _sought, _turned
-from psfcore.gap.search import place_search
+from psfcore.gap.optics_effects import (
+    ANGLES_DEG,
+    BLURS,
+    DIRECTIONS,
+    HALOS,
+    Halo,
+    _blurred,
+    _sought,
+    _sought_halo,
+    _turned,
+)
+from psfcore.gap.search import STEP_PX, coarse_kernel, place_search
+from psfcore.psf import crop_or_pad
 from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.optics import Blur
 from psfcore.simulate.plan import default_plan
@@ -92,6 +103,47 @@ def test_a_turned_mesh_is_found_at_its_angle() -> None:
     transit = simulate(plan, TRUTH, turned / turned.sum(), seed=4).transit
     view = View(invert(replace(transit, diffraction=cross())))
     assert _sought(view, _turned, ANGLES_DEG) == pytest.approx(12.0, abs=2.0)
+
+
+def test_a_wide_change_of_the_psf_moves_the_discs_as_its_sum_over_coarse_displacements_says() -> None:
+    view = View(solution())
+    search, blur = place_search(view), Blur(HALOS[2](255), solution().transit.shape)
+    coarse = coarse_kernel(HALOS[2](255), STEP_PX)
+    half, reach = search._to_far.shape[1] // 2, coarse.shape[0] // 2
+    least = min(half, reach)
+    window = search._to_far[:, half - least : half + least + 1, half - least : half + least + 1]
+    kernel = coarse[reach - least : reach + least + 1, reach - least : reach + least + 1]
+    for k, n in enumerate(solution().part[:4]):
+        dark = solution().sky.dark[n]
+        (plane,) = sensitivities(solution().optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
+        moved = float(np.vdot(plane, view.blurred(n, blur)))
+        assert float(np.vdot(window[k], kernel)) == pytest.approx(moved, rel=0.05)
+
+
+@pytest.mark.parametrize("halo", HALOS[:6])
+def test_a_halo_of_share_one_holds_all_light(halo: Halo) -> None:
+    kernel = halo(2047)
+    assert kernel.min() >= 0 and kernel.shape == (2047, 2047)
+    assert kernel[1023, 1023] == kernel.max()
+    assert float(kernel.sum()) == pytest.approx(
+        1.0, abs=0.08
+    )  # of a Moffat of 80 px a thirteenth lies beyond
+
+
+def test_a_wide_halo_is_found_at_about_its_width() -> None:
+    """An exponential of 30 px, between two that are tried; the power law refitted takes up the most of it."""
+    plan = default_plan(18, 128, oversampling=1, brightness=60.0)
+    kernel = crop_or_pad(diffraction(), 255)
+    y, x = np.indices(kernel.shape) - 127
+    wide = np.exp(-np.hypot(x, y) / 30.0)
+    transit = simulate(plan, TRUTH, 0.8 * kernel + 0.2 * wide / wide.sum(), seed=4).transit
+    found = invert(replace(transit, diffraction=kernel))
+    halo = _sought_halo(View(found))
+    assert halo in HALOS[2:6]
+    library = [effect("wide_halo"), effect("dark_offset")]
+    model = LinearModel(gather(found, library), FLOOR)
+    share, sigma, _ = fitted(model, library[:1]).values["share"]
+    assert share > 5 * sigma
 
 
 def brightening(share: float) -> Transit:

@@ -233,6 +233,50 @@ def test_products_in_a_folder_alone(
     assert sha256(gone) == made[0]["sha256"] and sha256(changed) == made[1]["sha256"]
 
 
+@pytest.mark.parametrize("job_ends", [True, False])
+def test_an_image_that_a_job_is_at_is_waited_for(
+    api: TestClient,
+    archive: Path,
+    psf_id: str,
+    settings: Settings,
+    work: Callable[[], None],
+    monkeypatch: pytest.MonkeyPatch,
+    job_ends: bool,
+) -> None:
+    """Its product is made once: by the job, or, where that has lost its worker, by the bulk."""
+    image_id = upload(api, archive / "2020" / "image 0.fits")
+    body = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id, **FEW}}
+    job = api.post("/v1/jobs", json=body).json()
+    catalogue = Catalogue(settings.catalogue_url)
+    lease = catalogue.jobs.claim(job["id"], worker="another")
+    assert lease is not None
+    rests: list[bool] = []
+
+    def rest() -> None:
+        rests.append(True)
+        if len(rests) < 3:
+            return
+        catalogue.jobs.requeue(lease)
+        if job_ends:
+            Runner(settings, catalogue, Store(settings.data_dir)).run(job["id"])
+
+    computed: list[object] = []
+    real = deconvolve_task.make
+    monkeypatch.setattr(deconvolve_task, "make", lambda *a, **k: computed.append(a) or real(*a, **k))
+    monkeypatch.setattr(bulk_image, "_rest", rest)
+    bulk = asked(api, images=[image_id], psf_id=psf_id)
+    work()
+    (line,) = results(api, bulk)
+    assert len(rests) == 3 and len(computed) == 1 and line["reused"] == job_ends
+    assert seen(api, bulk)["images"]["done"] == 1
+    if not job_ends:
+        Runner(settings, catalogue, Store(settings.data_dir)).run(job["id"])
+        assert len(computed) == 1
+    product = api.get(f"/v1/jobs/{job['id']}").json()["result"]
+    assert product == f"/v1/products/{line['product_id']}"
+    catalogue.close()
+
+
 def test_what_fails_is_apart_and_tried_again(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], tmp_path: Path
 ) -> None:

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -82,6 +83,8 @@ def test_a_file_is_removed_unless_it_was_kept_again_since(store: Store, tmp_path
     assert store.remove(digest, kept_before=time.time() + 3600.0)
     assert not store.remove(digest, kept_before=time.time() + 3600.0), "it is gone"
     assert list(store.blobs()) == []
+    assert store.settle(()) == set()
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
     with pytest.raises(FileNotFoundError):
         elsewhere(store, tmp_path).path(digest).open("rb")
 
@@ -112,6 +115,59 @@ def test_a_file_kept_while_it_is_removed_is_not_lost(tmp_path: Path, monkeypatch
     monkeypatch.setattr(os, "replace", kept_meanwhile)
     assert not store.remove(digest, kept_before=time.time() - 60.0)
     assert again and store.path(digest).read_bytes() == CONTENT
+
+
+@pytest.fixture
+def s3_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    with opened_store("s3", tmp_path, monkeypatch) as opened:
+        yield opened
+
+
+def test_a_file_that_is_named_after_all_is_put_back(s3_store: Store, tmp_path: Path) -> None:
+    wanted, other = kept(s3_store), kept(s3_store, b"other")
+    for digest in (wanted, other):
+        assert s3_store.remove(digest, kept_before=time.time() + 3600.0)
+    assert list(s3_store.blobs()) == [], "what is aside is not listed"
+    assert s3_store.settle(iter((wanted, "a" * 64))) == {wanted}
+    assert elsewhere(s3_store, tmp_path).path(wanted).read_bytes() == CONTENT
+    assert [blob.digest for blob in s3_store.blobs()] == [wanted]
+
+    def unread() -> Iterator[str]:
+        raise AssertionError("nothing is aside")
+        yield
+
+    assert s3_store.settle(unread(), after_s=3600.0) == set()
+
+
+def test_a_file_that_was_kept_again_is_left_as_it_is(s3_store: Store) -> None:
+    digest = kept(s3_store)
+    assert s3_store.remove(digest, kept_before=time.time() + 3600.0)
+    kept(s3_store)
+    assert s3_store.settle([digest]) == set()
+    assert [blob.digest for blob in s3_store.blobs()] == [digest]
+
+
+def test_a_file_kept_while_its_copy_is_put_aside_is_not_removed(
+    s3_store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    s3 = s3_store._s3  # type: ignore[attr-defined]
+    digest = kept(s3_store)
+    copied, looked_at, again = s3.cp_file, s3.info, []
+
+    def kept_meanwhile(source: str, target: str) -> None:
+        copied(source, target)
+        again.append(kept(s3_store))
+
+    def as_old(key: str, **how: object) -> dict[str, object]:
+        about = looked_at(key, **how)
+        return about if again else about | {"LastModified": about["LastModified"] - timedelta(days=9)}
+
+    monkeypatch.setattr(s3, "cp_file", kept_meanwhile)
+    monkeypatch.setattr(s3, "info", as_old)
+    assert not s3_store.remove(digest, kept_before=time.time() - 3600.0)
+    assert again == [digest] and [blob.digest for blob in s3_store.blobs()] == [digest]
+    s3_store.settle(())
+    assert [blob.digest for blob in s3_store.blobs()] == [digest], "the copy alone is dropped"
 
 
 class Remote:
@@ -176,6 +232,7 @@ def test_a_server_that_is_away_is_a_passing_failure(tmp_path: Path, monkeypatch:
             lambda: kept(store),
             store.check,
             lambda: list(store.blobs()),
+            lambda: store.settle(()),
         ):
             with pytest.raises(StoreAway):
                 attempt()
