@@ -45,7 +45,7 @@ def test_no_step_is_begun_after_the_one_at_work(stack: Stack, tmp_path: Path, ps
     write_image(tmp_path / "image.fits", shape=(2048, 2048))
     write_image(tmp_path / "small.fits")
     image_id, psf_id = client.upload_image(tmp_path / "image.fits")["id"], client.upload_psf(psf_file)["id"]
-    method = {"name": "richardson-lucy-extended", "steps": 200, "margin_px": 1024}
+    method = {"name": "richardson-lucy-extended", "steps": 200, "margin_px": 2048}
     job = client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
     wait_for(lambda: client.job(job["id"])["progress"]["step"] >= 2, "steps are reported", 120)
     blobs = {path for path in (stack.data / "blobs").rglob("*") if path.is_file()}
