@@ -153,7 +153,7 @@ def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shar
 
     The PSF, or the context that pins one for each image, is fixed here. A product that is there is not made again.
     """
-    if body.output is None or not body.output.only:
+    if body.keeps_products:
         check_room(state, caller.owner)
     try:
         row, new = begin(body, state.catalogue, caller.owner, state.settings)

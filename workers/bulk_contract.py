@@ -119,6 +119,11 @@ class BulkWork(_Strict):
     parameters: Treatment = Field(default_factory=lambda: Treatment())
     output: Output | None = None
 
+    @property
+    def keeps_products(self) -> bool:
+        """Whether the service keeps what it makes, in its store."""
+        return self.output is None or not self.output.only
+
 
 class BulkRequest(BulkWork):
     """Many images to be deconvolved with one PSF, or each with the PSF that a context pins for it."""

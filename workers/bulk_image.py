@@ -73,7 +73,7 @@ def treat(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> O
 def _waited(context: Context, request: BulkWork, identity: str) -> bool:
     """Wait while a job makes the very product; whether one did. Where the service keeps none, nobody else makes it."""
     waited = False
-    if request.output is not None and request.output.only:
+    if not request.keeps_products:
         return False
     while context.catalogue.jobs.at_work_on(context.owner, identity):
         waited = True
@@ -130,8 +130,7 @@ def _done_before(
     context: Context, wanted: ResolvedDeconvolve, identity: str, request: BulkWork, target: Path | None
 ) -> Outcome | None:
     """The product that is there, put into the output folder where it is not yet; None where there is none."""
-    only = request.output is not None and request.output.only
-    if not only:
+    if request.keeps_products:
         row = context.catalogue.get(ProductRow, identity, context.owner)
         return None if row is None else _kept(context, row, target, reused=True)
     earlier = context.catalogue.bulks.done_before(context.owner, identity, str(target))
@@ -161,17 +160,16 @@ def _done_now(
     source: _Source,
     target: Path | None,
 ) -> Outcome:
-    only = request.output is not None and request.output.only
     needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
     estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
     psf_row = psf_of(context, wanted)
     image = deconvolve_task.load(context, wanted, source.path, source.summary)
     started = time.perf_counter()
-    made = deconvolve_task.make(context, wanted, psf_row, image, preview=not only)
+    made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
     kernel = {"kernel_seconds": round(time.perf_counter() - started, 3)}
     with context.store.temporary() as path:
         deconvolve_task.write(made, path)
-        if not only:
+        if request.keeps_products:
             outcome = _kept(context, deconvolve_task.keep(made, path), target, reused=False)
             return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
         assert target is not None

@@ -61,9 +61,8 @@ def work_of(bulk: BulkRow) -> BulkWork:
 
 def _no_room(context: Context, bulk: BulkRow) -> bool:
     """Whether the owner may keep nothing more; the bulk then stops, to be resumed once there is room."""
-    output = work_of(bulk).output
     usage = context.catalogue.owners.usage(context.owner, context.settings.quota_mib)
-    if not usage.full or (output is not None and output.only):
+    if not usage.full or not work_of(bulk).keeps_products:
         return False
     message = f"expected room for products: {usage.used_bytes} of {usage.limit_bytes} bytes are used"
     context.catalogue.bulks.stop_with(

@@ -79,14 +79,17 @@ def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
     return [Change(change, lit=False)]
 
 
+def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
+    """The effect of that name with a form that is sought no more."""
+    sought = next(effect for effect in EFFECTS if effect.name == name)
+    return replace(sought, changes=changes, held=None)
+
+
 def _held_ghost(view: View) -> Effect:
     blur_px, dx, dy = place_search(view).copy()
-    ghost = next(effect for effect in EFFECTS if effect.name == "ghost")
+    ghost = _held("ghost", lambda view: _copy(blur_px, dx, dy))
     return replace(
-        ghost,
-        changes=lambda view: _copy(blur_px, dx, dy),
-        held=None,
-        cause=f"{ghost.cause[:-1]}: displaced by ({dx}, {dy}) px, blurred by {blur_px:g} px.",
+        ghost, cause=f"{ghost.cause[:-1]}: displaced by ({dx}, {dy}) px, blurred by {blur_px:g} px."
     )
 
 
@@ -117,12 +120,9 @@ HALOS: tuple[Halo, ...] = tuple(form(scale) for scale in HALO_SCALES_PX for form
 
 def _as_halo(view: View, halo: Halo) -> Sequence[Change]:
     """A share of the scattered light in a halo instead."""
-    solution, size = view.solution, view.solution.total.size
-    scatter = solution.inversion.shape.kernel(solution.inversion.coordinates, size)
-    through = Convolver(
-        solution.transit.diffraction, (size, size), dtype=np.float64, threads=solution.threads
-    )
-    return [by_psf(view, _blur(view, np.asarray(through.apply(halo(size) - scatter), dtype=np.float64)))]
+    total, inversion = view.solution.total, view.solution.inversion
+    scatter = inversion.shape.kernel(inversion.coordinates, total.size)
+    return [by_psf(view, _blur(view, total.diffracted(halo(total.size) - scatter)))]
 
 
 def _sought_halo(view: View) -> Halo:
@@ -133,8 +133,7 @@ def _sought_halo(view: View) -> Halo:
 
 def _held_halo(view: View) -> Effect:
     halo = _sought_halo(view)
-    wide = next(effect for effect in EFFECTS if effect.name == "wide_halo")
-    return replace(wide, changes=lambda view: _as_halo(view, halo), held=None)
+    return _held("wide_halo", lambda view: _as_halo(view, halo))
 
 
 def _field_dependent(view: View) -> Sequence[Change]:
@@ -175,8 +174,7 @@ def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
 
 def _held_blur(view: View) -> Effect:
     blur = _sought_blur(view)
-    core = next(effect for effect in EFFECTS if effect.name == "core_blur")
-    return replace(core, changes=lambda view: blur_as(view, *blur), held=None)
+    return _held("core_blur", lambda view: blur_as(view, *blur))
 
 
 def _mesh(view: View, changed: Kernel) -> list[Change]:

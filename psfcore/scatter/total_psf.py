@@ -32,12 +32,15 @@ class TotalPsf:
 
     def kernel(self, coordinates: Vector) -> Kernel:
         """The total PSF [y, x] at these coordinates of the shape."""
-        return np.asarray(self._convolver.apply(self.shape.kernel(coordinates, self.size)), dtype=np.float64)
+        return self.diffracted(self.shape.kernel(coordinates, self.size))
+
+    def diffracted(self, scatter: Kernel) -> Kernel:
+        """Scattered light [y, x] on the square, seen through the diffraction."""
+        return np.asarray(self._convolver.apply(scatter), dtype=np.float64)
 
     def slope(self, coordinates: Vector, k: int) -> Kernel:
         """d kernel / d coordinate k, [y, x]."""
-        slope = self._convolver.apply(self.shape.slope(coordinates, k, self.size))
-        return np.asarray(slope, dtype=np.float64)
+        return self.diffracted(self.shape.slope(coordinates, k, self.size))
 
     def slopes(self, coordinates: Vector) -> list[Kernel]:
         """d kernel / d coordinate, one array [y, x] a coordinate."""

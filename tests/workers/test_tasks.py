@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +59,30 @@ def test_an_equal_request_is_not_computed_again(
     first = local.deconvolve(image_file, psf_id=psf_id)
     monkeypatch.delattr(deconvolve_task, "method_named")
     assert local.deconvolve(image_file, psf_id=psf_id) == first
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_worker_of_one_thread_takes_no_second_one_for_the_picture(
+    settings: Settings, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    """A second would take the time of the worker next to it."""
+    of_threads: dict[str, int] = {}
+
+    def noted(name: str) -> None:
+        real = getattr(deconvolve_task, name)
+
+        def wrapped(*arguments: Any, **named: Any) -> Any:
+            of_threads[name] = threading.get_ident()
+            return real(*arguments, **named)
+
+        monkeypatch.setattr(deconvolve_task, name, wrapped)
+
+    noted("_preview")
+    noted("effects")
+    local = LocalService(settings.model_copy(update={"worker_threads": threads}))
+    local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"])
+    local.close()
+    assert (of_threads["_preview"] == of_threads["effects"]) == (threads == 1)
 
 
 def test_a_job_redelivered_after_its_end_does_nothing(
