@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -10,6 +11,8 @@ import numpy as np
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
 
 FAINT_DN = (30.0, 150.0)  # a mixture of both follows a loss at any faint level between
+FADES_IN = (1, 3)  # usual waits between images: with a share of the last one, mixtures fade as traps do
+LEAST_LEFT = 0.01  # what is left of an image after so long is too little to see
 
 
 def flat(view: View) -> Field:
@@ -72,20 +75,26 @@ def _column_smear(view: View) -> Sequence[Change]:
 
 
 def _persistence(view: View) -> Sequence[Change]:
-    """Shares of the image before and of the one before that, whatever they showed: traps empty slowly, and with time."""
+    """A share of the image before, and of all earlier ones as they fade in some waits: traps empty slowly."""
     frames = view.solution.transit.frames
-    waits = np.array([later.time_s - earlier.time_s for earlier, later in pairwise(frames)])
-    usual = max(float(waits.mean()), 1e-9) if waits.size else 1.0
+    waits = [later.time_s - earlier.time_s for earlier, later in pairwise(frames)]
+    usual = max(float(np.mean(waits)), 1e-9) if waits else 1.0
 
-    def before(n: int, images: Sequence[Field], back: int) -> Field:
-        if n < back:
-            return np.zeros(view.solution.transit.shape, np.float32)
-        return images[n - back] * np.float32(view.exposure_s(n - back) / view.exposure_s(n))
+    def left(n: int, images: Sequence[Field], share: Callable[[int], float]) -> Field:
+        out = np.zeros(view.solution.transit.shape, np.float32)
+        for k in range(n):
+            if (part := share(k)) >= LEAST_LEFT:
+                out += images[k] * np.float32(part * view.exposure_s(k) / view.exposure_s(n))
+        return out
 
-    def faded(n: int, images: Sequence[Field]) -> Field:
-        return before(n, images, 1) * np.float32(waits[n - 1] / usual - 1 if n else 0.0)
+    def fading(waits: float) -> Change:
+        def share(n: int, k: int) -> float:
+            return math.exp((frames[k].time_s - frames[n].time_s) / (waits * usual))
 
-    return [*(Change(lambda n, images, back=back: before(n, images, back)) for back in (1, 2)), Change(faded)]  # type: ignore[misc]
+        return Change(lambda n, images: left(n, images, lambda k: share(n, k)))
+
+    before = Change(lambda n, images: left(n, images, lambda k: float(k == n - 1)))
+    return [before, *(fading(waits) for waits in FADES_IN)]
 
 
 def _filled(view: View) -> Sequence[Change]:
@@ -128,9 +137,8 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _flat_field),
     Effect("column_smear", "detector", (_p("share", "", 0.01, True),), "Charge is smeared along columns while they are read.",
            "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
-    Effect("persistence", "detector", (_p("share", "", 0.01, True), _p("share_of_second", "", 0.01, True),
-            _p("change_with_wait", "", 0.01)),
-           "Shares of the two images before are left in the next.",
+    Effect("persistence", "detector", (_p("share", "", 0.01, True), *(_p(f"share_fading_in_{n}", "", 0.01, True) for n in FADES_IN)),
+           "Shares of the images before are left in the next, and fade.",
            "a dark exposure after a bright one", ("time", "pointing"), _persistence),
     Effect("saturation_fill", "detector", (_p("excess", "", 0.1),), "What was filled in for saturated pixels is wrong.",
            "a shorter exposure of the same time", ("pointing", "intensity"), _filled, _nothing_filled),

@@ -4,8 +4,8 @@ Gains of effects are compared after what their parameters, and a search over man
 
     score = gain - PENALTY parameters - 2 ln trials                         Eq. (1)
 
-There is a gap where patterns that any gap makes (`patterns`), all cells, the lit blocks or an effect's gain are less
-likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be told from it,
+There is a gap where patterns that any gap makes (`patterns`), the discs' means, all cells, the lit blocks or an effect's
+gain are less likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be told from it,
 unless it does clearly worse on images held out of its fit.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
 TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
@@ -53,7 +53,7 @@ MANY_PLACES = 100
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
-TESTS = 4
+TESTS = 5  # of `_Left`, and the effects'
 LENIENT = 5.0  # times likelier: what shows a gap, and names its cause, may be so under the other floors
 BY_CHANCE = 0.01  # a probe's greater gain is less likely than this to come of its further numbers alone
 LEAST_IMAGES = 6  # with fewer nothing can be held out, and that nothing shows says nothing
@@ -380,14 +380,15 @@ def _p_of_gap(left: _Left, named: Sequence[Tried]) -> float:
 
 @dataclass(frozen=True)
 class _Left:
-    """What a step leaves, and of how many degrees of freedom: along patterns, in all cells, in the lit blocks."""
+    """What a step leaves, and of how many degrees of freedom: along patterns, in the discs' means, in all cells, in the
+    lit blocks."""
 
-    gains: tuple[float, float, float]
-    freedom: tuple[int, int, int]
+    gains: tuple[float, ...]
+    freedom: tuple[int, ...]
 
     @property
     def p_values(self) -> tuple[float, ...]:
-        """Of each of the three."""
+        """Of each."""
         return tuple(float(chdtrc(k, gain)) for gain, k in zip(self.gains, self.freedom, strict=True))
 
     @property
@@ -444,8 +445,9 @@ def _left(model: LinearModel, step: Step, unsure: Vector) -> _Left:
     freedom = max(sum(left.size for left in shrink) - len(here), 1)
     cells = sum(float(left @ left) for left in shrink)
     gain, directions = model.gain_of_patterns(step, model.patterns, shrink)
+    of_means, images = model.gain_of_patterns(step, model.means, shrink)
     lit = model.evidence.steady_lit
     moved = float(unsure @ lit.normal[np.ix_(here, here)] @ unsure) / model.lit_scale
     of_lit = max(model.left_lit(step) - moved, 0.0) / (1 + LIT_WIDTH)
     of_lit_freedom = max(lit.freedom - model.evidence.numbers_of(here), 1)
-    return _Left((gain, cells, of_lit), (directions, freedom, of_lit_freedom))
+    return _Left((gain, of_means, cells, of_lit), (directions, images, freedom, of_lit_freedom))

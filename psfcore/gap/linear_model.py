@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from psfcore.gap.cells import DiscCells
 from psfcore.gap.evidence import Evidence
-from psfcore.gap.patterns import patterns
+from psfcore.gap.patterns import means, patterns
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -98,6 +98,11 @@ class LinearModel:
     def patterns(self) -> tuple[Matrix, ...]:
         """`patterns.patterns` of the evidence."""
         return patterns(self.evidence)
+
+    @cached_property
+    def means(self) -> tuple[Matrix, ...]:
+        """`patterns.means` of the evidence."""
+        return means(self.evidence)
 
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
         """The PSF's coordinates and these columns, from some equations (none: of all images)."""

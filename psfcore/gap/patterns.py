@@ -34,6 +34,14 @@ def _of_disc(evidence: Evidence, disc: DiscCells, fovs: list[int], times: dict[i
     return np.vstack([in_time.ravel()[:, None] * level, in_disc(disc) * level])
 
 
+def means(evidence: Evidence) -> tuple[Matrix, ...]:
+    """For each disc as many patterns as there are discs (discs, cells): its own, one plane, is as bright as the disc."""
+    return tuple(
+        np.outer(np.arange(len(evidence.discs)) == k, disc.expected).astype(np.float64)
+        for k, disc in enumerate(evidence.discs)
+    )
+
+
 def in_disc(disc: DiscCells) -> Matrix:
     """Radius, dipole and quadrupole of a disc's cells, each without mean: (5, cells)."""
     r, t = disc.radius, disc.azimuth

@@ -98,6 +98,24 @@ def test_a_gain_that_differs_between_modes_hides_in_the_discs_and_shows_in_the_l
     assert found.where[0].name in ("gain_mode", "exposure")
 
 
+def test_what_earlier_images_left_is_found_however_fast_it_fades(clean: Transit) -> None:
+    frames = clean.frames
+    fades_s = 1.6 * (frames[-1].time_s - frames[0].time_s) / (len(frames) - 1)
+
+    def remembered(n: int, f: Frame) -> np.ndarray:
+        left = sum(
+            np.exp((earlier.time_s - f.time_s) / fades_s) * earlier.pixels * earlier.exposure_s / f.exposure_s
+            for earlier in frames[:n]
+        )
+        return np.asarray(f.pixels + 0.06 * left, dtype=np.float32)
+
+    found = verdict(changed(clean, remembered))
+    assert found.judgement.answer == ("persistence",)
+    best = found.judgement.best
+    assert best is not None and best.left_share is not None and best.left_share < 0.05
+    assert sum(value for value, _, _ in best.values.values()) == pytest.approx(0.06, rel=0.3)
+
+
 def test_a_patch_of_light_is_nobodys_effect(clean: Transit) -> None:
     ny, nx = clean.shape
     glow = 40 * np.exp(-0.5 * ((np.arange(nx) - 60) / 14) ** 2) * np.ones((ny, 1))

@@ -130,6 +130,26 @@ def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> 
     )
 
 
+def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:
+    model = LinearModel(evidence, 0.003)
+    columns = [*evidence.base, *evidence.columns["dark_offset"]]
+    step = model.fit(evidence.columns["dark_offset"])
+    design = np.concatenate([disc.answers[columns] for disc in model.discs], axis=1)
+    own = np.zeros((len(model.discs), design.shape[1]))
+    start = 0
+    for k, (disc, white) in enumerate(zip(evidence.discs, model.discs, strict=True)):
+        own[k, start : start + disc.expected.size] = white.white @ disc.expected
+        start += disc.expected.size
+    left = np.concatenate(model.left(step))
+
+    def chi2(rows: np.ndarray) -> float:
+        return float(np.sum((left - rows.T @ np.linalg.lstsq(rows.T, left, rcond=None)[0]) ** 2))
+
+    gain, directions = model.gain_of_patterns(step, model.means, model.left(step))
+    assert gain == pytest.approx(chi2(design) - chi2(np.vstack([design, own])), rel=1e-3)
+    assert len(model.discs) - len(columns) <= directions <= len(model.discs)
+
+
 def test_lit_blocks_give_back_what_was_added_and_do_not_mind_brightness(solution: Solution) -> None:
     evidence = gather(solution, FEW)
     (column,) = evidence.columns["dark_offset"]
