@@ -234,9 +234,16 @@ def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
 
 @router.post("/{bulk_id}/retry", summary="Try again what failed")
 def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """Let the images that failed wait again; what is done stays done."""
+    """Let the images that failed wait again; what is done stays done.
+
+    An equal request that was sent since the bulk ended is open as a bulk of its own: 409 names it until it has ended.
+    """
     row = find(state, caller, bulk_id)
-    _done(state.catalogue.bulks.retry(row.id) is not None, row, "any but CANCELLED")
+    try:
+        changed = state.catalogue.bulks.retry(row.id)
+    except DataError as error:
+        raise Problem(409, error.code, error.message) from error
+    _done(changed is not None, row, "any but CANCELLED")
     state.reconciler.wake()
     return BulkView.of(find(state, caller, bulk_id), state)
 

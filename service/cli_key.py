@@ -9,8 +9,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import click
+from sqlalchemy import make_url
 
 from service.cli_database import DATA, opened_catalogue
+from service.cli_options import read_settings
 from workers.keys import OWNER, Scope
 from workers.tables import KeyRow
 
@@ -65,6 +67,7 @@ def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: st
         )
     wanted = {Scope(scope) for scope in scopes} or set(DEFAULT_SCOPES)
     expires_at = None if expires is None else time.time() + expires
+    url = make_url(read_settings(data).catalogue_url).render_as_string(hide_password=True)
     with opened_catalogue(data) as catalogue:
         catalogue.upgrade()
         made = catalogue.keys.make(owner, wanted, label=label, expires_at=expires_at)
@@ -72,7 +75,7 @@ def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: st
     ends = "until it is revoked" if expires_at is None else f"until {_day(expires_at)}"
     click.echo(
         f"for {owner}: {', '.join(sorted(wanted))}; {ends}. It cannot be shown again. Clients read it from "
-        "HELIOPSF_KEY.",
+        f"HELIOPSF_KEY. Servers on {url} let it in.",
         err=True,
     )
 

@@ -27,11 +27,13 @@ def store() -> None:
 @click.option(
     "--older-than", "older_than_s", type=Duration(), default="30d", show_default=True, help="Kept last before"
 )
+@click.option("--even-most", is_flag=True, help="Also where more than half of all files would go")
 @DATA
-def collect_command(dry_run: bool, older_than_s: float, data: Path | None) -> None:
+def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: Path | None) -> None:
     """Remove files that no upload, PSF, product, report or job names: left by what was killed half-way.
 
-    Young files are left alone, since uploads and jobs at work keep files before they write them down.
+    Young files are left alone, since uploads and jobs at work keep files before they write them down. Another
+    database's files are named by nothing in this one: a store is to have one database.
     """
     settings = read_settings(data)
     if older_than_s < settings.max_job_s:
@@ -46,7 +48,7 @@ def collect_command(dry_run: bool, older_than_s: float, data: Path | None) -> No
                 "the database is not at this version's revision, so what it names may not be known here: "
                 "`heliopsf database status`"
             )
-        found = collect(catalogue, open_store(settings), older_than_s, dry_run=dry_run)
+        found = collect(catalogue, open_store(settings), older_than_s, dry_run=dry_run, even_most=even_most)
         recounted = [] if dry_run else catalogue.owners.recount()
     if dry_run:
         for blob in found.removed:

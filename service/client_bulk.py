@@ -100,7 +100,7 @@ class BulkClient(ABC):
         return self._json("POST", f"/v1/bulk/{bulk_id}/cancel")
 
     def retry_bulk(self, bulk_id: str) -> dict[str, Any]:
-        """Try again what failed."""
+        """Try again what failed; "equal-bulk-open" where the same request is at work as another bulk."""
         return self._json("POST", f"/v1/bulk/{bulk_id}/retry")
 
     def bulk_failures(self, bulk_id: str) -> Iterator[dict[str, Any]]:

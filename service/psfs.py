@@ -131,7 +131,7 @@ async def upload_psf(
         channel=channel,
         kind=kind,
     )
-    row, new = await run_in_threadpool(state.catalogue.add, row)
+    row, new = await run_in_threadpool(take.add, row)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/psfs/{row.id}"
     return PsfView.of(row)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from service.callers import Caller
 from service.problems import Problem
 from service.state import State
-from workers.owner_rows import MIB, Usage
+from workers.catalogue import Row
+from workers.owner_rows import NOT_KEPT, OverQuota, Usage
 
 
 class Allowed:
@@ -20,28 +21,37 @@ class Allowed:
         self._asked += count
         usage = _usage(self._state, self._caller.owner)
         if not usage.allows(self._asked):
-            raise _exceeded(413, usage, f"this file needs at least {self._asked} more")
+            raise _file_too_large(usage, self._asked)
         self._state.rates.take_bytes(self._caller.name, count)
+
+    def add(self, row: Row) -> tuple[Row, bool]:
+        """``Catalogue.add`` of the upload's row; ``Problem`` 413 where others took the room meanwhile."""
+        try:
+            return self._state.catalogue.add(row, self._state.settings.quota_mib)
+        except OverQuota as over:
+            raise _file_too_large(over.usage, row.bytes) from over
 
 
 def check_room(state: State, owner: str) -> None:
     """Before work whose results are kept: ``Problem`` 507 where the owner may keep nothing more."""
     usage = _usage(state, owner)
     if usage.full:
-        raise _exceeded(507, usage, "what this makes could not be kept")
+        raise _exceeded(507, usage, NOT_KEPT)
 
 
 def _usage(state: State, owner: str) -> Usage:
     return state.catalogue.owners.usage(owner, state.settings.quota_mib)
 
 
+def _file_too_large(usage: Usage, count: int) -> Problem:
+    return _exceeded(413, usage, f"this file needs at least {count} more")
+
+
 def _exceeded(status: int, usage: Usage, why: str) -> Problem:
-    assert usage.limit_bytes is not None
     return Problem(
         status,
         "quota-exceeded",
-        f"expected room for it: {usage.used_bytes / MIB:.1f} of {usage.limit_bytes / MIB:.1f} MiB are used, and {why} "
-        "(the operator sets quotas)",
+        usage.no_room(why),
         used_bytes=usage.used_bytes,
         limit_bytes=usage.limit_bytes,
     )

@@ -84,17 +84,17 @@ async def upload_transit(
 
     Its table of contents and transit.json are checked; its pixels are not touched here.
     """
-    settings = state.settings
+    settings, take = state.settings, Allowed(state, caller)
     async with uploads.receive_transit(
         request,
         state.store,
         settings.archive_limits,
         settings.max_transit_bytes,
-        Allowed(state, caller),
+        take,
     ) as upload:
         await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
     row = transit_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
-    row, new = await run_in_threadpool(state.catalogue.add, row)
+    row, new = await run_in_threadpool(take.add, row)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/transits/{row.id}"
     return TransitDetails.of(row)

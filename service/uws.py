@@ -28,6 +28,7 @@ from workers.tables import JobRow, TermsRow
 
 MAX_RUN_ID = 256
 MOST = 2**31 - 1
+MOST_LISTED = 10_000  # jobs in one document, which is built in memory
 FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a job that is waited for is looked at less and less often
 
 
@@ -46,11 +47,11 @@ router = APIRouter(
     openapi_extra=routing.query(
         PHASE="jobs in this phase; several are one of them",
         AFTER="jobs created after this time, ISO 8601 in UTC",
-        LAST="so many jobs, the newest",
+        LAST=f"so many jobs, the newest; at most {MOST_LISTED}, which are as many as come without it",
     ),
 )
 def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
-    """All jobs, newest first, as far as they are asked for."""
+    """Jobs, newest first, as far as they are asked for: the newest 10,000 at most; /v1/jobs has pages."""
     query = query_of(request, "phase")
     after, last = query.get("after"), query.get("last")
     # Times are shown to the millisecond, so "after" is the millisecond after.
@@ -58,7 +59,7 @@ def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
     lines = state.catalogue.uws.lines(
         phases=[phase(text) for text in query.get("phase", ())],
         from_time=from_time,
-        last=None if last is None else min(integer("LAST", last[0], 1), MOST),
+        last=MOST_LISTED if last is None else min(integer("LAST", last[0], 1), MOST_LISTED),
         owner=caller.owner,
     )
     return _xml(documents.job_list(lines, _jobs_url(request)))

@@ -6,10 +6,12 @@ operator allows. So must every file that a pattern finds, and again when it is r
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
 from typing import Any
@@ -25,14 +27,31 @@ _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._-]+")
 _CHUNK = 2**20
 
 
+@dataclass(frozen=True)
+class Found:
+    """What a pattern names: a file, or an entry of a folder that cannot be looked at, and why."""
+
+    path: Path
+    error: DataError | None = None
+
+
 def roots(folders: str) -> tuple[Path, ...]:
     """Folders in a setting, as the system separates paths, each resolved."""
     return tuple(Path(folder).resolve() for folder in folders.split(os.pathsep) if folder.strip())
 
 
 def check_under(path: Path, allowed: Sequence[Path], what: str = "a path") -> Path:
-    """The path resolved, where it lies below a folder that is allowed; else DataError "path-not-allowed"."""
-    resolved = path.resolve()
+    """The path resolved, where it lies below a folder that is allowed.
+
+    Raises DataError "path-not-allowed", or "bad-path" where its links lead nowhere.
+    """
+    try:
+        resolved = _resolved(path)
+    except OSError as error:
+        raise DataError(
+            "bad-path",
+            f"expected {what} that leads somewhere; got {ascii(str(path))[:200]}: {_reason(error)}",
+        ) from error
     if any(resolved.is_relative_to(root) for root in allowed):
         return resolved
     none = (
@@ -48,13 +67,15 @@ def check_glob(glob: str, allowed: Sequence[Path]) -> None:
     check_under(folder, allowed)
 
 
-def find(glob: str, allowed: Sequence[Path]) -> Iterator[Path]:
-    """Files that a pattern names, in the order of their names. Links to elsewhere are not followed.
+def find(glob: str, allowed: Sequence[Path], tick: Callable[[], None] = lambda: None) -> Iterator[Found]:
+    """Files that a pattern names, each once: those of a folder by name, then those below it. Links out are not followed.
 
+    An entry that is meant and cannot be looked at comes with its error. ``tick`` is called for each folder and each
+    entry, whether it is meant or not; what it raises ends the walk.
     Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
     """
     folder, parts = _split(glob)
-    yield from _walk(check_under(folder, allowed), parts, allowed)
+    return _walk(check_under(folder, allowed), parts, allowed, tick)
 
 
 def matches(path: Path, where: dict[str, Condition], limits: FitsLimits) -> bool:
@@ -87,33 +108,72 @@ def safe_name(name: str, identity: str) -> str:
     return f"{stem}-{identity[:16]}.fits"
 
 
+def shown(path: PurePath) -> str:
+    """A path as text that any database and any answer takes: bytes that are not UTF-8 as \\xff."""
+    return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
 def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
-    """The folder before the first part with a wildcard in it, and the parts from there on."""
+    """The folder before the first part with a wildcard in it, and the parts from there on.
+
+    Of several ** in a row there is one; the last part is never one.
+    """
     path = PurePath(glob)
     if not path.is_absolute() or ".." in path.parts:
         raise DataError("bad-path", f"expected an absolute path without '..'; got {ascii(glob)[:200]}")
     fixed = next((n for n, part in enumerate(path.parts) if _MAGIC.search(part)), len(path.parts) - 1)
-    return Path(*path.parts[:fixed]), path.parts[fixed:]
+    parts: list[str] = []
+    for part in path.parts[fixed:]:
+        if part != ANY_FOLDERS or parts[-1:] != [ANY_FOLDERS]:
+            parts.append(part)
+    if parts[-1] == ANY_FOLDERS:
+        parts.append("*")
+    return Path(*path.parts[:fixed]), tuple(parts)
 
 
-def _walk(folder: Path, parts: tuple[str, ...], allowed: Sequence[Path]) -> Iterator[Path]:
-    head, rest = parts[0], parts[1:]
-    if head == ANY_FOLDERS:
-        yield from _walk(folder, rest or ("*",), allowed)
+def _walk(
+    top: Path, parts: tuple[str, ...], allowed: Sequence[Path], tick: Callable[[], None]
+) -> Iterator[Found]:
+    """Each folder is looked through once, for all parts that may come next there: several ** do not multiply."""
+    left = [(top, frozenset({0}))]
+    while left:
+        folder, places = left.pop()
+        tick()
+        places |= {place + 1 for place in places if parts[place] == ANY_FOLDERS}  # it may stand for none
+        below: list[tuple[Path, frozenset[int]]] = []
         for entry in _entries(folder):
-            if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
-                yield from _walk(Path(entry.path), parts, allowed)
-        return
-    for entry in _entries(folder):
-        if not _named(entry.name, head):
-            continue
-        path = Path(entry.path)
-        if not any(path.resolve().is_relative_to(root) for root in allowed):
-            continue
-        if rest and entry.is_dir():
-            yield from _walk(path, rest, allowed)
-        elif not rest and entry.is_file():
-            yield path
+            tick()
+            path = Path(entry.path)
+            try:
+                meant, further = _meant(entry, parts, places, allowed)
+            except OSError as error:
+                message = f"expected a file or folder that can be looked at: {_reason(error)}"
+                yield Found(path, DataError("unreadable-file", message))
+                continue
+            if meant:
+                yield Found(path)
+            if further:
+                below.append((path, further))
+        left += reversed(below)
+
+
+def _meant(
+    entry: os.DirEntry[str], parts: tuple[str, ...], places: frozenset[int], allowed: Sequence[Path]
+) -> tuple[bool, frozenset[int]]:
+    """Whether an entry is a file that is meant; the parts that may come next in it, none where it is no folder.
+
+    Raises OSError where that cannot be seen.
+    """
+    further = {place for place in places if parts[place] == ANY_FOLDERS}
+    if further and (entry.name.startswith(".") or not entry.is_dir(follow_symlinks=False)):
+        further.clear()
+    named = {n for n in places if parts[n] != ANY_FOLDERS and _named(entry.name, parts[n])}
+    if not named or not any(_resolved(Path(entry.path)).is_relative_to(root) for root in allowed):
+        return False, frozenset(further)
+    last = len(parts) - 1
+    if named != {last} and entry.is_dir():
+        further |= {place + 1 for place in named - {last}}
+    return last in named and entry.is_file(), frozenset(further)
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
@@ -121,10 +181,21 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
         with os.scandir(folder) as entries:
             return sorted(entries, key=lambda entry: entry.name)
     except OSError as error:
-        reason = error.strerror or type(error).__name__
         raise DataError(
-            "unreadable-folder", f"expected a folder that can be read; got {folder}: {reason}"
+            "unreadable-folder", f"expected a folder that can be read; got {shown(folder)}: {_reason(error)}"
         ) from error
+
+
+def _resolved(path: Path) -> Path:
+    """The path without links in it. Raises OSError."""
+    try:
+        return path.resolve()
+    except RuntimeError as error:  # what Python before 3.13 raises for links that lead round in a circle
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP)) from error
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or type(error).__name__
 
 
 def _named(name: str, pattern: str) -> bool:

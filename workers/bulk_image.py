@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -50,7 +52,7 @@ class Outcome:
 class _Source:
     """An image's file, what its header says, and what its product may be called after."""
 
-    path: Path
+    copy: Path | None  # of a file of the archive; an upload is in the store
     sha256: str
     summary: dict[str, Any]
     name: str
@@ -65,6 +67,8 @@ def treat(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> O
         if target is not None and taken.attempt > 1:
             _sweep(target)
         before = _done_before(context, wanted, identity, request, target)
+        if before is None and target is not None:
+            _make_folder(target.parent)
         if before is None and _waited(context, request, identity):
             before = _done_before(context, wanted, identity, request, target)
         return before or _done_now(context, wanted, request, source, target)
@@ -92,7 +96,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
         row = context.catalogue.get(ImageRow, taken.source, context.owner)
         if row is None:
             raise DataError("no-such-image", f"no image was uploaded with id {taken.source}")
-        yield _Source(context.store.path(row.id), row.id, row.summary, row.filename or "image")
+        yield _Source(None, row.id, row.summary, row.filename or "image")
         return
     allowed = archive_files.roots(context.settings.bulk_roots)
     path = archive_files.check_under(Path(taken.source), allowed)
@@ -163,7 +167,9 @@ def _done_now(
     needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
     estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
     psf_row = psf_of(context, wanted)
-    image = deconvolve_task.load(context, wanted, source.path, source.summary)
+    # Asked for now: a store's local copy may be gone after a wait for an equal job, or after the PSF was built.
+    image_file = source.copy or context.store.path(source.sha256)
+    image = deconvolve_task.load(context, wanted, image_file, source.summary)
     started = time.perf_counter()
     made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
     kernel = {"kernel_seconds": round(time.perf_counter() - started, 3)}
@@ -235,16 +241,30 @@ def _sweep(target: Path) -> None:
             partial.unlink(missing_ok=True)
 
 
+def _make_folder(folder: Path) -> None:
+    """Make an output folder before the work is done that would be lost without it. Raises DataError "output-not-written"."""
+    with _written_or_said():
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
 def _put(source: Path, target: Path) -> None:
     """Copy a file to its place; whoever looks there sees all of it, or nothing.
 
     Raises DataError "output-not-written".
     """
-    try:
+    with _written_or_said():
         target.parent.mkdir(parents=True, exist_ok=True)
         with source.open("rb") as file, whole_file(target) as copy:
             shutil.copyfileobj(file, copy, 2**20)
         sync(target.parent)  # its name too, before the image counts as done
+
+
+@contextmanager
+def _written_or_said() -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise DataError(

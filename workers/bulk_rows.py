@@ -18,6 +18,7 @@ from sqlalchemy.engine import CursorResult
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from psfcore.errors import DataError
 from workers.bulk_contract import AT_WORK, OPEN, STOPPED, BulkPhase, ItemState
 from workers.bulk_looks import BATCH, BulkLooks
 from workers.bulk_tables import BulkItemRow, BulkRow
@@ -25,6 +26,8 @@ from workers.contract import Fault, JobError, Phase
 from workers.job_rows import Lease
 from workers.tables import JobRow
 
+# Errors of files whose rows do not hold their paths: to try these again would find no file, or another one.
+NOT_UTF_8, TOO_LONG = "path-not-utf-8", "path-too-long"
 LOST = JobError(
     fault=Fault.INTERNAL,
     code="worker-lost",
@@ -60,21 +63,18 @@ class Bulks(BulkLooks):
 
     def create(self, row: BulkRow, uploaded: Iterable[str]) -> tuple[BulkRow, bool]:
         """A new bulk with these uploads as its first images, or the open one of an equal request; whether it is new."""
-        try:
-            with self._database.writing.begin() as session:
-                session.add(row)
-                session.flush()
-                row.total = _add(session, row.id, 0, (Listed(one, True) for one in uploaded))
-            return row, True
-        except IntegrityError:
-            equal = select(BulkRow).where(
-                BulkRow.owner == row.owner, BulkRow.request_key == row.request_key, BulkRow.phase.in_(OPEN)
-            )
-            with self._database.reading() as session:
-                existing = session.scalars(equal).first()
-            if existing is None:
-                raise
-            return existing, False
+        for _ in range(3):  # the equal bulk may end between the two statements
+            try:
+                with self._database.writing.begin() as session:
+                    session.add(row)
+                    session.flush()
+                    row.total = _add(session, row.id, 0, (Listed(one, True) for one in uploaded))
+                return row, True
+            except IntegrityError:
+                existing = self._equal_open(row)
+                if existing is not None:
+                    return existing, False
+        raise RuntimeError(f"bulk for request {row.request_key} neither inserted nor found")
 
     def pause(self, bulk_id: str) -> bool:
         """LISTING, RUNNING -> PAUSED; images at work are let end."""
@@ -96,13 +96,34 @@ class Bulks(BulkLooks):
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.ERROR, error=error.model_dump(mode="json"))
 
     def retry(self, bulk_id: str) -> int | None:
-        """Let what failed wait again; how many images that are. None for a bulk that was cancelled."""
+        """Let what failed wait again, but for files whose paths could not be kept; how many images that are.
+
+        None for a bulk that was cancelled.
+        Raises DataError "equal-bulk-open" for one that has ended, where an equal one is open.
+        """
+        for _ in range(3):  # the equal bulk may end between the two statements
+            try:
+                return self._retry(bulk_id)
+            except IntegrityError:
+                bulk = self.get(bulk_id)
+                equal = None if bulk is None else self._equal_open(bulk)
+            if equal is not None:
+                raise DataError(
+                    "equal-bulk-open",
+                    f"expected no other open bulk of the same request; bulk {equal.id} is {equal.phase}: "
+                    "cancel it, or try again when it has ended",
+                )
+        raise RuntimeError(f"bulk {bulk_id} neither opened again nor its equal found")
+
+    def _retry(self, bulk_id: str) -> int | None:
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase == BulkPhase.CANCELLED:
                 return None
             again = update(BulkItemRow).where(
-                BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.FAILED
+                BulkItemRow.bulk_id == bulk_id,
+                BulkItemRow.state == ItemState.FAILED,
+                BulkItemRow.error["code"].as_string().not_in((NOT_UTF_8, TOO_LONG)),
             )
             changed = _changed(
                 session, again.values(state=ItemState.WAITING, attempts=0, ended_at=None, error=None)
@@ -111,6 +132,17 @@ class Bulks(BulkLooks):
             if changed and bulk.phase == BulkPhase.COMPLETED:
                 bulk.phase, bulk.ended_at, bulk.running_since = BulkPhase.RUNNING, None, time.time()
             return changed
+
+    def _equal_open(self, row: BulkRow) -> BulkRow | None:
+        """Another bulk, of an equal request, that is open."""
+        equal = select(BulkRow).where(
+            BulkRow.owner == row.owner,
+            BulkRow.request_key == row.request_key,
+            BulkRow.phase.in_(OPEN),
+            BulkRow.id != row.id,
+        )
+        with self._database.reading() as session:
+            return session.scalars(equal).first()
 
     # Listing ------------------------------------------------------------------------------------------
 

@@ -9,15 +9,15 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator, Mapping
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from psfcore.errors import DataError
 from workers import archive_files
-from workers.bulk_contract import BulkPhase, BulkWork
+from workers.bulk_contract import BulkPhase, BulkWork, Condition
 from workers.bulk_image import Outcome, treat
-from workers.bulk_rows import Listed, Taken
+from workers.bulk_rows import NOT_UTF_8, TOO_LONG, Listed, Taken
 from workers.bulk_tables import BulkRow
 from workers.context import Context, TurnOver
 from workers.contract import Fault, JobError
@@ -26,6 +26,7 @@ from workers.stage_times import STARTING
 
 LIST_AT_ONCE = 200
 MOST_IMAGES = 1_000_000
+MOST_LETTERS = 1024  # of a path, as bulk_items.source takes it
 TELL_EVERY_S = 1.0  # how far a turn is, and whether it is to stop: nobody waits for a single image of many
 BETWEEN = "between images"  # noting what one became, and taking the next
 TURN_S = 60.0  # then the turn of another bulk may come; far below what one attempt of a job may last
@@ -138,28 +139,65 @@ def _list(context: Context, bulk: BulkRow, lease: Lease) -> bool:
 def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
     """Files once each, though several patterns may find them."""
     allowed = archive_files.roots(context.settings.bulk_roots)
-    found = chain.from_iterable(
-        ((path, files.where) for path in archive_files.find(files.glob, allowed)) for files in request.files
-    )
     seen: set[Path] = set()
-    looked_at = 0
-    for path, where in found:
-        looked_at += 1
+    looked_at, told_at = 0, 0.0
+
+    def tell() -> None:
+        nonlocal told_at
+        told_at = time.monotonic()
         context.report("listing", len(seen), max(looked_at, len(seen) + 1))
-        if path in seen:
-            continue
-        error = None
-        try:
-            if not archive_files.matches(path, where, context.limits):
+
+    def tick() -> None:
+        """A walk may be long and find nothing: it is to stop as any work is."""
+        if time.monotonic() - told_at >= TELL_EVERY_S:
+            tell()
+
+    for files in request.files:
+        for found in archive_files.find(files.glob, allowed, tick):
+            looked_at += 1
+            tell()
+            if found.path in seen:
                 continue
-        except DataError as unreadable:
-            error = JobError(fault=Fault.USER, code=unreadable.code, message=unreadable.message)
-        except OSError as unreadable:
-            error = unreadable_file(unreadable)
-        seen.add(path)
-        if len(seen) > MOST_IMAGES:
-            raise DataError("too-many-images", f"expected at most {MOST_IMAGES} images in a bulk; got more")
-        yield Listed(str(path), uploaded=False, error=error)
+            listed = _looked_at(context, found, files.where)
+            if listed is None:
+                continue
+            seen.add(found.path)
+            if len(seen) > MOST_IMAGES:
+                raise DataError(
+                    "too-many-images", f"expected at most {MOST_IMAGES} images in a bulk; got more"
+                )
+            yield listed
+
+
+def _looked_at(context: Context, found: archive_files.Found, where: dict[str, Condition]) -> Listed | None:
+    """What was found as an image, and why it cannot be worked on if so; None where another header is asked for."""
+    error = None
+    try:
+        if found.error is not None:
+            raise found.error
+        if not archive_files.matches(found.path, where, context.limits):
+            return None
+    except DataError as unreadable:
+        error = JobError(fault=Fault.USER, code=unreadable.code, message=unreadable.message)
+    except OSError as unreadable:
+        error = unreadable_file(unreadable)
+    source = archive_files.shown(found.path)
+    unkept = _unkept(found.path, source)
+    if len(source) > MOST_LETTERS:
+        source = source[: MOST_LETTERS - 1] + "…"
+    return Listed(source, uploaded=False, error=unkept or error)
+
+
+def _unkept(path: Path, source: str) -> JobError | None:
+    """Why a path cannot be kept as it is, to be read by later; None where it can."""
+    if source != str(path):
+        code, message = NOT_UTF_8, f"expected a path in UTF-8; got one that ends in {source[-100:]}"
+    elif len(source) > MOST_LETTERS:
+        code = TOO_LONG
+        message = f"expected a path of at most {MOST_LETTERS} characters; got {len(source)} that end in {source[-100:]}"
+    else:
+        return None
+    return JobError(fault=Fault.USER, code=code, message=message)
 
 
 def unreadable_file(error: OSError) -> JobError:

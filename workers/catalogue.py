@@ -19,7 +19,7 @@ from workers.database import Database
 from workers.job_rows import Jobs
 from workers.keys import Keys
 from workers.named_files import NamedFiles
-from workers.owner_rows import Owners, add_bytes
+from workers.owner_rows import Owners, add_bytes, hold_to_quota
 from workers.part_rows import Parts
 from workers.psf_contexts import Contexts
 from workers.psf_rows import Psfs
@@ -75,13 +75,19 @@ class Catalogue:
         with self._database.reading() as session:
             session.execute(select(1))
 
-    def add(self, row: Row) -> tuple[Row, bool]:
-        """Insert a content-addressed row; returns the row of that identity, and whether it is new."""
+    def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
+        """Insert a content-addressed row; returns the row of that identity, and whether it is new.
+
+        quota_mib: of owners who have none of their own, where the row is held to it; none: what was made is kept. Raises
+        ``owner_rows.OverQuota``, and adds nothing.
+        """
         try:
             with self._database.writing.begin() as session:
                 session.add(row)
                 session.flush()
                 add_bytes(session, row.owner, row.bytes)
+                if quota_mib is not None:
+                    hold_to_quota(session, row.owner, row.bytes, quota_mib)
             return row, True
         except IntegrityError:
             existing = self.get(type(row), row.id, row.owner)

@@ -36,11 +36,13 @@ def collect(
     older_than_s: float,
     *,
     dry_run: bool = False,
+    even_most: bool = False,
     second_look_after_s: float = SECOND_LOOK_AFTER_S,
 ) -> Collected:
     """Remove files that were kept last before so many seconds, and that nothing names; one collection at a time.
 
-    Raises DataError "nothing-named" where no file at all is named: then the database is another one.
+    Raises DataError "nothing-named" where no file at all is named: then the database is another one; "most-unnamed" where
+    more than half would go, which jobs that are killed do not leave, unless ``even_most``.
     """
     kept_before = time.time() - older_than_s
     there = {blob.digest: blob for blob in store.blobs()}
@@ -53,6 +55,12 @@ def collect(
             f"expected a database that names some of the {len(there)} files; this one names none: is it the right one?",
         )
     old = [blob for blob in left.values() if blob.kept_at < kept_before]
+    if not dry_run and not even_most and 2 * len(old) > len(there):
+        raise DataError(
+            "most-unnamed",
+            f"expected a database that names most of the {len(there)} files; {len(old)} old ones are named by nothing in "
+            "this one: is it the right one? Nothing was removed; if all of them are to go, say --even-most",
+        )
     if not dry_run:
         old = _removed(old, catalogue, store, kept_before, second_look_after_s)
     return Collected(len(there), sum(blob.bytes for blob in there.values()), tuple(old))

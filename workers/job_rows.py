@@ -7,6 +7,7 @@ compare of each other's times, as heartbeats, is written and read by the databas
 
 from __future__ import annotations
 
+import logging
 import time
 import uuid
 from collections.abc import Sequence
@@ -17,10 +18,12 @@ from sqlalchemy import ColumnElement, and_, case, literal, or_, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import InstrumentedAttribute, aliased
 
-from workers.contract import LIVE, Fault, JobError, Phase
+from workers.contract import LIVE, Fault, JobError, Phase, canonical_hash
 from workers.database import Database
-from workers.tables import JobRow
+from workers.tables import JobRow, TermsRow
 from workers.urgency import Queue, queue_of
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -57,15 +60,12 @@ class Jobs:
     ) -> tuple[JobRow, bool]:
         """A new queued job, or the live one of an equal request, which goes up where it waits in a less urgent queue.
 
-        Also whether it is new. ``queue``: none is that of its kind.
+        Also whether it is new. ``queue``: none is that of its kind. A job that was cancelled, or that ends on terms, is
+        not shared: the new one has a key of its own, waits while that one is at work, and finds what it made, if it did.
         """
         queue = queue or queue_of(kind)
-        live = select(JobRow).where(
-            JobRow.owner == owner, JobRow.request_key == request_key, JobRow.phase.in_(LIVE)
-        )
         for _ in range(3):  # the equal job may end badly between the two statements
-            with self._database.reading() as session:
-                existing = session.scalars(live).first()
+            key, existing = self._shared(owner, request_key)
             if existing is not None:
                 return self._moved_up(existing, queue), False
             row = JobRow(
@@ -73,7 +73,7 @@ class Jobs:
                 owner=owner,
                 kind=kind,
                 parameters=parameters,
-                request_key=request_key,
+                request_key=key,
                 work_key=request_key,
                 phase=Phase.QUEUED,
                 queue=queue,
@@ -87,6 +87,25 @@ class Jobs:
             except IntegrityError:
                 continue
         raise RuntimeError(f"job for request {request_key} neither inserted nor found")
+
+    def _shared(self, owner: str, request_key: str) -> tuple[str, JobRow | None]:
+        """The live job that an equal request shares, or None, with the key that it has or that a new one gets.
+
+        The key of a job beside one that is not shared follows from that one: equal requests after it find it.
+        """
+        key = request_key
+        live = select(JobRow, TermsRow.job_id).outerjoin(TermsRow, TermsRow.job_id == JobRow.id)
+        live = live.where(JobRow.owner == owner, JobRow.phase.in_(LIVE))
+        while True:
+            with self._database.reading() as session:
+                found = session.execute(live.where(JobRow.request_key == key)).first()
+            if found is None:
+                return key, None
+            row, terms = found
+            stops = row.cancel_requested and row.phase != Phase.COMPLETED
+            if not stops and terms is None:
+                return key, row
+            key = canonical_hash({"request_key": request_key, "beside": row.id})
 
     def _moved_up(self, row: JobRow, queue: Queue) -> JobRow:
         order = list(Queue)
@@ -167,13 +186,12 @@ class Jobs:
         )
 
     def requeue(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED under the lease, after a passing failure: submitted again after the usual wait."""
+        """EXECUTING -> QUEUED under the lease, after a passing failure: submitted again after the usual wait.
+
+        A job that was cancelled is aborted.
+        """
         return self._set(
-            _held(lease),
-            phase=Phase.QUEUED,
-            submitted_at=self._database.now,
-            submissions=JobRow.attempt,
-            lease=None,
+            _held(lease), **self._again(), submitted_at=self._database.now, submissions=JobRow.attempt
         )
 
     def abort(self, lease: Lease) -> bool:
@@ -187,9 +205,13 @@ class Jobs:
 
     def cancel(self, job_id: str) -> None:
         """PENDING, QUEUED -> ABORTED at once; an executing job is asked to stop; an ended one stays as it is."""
-        waiting = [JobRow.id == job_id, JobRow.phase.in_((Phase.PENDING, Phase.QUEUED))]
-        if not self._set(waiting, phase=Phase.ABORTED, ended_at=self._database.now, cancel_requested=True):
-            self._set([JobRow.id == job_id, JobRow.phase == Phase.EXECUTING], cancel_requested=True)
+        at_work = JobRow.phase == Phase.EXECUTING
+        self._set(  # in one statement, between two the job may be claimed or queued again
+            [JobRow.id == job_id, JobRow.phase.in_((Phase.PENDING, Phase.QUEUED, Phase.EXECUTING))],
+            phase=case((at_work, JobRow.phase), else_=Phase.ABORTED.value),
+            ended_at=case((at_work, JobRow.ended_at), else_=self._database.now),
+            cancel_requested=True,
+        )
 
     def hand_back(self, lease: Lease) -> bool:
         """EXECUTING -> QUEUED under the lease: the worker stops, the job is not to blame, the attempt not counted."""
@@ -208,27 +230,27 @@ class Jobs:
         A job that was cancelled is aborted, and one that was started ``max_attempts`` times is an error.
         """
         silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
-        self._set(
-            [*silent, JobRow.cancel_requested.is_(True)],
-            phase=Phase.ABORTED,
-            ended_at=self._database.now,
-            lease=None,
-        )
+        too_often = and_(JobRow.cancel_requested.is_(False), JobRow.attempt >= max_attempts)
         error = JobError(
             fault=Fault.INTERNAL,
             code="worker-lost",
             message=f"the worker was lost {max_attempts} times while it ran this job; it is not tried again",
         )
-        self._set(
-            [*silent, JobRow.attempt >= max_attempts],
-            phase=Phase.ERROR,
-            ended_at=self._database.now,
-            lease=None,
-            error=error.model_dump(mode="json"),
-        )
+        ended = {
+            "phase": Phase.ERROR,
+            "ended_at": self._database.now,
+            "lease": None,
+            "error": error.model_dump(mode="json"),
+        }
         with self._database.writing.begin() as session:
-            back = update(JobRow).where(*silent).values(phase=Phase.QUEUED, submitted_at=None, lease=None)
-            return list(session.scalars(back.returning(JobRow.id)))
+            lost = update(JobRow).where(*silent, too_often).values(**ended)
+            for job_id in session.scalars(lost.returning(JobRow.id)):
+                log.error("job %s: %s (%s)", job_id, error.message, error.code)
+        with self._database.writing.begin() as session:
+            # Others may have been cancelled, or have fallen silent too often, since the statement before.
+            back = update(JobRow).where(*silent, ~too_often).values(**self._again(), submitted_at=None)
+            taken = session.execute(back.returning(JobRow.id, JobRow.phase))
+            return [job_id for job_id, phase in taken if phase == Phase.QUEUED]
 
     def unsubmitted(self, resubmit_s: float, limit: int = 1000) -> list[Waiting]:
         """Queued jobs that the broker was never given, or seems to have lost: the most urgent first, then the oldest.
@@ -269,6 +291,15 @@ class Jobs:
         )
         with self._database.reading() as session:
             return session.scalars(query.limit(1)).first() is not None
+
+    def _again(self) -> dict[str, Any]:
+        """What makes an executing job wait again; or ends it, where it was cancelled and nobody should claim it."""
+        cancelled = JobRow.cancel_requested.is_(True)
+        return {
+            "phase": case((cancelled, Phase.ABORTED.value), else_=Phase.QUEUED.value),
+            "ended_at": case((cancelled, self._database.now)),
+            "lease": None,
+        }
 
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
         """One UPDATE; True where it changed a row."""

@@ -7,7 +7,7 @@ count is changed in the transaction that adds the row.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sqlalchemy import func, select, update
 from sqlalchemy.dialects import postgresql, sqlite
@@ -18,6 +18,7 @@ from workers.tables import ImageRow, OwnerRow, ProductRow, PsfRow, ReportRow, Tr
 
 COUNTED = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow)
 MIB = 2**20
+NOT_KEPT = "what this makes could not be kept"  # for Usage.no_room, of work
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,22 @@ class Usage:
         """True where nothing more may be kept."""
         return not self.allows(1)
 
+    def no_room(self, why: str) -> str:
+        """What is told where there is no room. why: half a sentence on what it is needed for."""
+        assert self.limit_bytes is not None
+        return (
+            f"expected room for it: {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are used, and "
+            f"{why} (the operator sets quotas)"
+        )
+
+
+class OverQuota(Exception):
+    """More bytes than were left. usage: before them."""
+
+    def __init__(self, usage: Usage) -> None:
+        super().__init__(usage.owner)
+        self.usage = usage
+
 
 class Owners:
     """The table of owners; each method is one transaction."""
@@ -47,10 +64,7 @@ class Owners:
     def usage(self, owner: str, quota_mib: int) -> Usage:
         """What an owner has kept. quota_mib: the limit of those who have none of their own; 0 is none."""
         with self._database.reading() as session:
-            row = session.get(OwnerRow, owner)
-        own = None if row is None else row.quota_mib
-        limit_mib = quota_mib if own is None else own
-        return Usage(owner, 0 if row is None else row.bytes, limit_mib * MIB if limit_mib else None)
+            return _usage(session, owner, quota_mib)
 
     def all(self, quota_mib: int) -> list[Usage]:
         """All owners who have kept anything or have a limit of their own."""
@@ -95,3 +109,22 @@ def add_bytes(session: Session, owner: str, count: int) -> None:
     session.execute(
         row.on_conflict_do_update(index_elements=["owner"], set_={"bytes": OwnerRow.bytes + count})
     )
+
+
+def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int) -> None:
+    """Raise OverQuota where bytes that are counted already are more than were left.
+
+    Others of the owner's wait with their bytes until this transaction ends: of uploads that each fit, and together do
+    not, the last are refused.
+    """
+    counted = _usage(session, owner, quota_mib)
+    before = replace(counted, used_bytes=counted.used_bytes - count)
+    if not before.allows(count):
+        raise OverQuota(before)
+
+
+def _usage(session: Session, owner: str, quota_mib: int) -> Usage:
+    row = session.get(OwnerRow, owner)
+    own = None if row is None else row.quota_mib
+    limit_mib = quota_mib if own is None else own
+    return Usage(owner, 0 if row is None else row.bytes, limit_mib * MIB if limit_mib else None)

@@ -15,7 +15,7 @@ from workers.tables import PartRow
 
 @dataclass(frozen=True)
 class Part:
-    """The right to work on a part; results written under a lost right do nothing."""
+    """The right to work on a part; who lost it may still bring the result, if nobody else has."""
 
     owner: str
     request_key: str
@@ -61,12 +61,15 @@ class Parts:
                 return part
 
     def heartbeat(self, part: Part) -> bool:
-        """Say that the part is worked on; False where it was taken by another."""
+        """Say that the part is worked on; False where it was taken by another, or is done."""
         return self._set(_holding(part), heartbeat_at=self._database.now)
 
     def finish(self, part: Part, result: dict[str, Any]) -> bool:
-        """Write a part's result; False where it was taken by another, whose result will count."""
-        return self._set(_holding(part), result=result, token=None)
+        """Write a part's result; False where it has one.
+
+        Whoever else took the part meanwhile: a result follows from the request alone, so the first one counts.
+        """
+        return self._set(_undone(part), result=result, token=None)
 
     def release(self, part: Part) -> None:
         """Give a part back undone."""
@@ -84,11 +87,14 @@ class Parts:
         return bool(self._database.change(update(PartRow).where(and_(*conditions)).values(**values)))
 
 
-def _holding(part: Part) -> list[Any]:
+def _undone(part: Part) -> list[Any]:
     return [
         PartRow.owner == part.owner,
         PartRow.request_key == part.request_key,
         PartRow.number == part.number,
-        PartRow.token == part.token,
         PartRow.result.is_(None),
     ]
+
+
+def _holding(part: Part) -> list[Any]:
+    return [*_undone(part), PartRow.token == part.token]

@@ -50,8 +50,8 @@ class _Apart(Catalogue):
         """The row of this identity, or None where it is there and hidden too."""
         return None if identity in self._hidden else super().get(table, identity, owner)
 
-    def add(self, row: Row) -> tuple[Row, bool]:
-        """Keep the row here."""
+    def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
+        """Keep the row here, where it takes no room."""
         self.made.append(row)
         return row, True
 

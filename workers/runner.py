@@ -19,11 +19,12 @@ from workers.catalogue import Catalogue
 from workers.context import Context, TurnOver
 from workers.contract import Fault, JobError, Phase
 from workers.job_rows import Lease
+from workers.owner_rows import NOT_KEPT
 from workers.settings import Settings
 from workers.stage_times import StageTimes
 from workers.stopping import Stopping
 from workers.store import Store
-from workers.tables import JobRow
+from workers.tables import JobRow, ProductRow, PsfRow, ReportRow
 from workers.urgency import Queue
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,8 @@ log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
 REPORT_EVERY_S = 0.3
+# A bulk asks for room before each of its images, and may keep none in the service; tables of a PSF are not counted.
+NEED_NO_ROOM = frozenset({"bulk", "psf-tables"})
 
 
 def worker_name() -> str:
@@ -214,6 +217,7 @@ class Runner:
             times=work.times,
         )
         try:
+            self._check_room(job)
             result_id = tasks.TASKS[job.kind](context, job.parameters)
         except TurnOver:
             self._let_others_go_first(job, lease)
@@ -234,6 +238,29 @@ class Runner:
             completed = self._persist(lambda: self._catalogue.jobs.complete(lease, result_id))
             said = f"{Phase.COMPLETED}, result {result_id}" if completed else "done, but the lease was lost"
             log.info("job %s: %s", job.id, said)
+
+    def _check_room(self, job: JobRow) -> None:
+        """Raise DataError "quota-exceeded" where the owner may not keep what the job makes.
+
+        There was room when it was asked for, but for any number of jobs at once. What is there already needs none.
+        """
+        if job.kind in NEED_NO_ROOM:
+            return
+        usage = self._catalogue.owners.usage(job.owner, self._settings.quota_mib)
+        if usage.full and not self._is_there(job):
+            raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
+
+    def _is_there(self, job: JobRow) -> bool:
+        """Whether what the job makes was made before: by an equal one, or by an attempt that could not say so."""
+        made, find = job.work_key, self._catalogue.get
+        if made is None:
+            return False
+        found = (
+            find(ProductRow, made, job.owner),
+            find(PsfRow, made, job.owner),
+            find(ReportRow, made, job.owner),
+        )
+        return any(row is not None for row in found)
 
     def _keep_times(self, job: JobRow, times: StageTimes) -> None:
         """Add an attempt's stages to the sums; its outcome is written by now, and stays whatever comes of this."""

@@ -12,7 +12,7 @@ import shutil
 import time
 import uuid
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,11 +44,13 @@ class Store:
     def sweep(self, older_than_s: float = 86_400.0) -> None:
         """Remove temporary files that a killed process left behind."""
         for path in self._tmp.iterdir():
-            if time.time() - path.stat().st_mtime > older_than_s:
-                if path.is_dir():
-                    shutil.rmtree(path, ignore_errors=True)  # another sweep may be at it too
-                else:
-                    path.unlink(missing_ok=True)
+            # Whoever works beside this ends with its files, and another sweep may be at them too.
+            with suppress(FileNotFoundError):
+                if time.time() - path.stat().st_mtime > older_than_s:
+                    if path.is_dir():
+                        shutil.rmtree(path, ignore_errors=True)
+                    else:
+                        path.unlink()
 
     def path(self, digest: str) -> Path:
         """Where the file of this SHA-256 is, or would be, to be opened soon."""

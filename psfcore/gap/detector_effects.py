@@ -11,7 +11,8 @@ import numpy as np
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
 
 FAINT_DN = (30.0, 150.0)  # a mixture of both follows a loss at any faint level between
-FADES_IN = (1, 3)  # usual waits between images: with a share of the last one, mixtures fade as traps do
+# In mean waits between images: with a share of the last image, mixtures of these fade as traps do.
+FADES_IN = {"one_wait": 1, "three_waits": 3}
 LEAST_LEFT = 0.01  # what is left of an image after so long is too little to see
 
 
@@ -78,7 +79,7 @@ def _persistence(view: View) -> Sequence[Change]:
     """A share of the image before, and of all earlier ones as they fade in some waits: traps empty slowly."""
     frames = view.solution.transit.frames
     waits = [later.time_s - earlier.time_s for earlier, later in pairwise(frames)]
-    usual = max(float(np.mean(waits)), 1e-9) if waits else 1.0
+    mean_s = max(float(np.mean(waits)), 1e-9) if waits else 1.0
 
     def left(n: int, images: Sequence[Field], share: Callable[[int], float]) -> Field:
         out = np.zeros(view.solution.transit.shape, np.float32)
@@ -87,14 +88,14 @@ def _persistence(view: View) -> Sequence[Change]:
                 out += images[k] * np.float32(part * view.exposure_s(k) / view.exposure_s(n))
         return out
 
-    def fading(waits: float) -> Change:
+    def fading(times: int) -> Change:
         def share(n: int, k: int) -> float:
-            return math.exp((frames[k].time_s - frames[n].time_s) / (waits * usual))
+            return math.exp((frames[k].time_s - frames[n].time_s) / (times * mean_s))
 
         return Change(lambda n, images: left(n, images, lambda k: share(n, k)))
 
     before = Change(lambda n, images: left(n, images, lambda k: float(k == n - 1)))
-    return [before, *(fading(waits) for waits in FADES_IN)]
+    return [before, *(fading(times) for times in FADES_IN.values())]
 
 
 def _filled(view: View) -> Sequence[Change]:
@@ -137,7 +138,7 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _flat_field),
     Effect("column_smear", "detector", (_p("share", "", 0.01, True),), "Charge is smeared along columns while they are read.",
            "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
-    Effect("persistence", "detector", (_p("share", "", 0.01, True), *(_p(f"share_fading_in_{n}", "", 0.01, True) for n in FADES_IN)),
+    Effect("persistence", "detector", (_p("share", "", 0.01, True), *(_p(f"share_fading_in_{waits}", "", 0.01, True) for waits in FADES_IN)),
            "Shares of the images before are left in the next, and fade.",
            "a dark exposure after a bright one", ("time", "pointing"), _persistence),
     Effect("saturation_fill", "detector", (_p("excess", "", 0.1),), "What was filled in for saturated pixels is wrong.",

@@ -18,6 +18,11 @@ from psfcore.instruments.files import instrument_path
 _MOST_DOTS = 64  # in one stretch of a file without brackets, commas or line ends
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+# Lengths and angles are multiplied and divided with each other: within these bounds, which no telescope from X-rays to
+# the far infrared comes near to in the unit of its key, none of that overflows or comes to 0.
+_LEAST, _MOST = 1e-9, 1e9
+Size = Annotated[float, Field(ge=_LEAST, le=_MOST, allow_inf_nan=False)]
+SizeOrNone = Annotated[float, Field(ge=0, le=_MOST, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Share = Annotated[float, Field(gt=0, lt=1)]
@@ -39,18 +44,18 @@ class GainMode(_Frozen):
 class Detector(_Frozen):
     """The sensor. ``gain_modes`` is keyed by the mode as GAINCOMB spells it."""
 
-    pixel_pitch_um: Positive
+    pixel_pitch_um: Size
     pixels: Count
     readout_pixels: Count
-    plate_scale_arcsec: Positive
+    plate_scale_arcsec: Size
     gain_modes: dict[str, GainMode] = {}
 
 
 class Aperture(_Frozen):
     """The entrance pupil: a disc, or a ring where the centre is obscured."""
 
-    diameter_mm: Positive
-    obscuration_diameter_mm: Annotated[float, Field(ge=0)] = 0.0
+    diameter_mm: Size
+    obscuration_diameter_mm: SizeOrNone = 0.0
 
     @model_validator(mode="after")
     def _ring(self) -> Aperture:
@@ -62,7 +67,7 @@ class Aperture(_Frozen):
 class Line(_Frozen):
     """A wavelength of the bandpass and its share of the light (shares are normalised to their sum)."""
 
-    wavelength_angstrom: Positive
+    wavelength_angstrom: Size
     weight: Positive
 
 
@@ -70,19 +75,19 @@ class Mirror(_Frozen):
     """A conic mirror: sag r^2 / (R (1 + sqrt(1 - (1 + K) r^2 / R^2)))."""
 
     name: str
-    radius_mm: Positive
+    radius_mm: Size
     conic: Number
-    diameter_mm: Positive
+    diameter_mm: Size
     figure: Literal["concave", "convex"]
 
 
 class Distances(_Frozen):
     """Distances along the light's way, as the drawings give them."""
 
-    aperture_to_primary_mm: Positive
-    primary_to_secondary_mm: Positive
-    secondary_to_filter_wheel_mm: Positive
-    filter_wheel_to_detector_mm: Positive
+    aperture_to_primary_mm: Size
+    primary_to_secondary_mm: Size
+    secondary_to_filter_wheel_mm: Size
+    filter_wheel_to_detector_mm: Size
 
 
 class Mesh(_Frozen):
@@ -94,8 +99,8 @@ class Mesh(_Frozen):
 
     name: str
     place: Literal["entrance", "filter_wheel"]
-    pitch_um: Positive
-    wire_um: Positive
+    pitch_um: Size
+    wire_um: Size
     windows: Count
     angle_deg: Number = 0.0
     share: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -111,15 +116,15 @@ class Rays(_Frozen):
     """Straight bars from the hub (or the centre) to the rim, at equal angles."""
 
     count: Count
-    width_mm: Positive
+    width_mm: Size
     first_angle_deg: Number = 0.0
 
 
 class Ring(_Frozen):
     """A circular bar; the radius is that of its middle."""
 
-    radius_mm: Positive
-    width_mm: Positive
+    radius_mm: Size
+    width_mm: Size
 
 
 class Polygon(_Frozen):
@@ -135,7 +140,7 @@ class MaskImage(_Frozen):
     """
 
     file: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*\.(png|fits|fits\.gz)$")]
-    width_mm: Positive
+    width_mm: Size
 
 
 class Mount(_Frozen):
@@ -144,7 +149,7 @@ class Mount(_Frozen):
     basis: Literal["drawing", "assumed"]
     rays: tuple[Rays, ...] = ()
     rings: tuple[Ring, ...] = ()
-    hub_diameter_mm: Annotated[float, Field(ge=0)] = 0.0
+    hub_diameter_mm: SizeOrNone = 0.0
     polygons: tuple[Polygon, ...] = ()
     mask_image: MaskImage | None = None
 
@@ -164,9 +169,9 @@ class Instrument(_Frozen):
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
     version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")]
     status: Literal["draft", "released"]
-    wavelength_angstrom: Positive
+    wavelength_angstrom: Size
     bandpass: tuple[Line, ...] = ()
-    focal_length_mm: Positive
+    focal_length_mm: Size
     match: dict[str, str] = {}
     aperture: Aperture
     mirrors: tuple[Mirror, ...] = ()

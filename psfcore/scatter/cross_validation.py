@@ -311,14 +311,16 @@ def exact_fit(
 ) -> FoldFit:
     """The PSF of one draw by a fit of its own; images held out are looked at with that PSF afterwards.
 
-    solution: of all images. Raises DataError as `shared_fits` and `inversion.invert`.
+    solution: of all images. progress is called before each image that is looked at, so that who does the fold can say
+    that it is alive, and stop. Raises DataError as `shared_fits` and `inversion.invert`.
     """
     shape = solution.inversion.shape
     start = solution.inversion.coordinates + shared_step(solution, draw)
     found = refit(solution, draw.counts, start, progress=progress)
     sky, at = found.sky, found.coordinates
     held_out = {}
-    for n in draw.held_out:
+    for step, n in enumerate(draw.held_out):
+        progress("images held out", step, len(draw.held_out))
         if solution.transit.frames[n].file in found.left_out:
             continue
         sky.scenes[n] = found.optics.undo(sky.observed[n], sky.scenes[n], steps=RESOLVE_STEPS)
@@ -326,7 +328,9 @@ def exact_fit(
         held_out[n] = float(-100 * residual.mean() / (expected + residual).mean())
     free = None
     if shape.isotropic:
-        for n in found.part:  # the last step of the fit moved the PSF by less than shows, and not the scenes
+        # The last step of the fit moved the PSF by less than shows, and not the scenes.
+        for step, n in enumerate(found.part):
+            progress("settling", step, len(found.part))
             sky.scenes[n] = found.optics.undo(sky.observed[n], sky.scenes[n], steps=SETTLE_STEPS)
         free = _fold_shells(free_shares(found, at, progress=progress), shape, draw, at)
     return _fold_fit(draw, shape, solution.total, at, held_out, free)

@@ -29,6 +29,7 @@ from psfcore.scatter.cross_validation import (
 from psfcore.scatter.cross_validation_plot import cross_validation_png
 from psfcore.scatter.free_shells import shells
 from psfcore.scatter.inversion import invert
+from psfcore.scatter.optics import Lanes, Optics
 from psfcore.scatter.shapes import SHAPES
 from psfcore.transit.blocks import folds
 from tests.psfcore.small_transits import IMAGES, observed, sky, solved
@@ -77,6 +78,46 @@ def test_the_solution_is_as_it_was_after_its_folds() -> None:
     exact_fit(solved(), draws(IMAGES, runs=1)[0])
     assert all((a == b).all() for a, b in zip(before, solved().sky.scenes, strict=True))
     assert places == solved().sky.found
+
+
+def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So a worker's lease outlasts what is done in silence, and a cancel is seen."""
+    since_report, most = 0, 0
+    undo = Optics.undo
+
+    def counted(optics: Optics, observed: Lanes, start: Lanes | None = None, *, steps: int) -> Lanes:
+        nonlocal since_report, most
+        since_report += 1
+        most = max(most, since_report)
+        return undo(optics, observed, start, steps=steps)
+
+    stages: dict[str, list[int]] = {}
+
+    def progress(stage: str, step: int, steps: int) -> None:
+        nonlocal since_report
+        since_report = 0
+        stages.setdefault(stage, []).append(step)
+        assert 0 <= step < steps
+
+    monkeypatch.setattr(Optics, "undo", counted)
+    draw = draws(IMAGES, runs=1)[1]
+    exact_fit(solved(), draw, progress=progress)
+    assert most == 1
+    assert stages["images held out"] == list(range(len(draw.held_out)))
+    assert stages["settling"] == stages["free shells"] != []
+
+
+@pytest.mark.parametrize("stage", ["images held out", "settling"])
+def test_a_fold_stops_where_its_report_says_so(stage: str) -> None:
+    class Stop(Exception):
+        pass
+
+    def progress(now: str, _step: int, _steps: int) -> None:
+        if now == stage:
+            raise Stop
+
+    with pytest.raises(Stop):
+        exact_fit(solved(), draws(IMAGES, runs=1)[1], progress=progress)
 
 
 def test_both_schemes_agree() -> None:

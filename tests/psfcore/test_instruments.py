@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,8 @@ from pydantic import ValidationError
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_digest, instrument_names, instrument_path, match_instrument
-from psfcore.instruments.model import Line, load_instrument
+from psfcore.instruments.model import Line, load_instrument, parse_instrument
+from tests.conftest import SMALL_INSTRUMENT
 
 
 def test_every_shipped_instrument_loads_under_its_own_name() -> None:
@@ -46,6 +48,8 @@ def test_an_unknown_instrument_names_the_known_ones() -> None:
     [
         ("wire_um = 40.0", "wire_um = -4.0", "wire_um"),
         ("wire_um = 40.0", "wire_um = 1400.0", "wire_um"),
+        ("wire_um = 40.0", "wire_um = 1e-10", "wire_um"),
+        ("focal_length_mm = 4187.0", "focal_length_mm = 1e10", "focal_length_mm"),
         ("b_px = 6.15", "b_pix = 6.15", "b_p"),
         ("windows = 37", 'windows = "many"', "windows"),
         ("total = 0.411", "total = 1.5", "total"),
@@ -81,6 +85,41 @@ def test_a_bad_file_is_one_line_that_names_the_key(tmp_path: Path, old: str, new
     assert caught.value.code == "bad-instrument-file"
     assert key in caught.value.message
     assert "\n" not in caught.value.message
+
+
+@pytest.mark.parametrize(
+    "key", ["wavelength_angstrom", "focal_length_mm", "diameter_mm", "pixel_pitch_um", "plate_scale_arcsec"]
+)
+@pytest.mark.parametrize(
+    ("value", "bound"), [("1e-320", "0.000000001"), ("1e300", "1000000000"), ("inf", "finite")]
+)
+def test_a_size_that_no_telescope_has_is_told_with_what_may_be(key: str, value: str, bound: str) -> None:
+    text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", SMALL_INSTRUMENT)
+    with pytest.raises(DataError) as caught:
+        parse_instrument(text, "mine")
+    assert caught.value.code == "bad-instrument-file"
+    for told in (key, bound, f"got {float(value)}"):
+        assert told in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("wavelength_angstrom", "focal_length_mm", "pixel_pitch_um"),
+    [(0.06, 1e4, 50.0), (1.24, 2e4, 24.0), (1e7, 1.5e5, 5e3)],  # hard X-rays, X-rays, far infrared
+)
+def test_telescopes_of_all_wavelengths_are_taken(
+    wavelength_angstrom: float, focal_length_mm: float, pixel_pitch_um: float
+) -> None:
+    text = SMALL_INSTRUMENT
+    wanted = {
+        "wavelength_angstrom": wavelength_angstrom,
+        "focal_length_mm": focal_length_mm,
+        "pixel_pitch_um": pixel_pitch_um,
+    }
+    for key, value in wanted.items():
+        text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
+    instrument = parse_instrument(text, "mine")
+    assert instrument.wavelength_angstrom == wavelength_angstrom
+    assert instrument.detector.pixel_pitch_um == pixel_pitch_um
 
 
 def test_instruments_do_not_change() -> None:

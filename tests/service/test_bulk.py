@@ -196,6 +196,32 @@ def test_products_in_a_folder_beside_the_service(
     assert [path.name for path in written.parent.iterdir()] == [written.name], "nothing half-written is left"
 
 
+def test_an_output_folder_that_cannot_be_written_to_is_told_before_the_work(
+    api: TestClient,
+    archive: Path,
+    psf_id: str,
+    work: Callable[[], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run").write_text("a file where the folder is to be")
+    # Root may write to any folder: what the system would answer to another user.
+    monkeypatch.setattr(bulk_image.os, "access", lambda *_: False)
+    monkeypatch.delattr(bulk_image.deconvolve_task, "make")
+    for folder, reason in (("run", "File exists"), ("other", "Permission denied")):
+        bulk = asked(
+            api,
+            files=[{"glob": f"{archive}/2020/image*"}],
+            psf_id=psf_id,
+            output={"folder": str(tmp_path / "out" / folder)},
+        )
+        work()
+        (failed,) = api.get(bulk["failures"]).json()["items"]
+        assert failed["error"]["code"] == "output-not-written"
+        assert failed["error"]["message"] == f"expected an output folder that can be written to: {reason}"
+
+
 def test_products_in_a_folder_alone(
     api: TestClient,
     archive: Path,

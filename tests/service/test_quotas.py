@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +76,101 @@ def test_work_is_refused_where_nothing_could_be_kept(
     form = {"KIND": "psf-build", "instrument": "hri_euv", "PHASE": "RUN"}
     assert api.post("/uws/jobs", data=form).status_code == 507
     assert catalogue.jobs.of_kind("deconvolve") == [] and api.get("/v1/bulk").json()["items"] == []
+
+
+def test_uploads_at_one_moment_that_each_fit_do_not_all_come_in(
+    api: TestClient, tmp_path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = threading.Barrier(5, timeout=60.0)
+    keep = Store.keep
+
+    def keep_together(store: Store, *given: Any) -> str:
+        together.wait()  # by now each was told that it fits
+        return keep(store, *given)
+
+    monkeypatch.setattr(Store, "keep", keep_together)
+    files = [large(tmp_path / f"{n}.fits", 300 + n).read_bytes() for n in range(5)]
+    places = ["/v1/images", "/v1/psfs", "/v1/images", "/v1/psfs", "/v1/images"]
+    headers = {"Content-Type": "application/fits"}
+    with ThreadPoolExecutor(5) as pool:
+        answers = list(
+            pool.map(
+                lambda at: api.post(at[0], content=at[1], headers=headers), zip(places, files, strict=True)
+            )
+        )
+    assert sorted(answer.status_code for answer in answers) == [201, 201, 201, 413, 413]
+    for answer in answers:
+        if answer.status_code == 413:
+            problem = answer.json()
+            assert problem["type"] == "urn:heliopsf:quota-exceeded" and problem["limit_bytes"] == 2**20
+            assert "0.9 of 1.0 MiB are used, and this file needs at least" in problem["detail"]
+    rows = [row for where in ("/v1/images", "/v1/psfs") for row in api.get(where).json()["items"]]
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    used = catalogue.owners.usage("local", 1).used_bytes
+    assert len(rows) == 3 and used == sum(row["bytes"] for row in rows) <= 2**20
+    assert list((tmp_path / "data" / "tmp").iterdir()) == []
+
+
+def test_the_same_upload_at_one_moment_counts_once(
+    api: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = threading.Barrier(2, timeout=60.0)
+    keep = Store.keep
+    monkeypatch.setattr(Store, "keep", lambda *given: (together.wait(), keep(*given))[1])
+    content = large(tmp_path / "a.fits", 900).read_bytes()
+    headers = {"Content-Type": "application/fits"}
+    with ThreadPoolExecutor(2) as pool:
+        sent = [pool.submit(api.post, "/v1/images", content=content, headers=headers) for _ in range(2)]
+    assert sorted(answer.result().status_code for answer in sent) == [200, 201]
+
+
+def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
+    api: TestClient, settings: Settings, image_file: Path, psf_file: Path
+) -> None:
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    row = catalogue.get(ImageRow, image_id, "local")
+    assert row is not None
+    left = 2**20 - catalogue.owners.usage("local", 1).used_bytes
+    catalogue.add(ImageRow(owner="local", id="b" * 64, created_at=1.0, bytes=left - 1, summary=row.summary))
+
+    def parameters(steps: int) -> dict[str, Any]:
+        method = {"name": "richardson-lucy", "steps": steps}
+        return {"image_id": image_id, "psf_id": psf_id, "method": method}
+
+    def asked(kind: str, parameters: dict[str, Any]) -> str:
+        answer = api.post("/v1/jobs", json={"kind": kind, "parameters": parameters})
+        assert answer.status_code == 202, answer.text
+        return str(answer.json()["id"])
+
+    first, second, third = (asked("deconvolve", parameters(steps)) for steps in (1, 2, 3))
+    form = {
+        "KIND": "deconvolve",
+        "PHASE": "RUN",
+        **parameters(1),
+        "method": json.dumps(parameters(1)["method"]),
+    }
+    equal = api.post("/uws/jobs", data=form, follow_redirects=False).headers["Location"][-32:]
+    tables = asked("psf-tables", {"psf_id": psf_id})
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    jobs = {}
+    for job_id in (first, second, third, equal, tables):
+        runner.run(job_id)
+        jobs[job_id] = api.get(f"/v1/jobs/{job_id}").json()
+    for job_id in (second, third):
+        job = jobs[job_id]
+        assert (job["phase"], job["error"]["code"], job["error"]["fault"]) == (
+            "ERROR",
+            "quota-exceeded",
+            "user",
+        )
+        assert "of 1.0 MiB are used, and what this makes could not be kept" in job["error"]["message"]
+    assert len(api.get("/v1/products").json()["items"]) == 1, "what was at work when the room ended"
+    assert jobs[first]["phase"] == "COMPLETED"
+    assert jobs[equal]["phase"] == "COMPLETED" and jobs[equal]["result"] == jobs[first]["result"], (
+        "nothing more"
+    )
+    assert jobs[tables]["phase"] == "COMPLETED", "tables are not counted"
 
 
 def test_a_bulk_that_fills_the_quota_stops_and_goes_on_with_room(

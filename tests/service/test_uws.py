@@ -14,6 +14,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
+from service import uws
 from service.app import create_app
 from tests.conftest import SMALL_INSTRUMENT
 from tests.service.conftest import upload
@@ -140,7 +141,7 @@ def test_a_job_that_runs_at_once_and_its_equals(api: TestClient, run_jobs: Calla
     as_json = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
     first = created(api, PHASE="RUN", **BUILD)
     assert api.get(f"{first}/phase").text == "QUEUED"
-    assert api.post("/v1/jobs", json=as_json).json()["id"] == first[-32:], "an equal request shares it"
+    assert api.post("/v1/jobs", json=as_json).json()["id"] != first[-32:], "its terms would end it for others"
     # A second client's job is its own: to delete one leaves the other.
     second = created(api, **BUILD)
     api.post(f"{second}/phase?PHASE=RUN", follow_redirects=False)
@@ -283,7 +284,7 @@ def test_bad_requests(
     assert unchanged.get(job).content == before, "nothing has changed"
 
 
-def test_the_list_and_its_filters(api: TestClient) -> None:
+def test_the_list_and_its_filters(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs = []
     for size in (64, 128, 256):
         jobs.append(created(api, **BUILD | {"size": str(size), "RUNID": f"<{size}>&"}))
@@ -302,6 +303,12 @@ def test_the_list_and_its_filters(api: TestClient) -> None:
     assert ids("?PHASE=QUEUED&PHASE=ABORTED") == everything[:3]
     assert ids("?PHASE=ARCHIVED") == ids("?PHASE=HELD&LAST=1") == []
     assert ids("?PHASE=PENDING&PHASE=QUEUED&LAST=2") == [everything[0], everything[2]]
+
+    monkeypatch.setattr(uws, "MOST_LISTED", 3)
+    assert ids() == ids("?LAST=4") == everything[:3] and ids("?LAST=2") == everything[:2], (
+        "the newest, of many"
+    )
+    monkeypatch.undo()
 
     root = document(api.get(JOBS))
     assert root.tag == f"{{{NAMES['uws']}}}jobs" and root.attrib == {"version": "1.1"}

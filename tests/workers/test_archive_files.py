@@ -34,7 +34,9 @@ def archive(tmp_path: Path) -> Path:
 
 
 def found(archive: Path, glob: str) -> list[str]:
-    return [str(path.relative_to(archive)) for path in archive_files.find(f"{archive}/{glob}", [archive])]
+    files = list(archive_files.find(f"{archive}/{glob}", [archive]))
+    assert all(file.error is None for file in files)
+    return [str(file.path.relative_to(archive)) for file in files]
 
 
 @pytest.mark.parametrize(
@@ -50,6 +52,11 @@ def found(archive: Path, glob: str) -> list[str]:
         ("**/03/*.fits", ["2022/03/b.fits"]),
         ("out/*.fits", []),
         ("**/s.fits", []),
+        ("**/**/*.fits", ["2021/a.fits", "2022/03/b.fits", "2022/c[1].fits"]),
+        ("**/2*/**/*.fits", ["2021/a.fits", "2022/03/b.fits", "2022/c[1].fits"]),
+        ("**/*/**/*.fits", ["2021/a.fits", "2022/03/b.fits", "2022/c[1].fits", "again/a.fits"]),
+        ("**/2*/**/03/**/**", ["2022/03/b.fits", "2022/03/b.txt"]),
+        ("**/0*/**/0*/**/*.fits", []),
     ],
 )
 def test_what_a_pattern_names(archive: Path, glob: str, names: list[str]) -> None:
@@ -58,6 +65,76 @@ def test_what_a_pattern_names(archive: Path, glob: str, names: list[str]) -> Non
             found(archive, glob)
         return
     assert sorted(found(archive, glob)) == names
+
+
+def test_files_come_before_those_of_folders_below_each_by_name(archive: Path) -> None:
+    for name in ("z.fits", "2022/b.fits", "2022/a/y.fits"):
+        (archive / name).parent.mkdir(exist_ok=True)
+        (archive / name).write_bytes(b"x")
+    expected = ["z.fits", "2021/a.fits", "2022/b.fits", "2022/c[1].fits", "2022/03/b.fits", "2022/a/y.fits"]
+    assert found(archive, "**/*.fits") == expected
+
+
+@pytest.mark.parametrize("pattern", ["/**" * 12 + "/*.fits", "/**/d*" * 5 + "/**/*.fits", "/**/*" * 8])
+def test_each_folder_is_looked_through_once_however_many_stand_for_any_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pattern: str
+) -> None:
+    root = tmp_path / "archive"
+    deep = root.joinpath(*(f"d{n}" for n in range(12)))
+    deep.mkdir(parents=True)
+    (deep / "x.fits").write_bytes(b"x")
+    looked: list[Path] = []
+    real = os.scandir
+
+    def counted(folder: Path) -> Any:
+        looked.append(folder)
+        return real(folder)
+
+    monkeypatch.setattr(archive_files.os, "scandir", counted)
+    ticks: list[None] = []
+    files = list(archive_files.find(f"{root}{pattern}", [root], lambda: ticks.append(None)))
+    assert [file.path for file in files] == [deep / "x.fits"]
+    assert sorted(looked) == sorted({root, deep, *(one for one in deep.parents if root in one.parents)})
+    assert len(ticks) == 13 + 13, "for each folder and each entry"
+
+
+def test_a_walk_that_finds_nothing_ticks_and_ends_where_it_is_told(archive: Path) -> None:
+    ticks: list[None] = []
+
+    def tick() -> None:
+        ticks.append(None)
+        if len(ticks) == 3:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        list(archive_files.find(f"{archive}/**/*.none", [archive], tick))
+    assert len(ticks) == 3
+
+
+@pytest.mark.parametrize("glob", ["*.fits", "**/*.fits", "*/*.fits"])
+def test_a_link_to_itself_comes_with_its_error_and_the_others_go_on(archive: Path, glob: str) -> None:
+    for name in ("loop.fits", "2021/loop.fits"):
+        (archive / name).symlink_to(archive / name)
+    (archive / "z.fits").write_bytes(b"x")
+    files = list(archive_files.find(f"{archive}/{glob}", [archive]))
+    wrong = [file for file in files if file.error is not None]
+    assert wrong and all(file.path.name == "loop.fits" for file in wrong)
+    for file in wrong:
+        assert file.error is not None and file.error.code == "unreadable-file"
+        assert "expected a file or folder" in file.error.message and "symbolic links" in file.error.message
+    right = {str(file.path.relative_to(archive)) for file in files if file.error is None}
+    assert right & {"z.fits", "2021/a.fits"}
+
+
+def test_a_pattern_below_a_link_to_itself_is_refused(archive: Path) -> None:
+    (archive / "loop").symlink_to(archive / "loop")
+    with pytest.raises(DataError, match="symbolic links"):
+        list(archive_files.find(f"{archive}/loop/*.fits", [archive]))
+
+
+def test_paths_are_shown_as_text_that_can_be_stored(tmp_path: Path) -> None:
+    assert archive_files.shown(Path("/a/Sönne.fits")) == "/a/Sönne.fits"
+    assert archive_files.shown(Path(os.fsdecode(b"/a/S\xf6nne.fits"))) == "/a/S\\xf6nne.fits"
 
 
 @pytest.mark.parametrize(

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import func, select, update
 
+from psfcore.errors import DataError
+from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
-from workers.bulk_contract import BulkPhase, ItemState
+from workers import bulk_task
+from workers.bulk_contract import BulkPhase, BulkWork, ItemState
 from workers.bulk_rows import Listed, Taken, new_id
 from workers.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue import Catalogue
+from workers.context import Context
 from workers.contract import Fault, JobError
 from workers.job_rows import Lease
+from workers.settings import Settings
+from workers.store import Store
 from workers.tables import ImageRow, JobRow
 
 BAD = JobError(fault=Fault.USER, code="bad", message="a bad image")
@@ -197,6 +205,62 @@ def test_an_equal_request_finds_the_open_bulk_alone(catalogue: Catalogue) -> Non
     assert made(catalogue, 2) != first
 
 
+def with_a_failure(catalogue: Catalogue) -> str:
+    """A bulk that has ended, with an image that failed."""
+    bulk_id, lease = made(catalogue, 2), turn(catalogue)
+    first, second = all_taken(catalogue, bulk_id, lease)
+    assert done(catalogue, first) and catalogue.bulks.fail(second, BAD)
+    return bulk_id
+
+
+def ends_unseen(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, bulk_id: str) -> None:
+    """A bulk ends just before the next look for an open one."""
+    database = catalogue.bulks._database
+    real = database.reading
+
+    def reading() -> Any:
+        catalogue.bulks.cancel(bulk_id)
+        return real()
+
+    monkeypatch.setattr(database, "reading", reading)
+
+
+def test_what_failed_waits_for_the_end_of_an_equal_bulk(catalogue: Catalogue) -> None:
+    ended = with_a_failure(catalogue)
+    other = made(catalogue, 2)
+    assert other != ended
+    for change, phase in ((catalogue.bulks.pause, "PAUSED"), (catalogue.bulks.resume, "RUNNING")):
+        assert change(other)
+        with pytest.raises(DataError, match=f"bulk {other} is {phase}") as refused:
+            catalogue.bulks.retry(ended)
+        assert refused.value.code == "equal-bulk-open"
+        now = row(catalogue, ended)
+        assert (now.phase, now.failed) == ("COMPLETED", 1), "nothing of it has changed"
+        check_counts(catalogue, ended)
+    catalogue.bulks.cancel(other)
+    assert catalogue.bulks.retry(ended) == 1 and row(catalogue, ended).phase == "RUNNING"
+    check_counts(catalogue, ended)
+
+
+def test_what_failed_is_tried_again_where_the_equal_bulk_ends_meanwhile(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = with_a_failure(catalogue)
+    ends_unseen(catalogue, monkeypatch, made(catalogue, 2))
+    assert catalogue.bulks.retry(ended) == 1
+    assert row(catalogue, ended).phase == "RUNNING"
+
+
+def test_a_bulk_whose_equal_ends_meanwhile_is_a_new_one(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = made(catalogue, 2)
+    ends_unseen(catalogue, monkeypatch, first)
+    second = made(catalogue, 3)
+    assert second != first and row(catalogue, second).total == 3
+    check_counts(catalogue, second)
+
+
 def test_files_are_listed_under_a_lease_and_from_the_start_by_the_next(catalogue: Catalogue) -> None:
     bulk_id, lost = made(catalogue, 1, listed=False), turn(catalogue)
     bulks = catalogue.bulks
@@ -213,6 +277,47 @@ def test_files_are_listed_under_a_lease_and_from_the_start_by_the_next(catalogue
     assert not bulks.end_listing(bulk_id, lost) and bulks.end_listing(bulk_id, other)
     assert [one.source[-2:] for one in all_taken(catalogue, bulk_id, other)] == ["00", "/a"]
     assert row(catalogue, bulk_id).failed == 1
+
+
+def test_files_whose_paths_cannot_be_kept_are_images_that_failed(
+    catalogue: Catalogue, settings: Settings, tmp_path: Path
+) -> None:
+    root = tmp_path / "archive"
+    long = root.joinpath(*(f"{n}" * 200 for n in range(6))) / "long.fits"
+    strange = root / os.fsdecode(b"\xff\xfe") / os.fsdecode(b"Sonne\xf6.fits")
+    many = root / os.fsdecode(b"\xf6" * 200) / os.fsdecode(b"\xf6" * 200) / "many.fits"
+    for path in (root / "a.fits", strange, long, many):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path)
+    (root / "loop.fits").symlink_to(root / "loop.fits")
+    context = Context(
+        catalogue=catalogue, store=Store(tmp_path / "data"), owner="o", job_id="j",
+        settings=settings.model_copy(update={"bulk_roots": str(root)}), report=lambda *_: None,
+    )  # fmt: skip
+    bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
+    assert catalogue.bulks.begin_listing(bulk_id, lease)
+    files = [{"glob": f"{root}/**/*.fits", "where": {"NAXIS": 2}}]
+    listed = list(bulk_task._listed(context, BulkWork.model_validate({"files": files})))
+    assert catalogue.bulks.add_listed(bulk_id, lease, listed) and catalogue.bulks.end_listing(bulk_id, lease)
+    (taken,) = all_taken(catalogue, bulk_id, lease)
+    assert taken.source == str(root / "a.fits")
+    failed = {
+        item.error["code"]: item for item in catalogue.bulks.items(bulk_id, ItemState.FAILED) if item.error
+    }
+    assert set(failed) == {"unreadable-file", "path-too-long", "path-not-utf-8"}
+    assert row(catalogue, bulk_id).failed == 4
+    assert failed["unreadable-file"].source == str(root / "loop.fits")
+    assert failed["path-too-long"].source == f"{str(long)[:1023]}…"
+    message = failed["path-too-long"].error["message"]  # type: ignore[index]
+    assert message.startswith(f"expected a path of at most 1024 characters; got {len(str(long))}")
+    assert message.endswith("5/long.fits")
+    sources = [item.source for item in catalogue.bulks.items(bulk_id, ItemState.FAILED)]
+    assert f"{root}/\\xff\\xfe/Sonne\\xf6.fits" in sources
+    assert max(map(len, sources)) == bulk_task.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
+    check_counts(catalogue, bulk_id)
+    assert done(catalogue, taken) and catalogue.bulks.retry(bulk_id) == 1, "no row tells where the others lie"
+    assert [one.source for one in all_taken(catalogue, bulk_id, lease)] == [str(root / "loop.fits")]
+    check_counts(catalogue, bulk_id)
 
 
 def test_a_listing_that_is_paused_goes_on_listing(catalogue: Catalogue) -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+
+import pytest
 
 from workers.catalogue import Catalogue
 from workers.contract import Fault, JobError, Phase
@@ -93,7 +96,9 @@ def test_cancel_of_each_phase(catalogue: Catalogue) -> None:
     assert phase(catalogue, done) == Phase.COMPLETED
 
 
-def test_a_silent_worker_loses_its_job_and_three_are_enough(catalogue: Catalogue) -> None:
+def test_a_silent_worker_loses_its_job_and_three_are_enough(
+    catalogue: Catalogue, caplog: pytest.LogCaptureFixture
+) -> None:
     job, lease = claimed(catalogue)
     assert catalogue.jobs.give_up_silent(60, 3) == []
     for attempt in (1, 2):
@@ -108,6 +113,8 @@ def test_a_silent_worker_loses_its_job_and_three_are_enough(catalogue: Catalogue
     row = catalogue.jobs.get(job.id)
     assert row is not None and row.phase == Phase.ERROR
     assert row.error is not None and row.error["code"] == "worker-lost"
+    (said,) = [record for record in caplog.records if record.levelname == "ERROR"]
+    assert f"job {job.id}: the worker was lost 3 times" in said.getMessage()
 
 
 def test_a_silent_worker_of_a_cancelled_job_aborts_it(catalogue: Catalogue) -> None:
@@ -170,3 +177,86 @@ def test_pages_hold_every_row_once_newest_first(catalogue: Catalogue) -> None:
         after = (rows[-1].created_at, rows[-1].id)
     assert len(seen) == len(set(seen)) == 7
     assert seen == sorted(seen, reverse=True)
+
+
+def meanwhile(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, transactions: int, act: Callable[[], object]
+) -> None:
+    """Have somebody act once that many of the transactions that follow are over."""
+    writing = catalogue.jobs._database.writing
+    left = transactions
+
+    class Slow:
+        def begin(self) -> object:
+            nonlocal left
+            left -= 1
+            if left == -1:
+                act()
+            return writing.begin()
+
+    monkeypatch.setattr(catalogue.jobs._database, "writing", Slow())
+
+
+ENDS_OF_AN_ATTEMPT: dict[str, Callable[[Catalogue, Lease], object]] = {
+    "passing failure": lambda catalogue, lease: catalogue.jobs.requeue(lease),
+    "worker stops": lambda catalogue, lease: (
+        catalogue.jobs.hand_back(lease) or catalogue.jobs.abort(lease)  # as the runner does
+    ),
+    "worker silent": lambda catalogue, lease: catalogue.jobs.give_up_silent(-1.0, 3),
+}
+
+
+@pytest.mark.parametrize("end", sorted(ENDS_OF_AN_ATTEMPT))
+@pytest.mark.parametrize("transactions", [0, 1])
+def test_a_cancel_is_not_lost_where_the_attempt_ends_meanwhile(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, end: str, transactions: int
+) -> None:
+    job, lease = claimed(catalogue)
+    with monkeypatch.context() as patched:
+        meanwhile(catalogue, patched, transactions, lambda: ENDS_OF_AN_ATTEMPT[end](catalogue, lease))
+        catalogue.jobs.cancel(job.id)
+    if phase(catalogue, job) == Phase.EXECUTING:  # the cancel was the first
+        ENDS_OF_AN_ATTEMPT[end](catalogue, lease)
+    assert phase(catalogue, job) == Phase.ABORTED
+    row = catalogue.jobs.get(job.id)
+    assert row is not None and row.ended_at is not None and row.cancel_requested
+
+
+@pytest.mark.parametrize("transactions", [0, 1, 2])
+def test_a_cancel_is_not_lost_while_silent_workers_are_given_up(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, transactions: int
+) -> None:
+    job, _ = claimed(catalogue)
+    with monkeypatch.context() as patched:
+        meanwhile(catalogue, patched, transactions, lambda: catalogue.jobs.cancel(job.id))
+        back = catalogue.jobs.give_up_silent(-1.0, 3)
+    if phase(catalogue, job) == Phase.QUEUED:
+        assert back == [job.id] and transactions == 2, "nobody has cancelled it yet"
+        catalogue.jobs.cancel(job.id)
+    else:
+        assert back == []
+    assert phase(catalogue, job) == Phase.ABORTED
+
+
+def test_a_cancelled_job_that_was_started_often_enough_is_no_error(catalogue: Catalogue) -> None:
+    job, _ = claimed(catalogue)
+    catalogue.jobs.cancel(job.id)
+    assert catalogue.jobs.give_up_silent(-1.0, 1) == []
+    assert phase(catalogue, job) == Phase.ABORTED
+
+
+def test_a_cancelled_job_is_not_tried_again_after_a_passing_failure(catalogue: Catalogue) -> None:
+    job, lease = claimed(catalogue)
+    catalogue.jobs.cancel(job.id)
+    assert catalogue.jobs.requeue(lease), "the attempt's end is written"
+    row = catalogue.jobs.get(job.id)
+    assert row is not None and row.phase == Phase.ABORTED
+    assert row.ended_at is not None and row.lease is None
+    assert waiting(catalogue) == [] and catalogue.jobs.claim(job.id, "other") is None
+
+
+def test_a_job_that_is_queued_again_has_not_ended(catalogue: Catalogue) -> None:
+    job, lease = claimed(catalogue)
+    assert catalogue.jobs.requeue(lease)
+    row = catalogue.jobs.get(job.id)
+    assert row is not None and (row.phase, row.ended_at, row.lease) == (Phase.QUEUED, None, None)

@@ -143,3 +143,80 @@ def test_jobs_from_before_say_what_they_make_by_their_key(catalogue: Catalogue) 
     catalogue.upgrade()
     assert (row(catalogue, job).work_key, row(catalogue, draft.id).work_key) == ("k", None)
     assert claim(catalogue, job) is not None and claim(catalogue, started(catalogue)) is None
+
+
+def asked_for(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, bool]:
+    return catalogue.jobs.submit("psf-build", {"key": key}, key, DEFAULT_OWNER)
+
+
+def test_a_job_that_was_told_to_stop_is_not_shared(catalogue: Catalogue) -> None:
+    doomed = asked_for(catalogue)[0].id
+    lease = claim(catalogue, doomed)
+    assert lease is not None
+    catalogue.jobs.cancel(doomed)
+    again, new = asked_for(catalogue)
+    assert new and again.id != doomed and (again.phase, again.work_key) == (Phase.QUEUED, "k")
+    shared, new = asked_for(catalogue)
+    assert shared.id == again.id and not new, "requests after it share the new one"
+    assert claim(catalogue, again.id) is None and waiting(catalogue) == set(), "one is at work at a time"
+    assert catalogue.jobs.abort(lease)
+    assert row(catalogue, again.id).phase == Phase.QUEUED and waiting(catalogue) == {again.id}
+    assert claim(catalogue, again.id) is not None
+
+
+def test_after_a_cancel_many_equal_requests_at_once_make_one_job(catalogue: Catalogue) -> None:
+    doomed = asked_for(catalogue)[0].id
+    assert claim(catalogue, doomed) is not None
+    catalogue.jobs.cancel(doomed)
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(lambda _: asked_for(catalogue), range(16)))
+    assert sum(new for _, new in answers) == 1
+    assert len({job.id for job, _ in answers}) == 1 and doomed not in {job.id for job, _ in answers}
+
+
+def test_a_second_cancel_does_not_take_a_third_request_with_it(catalogue: Catalogue) -> None:
+    first = asked_for(catalogue)[0].id
+    assert claim(catalogue, first) is not None
+    catalogue.jobs.cancel(first)
+    second = asked_for(catalogue)[0].id
+    catalogue.jobs.cancel(second)
+    assert row(catalogue, second).phase == Phase.ABORTED
+    third, new = asked_for(catalogue)
+    assert new and third.phase == Phase.QUEUED
+
+
+def test_a_job_that_was_done_before_it_could_stop_is_shared(catalogue: Catalogue) -> None:
+    done = asked_for(catalogue)[0].id
+    lease = claim(catalogue, done)
+    assert lease is not None
+    catalogue.jobs.cancel(done)
+    assert catalogue.jobs.complete(lease, "r")
+    shared, new = asked_for(catalogue)
+    assert shared.id == done and not new
+
+
+@pytest.mark.parametrize("end", ["too long", "destroyed"])
+def test_a_job_that_ends_on_terms_is_not_shared(catalogue: Catalogue, end: str) -> None:
+    limited = started(catalogue)
+    other, new = asked_for(catalogue)
+    assert new and other.id != limited and other.work_key == "k"
+    assert asked_for(catalogue)[0].id == other.id
+    lease = claim(catalogue, limited)
+    assert lease is not None and claim(catalogue, other.id) is None
+    if end == "too long":
+        catalogue.uws.set_terms(limited, execution_duration_s=1)
+        time.sleep(1.1)
+        assert catalogue.uws.end_by_terms() == [] and catalogue.jobs.abort(lease)
+    else:
+        catalogue.uws.set_terms(limited, destruction_at=time.time() - 1)
+        assert catalogue.uws.end_by_terms() == [limited]
+    assert row(catalogue, other.id).phase == Phase.QUEUED and not row(catalogue, other.id).cancel_requested
+    assert claim(catalogue, other.id) is not None
+
+
+def test_a_job_that_is_given_terms_is_shared_no_longer(catalogue: Catalogue) -> None:
+    job = asked_for(catalogue)[0].id
+    assert asked_for(catalogue)[0].id == job
+    catalogue.uws.set_terms(job, execution_duration_s=1)
+    other, new = asked_for(catalogue)
+    assert new and other.id != job and asked_for(catalogue)[0].id == other.id

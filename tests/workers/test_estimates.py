@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from workers import tasks
 from workers.catalogue import Catalogue
 from workers.context import Context
 from workers.contract import Method, PsfBuild, RichardsonLucy
-from workers.estimates import MARGIN_SHARE, STEP_NS, checked, estimate
+from workers.estimates import MARGIN_SHARE, STEP_NS, _build, checked, estimate
 from workers.settings import Settings
 from workers.tables import ImageRow, PsfRow, TransitRow
 
@@ -116,6 +118,17 @@ def test_an_instrument_file_that_asks_for_much_is_seen_for_it(
     small = PsfBuild(instrument_file=SMALL_INSTRUMENT).model_dump(mode="json")
     large = PsfBuild(instrument_file=SMALL_INSTRUMENT.replace("[aperture]", change)).model_dump(mode="json")
     assert needs(catalogue, "psf-build", large)[0] >= least > 10 * needs(catalogue, "psf-build", small)[0]
+
+
+@pytest.mark.parametrize("extremes", list(itertools.product(("1e-9", "1e9"), repeat=4)))
+def test_an_instrument_file_of_extremes_can_be_estimated(extremes: tuple[str, ...]) -> None:
+    text = SMALL_INSTRUMENT
+    keys = ("wavelength_angstrom", "focal_length_mm", "diameter_mm", "pixel_pitch_um")
+    for key, value in zip(keys, extremes, strict=True):
+        text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
+    mount = "\n[mount]\nbasis = 'assumed'\nrays = [{count = 4, width_mm = 1e-9}]\n"
+    seconds, mib = _build(PsfBuild(instrument_file=text + mount))
+    assert 0 < seconds < 600 and 0 < mib < 4096
 
 
 def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:

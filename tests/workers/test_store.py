@@ -58,6 +58,20 @@ def test_an_abandoned_file_is_removed(store: Store, tmp_path: Path) -> None:
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
 
 
+def test_a_sweep_meets_others_that_end_with_their_files(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tmp = tmp_path / "data" / "tmp"
+    for name in ("kept", "left"):
+        (tmp / name).write_bytes(b"half")
+    os.utime(tmp / "left", (0, 0))
+    gone = [tmp / "ended", tmp / "left", tmp / "kept"]  # the first was listed and is there no more
+    monkeypatch.setattr(Path, "iterdir", lambda folder: iter(gone))
+    store.sweep()
+    monkeypatch.undo()
+    assert [path.name for path in tmp.iterdir()] == ["kept"]
+
+
 def test_a_file_that_is_not_there_says_so(store: Store) -> None:
     with pytest.raises(FileNotFoundError):
         store.path("a" * 64).open("rb")
