@@ -22,7 +22,7 @@ demo: $(RUN)
 	$(BIN)/heliopsf demo $(if $(IMAGE),--image "$(IMAGE)")
 
 test: $(DEV)
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile tests
+	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile tests
 
 test-full: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests

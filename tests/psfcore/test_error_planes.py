@@ -83,7 +83,8 @@ def check_widths(scene: Plane, psf: Psf, images: int) -> None:
     assert abs(z.mean()) < 0.1
 
 
-@pytest.mark.parametrize("light", [pytest.param(0.5, marks=pytest.mark.slow), 0.05])
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [0.5, 0.05])
 def test_pulls_of_forty_images_have_width_one(psf: Psf, light: float) -> None:
     """At 50 to 650 photons a pixel, and at a dozen or so."""
     check_widths(cut(light), psf, 40)

@@ -37,6 +37,7 @@ def compared_stretched() -> ShapesByErrors:
     return compare_shapes_by_errors(invert(observed(sky(much, brightness=BRIGHT)).transit))
 
 
+@pytest.mark.slow
 def test_all_shapes_are_compared_on_the_same_images() -> None:
     found = compared()
     assert [s.name for s in found.shapes] == ["softened-power-law", *STRETCHED, FREE_SHELLS]
@@ -51,6 +52,7 @@ def test_all_shapes_are_compared_on_the_same_images() -> None:
         assert second.minus_first[name][0] == pytest.approx(difference, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_shapes_do_not_differ_where_the_truth_is_isotropic() -> None:
     for shape in compared().shapes[1:]:
         for name in ("mpe_rms_pct", "mape_mean_pct"):

@@ -150,6 +150,7 @@ def test_the_noise_of_the_images_is_measured(clean: Transit) -> None:
     assert measured_noise(replace(clean, frames=(first, replace(second, fov=2)))) is None
 
 
+@pytest.mark.slow
 def test_one_pointing_and_few_images_say_what_they_cannot(clean: Transit) -> None:
     one = replace(clean, frames=tuple(f for f in clean.frames if f.fov == 2))
     found = verdict(one)

@@ -174,6 +174,7 @@ def test_a_sun_that_changes_shows_in_the_lit_parts_alone(share: float, seen: boo
     assert set(tried.values) == ({"rms"} if seen else set())
 
 
+@pytest.mark.slow
 def test_beside_an_effect_that_explains_the_lit_parts_a_second_is_found_in_the_discs() -> None:
     """A difference of gain, which the discs hide, and a light leak, which they alone show."""
     transit = clean()

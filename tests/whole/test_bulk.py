@@ -109,6 +109,7 @@ def test_killed_and_gone_on_with_nothing_is_done_twice(stack: Stack, psf_file: P
     assert [line["position"] for line in manifest] == list(range(IMAGES))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stack", SERVED_FIRST, indirect=True)
 def test_two_workers_share_a_bulk_and_a_persons_job_goes_first(
     stack: Stack, tmp_path: Path, psf_file: Path

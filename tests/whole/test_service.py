@@ -95,6 +95,7 @@ def test_cancel_at_work(living: Stack, tmp_path: Path, psf_file: Path) -> None:
     assert list(living.client.products()) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stack", EMBEDDED_FIRST, indirect=True)
 def test_what_was_queued_while_everything_was_down_is_done(
     stack: Stack, tmp_path: Path, psf_file: Path
@@ -153,6 +154,7 @@ def test_a_server_that_dies_takes_its_worker_along(tmp_path: Path) -> None:
         assert left == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("living", ["embedded"], indirect=True)
 def test_the_command_line_over_http_and_local_agree(living: Stack, tmp_path: Path, psf_file: Path) -> None:
     write_image(tmp_path / "image.fits", seed=7)

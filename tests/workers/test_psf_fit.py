@@ -155,6 +155,7 @@ def test_no_occulter_where_it_should_be(service: LocalService, transit: Path, tm
     assert caught.value.code == "too-few-frames" and "expected an occulter at (64, 110)" in str(caught.value)
 
 
+@pytest.mark.slow
 def test_one_pointing_alone_is_a_stated_limit(service: LocalService, transit: Path, tmp_path: Path) -> None:
     two = [image for image in images_of(transit) if image["fov"] < 3]
     psf = service.fit_psf(changed(transit, tmp_path / "t", images=two))

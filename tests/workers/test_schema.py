@@ -228,7 +228,7 @@ print(catalogue.schema.status().state, catalogue.schema.faults().tables)
 """
 
 
-@pytest.mark.parametrize("adopted", [False, True])
+@pytest.mark.parametrize("adopted", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_processes_that_start_at_once_make_one_upgrade(url: str, catalogue: Catalogue, adopted: bool) -> None:
     if adopted:
         make_as_before_revisions(catalogue)

@@ -213,7 +213,7 @@ main()
 """
 
 
-@pytest.mark.parametrize("task", ["listens", "deaf"])
+@pytest.mark.parametrize("task", [pytest.param("listens", marks=pytest.mark.slow), "deaf"])
 def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     tmp_path: Path, task: str
 ) -> None:
