@@ -51,7 +51,7 @@ router = APIRouter(
     ),
 )
 def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
-    """Jobs, newest first, as far as they are asked for: the newest 10,000 at most; /v1/jobs has pages."""
+    """Jobs, newest first, as far as they are asked for, and no more than LAST may be; /v1/jobs has pages."""
     query = query_of(request, "phase")
     after, last = query.get("after"), query.get("last")
     # Times are shown to the millisecond, so "after" is the millisecond after.

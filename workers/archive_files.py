@@ -50,7 +50,7 @@ def check_under(path: Path, allowed: Sequence[Path], what: str = "a path") -> Pa
     except OSError as error:
         raise DataError(
             "bad-path",
-            f"expected {what} that leads somewhere; got {ascii(str(path))[:200]}: {_reason(error)}",
+            f"expected {what} that leads somewhere; got {ascii(str(path))[:200]}: {reason_of(error)}",
         ) from error
     if any(resolved.is_relative_to(root) for root in allowed):
         return resolved
@@ -147,7 +147,7 @@ def _walk(
             try:
                 meant, further = _meant(entry, parts, places, allowed)
             except OSError as error:
-                message = f"expected a file or folder that can be looked at: {_reason(error)}"
+                message = f"expected a file or folder that can be looked at: {reason_of(error)}"
                 yield Found(path, DataError("unreadable-file", message))
                 continue
             if meant:
@@ -182,7 +182,8 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
             return sorted(entries, key=lambda entry: entry.name)
     except OSError as error:
         raise DataError(
-            "unreadable-folder", f"expected a folder that can be read; got {shown(folder)}: {_reason(error)}"
+            "unreadable-folder",
+            f"expected a folder that can be read; got {shown(folder)}: {reason_of(error)}",
         ) from error
 
 
@@ -194,7 +195,8 @@ def _resolved(path: Path) -> Path:
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP)) from error
 
 
-def _reason(error: OSError) -> str:
+def reason_of(error: OSError) -> str:
+    """What the system says of it, without the path."""
     return error.strerror or type(error).__name__
 
 

@@ -104,7 +104,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
         try:
             sha256 = archive_files.copy_hashed(path, copy, context.settings.max_upload_bytes)
         except OSError as error:
-            reason = error.strerror or type(error).__name__
+            reason = archive_files.reason_of(error)
             raise DataError("unreadable-file", f"expected a file that can be read: {reason}") from error
         summary = dataclasses.asdict(read_summary(copy, context.limits))
         yield _Source(copy, sha256, summary, path.name)
@@ -266,7 +266,7 @@ def _written_or_said() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = error.strerror or type(error).__name__
+        reason = archive_files.reason_of(error)
         raise DataError(
             "output-not-written", f"expected an output folder that can be written to: {reason}"
         ) from error

@@ -9,6 +9,7 @@ from sqlalchemy.orm import Mapped, mapped_column
 
 from workers.tables import Base
 
+MOST_LETTERS = 1024  # of a file's path
 _OPEN = text("phase IN ('ERROR', 'LISTING', 'PAUSED', 'RUNNING')")
 
 
@@ -57,7 +58,7 @@ class BulkItemRow(Base):
     bulk_id: Mapped[str] = mapped_column(String(32), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
     uploaded: Mapped[bool]
-    source: Mapped[str] = mapped_column(String(1024))  # an upload's id, or a path
+    source: Mapped[str] = mapped_column(String(MOST_LETTERS))  # an upload's id, or a path
     state: Mapped[str] = mapped_column(String(16))
     attempts: Mapped[int] = mapped_column(default=0)
     job_id: Mapped[str | None] = mapped_column(String(32))

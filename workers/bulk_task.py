@@ -18,7 +18,7 @@ from workers import archive_files
 from workers.bulk_contract import BulkPhase, BulkWork, Condition
 from workers.bulk_image import Outcome, treat
 from workers.bulk_rows import NOT_UTF_8, TOO_LONG, Listed, Taken
-from workers.bulk_tables import BulkRow
+from workers.bulk_tables import MOST_LETTERS, BulkRow
 from workers.context import Context, TurnOver
 from workers.contract import Fault, JobError
 from workers.job_rows import Lease
@@ -26,7 +26,6 @@ from workers.stage_times import STARTING
 
 LIST_AT_ONCE = 200
 MOST_IMAGES = 1_000_000
-MOST_LETTERS = 1024  # of a path, as bulk_items.source takes it
 TELL_EVERY_S = 1.0  # how far a turn is, and whether it is to stop: nobody waits for a single image of many
 BETWEEN = "between images"  # noting what one became, and taking the next
 TURN_S = 60.0  # then the turn of another bulk may come; far below what one attempt of a job may last
@@ -202,7 +201,7 @@ def _unkept(path: Path, source: str) -> JobError | None:
 
 def unreadable_file(error: OSError) -> JobError:
     """Why a file cannot be read, without its place."""
-    reason = error.strerror or type(error).__name__
+    reason = archive_files.reason_of(error)
     return JobError(
         fault=Fault.USER, code="unreadable-file", message=f"expected a file that can be read: {reason}"
     )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -205,8 +205,10 @@ def make(
     errors = work.errors(result)
     context.report("saving", 0, 1)
     edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
-    with _beside(context.settings.threads) as beside:
-        picture = beside.submit(_preview, work, result) if preview else None
+    draw = partial(_preview, work, result)
+    with ThreadPoolExecutor(1) as beside:
+        # A worker of one thread draws in turn: another thread would take the time of the worker next to it.
+        picture = beside.submit(draw).result if preview and context.settings.threads > 1 else draw
         found = effects(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
         quality = quality_plane(
             image,
@@ -216,20 +218,8 @@ def make(
             error=None if errors is None else errors.error,
         )
         details = _details(work, result, errors, found)
-        preview_sha256 = None if picture is None else picture.result()
+        preview_sha256 = picture() if preview else None
     return Made(work, result, errors, found, quality, details, preview_sha256)
-
-
-def _beside(threads: int) -> Executor:
-    """What does a piece of work beside another; with one thread, which others' may stand next to, at once."""
-    return ThreadPoolExecutor(1) if threads > 1 else _AtOnce()
-
-
-class _AtOnce(Executor):
-    def submit(self, work: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
-        done: Future[Any] = Future()
-        done.set_result(work(*args, **named))
-        return done
 
 
 def write(made: Made, path: Path) -> None:

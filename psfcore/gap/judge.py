@@ -5,8 +5,8 @@ Gains of effects are compared after what their parameters, and a search over man
     score = gain - PENALTY parameters - 2 ln trials                         Eq. (1)
 
 There is a gap where patterns that any gap makes (`patterns`), the discs' means, all cells, the lit blocks or an effect's
-gain are less likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be told from it,
-unless it does clearly worse on images held out of its fit.
+gain are less likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be
+told from it, unless it does clearly worse on images held out of its fit.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
 TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
 sky's. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
@@ -53,7 +53,6 @@ MANY_PLACES = 100
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
-TESTS = 5  # of `_Left`, and the effects'
 LENIENT = 5.0  # times likelier: what shows a gap, and names its cause, may be so under the other floors
 BY_CHANCE = 0.01  # a probe's greater gain is less likely than this to come of its further numbers alone
 LEAST_IMAGES = 6  # with fewer nothing can be held out, and that nothing shows says nothing
@@ -375,7 +374,8 @@ def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
 def _p_of_gap(left: _Left, named: Sequence[Tried]) -> float:
     """The least of the p-values of patterns, cells, lit blocks and single effects, times how many they are."""
     effects = min((t.p_value for t in named), default=1.0) * max(len(named), 1)
-    return float(min(1.0, TESTS * min(*left.p_values, effects)))
+    tests = (*left.p_values, effects)
+    return float(min(1.0, len(tests) * min(tests)))
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,8 @@ def _of_disc(evidence: Evidence, disc: DiscCells, fovs: list[int], times: dict[i
 
 def means(evidence: Evidence) -> tuple[Matrix, ...]:
     """For each disc as many patterns as there are discs (discs, cells): its own, one plane, is as bright as the disc."""
-    return tuple(
-        np.outer(np.arange(len(evidence.discs)) == k, disc.expected).astype(np.float64)
-        for k, disc in enumerate(evidence.discs)
-    )
+    own = np.eye(len(evidence.discs))
+    return tuple(np.outer(row, disc.expected) for row, disc in zip(own, evidence.discs, strict=True))
 
 
 def in_disc(disc: DiscCells) -> Matrix:
