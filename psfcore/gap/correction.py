@@ -94,6 +94,9 @@ def add_to_model(
         again = replace(model, evidence=evidence)
         left = fitted(again, evidence.effects, any_sign=True)
         found_now = np.array([value for value, _, _ in left.values.values()])
+        base = len(evidence.base)
+        out_already = np.concatenate([np.zeros(base), np.where(in_images, theta, 0.0)])
+        found_now -= again.pull_of_prior(left.step, out_already)[base:]
         sigma = np.array([s for _, s, _ in left.values.values()])
         # What was taken out of the images shows what is left of it, the rest shows all of it.
         steps = np.where(in_images, found_now, found_now - theta)

@@ -14,6 +14,7 @@ FAINT_DN = (30.0, 150.0)  # a mixture of both follows a loss at any faint level 
 # In mean waits between images: with a share of the last image, mixtures of these fade as traps do.
 FADES_IN = {"one_wait": 1, "three_waits": 3}
 LEAST_LEFT = 0.01  # what is left of an image after so long is too little to see
+FINEST = 5  # half waves across the field, of a smooth field's finest cosines
 
 
 def flat(view: View) -> Field:
@@ -62,10 +63,29 @@ def _nonlinearity(view: View) -> Sequence[Change]:
     return [Change(lambda n, images, k=k: change(n, images, k)) for k in FAINT_DN]  # type: ignore[misc]
 
 
+def half_waves() -> list[tuple[int, int]]:
+    """How many half waves along x and y the cosines of a smooth field have across it; the even one is not among them."""
+    every = range(FINEST + 1)
+    return [(kx, ky) for ky in every for kx in every if 0 < kx * kx + ky * ky <= FINEST * FINEST]
+
+
+def cosines(view: View) -> list[Field]:
+    """Cosines of these half waves [y, x], rms 1: no smooth field lacks them, and none has a slope at the edges."""
+    x, y = (np.pi * (place + 0.5) for place in view.places)
+
+    def along(waves: int, at: Field) -> Field:
+        return np.asarray(math.sqrt(2.0) * np.cos(waves * at) if waves else np.ones_like(at))
+
+    return [np.asarray(along(kx, x) * along(ky, y), np.float32) for kx, ky in half_waves()]
+
+
+def cosine_parameters(unit: str, likely: float) -> tuple[EffectParameter, ...]:
+    """One a cosine."""
+    return tuple(EffectParameter(f"cos_{kx}x_{ky}y", unit, likely) for kx, ky in half_waves())
+
+
 def _flat_field(view: View) -> Sequence[Change]:
-    x, y = view.places
-    twelfth = np.float32(1 / 12)
-    return [times_image(np.asarray(p)) for p in (x, y, x * x - twelfth, x * y, y * y - twelfth)]
+    return [times_image(cosine) for cosine in cosines(view)]
 
 
 def _column_smear(view: View) -> Sequence[Change]:
@@ -131,11 +151,9 @@ EFFECTS: tuple[Effect, ...] = (
            "the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
     Effect("nonlinearity", "detector", (_p("loss", "", 0.05), _p("loss_beyond", "", 0.05)), "Faint signals are read out too low.",
            "a ladder of exposures at one pointing", ("intensity",), _nonlinearity),
-    Effect("flat_field_residual", "detector",
-           tuple(_p(name, unit, 0.05) for name, unit in
-                 (("x", "/field"), ("y", "/field"), ("xx", "/field2"), ("xy", "/field2"), ("yy", "/field2"))),
+    Effect("flat_field_residual", "detector", cosine_parameters("", 0.02),
            "The detector's sensitivity is not quite flattened.", "the same scene displaced on the detector",
-           ("detector_x", "detector_y"), _flat_field),
+           ("detector_x", "detector_y"), _flat_field, field=True),
     Effect("column_smear", "detector", (_p("share", "", 0.01, True),), "Charge is smeared along columns while they are read.",
            "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
     Effect("persistence", "detector", (_p("share", "", 0.01, True), *(_p(f"share_fading_in_{waits}", "", 0.01, True) for waits in FADES_IN)),

@@ -6,6 +6,7 @@ them: one look at each image gives how its cells (`cells`) and its lit blocks (`
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,6 +24,8 @@ from psfcore.transit.transit import Frame
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+
+AT_ONCE = 16  # fields that are looked at together
 
 
 @dataclass(frozen=True)
@@ -150,11 +153,16 @@ def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
     lit = view.lit_scene(n)
-    answers = [flat @ slope.field(slope.see(lit)).ravel() for slope in view.slopes]
-    for change in changes:
-        hidden = np.zeros(flat.shape[0])
-        answers.append(flat @ np.asarray(change.change(n, view.expected)).ravel() if change.disc else hidden)
-    return replace(cells, answers=np.array(answers, dtype=np.float64))
+    slopes = (slope.field(slope.see(lit)) for slope in view.slopes)
+    shown = [k for k, change in enumerate(changes) if change.disc]
+    fields = itertools.chain(slopes, (changes[k].change(n, view.expected) for k in shown))
+    rows = [*range(len(view.slopes)), *(len(view.slopes) + k for k in shown)]
+    answers = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
+    for first in range(0, len(rows), AT_ONCE):
+        # Together: the cells' planes are read from memory once for all of them.
+        some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
+        answers[rows[first : first + AT_ONCE]] = some @ flat.T
+    return replace(cells, answers=answers)
 
 
 class _Distance:

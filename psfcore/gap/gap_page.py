@@ -22,7 +22,7 @@ from psfcore.gap.gap_plot import (
     slices_png,
     where_png,
 )
-from psfcore.gap.gap_report import AXIS_WORDS, words
+from psfcore.gap.gap_report import AXIS_WORDS, in_short_if_many, words
 from psfcore.gap.judge import ALARM, ENOUGH, TIE
 from psfcore.gap.linear_model import FLOOR
 from psfcore.gap.where import DRAWS
@@ -307,7 +307,7 @@ def _effect_row(effect: Report) -> list[str]:
     fall = effect["delta_chi2_held_out"]
     return [
         words(effect["name"]),
-        numbers,
+        in_short_if_many([p["value"] for p in effect["parameters"].values()]) or numbers,
         f"{effect['score']:.1f}",
         DASH if fall is None else f"{fall:.1f}",
         *_closure_cells(effect["closure"]),

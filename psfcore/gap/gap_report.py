@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from psfcore.gap.probes import PROBES
 from psfcore.scatter.inversion import Inversion
 
 SCHEMA = "gap/1"
+MOST_READ = 12  # numbers of an effect that a person reads one by one
 PROBE_NAMES = {probe.name for probe in PROBES}
 AXIS_WORDS = {
     "detector_x": "along detector x",
@@ -220,14 +222,22 @@ def _lit_alone(found: Diagnosis) -> bool:
 
 def _explained(found: Diagnosis, best: Tried) -> str:
     values = found.corrected[0].values if found.corrected else best.values
-    numbers = ", ".join(
+    numbers = [
         f"{words(name)} {value:.3g} ± {sigma:.2g} {unit}".strip()
         for name, (value, sigma, unit) in values.items()
-    )
+    ]
+    in_short = in_short_if_many([value for value, _, _ in values.values()])
     return (
-        f"{words(best.label)} explains it ({numbers}); held-out gap {found.rms.value:.1f} -> "
+        f"{words(best.label)} explains it ({in_short or ', '.join(numbers)}); held-out gap {found.rms.value:.1f} -> "
         f"{found.after.value:.1f} %, noise {found.noise_pct:.1f} %"
     )
+
+
+def in_short_if_many(values: Sequence[float]) -> str | None:
+    """What a person reads in place of more numbers than MOST_READ; none of fewer."""
+    if len(values) <= MOST_READ:
+        return None
+    return f"{len(values)} numbers, root of their summed squares {float(np.linalg.norm(values)):.2g}"
 
 
 def _excluded(found: Diagnosis, best: Tried) -> str:

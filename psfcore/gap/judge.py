@@ -2,14 +2,14 @@
 
 Gains of effects are compared after what their parameters, and a search over many places, gain from noise:
 
-    score = gain - PENALTY parameters - 2 ln trials                         Eq. (1)
+    score = gain - PENALTY parameters - cost of a field - 2 ln trials       Eq. (1)
 
 There is a gap where patterns that any gap makes (`patterns`), the discs' means, all cells, the lit blocks or an effect's
 gain are less likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be
 told from it, unless it does clearly worse on images held out of its fit.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
 TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
-sky's. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
+sky's. Another is named beside it where it gains more than a search and that error let it. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
 model for real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
 Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
 where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better
@@ -193,7 +193,7 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
         second = _beside(model, best, beyond)
         if second is not None:
             return replace(second, p_value=p_gap, tried=(*second.tried, *named), probes=probes)
-    pair = None if enough else _best_pair(model, best, before, refit)
+    pair = _best_pair(model, best, before, refit, enough=enough)
     winner = pair or best
     if (not enough and pair is None) or best.p_value * len(named) > lenient * ALARM:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
@@ -298,13 +298,21 @@ def _is_enough(tried: Tried, rival_score: float) -> bool:
     return tried.left_p_value >= ENOUGH or nearly
 
 
-def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit) -> Tried | None:
-    """The pair of effects that explains most, if it is clearly better than one and leaves nothing."""
+def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, enough: bool) -> Tried | None:
+    """The pair of effects that explains most, if it is clearly better than one and leaves nothing.
+
+    Where one is enough, what another beside it explains has to be beyond a search for it, and beyond what the first's
+    own form may be wrong by.
+    """
     effects = [effect for effect in model.evidence.effects if effect.named]
-    pairs = sorted(
-        (fitted(model, pair) for pair in itertools.combinations(effects, 2)), key=lambda t: -t.score
-    )
-    if not pairs or pairs[0].score < best.score + CLEAR:
+    couples = [
+        pair
+        for pair in itertools.combinations(effects, 2)
+        if not enough or best.names[0] in (pair[0].name, pair[1].name)
+    ]
+    pairs = sorted((fitted(model, pair) for pair in couples), key=lambda t: -t.score)
+    clear = CLEAR + (2 * math.log(len(effects)) + TEMPLATE_ERROR**2 * best.gain if enough else 0.0)
+    if not pairs or pairs[0].score < best.score + clear:
         return None
     pair = _with_left(model, pairs[0], before, refit)
     # Two forms that are not quite right fit too much: of a pair nothing may be left.
@@ -342,7 +350,9 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
         step = model.fit(tuple(columns))
     gain = model.gain(step)
     trials = math.prod(effect.trials for effect in effects)
-    freedom = len(columns) + model.evidence.numbers_of(tuple(columns))
+    of_fields = [column for column, (effect, _) in columns.items() if effect.field]
+    learned = model.learned(tuple(columns), of_fields)
+    freedom = len(columns) - len(of_fields) + model.evidence.numbers_of(tuple(columns))
     sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
     values = {}
     for k, (effect, parameter) in enumerate(columns.values(), base):
@@ -353,10 +363,18 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
         named=all(effect.named for effect in effects),
         values=values,
         gain=gain,
-        score=gain - PENALTY * freedom - 2 * math.log(trials),
-        p_value=min(1.0, trials * float(chdtrc(freedom, gain))) if columns else 1.0,
+        score=gain - PENALTY * freedom - float(np.log1p(learned).sum()) - 2 * math.log(trials),
+        p_value=min(1.0, trials * _by_noise(gain, freedom, learned / (1 + learned))) if columns else 1.0,
         step=step,
     )
+
+
+def _by_noise(gain: float, freedom: int, shares: Vector) -> float:
+    """How often noise gains as much by numbers that are free and by shares of some: a chi2 of the same mean and width."""
+    middle, half_spread = freedom + float(shares.sum()), freedom + float((shares**2).sum())
+    if half_spread <= 0:
+        return 1.0
+    return float(chdtrc(middle**2 / half_spread, gain * middle / half_spread))
 
 
 def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:

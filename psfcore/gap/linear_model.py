@@ -5,7 +5,14 @@
 
 m being what is expected in a disc's cells: a floor, the share f, common to a disc, for what nobody has thought of. An
 effect is tried beside the PSF's own coordinates, which are refitted with it: what they absorb is not its. Its parameters have a
-prior of UNLIKELY times what is likely: a flat field of 500 % explains nothing. Its gain is what chi2 and prior fall by.
+prior of UNLIKELY times what is likely: an offset of 200 DN explains nothing. Its gain is what chi2 and prior fall by.
+
+A field's many parameters have the prior itself, of width S. With N the normal matrix of them, all else refitted, and l
+the eigenvalues of S N S, what was learned of them costs, and noise alone gains by them,
+
+    cost = sum of ln(1 + l)                     gain = sum of l / (1 + l) chi2_1                     Eq. (3)
+
+so that gain less cost is twice the logarithm of how much likelier the field makes the data.
 
 | symbol | name | unit |
 |---|---|---|
@@ -108,7 +115,7 @@ class LinearModel:
         """The PSF's coordinates and these columns, from some equations (none: of all images)."""
         here = [*self.evidence.base, *columns]
         normal, score = self.whole if equations is None else equations
-        normal, score = normal[np.ix_(here, here)] + np.diag(self._prior[here]), score[here]
+        normal, score = normal[np.ix_(here, here)] + np.diag(self.prior[here]), score[here]
         size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         covariance = np.linalg.pinv(normal / np.outer(size, size), rcond=WEAKEST, hermitian=True)
         covariance = covariance / np.outer(size, size)
@@ -116,13 +123,34 @@ class LinearModel:
         return Step(tuple(here), values, covariance, float(score @ values))
 
     @cached_property
-    def _prior(self) -> Vector:
+    def prior(self) -> Vector:
         """Of each column, over its variance: 0 of the PSF's coordinates."""
         out = np.zeros(self.evidence.size)
         for effect in self.evidence.effects:
+            wide = 1.0 if effect.field else UNLIKELY
             for column, parameter in zip(self.evidence.columns[effect.name], effect.parameters, strict=False):
-                out[column] = (UNLIKELY * parameter.likely) ** -2
+                out[column] = (wide * parameter.likely) ** -2
         return out
+
+    def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
+        """By how much less a step's columns would be found, had their prior known of what was taken out beforehand."""
+        return np.asarray(step.covariance @ (self.prior[list(step.columns)] * taken_out))
+
+    def learned(self, columns: Sequence[int], field: Sequence[int]) -> Vector:
+        """l of Eq. (3) of a field's columns, the others of `columns` and the PSF's coordinates refitted."""
+        if not field:
+            return np.zeros(0)
+        others = [*self.evidence.base, *(column for column in columns if column not in set(field))]
+        here = [*others, *field]
+        normal = self.whole[0][np.ix_(here, here)]
+        first = len(others)
+        known = normal[:first, :first] + np.diag(self.prior[others])
+        cross = normal[:first, first:]
+        size = np.sqrt(np.maximum(np.diag(known), 1e-300))
+        inverse = np.linalg.pinv(known / np.outer(size, size), rcond=WEAKEST, hermitian=True)
+        left = normal[first:, first:] - cross.T @ (inverse / np.outer(size, size)) @ cross
+        width = self.prior[list(field)] ** -0.5
+        return np.maximum(np.linalg.eigvalsh(left * np.outer(width, width)), 0.0)
 
     @cached_property
     def base(self) -> Step:

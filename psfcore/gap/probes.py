@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psfcore.gap.detector_effects import fixed, flat, times_image
+from psfcore.gap.detector_effects import cosine_parameters, cosines, fixed, flat, times_image
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
 from psfcore.gap.optics_effects import (
     AMOUNT,
@@ -49,6 +49,10 @@ def _glow(view: View) -> Sequence[Change]:
 
 def _shadow(view: View) -> Sequence[Change]:
     return [times_image(-_patch(view, of_image=True, sign=-1.0))]
+
+
+def _structured(view: View) -> Sequence[Change]:
+    return [fixed(cosine) for cosine in (flat(view), *cosines(view))]
 
 
 def _planes_of_pointings(view: View) -> Sequence[Change]:
@@ -139,8 +143,8 @@ def _p(*names: str) -> tuple[EffectParameter, ...]:
     return tuple(EffectParameter(name, "", math.inf) for name in names)
 
 
-def _probe(name, stage, parameters, form, axes, changes, why_not=lambda view: None, trials=1):  # type: ignore[no-untyped-def]
-    return Effect(name, stage, parameters, form, "", axes, changes, why_not, trials, named=False)
+def _probe(name, stage, parameters, form, axes, changes, why_not=lambda view: None, trials=1, field=False):  # type: ignore[no-untyped-def]
+    return Effect(name, stage, parameters, form, "", axes, changes, why_not, trials, named=False, field=field)
 
 
 PROBES: tuple[Effect, ...] = (
@@ -148,6 +152,8 @@ PROBES: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _glow, trials=PATCH_TRIALS),
     _probe("patch_of_shadow", "detector", _p("depth"), "a patch of lost light, fixed on the detector",
            ("detector_x", "detector_y"), _shadow, trials=PATCH_TRIALS),
+    _probe("structured_light", "detector", (EffectParameter("level", "DN/s", 2.0), *cosine_parameters("DN/s", 0.4)),
+           "added light of a smooth form, fixed on the detector", ("detector_x", "detector_y"), _structured, field=True),
     _probe("drifting_light", "scene", _p("linear", "quadratic"), "added light that drifts with time", ("time",), _drift),
     _probe("drifting_dark_level", "detector", _p("linear", "quadratic"), "a dark level that drifts with time",
            ("time", "exposure"), _dark_drift),

@@ -18,7 +18,9 @@ from psfcore.transit.transit import Place
 
 Planes = NDArray[np.float64]
 
-MOTION_PX = 1.0
+# In the longest exposure. What a long track changes is not so many times what a short one does.
+MOTIONS_PX = (1.0, 5.0)
+MOTION_PARTS = 5  # that an exposure is divided into
 STRUCTURE_PX = 6.0
 LEAST_TO_EVOLVE = 5
 MOST_TERMS = 4
@@ -75,24 +77,25 @@ def _motion(view: View) -> Sequence[Change]:
     longest = max(frame.exposure_s for frame in frames)
     shape = solution.transit.shape
 
-    def change(n: int, _: Sequence[Field]) -> Field:
+    def change(n: int, longest_px: float) -> Field:
         near = [k for k, f in enumerate(frames) if f.fov == frames[n].fov and k != n]
         hidden = view.behind(n)
         if not near or hidden is None:
             return np.zeros(shape, np.float32)
         other = min(near, key=lambda k: abs(frames[k].time_s - frames[n].time_s))
         dx, dy = places[other].x_px - places[n].x_px, places[other].y_px - places[n].y_px
-        reach = MOTION_PX * frames[n].exposure_s / longest / max(float(np.hypot(dx, dy)), 1e-9)
+        reach = longest_px * frames[n].exposure_s / longest / max(float(np.hypot(dx, dy)), 1e-9)
         here = places[n]
-        ahead, behind = (
+        parts = (np.arange(MOTION_PARTS) + 0.5) / MOTION_PARTS - 0.5
+        along = (
             coverage(shape, Place(here.x_px + s * reach * dx, here.y_px + s * reach * dy, here.radius_px))
-            for s in (0.5, -0.5)
+            for s in parts
         )
-        lost = ((ahead + behind) / 2 - coverage(shape, here)) * hidden
+        lost = (sum(along) / MOTION_PARTS - coverage(shape, here)) * hidden
         optics = solution.optics
         return optics.field(optics.see(optics.lanes((-lost).astype(np.float32))))
 
-    return [Change(change, lit=False)]
+    return [Change(lambda n, _, px=px: change(n, px), lit=False) for px in MOTIONS_PX]  # type: ignore[misc]
 
 
 def _evolution(view: View) -> Sequence[Change]:
@@ -196,7 +199,8 @@ def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectPar
 
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect("occulter_motion", "scene", (_p("amount", "", 2.0, True),), "The occulter moves during an exposure.",
+    Effect("occulter_motion", "scene",
+           (_p("short_tracks", "", 4.0, True), _p("long_tracks", "", 1.0, True)), "The occulter moves during an exposure.",
            "shorter exposures", ("radius_in_disc", "azimuth_in_disc"), _motion),
     Effect("out_of_field_light", "scene", tuple(_p(f"{side}_{k}", "", 0.5, True) for k in range(1, MOST_POINTINGS + 1) for side in SIDES),
            "The Sun goes on beyond the field and scatters in.",

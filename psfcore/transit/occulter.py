@@ -50,6 +50,7 @@ STEPS = 30
 LEAST_DEPTH = 0.5
 SCALE_SIGMA = 0.02  # images of one pointing are as bright as each other, but for a percent or two
 DOUBT_SIGMAS = 3.0
+UNDESCRIBED = 4.0  # chi2 a pixel
 DAMPED_FROM = 6  # steps: before a faint scene they may swing to and fro
 DECONVOLUTION_NOISE = 2.3  # how much a deconvolution adds to it, for a core weight of 0.43
 _STRIPS = 32
@@ -79,7 +80,7 @@ class FoundPlace:
     @property
     def seen(self) -> bool:
         """Whether an occulter may be there: False where the light is not missing, beyond doubt, or where the search
-        ran to the end of LARGEST_SHIFT_PX."""
+        ran to the end of LARGEST_SHIFT_PX, or farther than DOUBT_SIGMAS of the ephemeris by what it cannot describe."""
         return self.within_reach and self.depth + DOUBT_SIGMAS * self.depth_sigma >= LEAST_DEPTH
 
 
@@ -193,18 +194,21 @@ def find_occulter(
         float(solved.at[0] + window[1].start), float(solved.at[1] + window[0].start), start.radius_px
     )
     sigma = np.sqrt(np.diag(scaled_inverse(solved.normal)))
+    chi2_per_pixel = solved.chi2 / observed.size
+    described = chi2_per_pixel < UNDESCRIBED
+    # By a patch that is not described a place is moved anywhere: far from the ephemeris it is not believed.
+    reach_px = LARGEST_SHIFT_PX - 1e-6 if described else DOUBT_SIGMAS * ephemeris_sigma_px
     return FoundPlace(
         place=place,
         sigma_x_px=float(sigma[0]),
         sigma_y_px=float(sigma[1]),
-        chi2_per_pixel=solved.chi2 / observed.size,
+        chi2_per_pixel=chi2_per_pixel,
         neighbours=len(chosen),
         steps_done=solved.steps_done,
         settled=solved.settled,
         depth=solved.depth,
         depth_sigma=solved.depth_sigma,
-        within_reach=max(abs(place.x_px - start.x_px), abs(place.y_px - start.y_px))
-        < LARGEST_SHIFT_PX - 1e-6,
+        within_reach=max(abs(place.x_px - start.x_px), abs(place.y_px - start.y_px)) < reach_px,
     )
 
 
@@ -274,9 +278,11 @@ def _solve(
         ).reshape(4, -1)
         weighted = slopes * weight.ravel()
         normal = weighted @ slopes.T
-        step = np.linalg.lstsq(normal + prior, weighted @ misfit.ravel() + prior @ (origin - at), rcond=None)[
-            0
-        ]
+        # Where the Sun changed between the images the neighbours do not describe the patch: of the place it says less,
+        # and the ephemeris more.
+        held = prior.copy()
+        held[:2, :2] *= _excess(weight, misfit)
+        step = np.linalg.lstsq(normal + held, weighted @ misfit.ravel() + held @ (origin - at), rcond=None)[0]
         step[:2] = np.clip(step[:2], -1.0, 1.0) * (0.5 if done >= DAMPED_FROM else 1.0)
         at = at + step
         at[:2] = np.clip(at[:2], origin[:2] - LARGEST_SHIFT_PX, origin[:2] + LARGEST_SHIFT_PX)
@@ -290,19 +296,21 @@ def _solve(
     normal_2 = (templates * weight.ravel()) @ templates.T
     inverse = scaled_inverse(normal_2)
     more = inverse @ (templates * weight.ravel()) @ misfit.ravel()
-    chi2 = float(np.sum(weight * misfit**2))
-    # Where the simulation does not describe the patch, as where the disc's surroundings stand in for the scene, the
-    # patch says less of the place than its noise would allow; what the ephemeris says stays.
-    excess = max(chi2 / observed.size, 1.0)
     return _Solved(
         at=at,
-        normal=normal / excess + prior,
-        chi2=chi2,
+        normal=normal / _excess(weight, misfit) + prior,
+        chi2=float(np.sum(weight * misfit**2)),
         steps_done=done,
         settled=settled,
         depth=float(1 + more[0]),
-        depth_sigma=float(np.sqrt(inverse[0, 0])),
+        depth_sigma=float(np.sqrt(inverse[0, 0] * _excess(weight, misfit))),
     )
+
+
+def _excess(weight: Plane, misfit: Plane) -> float:
+    """By how much a patch's misfit exceeds its noise, in variance; 1 where it does not. As where the disc's surroundings
+    stand in for the scene, or the scene changed."""
+    return max(float(np.mean(weight * misfit**2)), 1.0)
 
 
 def _ring_mean(frame: Frame, place: Place, window: Window) -> float:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from psfcore.blind.scene_effects import patches
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import Diagnosis, diagnose, diagnose_solution
 from psfcore.gap.gap_report import gap_report
@@ -114,6 +115,16 @@ def test_what_earlier_images_left_is_found_however_fast_it_fades(clean: Transit)
     best = found.judgement.best
     assert best is not None and best.left_share is not None and best.left_share < 0.05
     assert sum(value for value, _, _ in best.values.values()) == pytest.approx(0.06, rel=0.3)
+
+
+def test_a_flat_field_of_patches_is_found_as_one(clean: Transit) -> None:
+    uneven = 1 + 0.15 * patches(clean.shape[0], seed=3, patch=0.2)
+    found = verdict(changed(clean, lambda n, f: f.pixels * uneven))
+    assert found.judgement.answer == ("flat_field_residual",)
+    (best, *_) = found.judgement.tried
+    # Many numbers, each near nothing where the discs say nothing of it: together no more than the patches are.
+    assert np.linalg.norm([value for value, _, _ in best.values.values()]) < 0.2
+    assert f"{len(best.values)} numbers" in gap_report(found)["sentence"]
 
 
 def test_a_patch_of_light_is_nobodys_effect(clean: Transit) -> None:

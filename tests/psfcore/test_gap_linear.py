@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 from scipy.ndimage import gaussian_filter
 from scipy.stats import multivariate_normal
 
@@ -17,6 +18,7 @@ from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.judge import (
     Judgement,
     Tried,
+    _by_noise,
     _explains_more,
     _few_numbers_do,
     _worse_held_out,
@@ -128,6 +130,36 @@ def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> 
     assert model.gain(model.fit(columns)) == pytest.approx(
         chi2(base) - chi2([*base, *columns]), rel=1e-4, abs=1e-6
     )
+
+
+def test_a_field_s_gain_less_its_cost_is_how_much_likelier_it_makes_the_discs(solution: Solution) -> None:
+    evidence = gather(solution, [effect for effect in EFFECTS if effect.name == "flat_field_residual"])
+    bare = replace(evidence, lit=replace(evidence.lit, part=np.zeros(len(evidence.taken), dtype=bool)))
+    model = LinearModel(bare, FLOOR)
+    (effect,) = bare.effects
+    residual = np.concatenate([disc.residual for disc in model.discs])
+    answers = np.concatenate([disc.answers for disc in model.discs], axis=1)
+    base, columns = list(bare.base), list(bare.columns[effect.name])
+    # What the PSF's own coordinates absorb is not looked at, and the rest has unit noise.
+    free = scipy.linalg.null_space(answers[base])
+    seen = (answers[columns] @ free).T * [parameter.likely for parameter in effect.parameters]
+    ours, nothing = (
+        multivariate_normal(np.zeros(free.shape[1]), np.eye(free.shape[1]) + more).logpdf(residual @ free)
+        for more in (seen @ seen.T, 0.0)
+    )
+    tried = fitted(model, [effect])
+    assert tried.score == pytest.approx(2 * (ours - nothing), abs=1e-3)
+    assert tried.gain > 0 and tried.gain - tried.score > 1.0
+    # Noise alone gains as much by chance as often as it does in many draws of it.
+    rng = np.random.default_rng(2)
+    inverse = np.linalg.inv(np.eye(len(columns)) + seen.T @ seen)
+    scores = rng.standard_normal((4000, free.shape[1])) @ seen
+    gains = np.einsum("nk,kl,nl->n", scores, inverse, scores)
+    shares = np.linalg.eigvalsh(seen.T @ seen)
+    for often in (0.5, 0.1, 0.02):
+        at = float(np.quantile(gains, 1 - often))
+        assert _by_noise(at, 0, shares / (1 + shares)) == pytest.approx(often, rel=0.25)
+    assert _by_noise(9.0, 3, np.zeros(0)) == pytest.approx(0.0293, abs=1e-4)
 
 
 def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:
@@ -270,7 +302,8 @@ def test_few_numbers_that_gain_nearly_as_much_go_before_what_was_measured_in_the
     ("images", "name", "offset_dn", "worse"),
     [
         (15, "dark_offset", 3.0, False),
-        (15, "flat_field_residual", 0.0, True),
+        (15, "intensity_gradient", 0.0, True),
+        (15, "flat_field_residual", 0.0, False),
         # No two neighbours in one fold: what the lit blocks show so surely is not asked held out.
         (9, "dark_offset", 3.0, False),
     ],
@@ -278,7 +311,7 @@ def test_few_numbers_that_gain_nearly_as_much_go_before_what_was_measured_in_the
 def test_what_fits_by_its_freedom_predicts_held_out_images_worse_than_nothing(
     images: int, name: str, offset_dn: float, worse: bool
 ) -> None:
-    """An offset that is there, and five numbers fitted to noise."""
+    """An offset that is there, and three numbers fitted to noise; what few of a field's numbers say is no worse."""
     plan = default_plan(images, 160, oversampling=1, brightness=4.0)
     transit = simulate(plan, TRUTH, diffraction(), seed=5).transit
     frames = tuple(replace(f, pixels=f.pixels + np.float32(offset_dn / f.exposure_s)) for f in transit.frames)

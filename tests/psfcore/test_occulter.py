@@ -168,6 +168,22 @@ def test_the_ephemeris_decides_where_the_image_says_nothing() -> None:
         assert (f.sigma_x_px, f.sigma_y_px) == pytest.approx((1.0, 1.0), abs=0.02)
 
 
+def test_where_the_sun_changed_between_the_images_the_ephemeris_says_more() -> None:
+    """Of one image every structure is another: what its neighbours show is not behind its disc."""
+    of = sky(brightness=4.0)
+    transit = noise_free(of)
+    y, x = np.indices((SIZE_PX, SIZE_PX))
+    for n in EVERY:
+        exact = of.plan.place(n)
+        patches = np.sin((x - exact.x_px) / 7.0 + 1.0) * np.cos((y - exact.y_px) / 9.0 + 2.0)
+        pixels = [f.pixels * np.exp(1.5 * patches * (k == n)) for k, f in enumerate(transit.frames)]
+        changed = displaced(with_pixels(transit, pixels), n, exact)
+        found = found_in(of, changed, [n], ephemeris_sigma_px=0.2)[0]
+        assert found.chi2_per_pixel > 3.0 and found.seen
+        # By the images alone it would be 1 to 6 px in most of them.
+        assert np.hypot(*apart([found.place], [exact])[0]) < 0.7
+
+
 def test_image_and_ephemeris_share_the_say_by_their_errors() -> None:
     """Of the way from the ephemeris to the truth, 1 - sigma^2 is gone where the ephemeris' own error is 1."""
     of, exact = sky(), sky().plan.place(5)
