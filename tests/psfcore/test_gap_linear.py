@@ -18,9 +18,11 @@ from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.judge import (
     Judgement,
     Tried,
+    _best_pair,
     _by_noise,
     _explains_more,
     _few_numbers_do,
+    _left,
     _worse_held_out,
     fitted,
     no_refit,
@@ -160,6 +162,59 @@ def test_a_field_s_gain_less_its_cost_is_how_much_likelier_it_makes_the_discs(so
         at = float(np.quantile(gains, 1 - often))
         assert _by_noise(at, 0, shares / (1 + shares)) == pytest.approx(often, rel=0.25)
     assert _by_noise(9.0, 3, np.zeros(0)) == pytest.approx(0.0293, abs=1e-4)
+
+
+def with_residuals(evidence: Evidence, values: dict[str, float], noise: float = 0.0) -> LinearModel:
+    """A model whose discs show these effects' changes and so much of their noise, and no lit part."""
+    rng = np.random.default_rng(4)
+    theta = np.zeros(evidence.size)
+    for name, value in values.items():
+        theta[evidence.columns[name][0]] = value
+    discs = tuple(
+        replace(
+            disc,
+            residual=disc.answers.T @ theta
+            + noise
+            * rng.multivariate_normal(np.zeros(disc.expected.size), disc.covariance, check_valid="ignore"),
+        )
+        for disc in evidence.discs
+    )
+    lit = replace(evidence.lit, part=np.zeros(len(evidence.taken), dtype=bool))
+    return LinearModel(replace(evidence, discs=discs, lit=lit), FLOOR)
+
+
+def test_what_was_taken_out_of_the_images_counts_against_the_prior_of_what_is_left(
+    evidence: Evidence,
+) -> None:
+    columns = evidence.columns["dark_offset"]
+    whole = with_residuals(evidence, {"dark_offset": 400.0}).fit(columns)
+    first = len(evidence.base)
+    left = with_residuals(evidence, {"dark_offset": 100.0})
+    step = left.fit(columns)
+    taken_out = np.concatenate([np.zeros(first), [300.0]])
+    found = 300.0 + step.values - left.pull_of_prior(step, taken_out)
+    assert whole.values[first] < 399.0  # the prior, of 20 DN, holds it back
+    assert found[first] == pytest.approx(whole.values[first], rel=1e-6)
+
+
+def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_than_a_search_lets_it(
+    evidence: Evidence,
+) -> None:
+    def second(dark: float, smear: float) -> Tried | None:
+        model = with_residuals(evidence, {"dark_offset": dark, "column_smear": smear}, noise=1.0)
+        best = max((fitted(model, [effect]) for effect in evidence.effects), key=lambda t: t.score)
+        assert best.names == ("dark_offset",)
+        before = _left(model, model.base, np.zeros(len(model.base.columns)))
+        return _best_pair(model, best, before, no_refit, enough=True)
+
+    (smear,) = evidence.columns["column_smear"]
+    model = with_residuals(evidence, {})
+    sigma = float(np.sqrt(model.fit([smear]).covariance[-1, -1]))
+    found = second(10.0, 8.0 * sigma)
+    assert found is not None and set(found.names) == {"dark_offset", "column_smear"}
+    assert second(10.0, 1.0 * sigma) is None
+    # Of so large an offset the form's own error is larger than the smear.
+    assert second(1000.0, 8.0 * sigma) is None
 
 
 def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:
