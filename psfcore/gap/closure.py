@@ -106,11 +106,12 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
     images: list[int] = []
     deviance: dict[tuple[int, ...], float] = {}
     base = len(evidence.base)
+    free = base + len(set(columns) - model.of_fields)  # a field's numbers have a prior to go by
     lit_noise = math.sqrt(model.lit_scale)
     for fold in scheme:
         fitted = [n for n in fold.fitted if n in by_index]
         held = [n for n in fold.held_out if n in by_index]
-        if len(fitted) <= base + len(columns) or not held:
+        if len(fitted) <= free or not held:
             continue
         step = model.fit(columns, model.equations(fitted))
         here = list(step.columns)

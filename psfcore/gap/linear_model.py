@@ -132,6 +132,12 @@ class LinearModel:
                 out[column] = (wide * parameter.likely) ** -2
         return out
 
+    @cached_property
+    def of_fields(self) -> frozenset[int]:
+        """The columns of all fields."""
+        fields = (effect.name for effect in self.evidence.effects if effect.field)
+        return frozenset(column for name in fields for column in self.evidence.columns[name])
+
     def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
         """By how much less a step's columns would be found, had their prior known of what was taken out beforehand."""
         return np.asarray(step.covariance @ (self.prior[list(step.columns)] * taken_out))

@@ -122,6 +122,8 @@ def test_a_flat_field_of_patches_is_found_as_one(clean: Transit) -> None:
     found = verdict(changed(clean, lambda n, f: f.pixels * uneven))
     assert found.judgement.answer == ("flat_field_residual",)
     (best, *_) = found.judgement.tried
+    closure = found.shrinking["flat_field_residual"].closure
+    assert closure is not None and closure.value > 0.3
     # Many numbers, each near nothing where the discs say nothing of it: together no more than the patches are.
     assert np.linalg.norm([value for value, _, _ in best.values.values()]) < 0.2
     assert f"{len(best.values)} numbers" in gap_report(found)["sentence"]
