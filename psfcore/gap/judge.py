@@ -16,7 +16,8 @@ where a probe, a form of unknown cause, does clearly better, the verdict is unkn
 and explains more, or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
 the floor, where gap and effect may be LENIENT times likelier; where it flips, the answer holds both, or is inconclusive.
 So it is where the answer predicts images held out of its fit worse than nothing does. What was measured in the lit parts
-fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it.
+fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it, and where nothing else
+comes near it is the answer, however much it leaves.
 """
 
 from __future__ import annotations
@@ -49,6 +50,9 @@ TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less wou
 LEFT_SHARE = 0.15
 BEHIND = 0.85  # of the best score: what a rival may reach at most
 NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits anything a little
+UNRIVALLED = (
+    0.1  # of the best score: where no rival reaches it, what was measured in the lit parts is the cause
+)
 MANY_PLACES = 100
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
@@ -193,6 +197,10 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
         second = _beside(model, best, beyond)
         if second is not None:
             return replace(second, p_value=p_gap, tried=(*second.tried, *named), probes=probes)
+        if best.label in measured and rivals < UNRIVALLED * best.score:
+            # A Sun that changes faster than it is followed: much is left in the lit parts, and the discs' places,
+            # found by what the neighbours show, are off.
+            return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
     pair = _best_pair(model, best, before, refit, enough=enough)
     winner = pair or best
     if (not enough and pair is None) or best.p_value * len(named) > lenient * ALARM:

@@ -13,6 +13,7 @@ from psfcore.blind.scene_effects import patches
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import Diagnosis, diagnose, diagnose_solution
 from psfcore.gap.gap_report import gap_report
+from psfcore.gap.judge import LEFT_SHARE
 from psfcore.gap.library import LIBRARY
 from psfcore.gap.measured_noise import measured_noise
 from psfcore.noise import Noise
@@ -127,6 +128,19 @@ def test_a_flat_field_of_patches_is_found_as_one(clean: Transit) -> None:
     # Many numbers, each near nothing where the discs say nothing of it: together no more than the patches are.
     assert np.linalg.norm([value for value, _, _ in best.values.values()]) < 0.2
     assert f"{len(best.values)} numbers" in gap_report(found)["sentence"]
+
+
+def test_a_sun_that_changes_faster_than_it_is_followed_is_named_all_the_same() -> None:
+    plan = default_plan(18, 128, oversampling=1, brightness=4.0)
+    one, other = (patches(128, seed=seed, patch=0.1) for seed in (3, 4))
+
+    def flickering(n: int, f: Frame) -> np.ndarray:
+        return np.asarray(f.pixels * np.exp(0.3 * (one * np.sin(0.9 * n) + other * np.cos(0.9 * n))))
+
+    found = verdict(changed(simulate(plan, TRUTH, diffraction(), seed=8).transit, flickering))
+    best = found.judgement.best
+    assert best is not None and best.left_share is not None and best.left_share > LEFT_SHARE
+    assert found.judgement.answer == ("scene_evolution",)
 
 
 def test_a_patch_of_light_is_nobodys_effect(clean: Transit) -> None:
