@@ -9,8 +9,9 @@ gain are less likely than ALARM, counted for how many were looked at. What lies 
 told from it, unless it does clearly worse on images held out of its fit.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
 TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
-sky's. Another is named beside it where it gains more than a search and that error let it. The linear model is good for a small gap alone: the best effect that is not enough in it is added to the
-model for real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
+sky's. Another is named beside it where it gains more than a search and that error let it.
+The linear model is good for a small gap alone: the best effect that is not enough in it is added to the model for
+real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
 Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
 where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better
 and explains more, or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
@@ -50,9 +51,7 @@ TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less wou
 LEFT_SHARE = 0.15
 BEHIND = 0.85  # of the best score: what a rival may reach at most
 NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits anything a little
-UNRIVALLED = (
-    0.1  # of the best score: where no rival reaches it, what was measured in the lit parts is the cause
-)
+UNRIVALLED = 0.1  # of the best score: below it no rival comes near
 MANY_PLACES = 100
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
@@ -358,9 +357,8 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
         step = model.fit(tuple(columns))
     gain = model.gain(step)
     trials = math.prod(effect.trials for effect in effects)
-    of_fields = [column for column, (effect, _) in columns.items() if effect.field]
-    learned = model.learned(tuple(columns), of_fields)
-    freedom = len(columns) - len(of_fields) + model.evidence.numbers_of(tuple(columns))
+    learned = model.learned(tuple(columns))
+    freedom = len(columns) - learned.size + model.evidence.numbers_of(tuple(columns))
     sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
     values = {}
     for k, (effect, parameter) in enumerate(columns.values(), base):

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from psfcore.gap.cells import DiscCells
 from psfcore.gap.evidence import Evidence
 from psfcore.gap.patterns import means, patterns
+from psfcore.normal_equations import scaled_inverse
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -115,15 +116,13 @@ class LinearModel:
         """The PSF's coordinates and these columns, from some equations (none: of all images)."""
         here = [*self.evidence.base, *columns]
         normal, score = self.whole if equations is None else equations
-        normal, score = normal[np.ix_(here, here)] + np.diag(self.prior[here]), score[here]
-        size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        covariance = np.linalg.pinv(normal / np.outer(size, size), rcond=WEAKEST, hermitian=True)
-        covariance = covariance / np.outer(size, size)
+        normal, score = normal[np.ix_(here, here)] + np.diag(self._prior[here]), score[here]
+        covariance = scaled_inverse(normal, weakest=WEAKEST)
         values = covariance @ score
         return Step(tuple(here), values, covariance, float(score @ values))
 
     @cached_property
-    def prior(self) -> Vector:
+    def _prior(self) -> Vector:
         """Of each column, over its variance: 0 of the PSF's coordinates."""
         out = np.zeros(self.evidence.size)
         for effect in self.evidence.effects:
@@ -140,23 +139,21 @@ class LinearModel:
 
     def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
         """By how much less a step's columns would be found, had their prior known of what was taken out beforehand."""
-        return np.asarray(step.covariance @ (self.prior[list(step.columns)] * taken_out))
+        return np.asarray(step.covariance @ (self._prior[list(step.columns)] * taken_out))
 
-    def learned(self, columns: Sequence[int], field: Sequence[int]) -> Vector:
-        """l of Eq. (3) of a field's columns, the others of `columns` and the PSF's coordinates refitted."""
+    def learned(self, columns: Sequence[int]) -> Vector:
+        """l of Eq. (3) of those of some columns that are a field's, the others and the PSF's coordinates refitted."""
+        field = [column for column in columns if column in self.of_fields]
         if not field:
             return np.zeros(0)
-        others = [*self.evidence.base, *(column for column in columns if column not in set(field))]
-        here = [*others, *field]
+        others = [*self.evidence.base, *(column for column in columns if column not in self.of_fields)]
+        here, first = [*others, *field], len(others)
         normal = self.whole[0][np.ix_(here, here)]
-        first = len(others)
-        known = normal[:first, :first] + np.diag(self.prior[others])
         cross = normal[:first, first:]
-        size = np.sqrt(np.maximum(np.diag(known), 1e-300))
-        inverse = np.linalg.pinv(known / np.outer(size, size), rcond=WEAKEST, hermitian=True)
-        left = normal[first:, first:] - cross.T @ (inverse / np.outer(size, size)) @ cross
-        width = self.prior[list(field)] ** -0.5
-        return np.maximum(np.linalg.eigvalsh(left * np.outer(width, width)), 0.0)
+        known = scaled_inverse(normal[:first, :first] + np.diag(self._prior[others]), weakest=WEAKEST)
+        width = self._prior[field] ** -0.5
+        left = (normal[first:, first:] - cross.T @ known @ cross) * np.outer(width, width)
+        return np.maximum(np.linalg.eigvalsh(left), 0.0)
 
     @cached_property
     def base(self) -> Step:

@@ -296,14 +296,15 @@ def _solve(
     normal_2 = (templates * weight.ravel()) @ templates.T
     inverse = scaled_inverse(normal_2)
     more = inverse @ (templates * weight.ravel()) @ misfit.ravel()
+    excess = _excess(weight, misfit)
     return _Solved(
         at=at,
-        normal=normal / _excess(weight, misfit) + prior,
+        normal=normal / excess + prior,
         chi2=float(np.sum(weight * misfit**2)),
         steps_done=done,
         settled=settled,
         depth=float(1 + more[0]),
-        depth_sigma=float(np.sqrt(inverse[0, 0] * _excess(weight, misfit))),
+        depth_sigma=float(np.sqrt(inverse[0, 0] * excess)),
     )
 
 
