@@ -195,7 +195,8 @@ class Engine:
             finally:
                 self._scratch.put(scratch)
 
-        return list(self._pool.map(one, range(chunks)))
+        # One chunk is not worth handing to another thread.
+        return [one(0)] if chunks == 1 else list(self._pool.map(one, range(chunks)))
 
     @property
     def transfer_scale(self) -> int:

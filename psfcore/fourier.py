@@ -135,6 +135,23 @@ def linear_convolve(
     return out
 
 
+def correlations(
+    planes: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int
+) -> NDArray[np.floating]:
+    """Sums over pixels of plane(x) scene(x - d) for displacements d up to reach_px along each axis.
+
+    planes: (k, ny, nx). scene: (ny + 2 reach, nx + 2 reach), the same place in its middle. Returns (k, 2 reach + 1,
+    2 reach + 1), no displacement in the middle.
+    """
+    length = tuple(int(scipy.fft.next_fast_len(n, real=True)) for n in scene.shape)
+    wide = scipy.fft.rfft2(planes, s=length)
+    wide *= scipy.fft.rfft2(scene, s=length).conj()
+    # What is at index i of a plane is at i + reach of the scene: the sums come reach_px further back.
+    back = scipy.fft.irfft2(wide, s=length)
+    at = np.arange(-2 * reach_px, 1)
+    return np.asarray(back[:, at[:, None], at[None, :]])
+
+
 class ChirpTransform:
     """Fourier sum between two centred grids of any steps, as one convolution with a chirp (Bluestein 1970).
 

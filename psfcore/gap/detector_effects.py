@@ -89,10 +89,22 @@ def _flat_field(view: View) -> Sequence[Change]:
 
 
 def _column_smear(view: View) -> Sequence[Change]:
-    def change(n: int, images: Sequence[Field]) -> Field:
-        return np.broadcast_to(images[n].mean(axis=0, dtype=np.float32), images[n].shape)
+    """Every pixel gets shares of the light of its column's pixels below it, and of those above it.
 
-    return [Change(change, lit=False)]
+    It passes the ones on its way out, and the others before the exposure; with both shares alike it gets a share of the
+    column's mean.
+    """
+
+    def below(n: int, images: Sequence[Field]) -> Field:
+        image = images[n]
+        return np.asarray(
+            (np.cumsum(image, axis=0, dtype=np.float32) - image / 2) / np.float32(image.shape[0])
+        )
+
+    def above(n: int, images: Sequence[Field]) -> Field:
+        return np.asarray(images[n].mean(axis=0, dtype=np.float32) - below(n, images))
+
+    return [Change(change, lit=False) for change in (below, above)]
 
 
 def _persistence(view: View) -> Sequence[Change]:
@@ -154,7 +166,8 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("flat_field_residual", "detector", cosine_parameters("", 0.02),
            "The detector's sensitivity is not quite flattened.", "the same scene displaced on the detector",
            ("detector_x", "detector_y"), _flat_field, field=True),
-    Effect("column_smear", "detector", (_p("share", "", 0.01, True),), "Charge is smeared along columns while they are read.",
+    Effect("column_smear", "detector", (_p("share_below", "", 0.01, True), _p("share_above", "", 0.01, True)),
+           "Charge is smeared along columns while they are read.",
            "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
     Effect("persistence", "detector", (_p("share", "", 0.01, True), *(_p(f"share_fading_in_{waits}", "", 0.01, True) for waits in FADES_IN)),
            "Shares of the images before are left in the next, and fade.",

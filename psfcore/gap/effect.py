@@ -175,9 +175,11 @@ class View:
         return np.asarray(mean, dtype=np.float32)
 
     def lit_scene(self, n: int) -> Lanes:
-        """One of `scenes` with the dark pixels of the occulter dark, in the engine's order."""
-        lit = self.solution.optics.lanes(self.scenes[n])
-        put(lit, self.solution.sky.dark[n], 0.0)
+        """One of `scenes` less what the occulter hides of it, in the engine's order."""
+        solution = self.solution
+        seen = 1 - coverage(solution.transit.shape, solution.sky.found[n].place)
+        lit = solution.optics.lanes(self.scenes[n] * seen.astype(np.float32))
+        put(lit, solution.sky.dark[n], 0.0)
         return lit
 
     @cached_property

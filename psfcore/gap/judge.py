@@ -18,7 +18,8 @@ and explains more, or the effect's own gain is not unlikely enough, inconclusive
 the floor, where gap and effect may be LENIENT times likelier; where it flips, the answer holds both, or is inconclusive.
 So it is where the answer predicts images held out of its fit worse than nothing does. What was measured in the lit parts
 fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it, and where nothing else
-comes near it is the answer, however much it leaves.
+comes near it is the answer, however much it leaves. Of a pair, what would do in place of one is named too; where many would,
+the other alone.
 """
 
 from __future__ import annotations
@@ -47,12 +48,16 @@ CONFIDENT = 1e-3  # of an effect that is named, counted for how many were tried
 ENOUGH = 1e-3
 PENALTY = 2.0
 TIE = 9.0
+HELD_OUT_SIGMA = 2.0  # by which an effect does clearly worse on images held out
 TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less would tell two apart
 LEFT_SHARE = 0.15
 BEHIND = 0.85  # of the best score: what a rival may reach at most
 NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits anything a little
 UNRIVALLED = 0.1  # of the best score: below it no rival comes near
 MANY_PLACES = 100
+MOST_SECONDS = (
+    2  # where more effects than that would do beside one that explains most, the second is not named
+)
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
@@ -211,7 +216,13 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
     ):
         return Judgement("inconclusive", (), p_gap, tuple(named), probes, best)
     if pair is not None:
-        return Judgement("attributed", tuple(sorted(pair.names)), p_gap, (pair, *named), probes, pair)
+        instead = _in_place_of_one(model, pair)
+        of_one, of_other = instead.values()
+        if best.explains and instead.get(best.names[0]) == [] and len({*of_one, *of_other}) >= MOST_SECONDS:
+            return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
+        answer = tuple(sorted({*pair.names, *of_one, *of_other}))
+        verdict: Verdict = "attributed" if len(answer) == len(pair.names) else "tie"
+        return Judgement(verdict, answer, p_gap, (pair, *named), probes, pair)
     alike = max(
         TIE, TIE_SHARE * best.gain, (1 - NEAR_BEHIND) * best.score if _searched(best, evidence) else 0.0
     )
@@ -250,7 +261,9 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
         after = hold_out(model, tried.step.columns[base:], scheme)
         falls[tried.label] = 0.0 if after is None else fall(before, after)
     most = max(falls.values())
-    failed = {label for label, down in falls.items() if down < most - max(TIE, TIE_SHARE * most)}
+    # Of two effects that images tell apart by so much, the difference is uncertain by twice its root.
+    by_chance = HELD_OUT_SIGMA * 2 * math.sqrt(max(most, 0.0))
+    failed = {label for label, down in falls.items() if down < most - max(TIE, TIE_SHARE * most, by_chance)}
     return sorted(named, key=lambda t: (t not in alike or t.label in failed, -t.score)), failed
 
 
@@ -274,6 +287,8 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
         return Judgement("attributed", best.names, second.p_value, (), (), best) if best.explains else None
     if second.verdict not in ("attributed", "tie") or second.best is None or len(second.best.names) > 1:
         return None
+    if len(second.answer) > MOST_SECONDS and best.explains:
+        return Judgement("attributed", best.names, second.p_value, (), (), best)
     effects = {effect.name: effect for effect in model.evidence.effects}
     pair = fitted(model, [effects[name] for name in (*best.names, *second.best.names)])
     pair = replace(pair, left_p_value=second.best.left_p_value, left_share=second.best.left_share)
@@ -324,6 +339,27 @@ def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, 
     pair = _with_left(model, pairs[0], before, refit)
     # Two forms that are not quite right fit too much: of a pair nothing may be left.
     return pair if (pair.left_p_value or 0.0) >= ENOUGH else None
+
+
+def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, list[str]]:
+    """For each effect of a pair those others that explain, beside the one that stays, about as much as it does."""
+    effects = {effect.name: effect for effect in model.evidence.effects if effect.named}
+    found: dict[str, list[str]] = {name: [] for name in pair.names}
+    for stays, goes in (pair.names, pair.names[::-1]):
+        alone = fitted(model, (effects[stays],))
+        adds = pair.score - alone.score
+        alike = max(TIE, TIE_SHARE * (pair.gain - alone.gain))
+        if effects[goes].trials >= MANY_PLACES:
+            alike = max(alike, (1 - NEAR_BEHIND) * adds)
+        for name, effect in effects.items():
+            if name in pair.names:
+                continue
+            other = fitted(model, (effects[stays], effect))
+            if name in {key.split(".")[0] for key in other.values} and pair.score - other.score < min(
+                alike, adds
+            ):
+                found[goes].append(name)
+    return found
 
 
 def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> Tried:

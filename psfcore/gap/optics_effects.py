@@ -24,9 +24,14 @@ HALO_SCALES_PX = (20.0, 40.0, 80.0, 160.0, 320.0)
 MOFFAT = 1.5  # exponent of a halo that falls off as r^-3
 GHOST_TRIALS = 300  # a field of 512 px holds about that many copies that differ
 ANGLES_DEG = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
-PITCHES_PCT = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0)
+PITCHES_PCT = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 38.0)
 DIRECTIONS: tuple[Steps, ...] = (((1, 0), (0, 1)), ((1, 0),), ((0, 1),), ((1, 1),), ((1, -1),))
-BLURS = tuple((width, steps) for width in (0.4, 0.8, 1.5, 2.5) for steps in DIRECTIONS)
+# Between those, steps are longer: for blurs alone that are wider.
+BETWEEN_THEM: tuple[Steps, ...] = (((1, 2),), ((2, 1),), ((1, -2),), ((2, -1),))
+BLURS = (
+    *((width, steps) for width in (0.4, 0.8, 1.5, 2.5) for steps in DIRECTIONS),
+    *((width, steps) for width in (1.5, 2.5) for steps in BETWEEN_THEM),
+)
 BETWEEN = 6  # parts that the steps on both sides of the best are divided into
 SPLINE = 3  # a linear interpolation would blur what it turns
 AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate that says how much is scattered
@@ -157,8 +162,7 @@ def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
 def _sought_blur(view: View) -> tuple[float, Steps]:
     """Width (px) and directions of the blur that explains most."""
     near = crop_or_pad(view.kernel, 2 * KERNEL_REACH_PX + 1)
-    best = place_search(view).kernel([_blurred(near, *blur) - near for blur in BLURS])
-    return BLURS[best]
+    return BLURS[place_search(view).kernel([_blurred(near, *blur) - near for blur in BLURS])]
 
 
 def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:

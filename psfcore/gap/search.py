@@ -28,15 +28,17 @@ from psfcore.fourier import linear_convolve
 from psfcore.gap.cells import sensitivities
 from psfcore.gap.effect import View
 from psfcore.gap.linear_model import FLOOR
+from psfcore.gap.near_discs import NearDiscs
 from psfcore.psf import crop_or_pad
 
 Plane = NDArray[np.float64]
+Vector = NDArray[np.float64]
 
 STEP_PX = 8
 FINE_PX = 2
 COARSE_BLUR_PX = 8.0
 BLURS_PX = (2.0, 4.0, 8.0, 16.0)
-NEAREST_PX = 40.0
+NEAREST_RADII = 1.8  # of the disc: nearer, a copy would be the disc's own surroundings
 KERNEL_REACH_PX = 255  # beyond it no order of a mesh has much light
 SEEN = 1e-4  # of the best seen place's sum T^2: a place that the discs see less of is not looked at
 
@@ -68,35 +70,51 @@ class PlaceSearch:
             to_far.append(_correlation(self._planes[n], _binned(scene, STEP_PX), reach))
         self._to_displacements = np.array(to_displacements, dtype=np.float32)
         self._to_far = np.array(to_far)
+        self._nearest_px = NEAREST_RADII * float(np.mean([f.place.radius_px for f in solution.sky.found]))
+        self._near = NearDiscs(view)
         frames = solution.inversion.frames
         self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
-        self._absorbed = np.linalg.qr(np.array([f.answer for f in frames]) / self._sigma[:, None])[0]
+        answers = np.array([f.answer for f in frames]) / self._sigma[:, None]
+        self._absorbed = np.linalg.qr(answers)[0]
         residual = np.array([f.observed - f.expected for f in frames]) / self._sigma
         self._residual = self._left(residual)
+        slopes = solution.total.slopes(solution.inversion.coordinates)
+        in_cells = np.array([self._near.of_kernel(slope) for slope in slopes]).T
+        self._absorbed_in_all = np.linalg.qr(np.concatenate([answers, in_cells]))[0]
+        self._residual_in_all = self._left(np.concatenate([residual, self._near.residual]))
 
     def kernel(self, kernels: Sequence[Plane]) -> int:
-        """Which of some changes of the PSF [y, x], their centres at n//2, explains most as it stands, Eq. (2) and (3)."""
-        return self._best(self._to_displacements, kernels)
+        """Which of some changes of the PSF [y, x], their centres at n//2, explains most as it stands, Eq. (2) and (3).
+
+        In the discs' means, and in their cells so far as light moves near them.
+        """
+        return self._best(
+            self._to_displacements, kernels, [self._near.of_kernel(kernel) for kernel in kernels]
+        )
 
     def wide_kernel(self, kernels: Sequence[Plane]) -> int:
         """The same of changes that are smooth and may reach across the field; looked at on coarse pixels."""
         return self._best(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
 
-    def _best(self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane]) -> int:
-        gains = []
-        for kernel in kernels:
-            seen = crop_or_pad(kernel, to_displacements.shape[1]).astype(to_displacements.dtype)
-            answer = np.einsum("nyx,yx->n", to_displacements, seen).astype(np.float64) / self._sigma
-            left = self._left(answer)
-            along = float(self._residual @ left)
-            gains.append(along**2 / max(float(left @ left), 1e-300) if along > 0 else 0.0)
-        return int(np.argmax(gains))
+    def _best(
+        self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane], near: Sequence[Plane] = ()
+    ) -> int:
+        answers = np.array(
+            [
+                np.einsum("nyx,yx->n", to_displacements, crop_or_pad(k, n).astype(to_displacements.dtype))
+                for n in to_displacements.shape[1:2]
+                for k in kernels
+            ],
+            dtype=np.float64,
+        )
+        means = (answers / self._sigma).T
+        return int(np.argmax(self._gain(means, 1.0, np.array(near).T if len(near) else None)))
 
     def copy(self) -> tuple[float, int, int]:
         """Blur (px) and displacement (whole pixels x, y) of a copy of each image that explains most of the residuals.
 
-        Not nearer than NEAREST_PX, where a copy would be the disc's own surroundings. The place is looked for on a
-        coarse grid with a middling blur, then round it on a fine one with several.
+        Not nearer than NEAREST_RADII of the disc. The place is looked for on a coarse grid with a middling blur, then
+        round it on a fine one with several.
         """
         dx, dy = self._coarse_displacement(COARSE_BLUR_PX)
         best = (-1.0, COARSE_BLUR_PX, dx, dy)
@@ -114,27 +132,27 @@ class PlaceSearch:
 
         dy, dx = (_displacements(n) for n in (rows, columns))
         gain = self._gains(answer, 1.0)
-        gain[np.hypot(dy[:, None], dx[None, :]) < NEAREST_PX] = -1.0
+        gain[np.hypot(dy[:, None], dx[None, :]) < self._nearest_px] = -1.0
         at = int(np.argmax(gain))
         return int(dx[at % columns]), int(dy[at // columns])
 
     def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:
-        """The best gain within one coarse step of a displacement, on a grid of FINE_PX."""
+        """The best gain within one coarse step of a displacement, on a grid of FINE_PX; in all cells of the discs."""
         reach = STEP_PX // FINE_PX
-        steps = np.arange(-reach, reach + 1)
-
-        def answer(n: int, _: Plane) -> Plane:
-            copy = _binned(gaussian_filter(self._expected[n], blur_px), FINE_PX)
-            q = self._fine[n]
-            out = np.zeros((steps.size, steps.size))
-            for j, k in np.ndindex(out.shape):
-                moved = displaced(copy, dx // FINE_PX + int(steps[k]), dy // FINE_PX + int(steps[j]))
-                out[j, k] = float(np.vdot(q, moved))
-            return out
-
-        gain = self._gains(answer, 1.0)
-        row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        return float(gain.max()), dx + int(steps[column]) * FINE_PX, dy + int(steps[row]) * FINE_PX
+        steps = [(j, k) for j in range(-reach, reach + 1) for k in range(-reach, reach + 1)]
+        places = [(dx + k * FINE_PX, dy + j * FINE_PX) for j, k in steps]
+        of_means, of_cells = [], []
+        for n, q in self._fine.items():
+            copy = gaussian_filter(self._expected[n], blur_px)
+            coarse = _binned(copy, FINE_PX)
+            of_means.append(
+                [float(np.vdot(q, displaced(coarse, x // FINE_PX, y // FINE_PX))) for x, y in places]
+            )
+            of_cells.append(self._near.of_copies(n, copy, places))
+        means = np.array(of_means) / self._sigma[:, None]
+        gain = self._gain(means, 1.0, np.concatenate(of_cells))
+        best = int(np.argmax(gain))
+        return float(gain[best]), *places[best]
 
     def place(self, width_px: float, *, of_image: bool, sign: float) -> tuple[float, float]:
         """Pixel (x, y) where a Gaussian patch of light (of_image: of the image itself) explains most.
@@ -155,16 +173,21 @@ class PlaceSearch:
         answers = np.array(
             [answer(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
         )
-        flat = self._left(answers.reshape(self._sigma.size, -1))
-        size = (flat**2).sum(axis=0)
-        along = sign * (self._residual @ flat)
-        seen = size > SEEN * size.max()
-        gain = np.where(seen & (along > 0), along**2 / np.where(seen, size, 1.0), 0.0)
+        gain = self._gain(answers.reshape(self._sigma.size, -1), sign)
         return np.asarray(gain.reshape(answers.shape[1:]))
 
-    def _left(self, of_discs: Plane) -> Plane:
-        """What the PSF's parameters leave."""
-        return np.asarray(of_discs - self._absorbed @ (self._absorbed.T @ of_discs))
+    def _gain(self, means: Plane, sign: float, cells: Plane | None = None) -> Vector:
+        """Eq. (2) of some forms: how they move the discs' means (discs, forms), over their noise; and their cells."""
+        flat = self._left(means if cells is None else np.concatenate([means, cells]))
+        size = (flat**2).sum(axis=0)
+        along = sign * ((self._residual if cells is None else self._residual_in_all) @ flat)
+        seen = size > SEEN * size.max()
+        return np.asarray(np.where(seen & (along > 0), along**2 / np.where(seen, size, 1.0), 0.0))
+
+    def _left(self, answers: Plane) -> Plane:
+        """What the PSF's parameters leave: of the discs' means, or of these and the cells."""
+        absorbed = self._absorbed if answers.shape[0] == self._sigma.size else self._absorbed_in_all
+        return np.asarray(answers - absorbed @ (absorbed.T @ answers))
 
 
 def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int) -> Plane:

@@ -80,16 +80,22 @@ class Parameter:
 
 
 Falloff = Callable[[Values, int], Kernel]  # unnormalised, on a square of that size
+Radial = Callable[[Vector], Vector]  # the same of radii (px)
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape of scatter: its parameters and its falloff."""
+    """A shape of scatter: its parameters and its falloff, of radii alone where it is isotropic."""
 
     name: str
     parameters: tuple[Parameter, ...]
-    falloff: Falloff
-    isotropic: bool
+    radial: Callable[[Values], Radial] | None = None
+    falloff: Falloff | None = None
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether it is the same in all directions."""
+        return self.radial is not None
 
     @property
     def start(self) -> Vector:
@@ -112,6 +118,9 @@ class Shape:
     def kernel(self, coordinates: Vector, size: int) -> Kernel:
         """Scatter kernel [y, x] of Eq. (1) on (size, size), centre at [size // 2, size // 2]."""
         values = self.values(coordinates)
+        if self.radial is not None:
+            return _scaled_by_radius(self.radial(values), values["total"], size)
+        assert self.falloff is not None
         reach = max(size, REACH_GRID_PX)
         falloff = self.falloff(values, reach)
         middle = reach // 2
@@ -137,8 +146,8 @@ TOTAL = Parameter("total", "", 0.4, "logit", 0.4, "share of light that is scatte
 _POWER_LAW = (B, C, TOTAL)
 
 
-def _softened(values: Values, size: int) -> Kernel:
-    return _by_radius(size, lambda r: (values["b_px"] + r) ** -values["c"])
+def _softened(values: Values) -> Radial:
+    return lambda r: np.asarray((values["b_px"] + r) ** -values["c"])
 
 
 def _stretched(values: Values, size: int) -> Kernel:
@@ -152,18 +161,18 @@ def _one_sided(values: Values, size: int) -> Kernel:
     r = np.hypot(d[:, None], d[None, :])
     r[size // 2, size // 2] = 1.0
     lean = 1 + (values["x_share"] * d[None, :] + values["y_share"] * d[:, None]) / r  # Eq. (4)
-    return np.asarray(_softened(values, size) * np.maximum(lean, 0.0))
+    return np.asarray(_by_radius(size, _softened(values)) * np.maximum(lean, 0.0))
 
 
-def _knee(values: Values, size: int) -> Kernel:
+def _knee(values: Values) -> Radial:
     def falloff(r: Vector) -> Vector:
         bent = (1 + (r / KNEE_PX) ** 2) ** (-values["bend"] / 2)
         return np.asarray((values["b_px"] + r) ** -values["c"] * bent)  # Eq. (5)
 
-    return _by_radius(size, falloff)
+    return falloff
 
 
-def _two(values: Values, size: int) -> Kernel:
+def _two(values: Values) -> Radial:
     r, count = _radii(REACH_GRID_PX)
     first, second = ((b + r) ** -values["c"] for b in (values["b_px"], HALO_B_PX))
     ratio = float((first * count)[1:].sum() / (second * count)[1:].sum())
@@ -173,10 +182,10 @@ def _two(values: Values, size: int) -> Kernel:
         near, far = ((b + r) ** -values["c"] for b in (values["b_px"], HALO_B_PX))
         return np.asarray((1 - share) * near + share * ratio * far)  # Eq. (6)
 
-    return _by_radius(size, falloff)
+    return falloff
 
 
-def _core(values: Values, size: int) -> Kernel:
+def _core(values: Values) -> Radial:
     r, count = _radii(REACH_GRID_PX)
     wide = float(((values["b_px"] + r) ** -values["c"] * count)[1:].sum())
     narrow = float((np.exp(-0.5 * (r / CORE_PX) ** 2) * count)[1:].sum())
@@ -186,10 +195,10 @@ def _core(values: Values, size: int) -> Kernel:
         power_law, gaussian = (values["b_px"] + r) ** -values["c"], np.exp(-0.5 * (r / CORE_PX) ** 2)
         return np.asarray((1 - share) * power_law + share * (wide / narrow) * gaussian)  # Eq. (7)
 
-    return _by_radius(size, falloff)
+    return falloff
 
 
-SOFTENED_POWER_LAW = Shape("softened-power-law", _POWER_LAW, _softened, isotropic=True)
+SOFTENED_POWER_LAW = Shape("softened-power-law", _POWER_LAW, _softened)
 SHAPES: dict[str, Shape] = {
     shape.name: shape
     for shape in (
@@ -197,8 +206,7 @@ SHAPES: dict[str, Shape] = {
         Shape(
             "stretched-along-x",
             (*_POWER_LAW, Parameter("stretch_p", "", 0.0, "linear", 0.1, "ln(1 + stretch) along x")),
-            _stretched,
-            isotropic=False,
+            falloff=_stretched,
         ),
         Shape(
             "stretched",
@@ -211,8 +219,7 @@ SHAPES: dict[str, Shape] = {
                     "stretch_q", "", 0.0, "linear", 0.1, "ln(1 + stretch) times sin of twice its angle"
                 ),
             ),
-            _stretched,
-            isotropic=False,
+            falloff=_stretched,
         ),
         Shape(
             "one-sided",
@@ -221,14 +228,12 @@ SHAPES: dict[str, Shape] = {
                 Parameter("x_share", "", 0.0, "linear", 0.2, "excess towards +x, deficit towards -x"),
                 Parameter("y_share", "", 0.0, "linear", 0.2, "excess towards +y, deficit towards -y"),
             ),
-            _one_sided,
-            isotropic=False,
+            falloff=_one_sided,
         ),
         Shape(
             "knee",
             (*_POWER_LAW, Parameter("bend", "", 0.0, "linear", 0.3, f"steepening beyond {KNEE_PX:g} px")),
             _knee,
-            isotropic=True,
         ),
         Shape(
             "two-power-laws",
@@ -244,7 +249,6 @@ SHAPES: dict[str, Shape] = {
                 ),
             ),
             _two,
-            isotropic=True,
         ),
         Shape(
             "core",
@@ -253,7 +257,6 @@ SHAPES: dict[str, Shape] = {
                 Parameter("core_share", "", 0.0, "linear", 0.1, f"share of a Gaussian of {CORE_PX:g} px"),
             ),
             _core,
-            isotropic=True,
         ),
     )
 }
@@ -288,9 +291,18 @@ def _radius_index(size: int) -> NDArray[np.int32]:
     return np.asarray(position[squares])
 
 
-def _by_radius(size: int, falloff: Callable[[Vector], Vector]) -> Kernel:
+def _by_radius(size: int, falloff: Radial) -> Kernel:
     """An isotropic falloff on a square, worked out once a radius."""
     return np.asarray(falloff(_radii(size)[0])[_radius_index(size)])
+
+
+def _scaled_by_radius(falloff: Radial, total: float, size: int) -> Kernel:
+    """Eq. (1) of an isotropic falloff on a square: beyond it nothing but the sum over the full reach is asked for."""
+    r, count = _radii(REACH_GRID_PX)
+    whole = float((falloff(r) * count)[1:].sum())
+    scaled = falloff(_radii(size)[0]) * (total / whole)
+    scaled[0] = 1 - total
+    return np.asarray(scaled[_radius_index(size)])
 
 
 @compiled()

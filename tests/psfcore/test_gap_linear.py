@@ -22,6 +22,7 @@ from psfcore.gap.judge import (
     _by_noise,
     _explains_more,
     _few_numbers_do,
+    _in_place_of_one,
     _left,
     _worse_held_out,
     fitted,
@@ -207,7 +208,7 @@ def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_t
         before = _left(model, model.base, np.zeros(len(model.base.columns)))
         return _best_pair(model, best, before, no_refit, enough=True)
 
-    (smear,) = evidence.columns["column_smear"]
+    smear = evidence.columns["column_smear"][0]
     model = with_residuals(evidence, {})
     sigma = float(np.sqrt(model.fit([smear]).covariance[-1, -1]))
     found = second(10.0, 8.0 * sigma)
@@ -215,6 +216,24 @@ def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_t
     assert second(10.0, 1.0 * sigma) is None
     # Of so large an offset the form's own error is larger than the smear.
     assert second(1000.0, 8.0 * sigma) is None
+
+
+def test_what_would_do_in_place_of_one_of_a_pair_is_named_with_it(solution: Solution) -> None:
+    again = replace(next(e for e in FEW if e.name == "column_smear"), name="smear_again")
+    gradient = next(e for e in EFFECTS if e.name == "intensity_gradient")
+    evidence = gather(solution, (*FEW, again, gradient))
+    plain = with_residuals(evidence, {})
+    strong = {
+        name: 30.0 * float(np.sqrt(plain.fit([evidence.columns[name][0]]).covariance[-1, -1]))
+        for name in ("dark_offset", "column_smear")
+    }
+    model = with_residuals(evidence, strong, noise=1.0)
+    pair = fitted(model, [e for e in evidence.effects if e.name in strong])
+    assert _in_place_of_one(model, pair) == {"dark_offset": [], "column_smear": ["smear_again"]}
+    model = replace(
+        model, evidence=replace(model.evidence, effects=tuple(e for e in evidence.effects if e is not again))
+    )
+    assert _in_place_of_one(model, pair) == {"dark_offset": [], "column_smear": []}
 
 
 def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:

@@ -20,6 +20,7 @@ from psfcore.gap.library import LIBRARY
 from psfcore.gap.linear_model import FLOOR, LinearModel
 from psfcore.gap.optics_effects import (
     ANGLES_DEG,
+    BETWEEN_THEM,
     BLURS,
     DIRECTIONS,
     HALOS,
@@ -82,7 +83,7 @@ def test_a_blur_is_nowhere_negative_and_as_wide_as_it_says() -> None:
         dy, dx = steps[0]
         along = (y * dy + x * dx) / np.hypot(dy, dx)
         assert float((seen * along**2).sum()) == pytest.approx(width**2, rel=1e-6)
-    assert {steps for _, steps in BLURS} == set(DIRECTIONS)
+    assert {steps for _, steps in BLURS} == {*DIRECTIONS, *BETWEEN_THEM}
 
 
 @cache
