@@ -37,6 +37,7 @@ RINGS = (
     (0.7, 1.0, 8),
 )  # from, to (of the outermost dark pixel's radius), sectors
 LEAST_PIXELS = 3
+LEAST_VARIANCE = 1e-12  # of the noisiest direction's: cells that say the same leave others with none
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +86,14 @@ def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
         cell += optics.undo_once(optics.see_back(once), adjoint=True)
         out.append(optics.field(cell))
     return np.array(out)
+
+
+def whitening(covariance: Matrix) -> Matrix:
+    """What gives numbers with this covariance (n, n) a noise of one each; zeros where they have no noise at all."""
+    values, vectors = np.linalg.eigh(covariance)
+    if values[-1] <= 0:
+        return np.zeros_like(covariance)
+    return np.asarray((vectors / np.sqrt(np.maximum(values, values[-1] * LEAST_VARIANCE))) @ vectors.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,16 +95,12 @@ def _column_smear(view: View) -> Sequence[Change]:
     column's mean.
     """
 
-    def below(n: int, images: Sequence[Field]) -> Field:
-        image = images[n]
-        return np.asarray(
-            (np.cumsum(image, axis=0, dtype=np.float32) - image / 2) / np.float32(image.shape[0])
-        )
+    def passed(n: int, images: Sequence[Field], way: int) -> Field:
+        image = images[n][::way]
+        summed = np.cumsum(image, axis=0, dtype=np.float32) - image / 2
+        return np.asarray(summed[::way] / np.float32(image.shape[0]))
 
-    def above(n: int, images: Sequence[Field]) -> Field:
-        return np.asarray(images[n].mean(axis=0, dtype=np.float32) - below(n, images))
-
-    return [Change(change, lit=False) for change in (below, above)]
+    return [Change(lambda n, images, way=way: passed(n, images, way), lit=False) for way in (1, -1)]  # type: ignore[misc]
 
 
 def _persistence(view: View) -> Sequence[Change]:

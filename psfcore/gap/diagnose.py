@@ -241,15 +241,16 @@ class _Refits:
         return beyond(made, self._model.evidence.effects, self._model, progress=say)
 
     def of(self, found: Judgement) -> tuple[Corrected, ...]:
-        """Of the answer; with a tie, of each of its effects, the best first."""
+        """Of the answer; with a tie, of each of its effects, or of each with the one that is certain, the best first."""
         if found.verdict not in ("attributed", "tie") or found.best is None:
             return ()
         chosen: list[Tried] = [found.best]
         if found.verdict == "tie":
+            count = len(found.best.names)
             chosen += [
                 t
                 for t in found.tried
-                if len(t.names) == 1 and t.names[0] in found.answer and t is not found.best
+                if len(t.names) == count and set(t.names) <= set(found.answer) and t is not found.best
             ]
         fits = (self._fit(tried) for tried in chosen[:MOST_REFITS])
         return tuple(fit for fit in fits if fit is not None)

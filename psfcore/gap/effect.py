@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from psfcore.scatter.inversion import Solution
 from psfcore.scatter.optics import Blur, Lanes, put
-from psfcore.transit.occulter import coverage, disc_distance, neighbours_of
+from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, patch_window
 
 Field = NDArray[np.float32]
 Vector = NDArray[np.float64]
@@ -78,12 +78,16 @@ class View:
         return self.solution.total.kernel(self.solution.inversion.coordinates)
 
     @cached_property
+    def slope_kernels(self) -> tuple[Vector, ...]:
+        """How it changes with each coordinate of its shape [y, x]."""
+        return tuple(self.solution.total.slopes(self.solution.inversion.coordinates))
+
+    @cached_property
     def slopes(self) -> tuple[Blur, ...]:
-        """How it changes with each coordinate of its shape."""
+        """The same, to be applied to fields."""
         solution = self.solution
         return tuple(
-            Blur(slope, solution.transit.shape, threads=solution.threads)
-            for slope in solution.total.slopes(solution.inversion.coordinates)
+            Blur(slope, solution.transit.shape, threads=solution.threads) for slope in self.slope_kernels
         )
 
     @cached_property
@@ -174,12 +178,23 @@ class View:
         mean = np.where(others > 0, (total - own * away) / np.maximum(others, 1), own)
         return np.asarray(mean, dtype=np.float32)
 
+    def uncovered(self, n: int) -> Field:
+        """Share of each pixel [y, x] that frame n's occulter leaves open.
+
+        One where no other image shows the scene: there it is the image's own, and hidden already.
+        """
+        solution = self.solution
+        shape, place = solution.transit.shape, solution.sky.found[n].place
+        window = patch_window(shape, place, 1.0)
+        shown = self._scene_sums[solution.transit.frames[n].fov][1][window] > 0
+        out = np.ones(shape, np.float32)
+        out[window] -= (coverage(shape, place)[window] * shown).astype(np.float32)
+        return out
+
     def lit_scene(self, n: int) -> Lanes:
         """One of `scenes` less what the occulter hides of it, in the engine's order."""
-        solution = self.solution
-        seen = 1 - coverage(solution.transit.shape, solution.sky.found[n].place)
-        lit = solution.optics.lanes(self.scenes[n] * seen.astype(np.float32))
-        put(lit, solution.sky.dark[n], 0.0)
+        lit = self.solution.optics.lanes(self.scenes[n] * self.uncovered(n))
+        put(lit, self.solution.sky.dark[n], 0.0)
         return lit
 
     @cached_property

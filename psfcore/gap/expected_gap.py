@@ -16,7 +16,6 @@ from psfcore.gap.effect import View
 from psfcore.gap.evidence import gather
 from psfcore.gap.linear_model import LinearModel
 from psfcore.scatter.inversion import Progress, Solution, invert
-from psfcore.transit.occulter import coverage
 from psfcore.transit.transit import Transit
 
 
@@ -37,7 +36,7 @@ def simulated(view: View, seed: int) -> Transit:
     transit, optics = solution.transit, solution.optics
     frames = []
     for n, frame in enumerate(transit.frames):
-        lit = view.pointing_scene(n) * (1 - coverage(transit.shape, solution.sky.found[n].place))
+        lit = view.pointing_scene(n) * view.uncovered(n)
         seen = optics.field(optics.see(optics.lanes(lit.astype(np.float32)))).astype(np.float64)
         rng = np.random.default_rng([seed, n])
         pixels = transit.noise.observe(seen, frame.exposure_s, rng)

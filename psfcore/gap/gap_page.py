@@ -22,7 +22,7 @@ from psfcore.gap.gap_plot import (
     slices_png,
     where_png,
 )
-from psfcore.gap.gap_report import AXIS_WORDS, in_short_if_many, words
+from psfcore.gap.gap_report import AXIS_WORDS, in_short_if_many, tied_words, words
 from psfcore.gap.judge import ALARM, ENOUGH, TIE
 from psfcore.gap.linear_model import FLOOR
 from psfcore.gap.where import DRAWS
@@ -268,9 +268,8 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
             "nobody has thought of; or a form of unknown cause does as well; or there are too few images to say."
         )
     elif report["ties"]:
-        tied = " or ".join(words(name) for name in report["ties"][0])
         parts.append(
-            f"Tied: {tied}. Their scores lie within {TIE:g} of one another, or change places with what is taken for granted."
+            f"Tied: {tied_words(found.judgement)}. Their scores lie within {TIE:g} of one another, or change places with what is taken for granted."
         )
     if report["verdict"] != "none":
         parts.append(_effects_figure(report))

@@ -266,7 +266,10 @@ def draw_effects(axes: Any, report: Report) -> None:
 def _chosen(row: Report, report: Report) -> bool:
     """Whether an effect, or a pair, is the answer, or one of those that are tied."""
     names, answer = set(row["name"].split(" + ")), set(report["answer"])
-    return names <= answer if report["verdict"] == "tie" else names == answer
+    if report["verdict"] != "tie":
+        return names == answer
+    certain = answer.difference(*report["ties"])
+    return certain <= names <= answer and names != certain
 
 
 def _draw_closure(axes: Any, y: float, closure: dict[str, Any] | None, colour: str) -> None:

@@ -13,7 +13,7 @@ from psfcore.gap.closure import Interval
 from psfcore.gap.correction import Corrected
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.effect import Effect
-from psfcore.gap.judge import ALARM, LEAST_IMAGES, TIE, Tried
+from psfcore.gap.judge import ALARM, LEAST_IMAGES, TIE, Judgement, Tried
 from psfcore.gap.probes import PROBES
 from psfcore.scatter.inversion import Inversion
 
@@ -52,7 +52,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "verdict": judged.verdict,
         "answer": list(judged.answer),
         "effects": [_effect(found, tried, refits.get(tried.label)) for tried in judged.tried],
-        "ties": [list(judged.answer)] if judged.verdict == "tie" else [],
+        "ties": [list(judged.tied)] if judged.verdict == "tie" else [],
         "would_separate": would_separate(found),
         "untestable": [
             {"name": name, "why": why}
@@ -162,7 +162,7 @@ def would_separate(found: Diagnosis) -> str:
     """What observation would tell tied effects apart, or settle an answer."""
     if found.judgement.verdict != "tie":
         return ""
-    said = [_by_name(found, name).settled_by for name in found.judgement.answer]
+    said = [_by_name(found, name).settled_by for name in found.judgement.tied]
     return "; ".join(dict.fromkeys(said))
 
 
@@ -200,8 +200,7 @@ def sentence(found: Diagnosis) -> str:
         close = f"; it looks most like {like}" if like and judged.probes[0].score > 0 else ""
         return f"{lead}: no effect of the library explains it{close}."
     if judged.verdict == "tie":
-        among = " or ".join(words(name) for name in judged.answer)
-        return f"{lead}: {among}, which these data cannot tell apart; {would_separate(found)} would."
+        return f"{lead}: {tied_words(judged)}, which these data cannot tell apart; {would_separate(found)} would."
     if judged.verdict == "inconclusive":
         return (
             f"{lead} is likely (p = {judged.p_value:.2g}), but what causes it depends on what is taken for granted, or is "
@@ -231,6 +230,13 @@ def _explained(found: Diagnosis, best: Tried) -> str:
         f"{words(best.label)} explains it ({in_short or ', '.join(numbers)}); held-out gap {found.rms.value:.1f} -> "
         f"{found.after.value:.1f} %, noise {found.noise_pct:.1f} %"
     )
+
+
+def tied_words(judged: Judgement) -> str:
+    """What is tied, as a person writes it, and beside what."""
+    among = " or ".join(words(name) for name in judged.tied)
+    beside = " and ".join(words(name) for name in judged.certain)
+    return f"{beside}, and beside it {among}" if beside else among
 
 
 def in_short_if_many(values: Sequence[float]) -> str | None:

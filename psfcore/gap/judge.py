@@ -48,16 +48,14 @@ CONFIDENT = 1e-3  # of an effect that is named, counted for how many were tried
 ENOUGH = 1e-3
 PENALTY = 2.0
 TIE = 9.0
-HELD_OUT_SIGMA = 1.0  # by which an effect does clearly worse on images held out
+HELD_OUT_SIGMA = 1.0  # by so many standard errors an effect does clearly worse on images held out
 TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less would tell two apart
 LEFT_SHARE = 0.15
 BEHIND = 0.85  # of the best score: what a rival may reach at most
 NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits anything a little
 UNRIVALLED = 0.1  # of the best score: below it no rival comes near
 MANY_PLACES = 100
-MOST_SECONDS = (
-    2  # where more effects than that would do beside one that explains most, the second is not named
-)
+MOST_SECONDS = 2  # that may act beside an effect that explains most: of more none is named
 CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
@@ -99,7 +97,10 @@ def label_of(names: Sequence[str]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """A verdict under one floor. tried: named effects, best first, the answer's pair before them. probes: best first."""
+    """A verdict under one floor. tried: named effects, best first, the answer's pairs before them. probes: best first.
+
+    certain: of a tie the effect that acts whichever of the others does beside it; none where one of them does alone.
+    """
 
     verdict: Verdict
     answer: tuple[str, ...]
@@ -107,6 +108,14 @@ class Judgement:
     tried: tuple[Tried, ...]
     probes: tuple[Tried, ...]
     best: Tried | None
+    certain: tuple[str, ...] = ()
+
+    @property
+    def tied(self) -> tuple[str, ...]:
+        """Of a tie the effects that cannot be told apart."""
+        return (
+            tuple(name for name in self.answer if name not in self.certain) if self.verdict == "tie" else ()
+        )
 
 
 # The model about a real refit with an effect in it, its columns beside the PSF's; none where there is no such fit.
@@ -137,14 +146,17 @@ def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit)
         return replace(found, verdict="inconclusive")
     if any((other.verdict == "unknown") != (found.verdict == "unknown") for other in others):
         return replace(found, verdict="inconclusive")
-    pairs = {
-        found.verdict == "attributed" and len(found.answer) == 2,
-        *(len(o.answer) == 2 and o.verdict == "attributed" for o in others),
-    }
-    answers = {name for one in (found, *others) for name in one.answer}
-    if len(pairs) > 1 or answers == set(found.answer):
+    every = (found, *others)
+    answers = {name for one in every for name in one.answer}
+    if len({_of_two(one) for one in every}) > 1 or answers == set(found.answer):
         return found
-    return replace(found, verdict="tie", answer=tuple(sorted(answers)))
+    certain = set.intersection(*(set(one.answer) - set(one.tied) for one in every))
+    return replace(found, verdict="tie", answer=tuple(sorted(answers)), certain=tuple(sorted(certain)))
+
+
+def _of_two(found: Judgement) -> bool:
+    """Whether two effects act."""
+    return found.best is not None and len(found.best.names) > 1
 
 
 def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
@@ -217,12 +229,14 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
         return Judgement("inconclusive", (), p_gap, tuple(named), probes, best)
     if pair is not None:
         instead = _in_place_of_one(model, pair)
-        of_one, of_other = instead.values()
-        if best.explains and instead.get(best.names[0]) == [] and len({*of_one, *of_other}) >= MOST_SECONDS:
+        others_do = {name for one in instead.values() for name in one}
+        if best.explains and instead.get(best.names[0]) == {} and len(others_do) + 1 > MOST_SECONDS:
             return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
-        answer = tuple(sorted({*pair.names, *of_one, *of_other}))
-        verdict: Verdict = "attributed" if len(answer) == len(pair.names) else "tie"
-        return Judgement(verdict, answer, p_gap, (pair, *named), probes, pair)
+        answer = tuple(sorted({*pair.names, *others_do}))
+        certain = tuple(name for name in pair.names if others_do and not instead[name])
+        verdict: Verdict = "tie" if others_do else "attributed"
+        pairs = (pair, *(other for one in instead.values() for other in one.values()))
+        return Judgement(verdict, answer, p_gap, (*pairs, *named), probes, pair, certain)
     alike = max(
         TIE, TIE_SHARE * best.gain, (1 - NEAR_BEHIND) * best.score if _searched(best, evidence) else 0.0
     )
@@ -261,7 +275,8 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
         after = hold_out(model, tried.step.columns[base:], scheme)
         falls[tried.label] = 0.0 if after is None else fall(before, after)
     most = max(falls.values())
-    # Of two effects that images tell apart by so much, the difference is uncertain by twice its root.
+    # The deviance of images that tell two models apart by so much is uncertain by twice its root: by no more than by
+    # that of what the best is told apart from nothing by.
     by_chance = HELD_OUT_SIGMA * 2 * math.sqrt(max(most, 0.0))
     failed = {label for label, down in falls.items() if down < most - max(TIE, TIE_SHARE * most, by_chance)}
     return sorted(named, key=lambda t: (t not in alike or t.label in failed, -t.score)), failed
@@ -269,7 +284,7 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
 
 def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
     """The verdict where one effect explains most of a gap and not all: is another at work beside it? None where that
-    cannot be said. Its tried are the answer's alone.
+    cannot be said; the one alone where more than MOST_SECONDS could be the other. Its tried are the answer's alone.
 
     So too where the best was measured in the lit parts and leaves much there: a Sun that flickers faster than it is
     followed. The discs do not show that, and what they show is judged by itself."""
@@ -290,10 +305,12 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
     if len(second.answer) > MOST_SECONDS and best.explains:
         return Judgement("attributed", best.names, second.p_value, (), (), best)
     effects = {effect.name: effect for effect in model.evidence.effects}
-    pair = fitted(model, [effects[name] for name in (*best.names, *second.best.names)])
+    beside = (*second.best.names, *(name for name in second.answer if name not in second.best.names))
+    pair, *others = (fitted(model, [effects[name] for name in (*best.names, one)]) for one in beside)
     pair = replace(pair, left_p_value=second.best.left_p_value, left_share=second.best.left_share)
     answer = tuple(sorted({*best.names, *second.answer}))
-    return Judgement(second.verdict, answer, second.p_value, (pair,), (), pair)
+    certain = best.names if second.verdict == "tie" else ()
+    return Judgement(second.verdict, answer, second.p_value, (pair, *others), (), pair, certain)
 
 
 def _explains_more(probe: Tried, best: Tried) -> bool:
@@ -341,24 +358,22 @@ def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, 
     return pair if (pair.left_p_value or 0.0) >= ENOUGH else None
 
 
-def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, list[str]]:
-    """For each effect of a pair those others that explain, beside the one that stays, about as much as it does."""
+def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tried]]:
+    """For each effect of a pair those others that explain, beside the one that stays, about as much as it does: by name
+    the pairs that they make."""
     effects = {effect.name: effect for effect in model.evidence.effects if effect.named}
-    found: dict[str, list[str]] = {name: [] for name in pair.names}
+    found: dict[str, dict[str, Tried]] = {name: {} for name in pair.names}
     for stays, goes in (pair.names, pair.names[::-1]):
         alone = fitted(model, (effects[stays],))
         adds = pair.score - alone.score
         alike = max(TIE, TIE_SHARE * (pair.gain - alone.gain))
         if effects[goes].trials >= MANY_PLACES:
             alike = max(alike, (1 - NEAR_BEHIND) * adds)
-        for name, effect in effects.items():
-            if name in pair.names:
-                continue
-            other = fitted(model, (effects[stays], effect))
-            if name in {key.split(".")[0] for key in other.values} and pair.score - other.score < min(
-                alike, adds
-            ):
-                found[goes].append(name)
+        for name in (name for name in effects if name not in pair.names):
+            other = fitted(model, (effects[stays], effects[name]))
+            takes_part = any(key.startswith(f"{name}.") for key in other.values)
+            if takes_part and pair.score - other.score < min(alike, adds):
+                found[goes][name] = other
     return found
 
 

@@ -29,7 +29,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.cells import DiscCells
+from psfcore.gap.cells import DiscCells, whitening
 from psfcore.gap.evidence import Evidence
 from psfcore.gap.patterns import means, patterns
 from psfcore.normal_equations import scaled_inverse
@@ -82,8 +82,7 @@ class LinearModel:
         covariance = disc.covariance * self.disc_scale + self.floor**2 * np.outer(
             disc.expected, disc.expected
         )
-        values, vectors = np.linalg.eigh(covariance)
-        white = (vectors / np.sqrt(np.maximum(values, values[-1] * 1e-12))) @ vectors.T
+        white = whitening(covariance)
         return Whitened(disc.index, white @ disc.residual, disc.answers @ white, white)
 
     def equations(self, images: Sequence[int] | None = None) -> tuple[Matrix, Vector]:

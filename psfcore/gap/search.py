@@ -12,7 +12,8 @@ r and T over their noise, the PSF's part taken out. In the same way a change K o
 
     T_n = sum over displacements of K(d) C_n(d),   C_n(d) = sum over pixels of q_n(x) scene_n(x - d)     Eq. (3)
 
-so that any number of kernels is looked at for the price of one correlation a disc.
+so that any number of kernels is looked at for the price of one correlation a disc. Where a form shows within the discs too,
+as copies and changes of the core do, r and T go on with their cells (`near_discs`).
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ BLURS_PX = (2.0, 4.0, 8.0, 16.0)
 NEAREST_RADII = 1.8  # of the disc: nearer, a copy would be the disc's own surroundings
 KERNEL_REACH_PX = 255  # beyond it no order of a mesh has much light
 SEEN = 1e-4  # of the best seen place's sum T^2: a place that the discs see less of is not looked at
+UNSEEN = 1e-300
 
 
 def place_search(view: View) -> PlaceSearch:
@@ -53,12 +55,13 @@ def place_search(view: View) -> PlaceSearch:
 
 
 class PlaceSearch:
-    """The discs' sensitivities on a grid of STEP_PX, and to displacements, for any number of searches."""
+    """The discs' sensitivities on a grid of STEP_PX, and to displacements, and their cells', for any number of searches."""
 
     def __init__(self, view: View) -> None:
         solution, self._expected = view.solution, view.expected
         self._planes, self._fine = {}, {}
         to_displacements, to_far = [], []
+        self._near = NearDiscs(view)
         for n in solution.part:
             dark = solution.sky.dark[n]
             (plane,) = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
@@ -66,49 +69,44 @@ class PlaceSearch:
             self._fine[n] = _binned(plane, FINE_PX) * FINE_PX**2
             scene = solution.optics.field(view.lit_scene(n))
             to_displacements.append(_correlation(plane, scene, KERNEL_REACH_PX))
+            self._near.add(n, scene)
             reach = max(self._planes[n].shape) - 2
             to_far.append(_correlation(self._planes[n], _binned(scene, STEP_PX), reach))
         self._to_displacements = np.array(to_displacements, dtype=np.float32)
         self._to_far = np.array(to_far)
         self._nearest_px = NEAREST_RADII * float(np.mean([f.place.radius_px for f in solution.sky.found]))
-        self._near = NearDiscs(view)
         frames = solution.inversion.frames
         self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
         answers = np.array([f.answer for f in frames]) / self._sigma[:, None]
-        self._absorbed = np.linalg.qr(answers)[0]
         residual = np.array([f.observed - f.expected for f in frames]) / self._sigma
-        self._residual = self._left(residual)
-        slopes = solution.total.slopes(solution.inversion.coordinates)
-        in_cells = np.array([self._near.of_kernel(slope) for slope in slopes]).T
-        self._absorbed_in_all = np.linalg.qr(np.concatenate([answers, in_cells]))[0]
-        self._residual_in_all = self._left(np.concatenate([residual, self._near.residual]))
+        in_cells = np.array([self._near.of_kernel(slope) for slope in view.slope_kernels]).T
+        self._of_means = _Left(answers, residual)
+        self._of_all = _Left(
+            np.concatenate([answers, in_cells]), np.concatenate([residual, self._near.residual])
+        )
 
     def kernel(self, kernels: Sequence[Plane]) -> int:
         """Which of some changes of the PSF [y, x], their centres at n//2, explains most as it stands, Eq. (2) and (3).
 
         In the discs' means, and in their cells so far as light moves near them.
         """
-        return self._best(
-            self._to_displacements, kernels, [self._near.of_kernel(kernel) for kernel in kernels]
-        )
+        cells = np.array([self._near.of_kernel(kernel) for kernel in kernels]).T
+        return self._best(self._to_displacements, kernels, cells)
 
     def wide_kernel(self, kernels: Sequence[Plane]) -> int:
         """The same of changes that are smooth and may reach across the field; looked at on coarse pixels."""
         return self._best(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
 
     def _best(
-        self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane], near: Sequence[Plane] = ()
+        self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane], cells: Plane | None = None
     ) -> int:
-        answers = np.array(
-            [
-                np.einsum("nyx,yx->n", to_displacements, crop_or_pad(k, n).astype(to_displacements.dtype))
-                for n in to_displacements.shape[1:2]
-                for k in kernels
-            ],
-            dtype=np.float64,
-        )
-        means = (answers / self._sigma).T
-        return int(np.argmax(self._gain(means, 1.0, np.array(near).T if len(near) else None)))
+        size, dtype = to_displacements.shape[1], to_displacements.dtype
+        of_discs = [
+            np.einsum("nyx,yx->n", to_displacements, crop_or_pad(kernel, size).astype(dtype))
+            for kernel in kernels
+        ]
+        means = np.array(of_discs, dtype=np.float64).T / self._sigma[:, None]
+        return int(np.argmax(self._gain(means, 1.0, cells)))
 
     def copy(self) -> tuple[float, int, int]:
         """Blur (px) and displacement (whole pixels x, y) of a copy of each image that explains most of the residuals.
@@ -150,7 +148,7 @@ class PlaceSearch:
             )
             of_cells.append(self._near.of_copies(n, copy, places))
         means = np.array(of_means) / self._sigma[:, None]
-        gain = self._gain(means, 1.0, np.concatenate(of_cells))
+        gain = self._gain(means, 1.0, np.concatenate(of_cells), least=SEEN)
         best = int(np.argmax(gain))
         return float(gain[best]), *places[best]
 
@@ -173,21 +171,36 @@ class PlaceSearch:
         answers = np.array(
             [answer(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
         )
-        gain = self._gain(answers.reshape(self._sigma.size, -1), sign)
+        gain = self._gain(answers.reshape(self._sigma.size, -1), sign, least=SEEN)
         return np.asarray(gain.reshape(answers.shape[1:]))
 
-    def _gain(self, means: Plane, sign: float, cells: Plane | None = None) -> Vector:
-        """Eq. (2) of some forms: how they move the discs' means (discs, forms), over their noise; and their cells."""
-        flat = self._left(means if cells is None else np.concatenate([means, cells]))
-        size = (flat**2).sum(axis=0)
-        along = sign * ((self._residual if cells is None else self._residual_in_all) @ flat)
-        seen = size > SEEN * size.max()
+    def _gain(self, means: Plane, sign: float, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
+        """Eq. (2) of some forms (forms,): how they move the discs' means (discs, forms), over their noise; and the cells.
+
+        sign: of the form's amplitude. least: share of the largest sum T^2 below which a form gains nothing.
+        """
+        left, answers = (
+            (self._of_means, means) if cells is None else (self._of_all, np.concatenate([means, cells]))
+        )
+        flat = left.of(answers)
+        size, along = (flat**2).sum(axis=0), sign * (left.residual @ flat)
+        seen = size > max(least * float(size.max()), UNSEEN)
         return np.asarray(np.where(seen & (along > 0), along**2 / np.where(seen, size, 1.0), 0.0))
 
-    def _left(self, answers: Plane) -> Plane:
-        """What the PSF's parameters leave: of the discs' means, or of these and the cells."""
-        absorbed = self._absorbed if answers.shape[0] == self._sigma.size else self._absorbed_in_all
-        return np.asarray(answers - absorbed @ (absorbed.T @ answers))
+
+class _Left:
+    """What the PSF's parameters leave, of a residual (n,) and of answers to forms (n, forms), over the noise.
+
+    absorbed: the answers to those parameters (n, parameters).
+    """
+
+    def __init__(self, absorbed: Plane, residual: Vector) -> None:
+        self._absorbed = np.linalg.qr(absorbed)[0]
+        self.residual: Vector = self.of(residual)
+
+    def of(self, answers: Plane) -> Plane:
+        """What is left of answers."""
+        return np.asarray(answers - self._absorbed @ (self._absorbed.T @ answers))
 
 
 def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int) -> Plane:

@@ -85,12 +85,16 @@ Radial = Callable[[Vector], Vector]  # the same of radii (px)
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape of scatter: its parameters and its falloff, of radii alone where it is isotropic."""
+    """A shape of scatter: its parameters, and its falloff: of radii alone where it is isotropic, else on a square."""
 
     name: str
     parameters: tuple[Parameter, ...]
     radial: Callable[[Values], Radial] | None = None
     falloff: Falloff | None = None
+
+    def __post_init__(self) -> None:
+        if (self.radial is None) == (self.falloff is None):
+            raise ValueError(f"{self.name}: expected a falloff either of radii or on a square")
 
     @property
     def isotropic(self) -> bool:

@@ -10,6 +10,7 @@ import scipy.linalg
 from scipy.ndimage import gaussian_filter
 from scipy.stats import multivariate_normal
 
+from psfcore.gap import judge as judging
 from psfcore.gap.cells import cells_of, disc_cells, sensitivities
 from psfcore.gap.closure import HeldOut, _deviance, closure, fall, gap
 from psfcore.gap.detector_effects import EFFECTS
@@ -229,11 +230,36 @@ def test_what_would_do_in_place_of_one_of_a_pair_is_named_with_it(solution: Solu
     }
     model = with_residuals(evidence, strong, noise=1.0)
     pair = fitted(model, [e for e in evidence.effects if e.name in strong])
-    assert _in_place_of_one(model, pair) == {"dark_offset": [], "column_smear": ["smear_again"]}
+    instead = _in_place_of_one(model, pair)
+    assert {name: list(one) for name, one in instead.items()} == {
+        "dark_offset": [],
+        "column_smear": ["smear_again"],
+    }
+    assert set(instead["column_smear"]["smear_again"].names) == {"dark_offset", "smear_again"}
     model = replace(
         model, evidence=replace(model.evidence, effects=tuple(e for e in evidence.effects if e is not again))
     )
-    assert _in_place_of_one(model, pair) == {"dark_offset": [], "column_smear": []}
+    assert _in_place_of_one(model, pair) == {"dark_offset": {}, "column_smear": {}}
+
+
+def test_what_another_floor_cannot_tell_from_one_of_a_pair_is_in_the_answer(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = with_residuals(evidence, {"dark_offset": 100.0})
+    pair = fitted(model, evidence.effects)
+
+    def under(one: LinearModel, *_: object) -> Judgement:
+        found = Judgement("attributed", pair.names, 0.0, (pair,), (), pair)
+        if one.floor >= model.floor:
+            return found
+        answer = (*pair.names, "persistence")
+        return replace(found, verdict="tie", answer=answer, certain=("dark_offset",))
+
+    monkeypatch.setattr(judging, "_judge", under)
+    monkeypatch.setattr(judging, "_worse_held_out", lambda *_: False)
+    found = judging.judge(model)
+    assert found.verdict == "tie" and set(found.answer) == {"dark_offset", "column_smear", "persistence"}
+    assert found.certain == ("dark_offset",) and set(found.tied) == {"column_smear", "persistence"}
 
 
 def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:

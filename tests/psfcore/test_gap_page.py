@@ -150,6 +150,22 @@ def test_every_verdict_has_a_page_that_says_what_it_means(
     assert ("a patch of added light" in text) is (verdict in ("unknown", "inconclusive"))
 
 
+def test_a_tie_beside_an_effect_that_is_certain_says_which_is_which(coarse: None) -> None:
+    both = judged("tie", "core_blur", "dark_offset", "gain_mismatch")
+    both = replace(both, judgement=replace(both.judgement, certain=("dark_offset",)))
+    report = report_of(both)
+    assert report["ties"] == [["core_blur", "gain_mismatch"]]
+    told = "dark offset, and beside it core blur or gain mismatch"
+    assert f"{told}, which these data cannot tell apart" in report["sentence"]
+    assert "a dark exposure" not in report["would_separate"] and "both gain modes" in report["would_separate"]
+    assert f"Tied: {told}." in text_of(gap_page(both, report).html())
+    rows = [
+        {"name": name}
+        for name in ("dark_offset", "core_blur", "core_blur + dark_offset", "persistence + dark_offset")
+    ]
+    assert [gap_plot._chosen(row, report) for row in rows] == [False, False, True, False]
+
+
 def test_without_images_held_out_it_says_so_and_draws_no_residuals(coarse: None) -> None:
     few = replace(judged("none"), residual=None)
     page = gap_page(few, report_of(few)).html()

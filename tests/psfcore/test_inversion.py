@@ -304,8 +304,8 @@ def test_a_shape_with_a_number_that_does_nothing_is_left_open() -> None:
         SOFTENED_POWER_LAW,
         name="twice",
         parameters=(*SOFTENED_POWER_LAW.parameters, dataclasses.replace(B, name="again")),
-        falloff=lambda values, size: SOFTENED_POWER_LAW.falloff(
-            {**values, "b_px": np.sqrt(values["b_px"] * values["again"])}, size
+        radial=lambda values: SOFTENED_POWER_LAW.radial(
+            {**values, "b_px": np.sqrt(values["b_px"] * values["again"])}
         ),
     )
     with pytest.raises(DataError, match=r"transit-says-too-little.*b_px, c, total, again"):
