@@ -101,7 +101,8 @@ class DiscCells:
     """The cells of frame `index` (a position among all frames): residuals (observed minus expected) and what moves them.
 
     residual, expected: (cells,) in DN/s. covariance: Eq. (2). answers: (columns, cells), DN/s for one unit.
-    pixels, radius, azimuth: of `Cells`. observed: the disc's mean.
+    pixels, radius, azimuth: of `Cells`. observed: the disc's mean. untouched: the same, DN/s, before an effect's light was
+    taken out of the image; none where nothing was.
     """
 
     index: int
@@ -112,6 +113,7 @@ class DiscCells:
     pixels: Vector
     radius: Vector
     azimuth: Vector
+    untouched: float | None = None
 
     @property
     def share(self) -> Vector:
@@ -122,6 +124,11 @@ class DiscCells:
     def observed(self) -> float:
         """The disc's mean, DN/s."""
         return float(self.share @ (self.expected + self.residual))
+
+    @property
+    def level(self) -> float:
+        """What percents of the disc are of, DN/s: the size of its mean as it was observed, whatever was taken out since."""
+        return abs(self.observed if self.untouched is None else self.untouched)
 
     @property
     def mean_expected(self) -> float:

@@ -137,8 +137,8 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
                     left.size + error,
                     float(of_blocks @ of_blocks),
                     of_lit,
-                    -100 * mean / disc.observed,
-                    100 * noise / disc.observed,
+                    -100 * mean / disc.level,
+                    100 * noise / disc.level,
                 )
             )
         residuals, answered = (np.concatenate(parts, axis=-1) for parts in zip(*everything, strict=True))

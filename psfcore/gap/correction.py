@@ -140,15 +140,17 @@ def hold(effect: Effect, view: View) -> Effect:
 
 
 def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
-    """The evidence after an effect was taken out, with the noise of before: the light that is gone left its noise."""
-    covariance = {disc.index: disc.covariance for disc in before.discs}
-    discs = tuple(
-        replace(disc, covariance=covariance[disc.index])
-        if disc.index in covariance and covariance[disc.index].shape == disc.covariance.shape
-        else disc
-        for disc in after.discs
-    )
-    return replace(after, discs=discs, lit=replace(after.lit, variance=before.lit.variance))
+    """The evidence after an effect was taken out, with the noise of before: the light that is gone left its noise. So
+    are the means that percents are of."""
+    were = {disc.index: disc for disc in before.discs}
+    discs = []
+    for disc in after.discs:
+        was = were.get(disc.index)
+        if was is not None:
+            same = was.covariance.shape == disc.covariance.shape
+            disc = replace(disc, covariance=was.covariance if same else disc.covariance, untouched=was.level)
+        discs.append(disc)
+    return replace(after, discs=tuple(discs), lit=replace(after.lit, variance=before.lit.variance))
 
 
 def _acting(effect: Effect, found: Tried, effects: int) -> Effect:

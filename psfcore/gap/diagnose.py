@@ -282,14 +282,14 @@ def _before_refit(model: LinearModel, found: Judgement, rng: np.random.Generator
     rows = []
     for disc in model.evidence.discs:
         mean = float(disc.share @ (disc.residual - disc.answers[base].T @ step.values[: len(base)]))
-        rows.append((-100 * mean / disc.observed, 100 * disc.mean_noise / disc.observed))
+        rows.append((-100 * mean / disc.level, 100 * disc.mean_noise / disc.level))
     residual, noise = np.array(rows).T
     nothing = np.zeros_like(residual)
     return gap(HeldOut((), nothing, nothing, nothing, nothing, residual, noise), rng)
 
 
 def _noise_pct(evidence: Evidence) -> float:
-    return float(np.sqrt(np.mean([(100 * d.mean_noise / d.observed) ** 2 for d in evidence.discs])))
+    return float(np.sqrt(np.mean([(100 * d.mean_noise / d.level) ** 2 for d in evidence.discs])))
 
 
 def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidence) -> tuple[str, ...]:

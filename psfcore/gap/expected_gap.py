@@ -63,7 +63,7 @@ def expected_gap(
     left = model.left(model.base)
     cells = max(sum(one.size for one in left) - len(model.base.columns), 1)
     lit = model.evidence.whole_lit
-    residual = [100 * float(d.share @ d.residual) / d.observed for d in model.evidence.discs]
+    residual = [100 * float(d.share @ d.residual) / d.level for d in model.evidence.discs]
     return ExpectedGap(
         disc_scale=sum(float(one @ one) for one in left) / cells,
         lit_scale=lit.chi2 / lit.freedom,

@@ -175,8 +175,8 @@ def cell_means(discs: Sequence[DiscCells]) -> tuple[Vector, Vector]:
     for disc in discs:
         noise = np.sqrt(np.diag(disc.covariance))
         for k, number in enumerate(_numbers(disc)):
-            sums[number] -= 100 * disc.residual[k] / disc.observed
-            variance[number] += (100 * noise[k] / disc.observed) ** 2
+            sums[number] -= 100 * disc.residual[k] / disc.level
+            variance[number] += (100 * noise[k] / disc.level) ** 2
             count[number] += 1
     there = np.where(count > 0, count, np.nan)
     return sums / there, np.sqrt(variance) / there

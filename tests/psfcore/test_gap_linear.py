@@ -12,7 +12,8 @@ from scipy.stats import multivariate_normal
 
 from psfcore.gap import judge as judging
 from psfcore.gap.cells import cells_of, disc_cells, sensitivities
-from psfcore.gap.closure import HeldOut, _deviance, closure, fall, gap
+from psfcore.gap.closure import HeldOut, _deviance, closure, fall, gap, hold_out, time_blocks
+from psfcore.gap.correction import _with_noise_of
 from psfcore.gap.detector_effects import EFFECTS
 from psfcore.gap.effect import View
 from psfcore.gap.evidence import Evidence, gather
@@ -309,6 +310,20 @@ def test_a_copy_and_a_patch_are_found_where_they_are(clean: Transit) -> None:
     )
     blur, x, y = PlaceSearch(View(invert(replace(clean, frames=frames)))).copy()
     assert (x, y) == pytest.approx((dx, dy), abs=6) and blur in (2.0, 4.0, 8.0)
+
+
+def test_percents_are_of_the_light_that_was_observed_whatever_was_taken_out(evidence: Evidence) -> None:
+    """With an effect's light taken out a disc may be left with less than none."""
+    taken_out = replace(
+        evidence, discs=tuple(replace(disc, residual=-1.5 * disc.expected) for disc in evidence.discs)
+    )
+    assert all(disc.observed < 0 for disc in taken_out.discs)
+    before, after = evidence, _with_noise_of(evidence, taken_out)
+    assert [disc.level for disc in after.discs] == [disc.level for disc in before.discs]
+    for one in (after, taken_out):
+        model = LinearModel(one, FLOOR)
+        held_out = hold_out(model, (), time_blocks(model))
+        assert held_out is not None and held_out.noise_pct.min() > 0
 
 
 def test_closure_and_gap_by_hand() -> None:
