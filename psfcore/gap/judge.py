@@ -262,7 +262,7 @@ def _few_numbers_do(named: Sequence[Tried], measured: set[str]) -> bool:
 
 def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tried], set[str]]:
     """Of effects that are about as good as the best, those first that are as good on images held out of their fit; and
-    the labels of those that are not: they fit by their freedom."""
+    the labels of those that are clearly not: they fit by their freedom."""
     best = named[0]
     alike = [t for t in named if best.score - t.score < max(TIE, TIE_SHARE * best.gain)]
     scheme = time_blocks(model)
@@ -275,11 +275,17 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
         after = hold_out(model, tried.step.columns[base:], scheme)
         falls[tried.label] = 0.0 if after is None else fall(before, after)
     most = max(falls.values())
+    nearly = max(TIE, TIE_SHARE * most)
     # The deviance of images that tell two models apart by so much is uncertain by twice its root: by no more than by
-    # that of what the best is told apart from nothing by.
+    # that of what the best is told apart from nothing by. Until it is beyond that an effect comes later, and no more.
     by_chance = HELD_OUT_SIGMA * 2 * math.sqrt(max(most, 0.0))
-    failed = {label for label, down in falls.items() if down < most - max(TIE, TIE_SHARE * most, by_chance)}
-    return sorted(named, key=lambda t: (t not in alike or t.label in failed, -t.score)), failed
+    failed = {label for label, down in falls.items() if down < most - max(nearly, by_chance)}
+
+    def place(tried: Tried) -> tuple[bool, bool, float]:
+        last = tried not in alike or tried.label in failed
+        return last, not last and falls[tried.label] < most - nearly, -tried.score
+
+    return sorted(named, key=place), failed
 
 
 def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
