@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ class NearDiscs:
         self._planes[n] = (white @ flat).astype(np.float32).reshape(planes.shape)
         self._residuals.append(white @ (cells.weights @ residual))
         wide = size[0] + 2 * REACH_PX, size[1] + 2 * REACH_PX
-        around = _cut(scene, top - REACH_PX, left - REACH_PX, wide)
+        around = cut(scene, top - REACH_PX, left - REACH_PX, wide)
         self._to_displacements.append(correlations(self._planes[n], around, REACH_PX))
 
     @property
@@ -83,7 +84,7 @@ class NearDiscs:
     def of_copies(self, n: int, image: Field, displacements: Sequence[tuple[int, int]]) -> Plane:
         """How an image [y, x] displaced by whole pixels (x, y) moves the cells of disc n, over their noise (cells, k)."""
         (top, left), planes = self._corners[n], self._planes[n]
-        copies = [_cut(image, top - dy, left - dx, self._size).ravel() for dx, dy in displacements]
+        copies = [cut(image, top - dy, left - dx, self._size).ravel() for dx, dy in displacements]
         return np.asarray(
             planes.reshape(planes.shape[0], -1) @ np.array(copies, np.float32).T, dtype=np.float64
         )
@@ -97,7 +98,7 @@ def _without(covariance: Plane, level: Vector) -> Plane:
     return np.asarray(white - np.outer(along, along @ white))
 
 
-def _cut(plane: Field, top: int, left: int, size: tuple[int, int]) -> Field:
+def cut(plane: Any, top: int, left: int, size: tuple[int, int]) -> Any:
     """A part of a plane [y, x], dark where the plane does not reach."""
     out = np.zeros(size, plane.dtype)
     low_y, high_y = (min(max(at, 0), plane.shape[0]) for at in (top, top + size[0]))

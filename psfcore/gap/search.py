@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.fourier import linear_convolve
+from psfcore.fourier import correlations, linear_convolve
 from psfcore.gap.cells import sensitivities
 from psfcore.gap.effect import View
 from psfcore.gap.linear_model import FLOOR
-from psfcore.gap.near_discs import NearDiscs
+from psfcore.gap.near_discs import NearDiscs, cut
 from psfcore.psf import crop_or_pad
 
 Plane = NDArray[np.float64]
@@ -205,12 +205,8 @@ class _Left:
 
 def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int) -> Plane:
     """C of Eq. (3) for displacements up to reach_px along each axis: (2 reach + 1, 2 reach + 1), none in the middle."""
-    count = 2 * reach_px + 3
-    both = plane.astype(np.float64), scene[::-1, ::-1].astype(np.float64)
-    wide = np.asarray(linear_convolve(*both, (count, count)), dtype=np.float64)
-    # Of lines of even length the convolution's middle is a displacement of one.
-    y, x = (reach_px + 1 - (n + 1) % 2 for n in plane.shape)
-    return wide[y - reach_px : y + reach_px + 1, x - reach_px : x + reach_px + 1]
+    around = np.pad(scene.astype(np.float64), reach_px)
+    return np.asarray(correlations(plane[None].astype(np.float64), around, reach_px)[0])
 
 
 def coarse_kernel(kernel: Plane, step: int) -> Plane:
@@ -233,13 +229,7 @@ def _displacements(count: int) -> NDArray[np.intp]:
 
 def displaced(plane: Any, dx: int, dy: int) -> Any:
     """A plane [y, x] moved by whole pixels, dark where nothing moved in."""
-    out = np.zeros_like(plane)
-    ny, nx = plane.shape
-    to_y, to_x = slice(max(dy, 0), min(ny + dy, ny)), slice(max(dx, 0), min(nx + dx, nx))
-    from_y, from_x = slice(max(-dy, 0), min(ny - dy, ny)), slice(max(-dx, 0), min(nx - dx, nx))
-    if to_y.start < to_y.stop and to_x.start < to_x.stop:
-        out[to_y, to_x] = plane[from_y, from_x]
-    return out
+    return cut(plane, -dy, -dx, plane.shape)
 
 
 def _binned(plane: NDArray[np.floating], step: int) -> Plane:

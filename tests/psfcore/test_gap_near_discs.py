@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from psfcore.fourier import correlations
 from psfcore.gap.cells import cells_of, sensitivities, whitening
 from psfcore.gap.effect import View
-from psfcore.gap.near_discs import NearDiscs, _cut
+from psfcore.gap.near_discs import NearDiscs, cut
 from psfcore.gap.optics_effects import _blurred, _sought_blur
 from psfcore.gap.search import displaced, place_search
 from psfcore.psf import crop_or_pad
@@ -76,9 +76,9 @@ def test_sums_over_displacements_are_those_of_the_definition() -> None:
 
 def test_a_patch_beyond_the_field_is_dark_there() -> None:
     plane = np.arange(20.0).reshape(4, 5)
-    assert _cut(plane, -1, 3, (3, 3)).tolist() == [[0, 0, 0], [3, 4, 0], [8, 9, 0]]
-    assert _cut(plane, 2, -1, (2, 3)).tolist() == [[0, 10, 11], [0, 15, 16]]
-    assert not _cut(plane, 7, 0, (3, 3)).any() and not _cut(plane, 0, -9, (3, 3)).any()
+    assert cut(plane, -1, 3, (3, 3)).tolist() == [[0, 0, 0], [3, 4, 0], [8, 9, 0]]
+    assert cut(plane, 2, -1, (2, 3)).tolist() == [[0, 10, 11], [0, 15, 16]]
+    assert not cut(plane, 7, 0, (3, 3)).any() and not cut(plane, 0, -9, (3, 3)).any()
 
 
 @pytest.mark.parametrize("disc", [5, 9])
