@@ -46,10 +46,11 @@ class _Discs:
 
 @dataclass(frozen=True)
 class Left:
-    """Percent, rms over images: what an effect leaves, and what the sampling leaves without one."""
+    """Percent, rms over images: what an effect leaves, and what the sampling leaves without one; and by image."""
 
     before_refit_pct: float
     after_refit_pct: float
+    by_image_pct: dict[int, float]
     clean_before_refit_pct: float
     clean_after_refit_pct: float
 
@@ -71,9 +72,11 @@ class LinearEstimator:
         residuals = {n: self._residual(n, pixels) for n, pixels in images.items()}
         changes = {n: residuals[n][0] - self._discs[n].residual for n in images}
         clean = {n: self._discs[n].residual for n in images}
+        after_refit = self._refitted(changes)
         return Left(
             before_refit_pct=self._rms(changes),
-            after_refit_pct=self._rms(self._refitted(changes)),
+            after_refit_pct=self._rms(after_refit),
+            by_image_pct={n: self._percent(n, residual) for n, residual in after_refit.items()},
             clean_before_refit_pct=self._rms(clean),
             clean_after_refit_pct=self._rms(self._refitted(clean)),
         )

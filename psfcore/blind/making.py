@@ -25,7 +25,7 @@ from psfcore.blind.cases import Case, case_scenes
 from psfcore.blind.chain import Chain, Sky
 from psfcore.blind.effect import Effect
 from psfcore.blind.fine_optics import boxed_glass, fine_optics
-from psfcore.blind.left import LinearEstimator, refitted, rms_difference
+from psfcore.blind.left import Left, LinearEstimator, refitted, rms_difference
 from psfcore.fits_io import Cards, CardValue, write_plane
 from psfcore.simulate.plan import HIGH, Plan
 from psfcore.simulate.transit_files import instrument_values, shot_values
@@ -67,25 +67,27 @@ def make(case: Case, images: Sequence[Plane] = ()) -> Made:
     expected = chain.all_expected() if effects else clean_rates
     own_level = chain.saturation_dn(expected) or level
     exposures = _clipped(chain.read_out(expected, case.seed), case.plan, own_level)
+    left = _left(case, chain, expected, estimator, diffraction, own_level)
     truth = case.as_json() | {
-        "effects": [effect.as_json() | {"left_alone_pct": left} for effect, left in alone],
+        "effects": [effect.as_json() | _left_alone(by_itself, left) for effect, by_itself in alone],
         "psf": {"b": case.law.b_px, "c": case.law.c, "total": case.law.total},
         "exact": [{"x": shot.x_px, "y": shot.y_px} for shot in case.plan.shots],
         "plan": case.plan.as_json() | {"saturation_dn": own_level},
-        **_left(case, chain, expected, estimator, diffraction, own_level),
+        **left,
     }
     return Made(exposures, _reported(case), own_level, diffraction, truth)
 
 
 def _at_target(
     effect: Effect, target_pct: float, case: Case, sky: Sky, estimator: LinearEstimator
-) -> tuple[Effect, float]:
+) -> tuple[Effect, Left]:
     """The effect at a strength that leaves about target_pct, or as near as its largest comes; and what it leaves."""
     tried, found = effect, _quick_left(effect, case, sky, estimator)
     for _ in range(TRIALS):
-        if max(found / target_pct, target_pct / max(found, 1e-6)) < STRENGTH_WITHIN:
+        short = target_pct / max(found.after_refit_pct, 1e-6)
+        if max(short, 1 / short) < STRENGTH_WITHIN:
             break
-        wanted = tried.strength * (target_pct / max(found, 1e-6)) ** (1 / tried.power)
+        wanted = tried.strength * short ** (1 / tried.power)
         strength = float(min(wanted, tried.largest))
         if strength == tried.strength:  # as strong as is believed, and still too little
             break
@@ -94,12 +96,19 @@ def _at_target(
     return tried, found
 
 
-def _quick_left(effect: Effect, case: Case, sky: Sky, estimator: LinearEstimator) -> float:
-    """What an effect leaves after a refit, to first order."""
+def _quick_left(effect: Effect, case: Case, sky: Sky, estimator: LinearEstimator) -> Left:
+    """What an effect leaves, to first order."""
     chain = Chain(sky, (effect,))
     expected = chain.all_expected()
     rates = _rates(chain, case, expected, chain.saturation_dn(expected))
-    return estimator.left(dict(enumerate(rates))).after_refit_pct
+    return estimator.left(dict(enumerate(rates)))
+
+
+def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
+    """What an effect leaves after a refit without the case's others: percent, and over the noise of the discs' means."""
+    noise = left["refitted"]["noise_pct"]
+    shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)
+    return {"left_alone_pct": by_itself.after_refit_pct, "left_alone_chi2": float(shown)}
 
 
 def _rates(chain: Chain, case: Case, expected: Sequence[Plane], level: float | None) -> list[Plane]:

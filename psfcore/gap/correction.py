@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from psfcore.gap.effect import Effect, View
 from psfcore.gap.evidence import Evidence, gather
-from psfcore.gap.judge import Tried, fitted, label_of
+from psfcore.gap.judge import Tried, fitted, label_of, left_chi2
 from psfcore.gap.linear_model import LinearModel
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.transit.transit import Transit
@@ -24,6 +24,10 @@ Vector = NDArray[np.float64]
 
 ROUNDS = 3
 SETTLED = 0.3  # of a parameter's error
+WORSE, WORSE_SHARE = (
+    9.0,
+    0.05,
+)  # of chi2, and of the effect's gain: what a round may leave more than the best did
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +82,13 @@ def add_to_model(
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
     values = {name: value for name, (value, _, _) in found.values.items()}
     theta = np.array(list(values.values()))
-    current, rounds = solution, 0
+    current = solution
     in_images = np.array([change.disc for effect in held for change in effect.changes(view)])
-    for _ in range(ROUNDS if in_images.any() else 1):
-        rounds += 1
+    positive = np.array([parameter.positive for effect in held for parameter in effect.parameters])
+    units = [unit for _, _, unit in found.values.values()]
+    least = np.inf
+    best: Corrected | None = None
+    for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
         if in_images.any():
             current = invert(
                 corrected(transit, View(current), held, theta),
@@ -100,21 +107,26 @@ def add_to_model(
         sigma = np.array([s for _, s, _ in left.values.values()])
         # What was taken out of the images shows what is left of it, the rest shows all of it.
         steps = np.where(in_images, found_now, found_now - theta)
-        theta = theta + steps
+        theta = np.where(positive, np.maximum(theta + steps, 0.0), theta + steps)
+        left_over = float(left_chi2(again, left.step).sum())
+        if left_over > least + max(WORSE, WORSE_SHARE * found.gain):  # too strong for first-order steps
+            break
+        least = min(least, left_over)
+        best = Corrected(
+            effects=tuple(held),
+            solution=current,
+            evidence=evidence,
+            model=again,
+            values={
+                name: (float(value), float(s), unit)
+                for name, value, s, unit in zip(values, theta, sigma, units, strict=True)
+            },
+            rounds=rounds,
+        )
         if float(np.abs(steps / np.maximum(sigma, 1e-300)).max()) < SETTLED:
             break
-    units = [unit for _, _, unit in found.values.values()]
-    return Corrected(
-        effects=tuple(held),
-        solution=current,
-        evidence=evidence,
-        model=again,
-        values={
-            name: (float(value), float(s), unit)
-            for name, value, s, unit in zip(values, theta, sigma, units, strict=True)
-        },
-        rounds=rounds,
-    )
+    assert best is not None
+    return best
 
 
 def beyond(

@@ -16,7 +16,8 @@ Closing much of a gap identifies nothing, for a wrong effect does that too: wher
 where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better
 and explains more, or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
 the floor, where gap and effect may be LENIENT times likelier; where it flips, the answer holds both, or is inconclusive.
-So it is where the answer predicts images held out of its fit worse than nothing does. What was measured in the lit parts
+So it is where the answer predicts images held out of its fit worse than nothing does. An effect that in the model for
+real explains less than half of what it does to first order is no answer: the verdict is given without it. What was measured in the lit parts
 fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it, and where nothing else
 comes near it is the answer, however much it leaves. Of a pair, what would do in place of one is named too; where many would,
 the other alone.
@@ -61,7 +62,32 @@ TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
 LENIENT = 5.0  # times likelier: what shows a gap, and names its cause, may be so under the other floors
 BY_CHANCE = 0.01  # a probe's greater gain is less likely than this to come of its further numbers alone
+MOST_AMISS = 2  # answers that fail in the model for real, before nothing more is said
 LEAST_IMAGES = 6  # with fewer nothing can be held out, and that nothing shows says nothing
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """How much noise alone gains: a chi2 of this mean and half variance, the largest of so many trials."""
+
+    mean: float
+    half_variance: float
+    trials: float
+
+    def beside(self, first: Freedom) -> Freedom:
+        """What this has more than a first of which it is a part."""
+        return Freedom(
+            max(self.mean - first.mean, 1.0),
+            max(self.half_variance - first.half_variance, 1.0),
+            max(self.trials / first.trials, 1.0),
+        )
+
+    def p_value(self, gain: float) -> float:
+        """How often noise gains as much, by a chi2 whose degrees of freedom have the same mean and variance."""
+        if self.half_variance <= 0:
+            return 1.0
+        share = self.mean / self.half_variance
+        return min(1.0, self.trials * float(chdtrc(self.mean * share, max(gain, 0.0) * share)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +105,7 @@ class Tried:
     gain: float
     score: float
     p_value: float
+    freedom: Freedom
     step: Step
     left_p_value: float | None = None
     left_share: float | None = None
@@ -135,6 +162,23 @@ def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit)
     """
     once, further = _once(refit), _once(beyond)
     found = _judge(model, once, further)
+    amiss: list[Tried] = []
+    while (best := found.best) and found.answer and _fails_for_real(model, best, once):
+        if len(amiss) == MOST_AMISS or len(best.names) > 1:
+            return replace(found, verdict="inconclusive", tried=(*found.tried, *amiss))
+        # In the model for real it does not do what it does to first order: the answer is among the others.
+        amiss.append(best)
+        others = tuple(effect for effect in model.evidence.effects if effect.name != best.names[0])
+        model = replace(model, evidence=replace(model.evidence, effects=others))
+        found = _judge(model, once, further)
+    found = _confirmed(model, found, once, further)
+    if amiss and found.verdict == "none":
+        found = replace(found, verdict="inconclusive")
+    return replace(found, tried=(*found.tried, *amiss))
+
+
+def _confirmed(model: LinearModel, found: Judgement, once: Refit, further: Refit) -> Judgement:
+    """A verdict under the model's floor, as it stands on images held out and under other floors."""
     if found.answer and _worse_held_out(model, found, once):
         return replace(found, verdict="inconclusive")
     if found.verdict == "none" and len(model.evidence.discs) < LEAST_IMAGES:
@@ -152,6 +196,19 @@ def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit)
         return found
     certain = set.intersection(*(set(one.answer) - set(one.tied) for one in every))
     return replace(found, verdict="tie", answer=tuple(sorted(answers)), certain=tuple(sorted(certain)))
+
+
+def _fails_for_real(model: LinearModel, best: Tried, refit: Refit) -> bool:
+    """Whether of what an answer explains in the linear model, in the discs or the lit parts, a real refit explains less
+    than half."""
+    real = refit(best)
+    if real is None:
+        return False
+    nothing, linear = left_chi2(model, model.base), left_chi2(model, best.step)
+    real = replace(real, floor=model.floor)
+    added = left_chi2(real, real.fit(range(len(real.evidence.base), real.evidence.size)))
+    most = int(np.argmax(nothing - linear))
+    return bool(nothing[most] - added[most] < (nothing[most] - linear[most]) / 2)
 
 
 def _of_two(found: Judgement) -> bool:
@@ -344,24 +401,41 @@ def _is_enough(tried: Tried, rival_score: float) -> bool:
 
 
 def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, enough: bool) -> Tried | None:
-    """The pair of effects that explains most, if it is clearly better than one and leaves nothing.
-
-    Where one is enough, what another beside it explains has to be beyond a search for it, and beyond what the first's
-    own form may be wrong by.
-    """
-    effects = [effect for effect in model.evidence.effects if effect.named]
-    couples = [
-        pair
-        for pair in itertools.combinations(effects, 2)
-        if not enough or best.names[0] in (pair[0].name, pair[1].name)
-    ]
-    pairs = sorted((fitted(model, pair) for pair in couples), key=lambda t: -t.score)
-    clear = CLEAR + (2 * math.log(len(effects)) + TEMPLATE_ERROR**2 * best.gain if enough else 0.0)
-    if not pairs or pairs[0].score < best.score + clear:
+    """The pair of effects that explains most, if it is clearly better than one and leaves nothing."""
+    couples = itertools.combinations((effect for effect in model.evidence.effects if effect.named), 2)
+    if enough:
+        with_best = (two for two in couples if best.names[0] in (two[0].name, two[1].name))
+        pair = _second(model, best, [fitted(model, two) for two in with_best])
+    else:
+        pairs = (fitted(model, two) for two in couples)
+        pair = max(pairs, key=lambda t: t.score, default=None)
+        pair = None if pair is None or pair.score < best.score + CLEAR else pair
+    if pair is None:
         return None
-    pair = _with_left(model, pairs[0], before, refit)
+    pair = _with_left(model, pair, before, refit)
     # Two forms that are not quite right fit too much: of a pair nothing may be left.
     return pair if (pair.left_p_value or 0.0) >= ENOUGH else None
+
+
+def _second(model: LinearModel, best: Tried, pairs: Sequence[Tried]) -> Tried | None:
+    """Of pairs with an effect that is enough alone, the one that explains most more; none where what it does is within a
+    search for it, and what the first's own form may be wrong by: a share of what it explains in the discs, or in the lit
+    parts, wherever the second shows."""
+    alone, nothing = left_chi2(model, best.step), left_chi2(model, model.base)
+    clear: dict[float, Tried] = {}
+    for pair in pairs:
+        more = np.maximum(alone - left_chi2(model, pair.step), 0.0)
+        shares = more / max(float(more.sum()), 1e-9)
+        amiss = TEMPLATE_ERROR**2 * float(shares @ np.maximum(nothing - alone, 0.0))
+        by_chance = pair.freedom.beside(best.freedom).p_value(pair.gain - best.gain - amiss)
+        if by_chance * len(pairs) < CONFIDENT and len(pair.values) > len(best.values):
+            clear[pair.score - amiss] = pair
+    return clear[max(clear)] if clear else None
+
+
+def left_chi2(model: LinearModel, step: Step) -> Vector:
+    """What a step leaves in the discs and in the lit parts."""
+    return np.array([sum(float(left @ left) for left in model.left(step)), model.left_lit(step)])
 
 
 def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tried]]:
@@ -415,7 +489,9 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
     gain = model.gain(step)
     trials = math.prod(effect.trials for effect in effects)
     learned = model.learned(tuple(columns))
-    freedom = len(columns) - learned.size + model.evidence.numbers_of(tuple(columns))
+    free = len(columns) - learned.size + model.evidence.numbers_of(tuple(columns))
+    shares = learned / (1 + learned)
+    by_chance = Freedom(free + float(shares.sum()), free + float((shares**2).sum()), trials)
     sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
     values = {}
     for k, (effect, parameter) in enumerate(columns.values(), base):
@@ -426,18 +502,11 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
         named=all(effect.named for effect in effects),
         values=values,
         gain=gain,
-        score=gain - PENALTY * freedom - float(np.log1p(learned).sum()) - 2 * math.log(trials),
-        p_value=min(1.0, trials * _by_noise(gain, freedom, learned / (1 + learned))) if columns else 1.0,
+        score=gain - PENALTY * free - float(np.log1p(learned).sum()) - 2 * math.log(trials),
+        p_value=by_chance.p_value(gain) if columns else 1.0,
+        freedom=by_chance,
         step=step,
     )
-
-
-def _by_noise(gain: float, freedom: int, shares: Vector) -> float:
-    """How often noise gains as much by numbers that are free and by shares of some: a chi2 of the same mean and width."""
-    middle, half_spread = freedom + float(shares.sum()), freedom + float((shares**2).sum())
-    if half_spread <= 0:
-        return 1.0
-    return float(chdtrc(middle**2 / half_spread, gain * middle / half_spread))
 
 
 def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:

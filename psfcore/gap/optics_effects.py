@@ -146,7 +146,7 @@ def _field_dependent(view: View) -> Sequence[Change]:
     # The coordinate is a logit: a share of the amount of scatter is what people ask for.
     share = np.float32(1 - view.solution.inversion.values["total"])
     x, y = view.places
-    return [by_psf(view, slope, x / share), by_psf(view, slope, y / share)]
+    return [by_psf(view, slope, (where / share).astype(np.float32)) for where in (x, y, x * x + y * y)]
 
 
 def _core_blur(view: View) -> Sequence[Change]:
@@ -266,8 +266,9 @@ EFFECTS: tuple[Effect, ...] = (
            "Scatter reaches farther along one direction: ln(1 + stretch) times cos and sin of twice its angle.",
            "a transit of a second track across the first", ("azimuth_in_disc", "detector_x", "detector_y"),
            _anisotropic, not_a_power_law),
-    Effect("field_dependent_scatter", "optics", (_p("x", "/field", 0.1), _p("y", "/field", 0.1)),
-           "The amount of scatter changes across the detector.", "a transit of another part of the detector",
+    Effect("field_dependent_scatter", "optics",
+           (_p("x", "/field", 0.1), _p("y", "/field", 0.1), _p("outwards", "/field2", 0.2)),
+           "The amount of scatter changes across the detector, along it or from its middle outwards.", "a transit of another part of the detector",
            ("detector_x", "detector_y"), _field_dependent, not_a_power_law),
     Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "A second, wide component of scatter.",
            "an eclipse or a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,

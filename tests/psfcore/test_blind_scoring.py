@@ -126,6 +126,19 @@ def test_of_a_pair_only_what_shows_has_to_be_named() -> None:
     assert score([Judged(0, pair, said, 1.0)]).rows[2].value == 0.0
 
 
+def test_a_pair_shows_where_each_of_it_would_alone() -> None:
+    shown = MEASURED | {"refitted": {"residual_pct": {"0": 3.0, "1": 4.0}, "noise_pct": {"0": 0.5, "1": 0.5}}}
+    pair = truth("pair", "ghost", "scene_evolution", left=4.0, **shown)
+    strong, weak = pair["effects"]
+    strong["left_alone_chi2"], weak["left_alone_chi2"] = 90.0, 29.0
+    case = Judged(0, pair, report("attributed", "ghost"), 1.0)
+    assert score([case]).rows[4].cases == 0
+    weak["left_alone_chi2"] = 31.0
+    assert score([case]).rows[4].cases == 1
+    weak |= {"left_alone_chi2": 29.0, "left_alone_pct": 0.5}  # need not be named
+    assert score([case]).rows[4].cases == 1
+
+
 def test_every_figure_is_as_by_hand(judged: list[Judged]) -> None:
     rows = {row.figure: row for row in score(judged).rows}
     assert set(rows) == set(EXPECTED)

@@ -145,7 +145,7 @@ def test_a_ghost_is_in_the_kernel_where_it_was_found() -> None:
 
 
 def test_an_effect_that_differs_over_the_field_is_that_of_its_middle() -> None:
-    kernel = made(answered(effect("field_dependent_scatter"), values=(0.5, 0.5))).kernel
+    kernel = made(answered(effect("field_dependent_scatter"), values=(0.5, 0.5, 0.5))).kernel
     assert np.abs(kernel - fitted_kernel()).max() < 1e-3 * fitted_kernel().max()
 
 

@@ -18,19 +18,20 @@ from psfcore.gap.detector_effects import EFFECTS
 from psfcore.gap.effect import View
 from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.judge import (
+    Freedom,
     Judgement,
     Tried,
     _best_pair,
-    _by_noise,
     _explains_more,
     _few_numbers_do,
     _in_place_of_one,
     _left,
     _worse_held_out,
     fitted,
+    left_chi2,
     no_refit,
 )
-from psfcore.gap.linear_model import FLOOR, UNLIKELY, LinearModel, Step
+from psfcore.gap.linear_model import FLOOR, UNLIKELY, LinearModel, Step, Vector
 from psfcore.gap.search import PlaceSearch, displaced
 from psfcore.gap.where import _shapley
 from psfcore.scatter.inversion import Solution, invert
@@ -161,10 +162,12 @@ def test_a_field_s_gain_less_its_cost_is_how_much_likelier_it_makes_the_discs(so
     scores = rng.standard_normal((4000, free.shape[1])) @ seen
     gains = np.einsum("nk,kl,nl->n", scores, inverse, scores)
     shares = np.linalg.eigvalsh(seen.T @ seen)
+    shares /= 1 + shares
+    by_chance = Freedom(float(shares.sum()), float((shares**2).sum()), 1)
     for often in (0.5, 0.1, 0.02):
         at = float(np.quantile(gains, 1 - often))
-        assert _by_noise(at, 0, shares / (1 + shares)) == pytest.approx(often, rel=0.25)
-    assert _by_noise(9.0, 3, np.zeros(0)) == pytest.approx(0.0293, abs=1e-4)
+        assert by_chance.p_value(at) == pytest.approx(often, rel=0.25)
+    assert Freedom(3, 3, 1).p_value(9.0) == pytest.approx(0.0293, abs=1e-4)
 
 
 def with_residuals(evidence: Evidence, values: dict[str, float], noise: float = 0.0) -> LinearModel:
@@ -201,7 +204,7 @@ def test_what_was_taken_out_of_the_images_counts_against_the_prior_of_what_is_le
 
 
 def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_than_a_search_lets_it(
-    evidence: Evidence,
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def second(dark: float, smear: float) -> Tried | None:
         model = with_residuals(evidence, {"dark_offset": dark, "column_smear": smear}, noise=1.0)
@@ -216,8 +219,18 @@ def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_t
     found = second(10.0, 8.0 * sigma)
     assert found is not None and set(found.names) == {"dark_offset", "column_smear"}
     assert second(10.0, 1.0 * sigma) is None
-    # Of so large an offset the form's own error is larger than the smear.
+    # Of so large an offset the form's own error is larger than the smear,
     assert second(1000.0, 8.0 * sigma) is None
+    # and so it is of one that explains as much in the discs, but not of one that does in the lit parts: the smear shows
+    # in the discs.
+    for more, names in (((1e6, 0.0), None), ((0.0, 1e6), {"dark_offset", "column_smear"})):
+
+        def chi2_of(model: LinearModel, step: Step, more: tuple[float, float] = more) -> Vector:
+            return left_chi2(model, step) + (np.array(more) if step is model.base else 0.0)
+
+        monkeypatch.setattr(judging, "left_chi2", chi2_of)
+        found = second(10.0, 8.0 * sigma)
+        assert (None if found is None else set(found.names)) == names
 
 
 def test_what_would_do_in_place_of_one_of_a_pair_is_named_with_it(solution: Solution) -> None:
@@ -261,6 +274,39 @@ def test_what_another_floor_cannot_tell_from_one_of_a_pair_is_in_the_answer(
     found = judging.judge(model)
     assert found.verdict == "tie" and set(found.answer) == {"dark_offset", "column_smear", "persistence"}
     assert found.certain == ("dark_offset",) and set(found.tied) == {"column_smear", "persistence"}
+
+
+@pytest.mark.parametrize(("does", "answers"), [(True, True), (False, False)])
+def test_an_answer_that_does_not_do_it_in_the_model_for_real_is_none(
+    evidence: Evidence, does: bool, answers: bool
+) -> None:
+    model = with_residuals(evidence, {"dark_offset": 100.0})
+    first = len(evidence.base)
+
+    def refit(tried: Tried) -> LinearModel:
+        """About the fit with the effect: nothing is left, or all that was there."""
+        columns = evidence.columns[tried.names[0]]
+        discs = tuple(
+            replace(
+                disc,
+                residual=disc.residual * (0.0 if does else 1.0),
+                answers=disc.answers[[*evidence.base, *columns]]
+                * np.r_[np.ones(first), np.zeros(1)][:, None],
+            )
+            for disc in model.evidence.discs
+        )
+        lit = evidence.lit
+        lit = replace(lit, errors=lit.errors[[*evidence.base, *columns]])
+        effects = tuple(effect for effect in evidence.effects if effect.name == tried.names[0])
+        rest = replace(
+            model.evidence, discs=discs, lit=lit, effects=effects, columns={tried.names[0]: (first,)}
+        )
+        return replace(model, evidence=rest)
+
+    found = judging.judge(model, refit)
+    assert ("dark_offset" in found.answer) is answers
+    assert (found.tried[-1].names == ("dark_offset",)) is not answers
+    assert found.verdict != "none"
 
 
 def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:
@@ -389,7 +435,7 @@ def test_a_probe_counts_where_it_explains_more_and_not_where_it_has_fewer_number
     def tried(gain: float, numbers: int) -> Tried:
         step = Step((), np.zeros(0), np.zeros((0, 0)), gain)
         values = {str(k): (1.0, 1.0, "") for k in range(numbers)}
-        return Tried(("x",), True, values, gain, gain - 2 * numbers, 0.0, step)
+        return Tried(("x",), True, values, gain, gain - 2 * numbers, 0.0, Freedom(1, 1, 1), step)
 
     effect = tried(45.0, 3)
     assert not _explains_more(tried(45.5, 1), effect)
@@ -404,7 +450,7 @@ def test_a_probe_counts_where_it_explains_more_and_not_where_it_has_fewer_number
 def test_few_numbers_that_gain_nearly_as_much_go_before_what_was_measured_in_the_lit_parts() -> None:
     def tried(name: str, gain: float) -> Tried:
         step = Step((), np.zeros(0), np.zeros((0, 0)), gain)
-        return Tried((name,), True, {}, gain, gain, 0.0, step)
+        return Tried((name,), True, {}, gain, gain, 0.0, Freedom(1, 1, 1), step)
 
     measured, few, other = tried("measured", 1000.0), tried("few", 870.0), tried("other", 800.0)
     assert _few_numbers_do([measured, few, other], {"measured"})

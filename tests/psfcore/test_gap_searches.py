@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -10,10 +11,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import rotate
 
+from psfcore.gap import correction
 from psfcore.gap import judge as judging
 from psfcore.gap.cells import sensitivities
 from psfcore.gap.correction import add_to_model, beyond
-from psfcore.gap.effect import View
+from psfcore.gap.effect import Effect, View
 from psfcore.gap.evidence import gather
 from psfcore.gap.judge import fitted
 from psfcore.gap.library import LIBRARY
@@ -199,3 +201,47 @@ def test_beside_an_effect_that_explains_the_lit_parts_a_second_is_found_in_the_d
     assert second.answer == ("gain_mismatch", "intensity_gradient")
     nothing = judging._beside(model, best, judging.no_refit)
     assert nothing is None
+
+
+def test_a_round_that_leaves_more_than_the_one_before_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An offset of 1 DN; in the second round the images lose what was never there."""
+    offset = effect("dark_offset")
+    frames = tuple(
+        replace(frame, pixels=frame.pixels + np.float32(1.0 / frame.exposure_s)) for frame in clean().frames
+    )
+    found = invert(replace(clean(), frames=frames))
+    model = LinearModel(gather(found, [offset]), FLOOR)
+    taken_out: list[float] = []
+    corrected = correction.corrected
+
+    def spoiled(
+        transit: Transit, view: View, effects: Sequence[Effect], theta: NDArray[np.float64]
+    ) -> Transit:
+        taken_out.append(float(theta[0]))
+        again = corrected(transit, view, effects, theta)
+        if len(taken_out) == 1:
+            return again
+        light = np.linspace(0.0, 40.0, again.shape[1], dtype=np.float32)
+        return replace(again, frames=tuple(replace(f, pixels=f.pixels + light) for f in again.frames))
+
+    monkeypatch.setattr(correction, "corrected", spoiled)
+    monkeypatch.setattr(correction, "SETTLED", 0.0)
+    added = add_to_model(found, [offset], fitted(model, [offset]), model)
+    value, sigma, _ = added.values["offset"]
+    assert len(taken_out) == 2 and added.rounds == 1
+    assert value == pytest.approx(1.0, abs=4 * sigma)
+
+
+def test_a_share_of_light_is_never_less_than_none() -> None:
+    """Images that lost a share of their columns' light: by a smear that adds light nothing of it is explained."""
+    smear = effect("column_smear")
+    frames = tuple(
+        replace(frame, pixels=frame.pixels - np.float32(0.03) * frame.pixels.mean(axis=0))
+        for frame in clean().frames
+    )
+    found = invert(replace(clean(), frames=frames))
+    model = LinearModel(gather(found, [smear]), FLOOR)
+    below = fitted(model, [smear], any_sign=True)
+    assert all(value < 0 for value, _, _ in below.values.values())
+    values = add_to_model(found, [smear], below, model).values
+    assert [value for value, _, _ in values.values()] == [0.0, 0.0]
