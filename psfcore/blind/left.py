@@ -46,7 +46,10 @@ class _Discs:
 
 @dataclass(frozen=True)
 class Left:
-    """Percent, rms over images: what an effect leaves, and what the sampling leaves without one; and by image."""
+    """Percent, rms over images: what an effect leaves, and what the sampling leaves without one.
+
+    by_image_pct: what an effect leaves after the refit, signed, by image.
+    """
 
     before_refit_pct: float
     after_refit_pct: float

@@ -105,7 +105,8 @@ def _quick_left(effect: Effect, case: Case, sky: Sky, estimator: LinearEstimator
 
 
 def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
-    """What an effect leaves after a refit without the case's others: percent, and over the noise of the discs' means."""
+    """What an effect leaves after a refit without the case's others, to first order: percent, and chi2 of the discs' means,
+    the sum of its squares over their noise."""
     noise = left["refitted"]["noise_pct"]
     shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)
     return {"left_alone_pct": by_itself.after_refit_pct, "left_alone_chi2": float(shown)}

@@ -2,7 +2,8 @@
 
 Images minus the effect's change, worked out from the scene and the PSF as they are; a new fit; the change worked out
 again from that, and what is left of the effect fitted beside the PSF. Two or three rounds settle it, as a Gauss-Newton
-step does, and what was a first-order change is one no more.
+step does, and what was a first-order change is one no more. A round that leaves clearly more than one before is not
+taken.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.errors import DataError
 from psfcore.gap.effect import Effect, View
 from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.judge import Tried, fitted, label_of, left_chi2
@@ -24,10 +26,8 @@ Vector = NDArray[np.float64]
 
 ROUNDS = 3
 SETTLED = 0.3  # of a parameter's error
-WORSE, WORSE_SHARE = (
-    9.0,
-    0.05,
-)  # of chi2, and of the effect's gain: what a round may leave more than the best did
+WORSE = 9.0  # of chi2: what a round may leave more than the best did
+WORSE_SHARE = 0.05  # and of the effect's gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,58 +75,106 @@ def add_to_model(
     *,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Corrected:
-    """Fit PSF and effects together, starting from the linear fit `found`. Raises what `invert` raises."""
+    """Fit PSF and effects together, starting from the linear fit `found`.
+
+    Raises what `invert` raises, and DataError "effect-unseen" where none of an effect is left.
+    """
     transit = solution.transit
     # A form with a place of its own keeps the place that was found: it is looked for once.
     view = View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
-    values = {name: value for name, (value, _, _) in found.values.items()}
-    theta = np.array(list(values.values()))
+    numbers = {name: value for name, (value, _, _) in found.values.items()}
+    units = {name: unit for name, (_, _, unit) in found.values.items()}
     current = solution
-    in_images = np.array([change.disc for effect in held for change in effect.changes(view)])
-    positive = np.array([parameter.positive for effect in held for parameter in effect.parameters])
-    units = [unit for _, _, unit in found.values.values()]
+    in_images = _in_images(held, view)
     least = np.inf
-    best: Corrected | None = None
+    taken: Corrected | None = None
     for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
-        if in_images.any():
-            current = invert(
-                corrected(transit, View(current), held, theta),
-                solution.inversion.shape,
-                start=current.inversion.coordinates,
-                threads=solution.threads,
-                progress=progress,
-            )
-        evidence = _with_noise_of(model.evidence, gather(current, held, progress=progress))
+        names, theta = list(numbers), np.array(list(numbers.values()))
+        try:
+            if in_images.any():
+                current = invert(
+                    corrected(transit, View(current), held, theta),
+                    solution.inversion.shape,
+                    start=current.inversion.coordinates,
+                    threads=solution.threads,
+                    progress=progress,
+                )
+            evidence = _with_noise_of(model.evidence, gather(current, held, progress=progress))
+        except DataError:
+            if taken is None:
+                raise
+            break  # no fit after a step that was too long
         again = replace(model, evidence=evidence)
         left = fitted(again, evidence.effects, any_sign=True)
         found_now = np.array([value for value, _, _ in left.values.values()])
+        if found_now.size != theta.size:
+            raise DataError(
+                "effect-unseen",
+                f"expected the images to show {label_of([e.name for e in held])} once it is taken out; they show "
+                f"{found_now.size} of {theta.size} parameters",
+            )
         base = len(evidence.base)
         out_already = np.concatenate([np.zeros(base), np.where(in_images, theta, 0.0)])
         found_now -= again.pull_of_prior(left.step, out_already)[base:]
         sigma = np.array([s for _, s, _ in left.values.values()])
         # What was taken out of the images shows what is left of it, the rest shows all of it.
         steps = np.where(in_images, found_now, found_now - theta)
-        theta = np.where(positive, np.maximum(theta + steps, 0.0), theta + steps)
+        theta = theta + steps
+        # Where light can be added alone, what would take it away does not act.
+        acts = ~(_positive(held) & (theta <= 0))
+        if not acts.all() and rounds < ROUNDS:
+            held = _those_that_act(held, acts)
+            numbers = {name: float(value) for name, value, a in zip(names, theta, acts, strict=True) if a}
+            in_images = in_images[acts]
+            taken, least = None, np.inf
+            continue
         left_over = float(left_chi2(again, left.step).sum())
         if left_over > least + max(WORSE, WORSE_SHARE * found.gain):  # too strong for first-order steps
             break
         least = min(least, left_over)
-        best = Corrected(
+        numbers = {name: float(value) for name, value in zip(names, theta, strict=True)}
+        taken = Corrected(
             effects=tuple(held),
             solution=current,
             evidence=evidence,
             model=again,
             values={
-                name: (float(value), float(s), unit)
-                for name, value, s, unit in zip(values, theta, sigma, units, strict=True)
+                name: (numbers[name], float(s), units[name]) for name, s in zip(names, sigma, strict=True)
             },
             rounds=rounds,
         )
         if float(np.abs(steps / np.maximum(sigma, 1e-300)).max()) < SETTLED:
             break
-    assert best is not None
-    return best
+    assert taken is not None
+    return taken
+
+
+def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:
+    """Which of some effects' changes the discs answer to."""
+    return np.array([change.disc for effect in effects for change in effect.changes(view)], dtype=np.bool_)
+
+
+def _positive(effects: Sequence[Effect]) -> NDArray[np.bool_]:
+    return np.array(
+        [parameter.positive for effect in effects for parameter in effect.parameters], dtype=np.bool_
+    )
+
+
+def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[Effect]:
+    """Effects with those of their parameters alone that act, in a row. Raises DataError "effect-unseen" where none does."""
+    out, first = [], 0
+    for effect in effects:
+        count = len(effect.parameters)
+        part = [k for k in range(count) if acts[first + k]]
+        first += count
+        if not part:
+            raise DataError(
+                "effect-unseen",
+                f"expected {effect.name} to add light beside the fitted PSF; it would take it away",
+            )
+        out.append(_with_part(effect, part))
+    return out
 
 
 def beyond(
@@ -168,8 +216,11 @@ def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
 def _acting(effect: Effect, found: Tried, effects: int) -> Effect:
     """The effect with those of its parameters alone that take part in a fit."""
     labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
-    part = [k for k, label in enumerate(labels) if label in found.values]
-    if len(part) == len(labels):
+    return _with_part(effect, [k for k, label in enumerate(labels) if label in found.values])
+
+
+def _with_part(effect: Effect, part: Sequence[int]) -> Effect:
+    if len(part) == len(effect.parameters):
         return effect
     return replace(
         effect,

@@ -141,7 +141,7 @@ def diagnose_solution(
     found = judge(model, refits.model, refits.beyond) if refit else judge(model)
     fits = refits.of(found) if refit else ()
     rng = np.random.default_rng(seed)
-    shrinking, before, after = _shrinking(model, found, fits, rng)
+    shrinking, before, after = _shrinking(model, found, refits.made, rng)
     favoured = [axis for effect in evidence.effects if effect.name in _likely(found) for axis in effect.axes]
     nothing = Interval(0.0, 0.0, 0.0)
     rms = gap(before, rng) if before is not None else nothing
@@ -163,7 +163,7 @@ def diagnose_solution(
         corrected=fits,
         residual=before,
         residual_after=after if gone else None,
-        cautions=(*_cautions(solution, noise, evidence), *refits.failures),
+        cautions=(*_cautions(solution, noise, evidence), *refits.failures, *_amiss(found)),
     )
 
 
@@ -181,7 +181,7 @@ def _shrinking(
     """
     schemes = (time_blocks(model), pointings(model))
     before = [hold_out(model, (), scheme) for scheme in schemes]
-    real = {fit.label: fit.model for fit in fits}
+    real = {fit.label: fit.model for fit in fits}  # whatever became of them
     out: dict[str, Shrinking] = {}
     best: HeldOut | None = None
     base = len(model.evidence.base)
@@ -240,6 +240,11 @@ class _Refits:
 
         return beyond(made, self._model.evidence.effects, self._model, progress=say)
 
+    @property
+    def made(self) -> tuple[Corrected, ...]:
+        """All that there are."""
+        return tuple(fit for fit in self._made.values() if fit is not None)
+
     def of(self, found: Judgement) -> tuple[Corrected, ...]:
         """Of the answer; with a tie, of each of its effects, or of each with the one that is certain, the best first."""
         if found.verdict not in ("attributed", "tie") or found.best is None:
@@ -290,6 +295,14 @@ def _before_refit(model: LinearModel, found: Judgement, rng: np.random.Generator
 
 def _noise_pct(evidence: Evidence) -> float:
     return float(np.sqrt(np.mean([(100 * d.mean_noise / d.level) ** 2 for d in evidence.discs])))
+
+
+def _amiss(found: Judgement) -> tuple[str, ...]:
+    return tuple(
+        f"{label.replace('_', ' ')} explains much of the gap to first order and less than half of that in the model for "
+        "real: it is no answer, whatever its score."
+        for label in found.amiss
+    )
 
 
 def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidence) -> tuple[str, ...]:

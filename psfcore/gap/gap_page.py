@@ -282,7 +282,7 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
 def _effects_figure(report: Report) -> Figure:
     return Figure(
         effects_png(report),
-        f"Effects of the library, best first (at most {MOST_EFFECTS}): the share of the gap that each closes on images held out, with its "
+        f"Effects of the library, best first (at most {MOST_EFFECTS}), what fails in the model for real last: the share of the gap that each closes on images held out, with its "
         "90 % interval; bars and intervals that leave the chart are cut, with an arrow. Blue: the answer, or what is tied. A wrong effect may close much of a gap too, so that the score decides: by how much chi2 falls, "
         f"less what its parameters and a search for its place gain from noise; what lies within {TIE:g} of the best is tied with it.",
         "Bars of held-out closure by effect",

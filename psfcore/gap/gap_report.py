@@ -248,7 +248,8 @@ def in_short_if_many(values: Sequence[float]) -> str | None:
 
 def _excluded(found: Diagnosis, best: Tried) -> str:
     """The next best effect, and by how many sigmas it is worse."""
-    others = [t for t in found.judgement.tried if not set(t.names) & set(best.names)]
+    gone = found.judgement.amiss  # said among the cautions
+    others = [t for t in found.judgement.tried if not set(t.names) & set(best.names) and t.label not in gone]
     if not others:
         return ""
     next_best = max(others, key=lambda t: t.score)

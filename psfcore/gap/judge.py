@@ -17,7 +17,8 @@ where a probe, a form of unknown cause, does clearly better, the verdict is unkn
 and explains more, or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
 the floor, where gap and effect may be LENIENT times likelier; where it flips, the answer holds both, or is inconclusive.
 So it is where the answer predicts images held out of its fit worse than nothing does. An effect that in the model for
-real explains less than half of what it does to first order is no answer: the verdict is given without it. What was measured in the lit parts
+real explains less than half of what it does to first order is no answer: the verdict is given without it, and where a
+pair does, it is inconclusive. What was measured in the lit parts
 fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it, and where nothing else
 comes near it is the answer, however much it leaves. Of a pair, what would do in place of one is named too; where many would,
 the other alone.
@@ -27,7 +28,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -57,12 +58,14 @@ NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits
 UNRIVALLED = 0.1  # of the best score: below it no rival comes near
 MANY_PLACES = 100
 MOST_SECONDS = 2  # that may act beside an effect that explains most: of more none is named
-CLEAR = 12.0  # by which a pair must beat a single effect, and a probe all effects
+CLEAR = 12.0  # by which a pair must beat a single effect that is not enough, and a probe all effects
 TEMPLATE_ERROR = 0.05
 LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
 LENIENT = 5.0  # times likelier: what shows a gap, and names its cause, may be so under the other floors
 BY_CHANCE = 0.01  # a probe's greater gain is less likely than this to come of its further numbers alone
-MOST_AMISS = 2  # answers that fail in the model for real, before nothing more is said
+MOST_AMISS = (
+    2  # answers that may fail in the model for real before no more is said, and so many of a tie are asked
+)
 LEAST_IMAGES = 6  # with fewer nothing can be held out, and that nothing shows says nothing
 
 
@@ -75,7 +78,7 @@ class Freedom:
     trials: float
 
     def beside(self, first: Freedom) -> Freedom:
-        """What this has more than a first of which it is a part."""
+        """What this has more than a first that is a part of it."""
         return Freedom(
             max(self.mean - first.mean, 1.0),
             max(self.half_variance - first.half_variance, 1.0),
@@ -124,7 +127,8 @@ def label_of(names: Sequence[str]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """A verdict under one floor. tried: named effects, best first, the answer's pairs before them. probes: best first.
+    """A verdict under one floor. tried: named effects, best first, the answer's pairs before them and what failed in the
+    model for real behind, whose labels amiss holds. probes: best first.
 
     certain: of a tie the effect that acts whichever of the others does beside it; none where one of them does alone.
     """
@@ -136,6 +140,7 @@ class Judgement:
     probes: tuple[Tried, ...]
     best: Tried | None
     certain: tuple[str, ...] = ()
+    amiss: tuple[str, ...] = ()
 
     @property
     def tied(self) -> tuple[str, ...]:
@@ -161,20 +166,42 @@ def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit)
     the rest of the library beside it. Each is asked at most once for the same.
     """
     once, further = _once(refit), _once(beyond)
-    found = _judge(model, once, further)
+    found = first = _judge(model, once, further)
     amiss: list[Tried] = []
-    while (best := found.best) and found.answer and _fails_for_real(model, best, once):
+    while (
+        refit is not no_refit and found.answer and (best := found.best) and _fails_for_real(model, best, once)
+    ):
         if len(amiss) == MOST_AMISS or len(best.names) > 1:
-            return replace(found, verdict="inconclusive", tried=(*found.tried, *amiss))
-        # In the model for real it does not do what it does to first order: the answer is among the others.
+            found = replace(found, verdict="inconclusive", answer=(), certain=())
+            return replace(found, amiss=(*_labels(amiss), best.label), tried=(*found.tried, *amiss))
+        # What it does to first order it does not do in the model for real: the others are asked.
         amiss.append(best)
-        others = tuple(effect for effect in model.evidence.effects if effect.name != best.names[0])
+        gone = {name for tried in amiss for name in tried.names}
+        others = tuple(effect for effect in model.evidence.effects if effect.name not in gone)
         model = replace(model, evidence=replace(model.evidence, effects=others))
-        found = _judge(model, once, further)
+        found = replace(_judge(model, once, further), p_value=first.p_value)
     found = _confirmed(model, found, once, further)
     if amiss and found.verdict == "none":
         found = replace(found, verdict="inconclusive")
-    return replace(found, tried=(*found.tried, *amiss))
+    if refit is not no_refit and found.verdict == "tie" and not found.certain:
+        found, fallen = _without_those_that_fail(model, found, once)
+        amiss += fallen
+    rest = (tried for tried in found.tried if tried not in amiss)
+    return replace(found, amiss=_labels(amiss), tried=(*rest, *amiss))
+
+
+def _labels(tried: Sequence[Tried]) -> tuple[str, ...]:
+    return tuple(one.label for one in tried)
+
+
+def _without_those_that_fail(
+    model: LinearModel, found: Judgement, refit: Refit
+) -> tuple[Judgement, list[Tried]]:
+    """A tie without those of its single effects that fail in the model for real, and these; of MOST_AMISS it is asked."""
+    alone = [t for t in found.tried if t is not found.best and len(t.names) == 1 and t.label in found.answer]
+    fallen = [tried for tried in alone[:MOST_AMISS] if _fails_for_real(model, tried, refit)]
+    answer = tuple(name for name in found.answer if name not in _labels(fallen))
+    return replace(found, verdict="tie" if len(answer) > 1 else "attributed", answer=answer), fallen
 
 
 def _confirmed(model: LinearModel, found: Judgement, once: Refit, further: Refit) -> Judgement:
@@ -198,17 +225,20 @@ def _confirmed(model: LinearModel, found: Judgement, once: Refit, further: Refit
     return replace(found, verdict="tie", answer=tuple(sorted(answers)), certain=tuple(sorted(certain)))
 
 
-def _fails_for_real(model: LinearModel, best: Tried, refit: Refit) -> bool:
-    """Whether of what an answer explains in the linear model, in the discs or the lit parts, a real refit explains less
-    than half."""
-    real = refit(best)
+def _fails_for_real(model: LinearModel, tried: Tried, refit: Refit) -> bool:
+    """Whether of what an effect explains in the linear model, wherever that is most, a real refit explains less than half,
+    or cannot be made."""
+    real = refit(tried)
     if real is None:
-        return False
-    nothing, linear = left_chi2(model, model.base), left_chi2(model, best.step)
+        return True
+    # A refit finds the discs anew and may lose one.
+    both = set(model.evidence.images) & set(real.evidence.images)
     real = replace(real, floor=model.floor)
-    added = left_chi2(real, real.fit(range(len(real.evidence.base), real.evidence.size)))
+    nothing, linear = (left_chi2(model, step, both) for step in (model.base, tried.step))
+    added = left_chi2(real, real.fit(range(len(real.evidence.base), real.evidence.size)), both)
     most = int(np.argmax(nothing - linear))
-    return bool(nothing[most] - added[most] < (nothing[most] - linear[most]) / 2)
+    explained = float(nothing[most] - linear[most])
+    return explained > 0 and float(nothing[most] - added[most]) < explained / 2
 
 
 def _of_two(found: Judgement) -> bool:
@@ -278,7 +308,8 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
     winner = pair or best
     if (not enough and pair is None) or best.p_value * len(named) > lenient * ALARM:
         return Judgement("unknown", (), p_gap, tuple(named), probes, best)
-    if probes and probes[0].score > winner.score + (CLEAR if pair is None else -CLEAR):
+    to_beat = winner.score - CLEAR if not enough else max(winner.score - CLEAR, best.score + CLEAR)
+    if probes and probes[0].score > to_beat:
         return Judgement("unknown", (), p_gap, tuple(named), probes, winner)
     if pair is None and (
         best.p_value * len(named) > lenient * CONFIDENT or (probes and _explains_more(probes[0], best))
@@ -354,6 +385,9 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
     rest = beyond(best)
     if rest is None:
         return None
+    effects = {effect.name: effect for effect in model.evidence.effects}
+    still = tuple(effect for effect in rest.evidence.effects if effect.name in effects)
+    rest = replace(rest, evidence=replace(rest.evidence, effects=still))
     lit = rest.evidence.steady_lit
     rest = replace(rest, floor=model.floor)
     # Of so much as the first explained in the lit parts a little is left, its form being not quite the sky's: no form
@@ -367,9 +401,11 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
         return None
     if len(second.answer) > MOST_SECONDS and best.explains:
         return Judgement("attributed", best.names, second.p_value, (), (), best)
-    effects = {effect.name: effect for effect in model.evidence.effects}
     beside = (*second.best.names, *(name for name in second.answer if name not in second.best.names))
-    pair, *others = (fitted(model, [effects[name] for name in (*best.names, one)]) for one in beside)
+    pairs = [fitted(model, [effects[name] for name in (*best.names, one)]) for one in beside]
+    if not all(_takes_part(one, pair) for one, pair in zip(beside, pairs, strict=True)):
+        return None
+    pair, *others = pairs
     pair = replace(pair, left_p_value=second.best.left_p_value, left_share=second.best.left_share)
     answer = tuple(sorted({*best.names, *second.answer}))
     certain = best.names if second.verdict == "tie" else ()
@@ -418,24 +454,29 @@ def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, 
 
 
 def _second(model: LinearModel, best: Tried, pairs: Sequence[Tried]) -> Tried | None:
-    """Of pairs with an effect that is enough alone, the one that explains most more; none where what it does is within a
-    search for it, and what the first's own form may be wrong by: a share of what it explains in the discs, or in the lit
-    parts, wherever the second shows."""
+    """Of pairs with an effect that is enough alone, the one that explains most more; none where that is within what a
+    search finds in noise, or within what the first's own form may be wrong by: a share of what it explains in the discs,
+    and one of what it explains in the lit parts."""
     alone, nothing = left_chi2(model, best.step), left_chi2(model, model.base)
-    clear: dict[float, Tried] = {}
+    amiss = TEMPLATE_ERROR**2 * np.maximum(nothing - alone, 0.0)
+    found: Tried | None = None
+    most = 0.0
     for pair in pairs:
-        more = np.maximum(alone - left_chi2(model, pair.step), 0.0)
-        shares = more / max(float(more.sum()), 1e-9)
-        amiss = TEMPLATE_ERROR**2 * float(shares @ np.maximum(nothing - alone, 0.0))
-        by_chance = pair.freedom.beside(best.freedom).p_value(pair.gain - best.gain - amiss)
-        if by_chance * len(pairs) < CONFIDENT and len(pair.values) > len(best.values):
-            clear[pair.score - amiss] = pair
-    return clear[max(clear)] if clear else None
+        second = next(name for name in pair.names if name not in best.names)
+        beyond = float(np.maximum(alone - left_chi2(model, pair.step) - amiss, 0.0).sum())
+        gain = min(pair.gain - best.gain, beyond)
+        by_chance = pair.freedom.beside(best.freedom).p_value(gain) * len(pairs)
+        lead = gain - (pair.gain - pair.score) + (best.gain - best.score)
+        if by_chance < CONFIDENT and lead > max(TIE, most) and _takes_part(second, pair):
+            found, most = pair, lead
+    return found
 
 
-def left_chi2(model: LinearModel, step: Step) -> Vector:
-    """What a step leaves in the discs and in the lit parts."""
-    return np.array([sum(float(left @ left) for left in model.left(step)), model.left_lit(step)])
+def left_chi2(model: LinearModel, step: Step, images: Collection[int] | None = None) -> Vector:
+    """What a step leaves in the discs, of some images (none: all), and in the lit parts."""
+    discs = zip(model.evidence.images, model.left(step), strict=True)
+    left = sum(float(one @ one) for n, one in discs if images is None or n in images)
+    return np.array([left, model.left_lit(step)])
 
 
 def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tried]]:
@@ -451,10 +492,14 @@ def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tri
             alike = max(alike, (1 - NEAR_BEHIND) * adds)
         for name in (name for name in effects if name not in pair.names):
             other = fitted(model, (effects[stays], effects[name]))
-            takes_part = any(key.startswith(f"{name}.") for key in other.values)
-            if takes_part and pair.score - other.score < min(alike, adds):
+            if _takes_part(name, other) and pair.score - other.score < min(alike, adds):
                 found[goes][name] = other
     return found
+
+
+def _takes_part(name: str, pair: Tried) -> bool:
+    """Whether any of an effect's numbers is left in a pair."""
+    return any(key.startswith(f"{name}.") for key in pair.values)
 
 
 def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> Tried:
@@ -503,7 +548,7 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
         values=values,
         gain=gain,
         score=gain - PENALTY * free - float(np.log1p(learned).sum()) - 2 * math.log(trials),
-        p_value=by_chance.p_value(gain) if columns else 1.0,
+        p_value=by_chance.p_value(gain),
         freedom=by_chance,
         step=step,
     )

@@ -276,37 +276,67 @@ def test_what_another_floor_cannot_tell_from_one_of_a_pair_is_in_the_answer(
     assert found.certain == ("dark_offset",) and set(found.tied) == {"column_smear", "persistence"}
 
 
-@pytest.mark.parametrize(("does", "answers"), [(True, True), (False, False)])
-def test_an_answer_that_does_not_do_it_in_the_model_for_real_is_none(
-    evidence: Evidence, does: bool, answers: bool
-) -> None:
+@pytest.mark.parametrize("does", [True, False])
+def test_an_answer_that_does_not_do_it_in_the_model_for_real_is_none(evidence: Evidence, does: bool) -> None:
     model = with_residuals(evidence, {"dark_offset": 100.0})
     first = len(evidence.base)
 
     def refit(tried: Tried) -> LinearModel:
         """About the fit with the effect: nothing is left, or all that was there."""
-        columns = evidence.columns[tried.names[0]]
+        here = [*evidence.base, *evidence.columns[tried.names[0]]]
         discs = tuple(
             replace(
                 disc,
                 residual=disc.residual * (0.0 if does else 1.0),
-                answers=disc.answers[[*evidence.base, *columns]]
-                * np.r_[np.ones(first), np.zeros(1)][:, None],
+                answers=disc.answers[here] * (np.arange(len(here)) < first)[:, None],
             )
             for disc in model.evidence.discs
         )
-        lit = evidence.lit
-        lit = replace(lit, errors=lit.errors[[*evidence.base, *columns]])
+        lit = replace(model.evidence.lit, errors=model.evidence.lit.errors[here])
         effects = tuple(effect for effect in evidence.effects if effect.name == tried.names[0])
-        rest = replace(
-            model.evidence, discs=discs, lit=lit, effects=effects, columns={tried.names[0]: (first,)}
+        columns = {tried.names[0]: tuple(range(first, len(here)))}
+        return replace(
+            model, evidence=replace(model.evidence, discs=discs, lit=lit, effects=effects, columns=columns)
         )
-        return replace(model, evidence=rest)
 
     found = judging.judge(model, refit)
-    assert ("dark_offset" in found.answer) is answers
-    assert (found.tried[-1].names == ("dark_offset",)) is not answers
-    assert found.verdict != "none"
+    assert ("dark_offset" in found.answer) is does
+    assert found.amiss[:1] == (() if does else ("dark_offset",))
+    assert does or "dark_offset" in [tried.label for tried in found.tried][-len(found.amiss) :]
+    # What shows a gap shows it still.
+    assert found.p_value < 1e-6
+
+
+def test_an_answer_that_cannot_be_added_to_the_model_is_none(evidence: Evidence) -> None:
+    model = with_residuals(evidence, {"dark_offset": 100.0})
+    found = judging.judge(model, lambda tried: None)
+    assert found.verdict in ("unknown", "inconclusive") and found.amiss[0] == "dark_offset"
+    assert judging.judge(model).answer == ("dark_offset",)
+
+
+def test_of_a_tie_what_fails_in_the_model_for_real_is_left_out(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = with_residuals(evidence, {"dark_offset": 100.0})
+    best, other = (fitted(model, [effect]) for effect in evidence.effects)
+    tie = Judgement("tie", ("column_smear", "dark_offset"), 0.0, (best, other), (), best)
+    monkeypatch.setattr(judging, "_fails_for_real", lambda model, tried, refit: tried is other)
+    found, fallen = judging._without_those_that_fail(model, tie, lambda tried: None)
+    assert (found.verdict, found.answer, fallen) == ("attributed", best.names, [other])
+
+
+def test_beside_an_effect_nothing_is_named_that_was_set_aside(evidence: Evidence) -> None:
+    """The model with the first in it knows of all effects, the one that is judged no longer of the smear."""
+    whole = with_residuals(evidence, {"dark_offset": 10.0, "column_smear": 0.3})
+    offset, smear = evidence.effects
+    first = fitted(whole, [offset])
+    base = (*evidence.base, *evidence.columns["dark_offset"])
+    rest = replace(whole, evidence=replace(whole.evidence, base=base, effects=(smear,)))
+    known = judging._beside(whole, first, lambda tried: rest)
+    assert known is not None and known.answer == ("column_smear", "dark_offset")
+    alone = replace(whole, evidence=replace(whole.evidence, effects=(offset,)))
+    found = judging._beside(alone, first, lambda tried: rest)
+    assert found is None or found.answer in ((), ("dark_offset",))
 
 
 def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:

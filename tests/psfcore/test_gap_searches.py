@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import rotate
 
+from psfcore.errors import DataError
 from psfcore.gap import correction
 from psfcore.gap import judge as judging
 from psfcore.gap.cells import sensitivities
@@ -243,5 +244,6 @@ def test_a_share_of_light_is_never_less_than_none() -> None:
     model = LinearModel(gather(found, [smear]), FLOOR)
     below = fitted(model, [smear], any_sign=True)
     assert all(value < 0 for value, _, _ in below.values.values())
-    values = add_to_model(found, [smear], below, model).values
-    assert [value for value, _, _ in values.values()] == [0.0, 0.0]
+    with pytest.raises(DataError, match="expected column_smear to add light") as caught:
+        add_to_model(found, [smear], below, model)
+    assert caught.value.code == "effect-unseen"
