@@ -134,7 +134,8 @@ def _lines(report: dict[str, Any]) -> list[str]:
     """What is said of a report on a terminal."""
     answer = f" ({', '.join(report['answer'])})" if report["answer"] else ""
     out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
-    for effect in report["effects"][:SHOWN]:
+    together = report.get("together", ())  # reports of earlier versions have none
+    for effect in [*together, *report["effects"]][:SHOWN]:
         closure = effect["closure"]
         closed = "" if closure is None else f", held-out closure {100 * closure['value']:.0f} %"
         numbers = ", ".join(

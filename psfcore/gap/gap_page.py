@@ -22,7 +22,7 @@ from psfcore.gap.gap_plot import (
     slices_png,
     where_png,
 )
-from psfcore.gap.gap_report import AXIS_WORDS, in_short_if_many, tied_words, words
+from psfcore.gap.gap_report import AXIS_WORDS, fits_of, in_short_if_many, tied_words, words
 from psfcore.gap.judge import ALARM, ENOUGH, TIE
 from psfcore.gap.linear_model import FLOOR
 from psfcore.gap.where import DRAWS
@@ -292,8 +292,8 @@ def _effects_figure(report: Report) -> Figure:
 def _effects_table(report: Report) -> Table:
     return Table(
         ["effect", "parameters", "score", "delta chi2, held out", "closure (%)", "90 % interval", "p-value"],
-        [_effect_row(effect) for effect in report["effects"]],
-        "Every effect that was tried, fitted beside the PSF. Errors are one standard deviation. Of the answer the parameters are those of "
+        [_effect_row(effect) for effect in fits_of(report)],
+        "Every effect that was tried, fitted beside the PSF: those that act together first, then each alone. Errors are one standard deviation. Of the answer the parameters are those of "
         "the real refit. Delta chi2: by how much likelier it makes images held out (-2 ln), its parameters' errors counted.",
     )
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from psfcore.gap.cells import RINGS, DiscCells
 from psfcore.gap.diagnose import Diagnosis
+from psfcore.gap.gap_report import fits_of
 from psfcore.page import PLOT_DPI
 from psfcore.plots import CHANGE, INK
 from psfcore.transit.evaluation_plot import tidy
@@ -234,14 +235,14 @@ def p_words(p_value: float) -> str:
 
 def effects_png(report: Report) -> bytes:
     """How far each effect closes the gap on images held out, best first."""
-    figure = _figure(WIDTH_IN, 1.1 + 0.34 * min(len(report["effects"]), MOST_EFFECTS))
+    figure = _figure(WIDTH_IN, 1.1 + 0.34 * min(len(fits_of(report)), MOST_EFFECTS))
     draw_effects(figure.subplots(), report)
     return _png(figure)
 
 
 def draw_effects(axes: Any, report: Report) -> None:
     """Closure with its 90 % interval; the answer, or what is tied, stands out; scores beside."""
-    rows = report["effects"][:MOST_EFFECTS]
+    rows = fits_of(report)[:MOST_EFFECTS]
     at = np.arange(len(rows))[::-1]
     names = []
     for y, row in zip(at, rows, strict=True):

@@ -37,7 +37,8 @@ AXIS_WORDS = {
 def gap_report(found: Diagnosis) -> dict[str, Any]:
     """The report of a diagnosis, schema gap/1."""
     judged = found.judgement
-    refits = {" + ".join(e.name for e in c.effects): c for c in found.corrected}
+    refits = {c.label: c for c in found.corrected}
+    fits = [(tried, _effect(found, tried, refits.get(tried.label))) for tried in judged.tried]
     return {
         "schema": SCHEMA,
         "sentence": sentence(found),
@@ -51,7 +52,12 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "where": [axis.to_json() for axis in found.where],
         "verdict": judged.verdict,
         "answer": list(judged.answer),
-        "effects": [_effect(found, tried, refits.get(tried.label)) for tried in judged.tried],
+        # Effects of an answer that act together may each do little alone: they go before what does more.
+        "effects": sorted(
+            (fit for tried, fit in fits if len(tried.names) == 1),
+            key=lambda fit: fit["name"] not in judged.answer,
+        ),
+        "together": [fit for tried, fit in fits if len(tried.names) > 1],
         "ties": [list(judged.tied)] if judged.verdict == "tie" else [],
         "would_separate": would_separate(found),
         "untestable": [
@@ -82,6 +88,11 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "images": _images(found),
         "inputs_sha256": found.solution.transit.sha256,
     }
+
+
+def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """A report's fits of effects together, if there are any, and then of each alone: as they are shown."""
+    return [*report["together"], *report["effects"]]
 
 
 def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, Any]:

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from psfcore.gap import gap_plot
-from psfcore.gap.diagnose import Diagnosis
+from psfcore.gap.diagnose import Diagnosis, Shrinking
 from psfcore.gap.gap_page import gap_page, interval_words, unit_words
 from psfcore.gap.gap_plot import cell_means, draw_cells, draw_effects, draw_map, gap_png, simulated_of
 from psfcore.gap.gap_report import gap_report
+from psfcore.gap.judge import fitted
 from psfcore.page import with_error
 from tests.html_page import Tag, check_stands_alone, read_page
 from tests.psfcore.small_gaps import OFFSET_DN, found
@@ -164,6 +165,27 @@ def test_a_tie_beside_an_effect_that_is_certain_says_which_is_which(coarse: None
         for name in ("dark_offset", "core_blur", "core_blur + dark_offset", "persistence + dark_offset")
     ]
     assert [gap_plot._chosen(row, report) for row in rows] == [False, False, True, False]
+
+
+def test_effects_that_act_together_stand_before_those_that_alone_do_more(coarse: None) -> None:
+    judgement = found().judgement
+    alone = [one for one in judgement.tried if one.label != "dark_offset"]
+    last = alone[-1].label
+    names = ("dark_offset", last)
+    pair = replace(
+        fitted(found().model, [e for e in found().evidence.effects if e.name in names]), left_p_value=0.5
+    )
+    both = replace(
+        found(), judgement=replace(judgement, answer=pair.names, tried=(pair, *judgement.tried), best=pair)
+    )
+    both = replace(both, shrinking=found().shrinking | {pair.label: Shrinking(None, None, None)})
+    report = report_of(both)
+    assert [fit["name"] for fit in report["effects"]][:2] == ["dark_offset", last]
+    assert len(report["effects"]) == len(judgement.tried)
+    assert [fit["name"] for fit in report["together"]] == [pair.label]
+    rows = [tag.text for tag in read_page(gap_page(both, report).html()) if tag.name == "td"]
+    at = [rows.index(name.replace("_", " ")) for name in (pair.label, "dark_offset", last)]
+    assert at == sorted(at)
 
 
 def test_without_images_held_out_it_says_so_and_draws_no_residuals(coarse: None) -> None:
