@@ -52,11 +52,9 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "where": [axis.to_json() for axis in found.where],
         "verdict": judged.verdict,
         "answer": list(judged.answer),
-        # Effects of an answer that act together may each do little alone: they go before what does more.
-        "effects": sorted(
-            (fit for tried, fit in fits if len(tried.names) == 1),
-            key=lambda fit: fit["name"] not in judged.answer,
-        ),
+        "effects": [
+            fit for tried, fit in sorted(fits, key=lambda fit: _place(found, fit[0])) if len(tried.names) == 1
+        ],
         "together": [fit for tried, fit in fits if len(tried.names) > 1],
         "ties": [list(judged.tied)] if judged.verdict == "tie" else [],
         "would_separate": would_separate(found),
@@ -88,6 +86,15 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "images": _images(found),
         "inputs_sha256": found.solution.transit.sha256,
     }
+
+
+def _place(found: Diagnosis, tried: Tried) -> tuple[bool, bool]:
+    """Effects of an answer may each do little without the other, and go before what alone does more; of two that act
+    together the one that was measured in the lit parts comes second, for it fits these whatever else acts on them."""
+    best = found.judgement.best
+    together = best is not None and len(best.names) > 1
+    here = tried.names[0] in found.judgement.answer
+    return not here, here and together and found.evidence.numbers_of(tried.step.columns) > 0
 
 
 def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:

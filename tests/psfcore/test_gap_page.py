@@ -183,6 +183,10 @@ def test_effects_that_act_together_stand_before_those_that_alone_do_more(coarse:
     assert [fit["name"] for fit in report["effects"]][:2] == ["dark_offset", last]
     assert len(report["effects"]) == len(judgement.tried)
     assert [fit["name"] for fit in report["together"]] == [pair.label]
+    # What was measured in the lit parts would fit them whatever the other did to them.
+    measured = replace(both.evidence, numbers={both.evidence.columns["dark_offset"][0]: 9})
+    report_so = report_of(replace(both, model=replace(both.model, evidence=measured)))
+    assert [fit["name"] for fit in report_so["effects"]][:2] == [last, "dark_offset"]
     rows = [tag.text for tag in read_page(gap_page(both, report).html()) if tag.name == "td"]
     at = [rows.index(name.replace("_", " ")) for name in (pair.label, "dark_offset", last)]
     assert at == sorted(at)
