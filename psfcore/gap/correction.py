@@ -8,6 +8,7 @@ taken.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -73,81 +74,116 @@ def add_to_model(
     found: Tried,
     model: LinearModel,
     *,
+    view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Corrected:
     """Fit PSF and effects together, starting from the linear fit `found`.
 
-    Raises what `invert` raises, and DataError "effect-unseen" where none of an effect is left.
+    view: of the solution, where there is one. Raises what `invert` raises, and DataError "effect-unseen" where none of
+    an effect is left.
     """
     transit = solution.transit
     # A form with a place of its own keeps the place that was found: it is looked for once.
-    view = View(solution)
+    view = view or View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
-    numbers = {name: value for name, (value, _, _) in found.values.items()}
-    units = {name: unit for name, (_, _, unit) in found.values.items()}
-    current = solution
+    names, theta = list(found.values), np.array([value for value, _, _ in found.values.values()])
+    units = [unit for _, _, unit in found.values.values()]
     in_images = _in_images(held, view)
+    base = len(model.evidence.base)
+    current, start = solution, _stepped(solution, found.step.values[:base])
     least = np.inf
     taken: Corrected | None = None
     for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
-        names, theta = list(numbers), np.array(list(numbers.values()))
         try:
             if in_images.any():
                 current = invert(
                     corrected(transit, View(current), held, theta),
                     solution.inversion.shape,
-                    start=current.inversion.coordinates,
+                    start=start,
                     threads=solution.threads,
                     progress=progress,
                 )
-            evidence = _with_noise_of(model.evidence, gather(current, held, progress=progress))
+            seen = _look(current, held, theta, in_images, model, progress)
         except DataError:
             if taken is None:
                 raise
             break  # no fit after a step that was too long
-        again = replace(model, evidence=evidence)
-        left = fitted(again, evidence.effects, any_sign=True)
-        found_now = np.array([value for value, _, _ in left.values.values()])
-        if found_now.size != theta.size:
-            raise DataError(
-                "effect-unseen",
-                f"expected the images to show {label_of([e.name for e in held])} once it is taken out; they show "
-                f"{found_now.size} of {theta.size} parameters",
-            )
-        base = len(evidence.base)
-        out_already = np.concatenate([np.zeros(base), np.where(in_images, theta, 0.0)])
-        found_now -= again.pull_of_prior(left.step, out_already)[base:]
-        sigma = np.array([s for _, s, _ in left.values.values()])
-        # What was taken out of the images shows what is left of it, the rest shows all of it.
-        steps = np.where(in_images, found_now, found_now - theta)
-        theta = theta + steps
+        steps, theta, start = seen.theta - theta, seen.theta, seen.start
         # Where light can be added alone, what would take it away does not act.
         acts = ~(_positive(held) & (theta <= 0))
         if not acts.all() and rounds < ROUNDS:
             held = _those_that_act(held, acts)
-            numbers = {name: float(value) for name, value, a in zip(names, theta, acts, strict=True) if a}
-            in_images = in_images[acts]
+            names, units = (list(itertools.compress(some, acts)) for some in (names, units))
+            theta, in_images = theta[acts], in_images[acts]
             taken, least = None, np.inf
             continue
-        left_over = float(left_chi2(again, left.step).sum())
+        left_over = float(left_chi2(seen.model, seen.left.step).sum())
         if left_over > least + max(WORSE, WORSE_SHARE * found.gain):  # too strong for first-order steps
             break
         least = min(least, left_over)
-        numbers = {name: float(value) for name, value in zip(names, theta, strict=True)}
         taken = Corrected(
             effects=tuple(held),
             solution=current,
-            evidence=evidence,
-            model=again,
+            evidence=seen.model.evidence,
+            model=seen.model,
             values={
-                name: (numbers[name], float(s), units[name]) for name, s in zip(names, sigma, strict=True)
+                name: (float(value), float(sigma), unit)
+                for name, value, sigma, unit in zip(names, theta, seen.sigma, units, strict=True)
             },
             rounds=rounds,
         )
-        if float(np.abs(steps / np.maximum(sigma, 1e-300)).max()) < SETTLED:
+        if float(np.abs(steps / np.maximum(seen.sigma, 1e-300)).max()) < SETTLED:
             break
     assert taken is not None
     return taken
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a fit shows of effects that were partly taken out of its images: the model about it, what is left of them
+    there, their parameters with what was taken out, and where the PSF's coordinates go beside them."""
+
+    model: LinearModel
+    left: Tried
+    theta: Vector
+    start: Vector
+
+    @property
+    def sigma(self) -> Vector:
+        """Of theta."""
+        return np.array([sigma for _, sigma, _ in self.left.values.values()])
+
+
+def _look(
+    current: Solution,
+    held: Sequence[Effect],
+    out: Vector,
+    in_images: NDArray[np.bool_],
+    model: LinearModel,
+    progress: Progress,
+) -> _Seen:
+    """out: the parameters of what was taken out of the images."""
+    evidence = _with_noise_of(model.evidence, gather(current, held, progress=progress))
+    again = replace(model, evidence=evidence)
+    left = fitted(again, evidence.effects, any_sign=True)
+    found = np.array([value for value, _, _ in left.values.values()])
+    if found.size != out.size:
+        raise DataError(
+            "effect-unseen",
+            f"expected the images to show {label_of([e.name for e in held])} once it is taken out; they show "
+            f"{found.size} of {out.size} parameters",
+        )
+    base = len(evidence.base)
+    out_already = np.concatenate([np.zeros(base), np.where(in_images, out, 0.0)])
+    found -= again.pull_of_prior(left.step, out_already)[base:]
+    # What was taken out of the images shows what is left of it, the rest shows all of it.
+    theta = np.where(in_images, out + found, found)
+    return _Seen(again, left, theta, _stepped(current, left.step.values[:base]))
+
+
+def _stepped(current: Solution, step: Vector) -> Vector:
+    """The coordinates of a fit after a step, as long as one of its own may be."""
+    return current.inversion.coordinates + current.inversion.shape.shortened(step)[0]
 
 
 def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:

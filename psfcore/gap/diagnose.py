@@ -15,7 +15,7 @@ import numpy as np
 from psfcore.errors import DataError
 from psfcore.gap.closure import HeldOut, Interval, closure, fall, gap, hold_out, pointings, time_blocks
 from psfcore.gap.correction import Corrected, add_to_model, beyond
-from psfcore.gap.effect import Effect
+from psfcore.gap.effect import Effect, View
 from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.expected_gap import ExpectedGap, expected_gap
 from psfcore.gap.judge import LEAST_IMAGES, Judgement, Tried, judge
@@ -129,7 +129,8 @@ def diagnose_solution(
 ) -> Diagnosis:
     """The diagnosis of a fit that was made already; arguments as in `diagnose`."""
     expected = expected_gap(solution, seed=seed, floor=FLOOR, progress=progress)
-    evidence = gather(solution, library, progress=progress)
+    view = View(solution)
+    evidence = gather(solution, library, view=view, progress=progress)
     model = LinearModel(
         evidence,
         FLOOR,
@@ -137,7 +138,7 @@ def diagnose_solution(
         lit_scale=float(np.clip(expected.lit_scale, SMALLEST_SCALE, LARGEST_SCALE)),
         scale_error=expected.scale_error,
     )
-    refits = _Refits(solution, model, progress)
+    refits = _Refits(view, model, progress)
     found = judge(model, refits.model, refits.beyond) if refit else judge(model)
     fits = refits.of(found) if refit else ()
     rng = np.random.default_rng(seed)
@@ -219,8 +220,8 @@ def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | Non
 class _Refits:
     """Real refits of effects, each made once."""
 
-    def __init__(self, solution: Solution, model: LinearModel, progress: Progress) -> None:
-        self._solution, self._model, self._progress = solution, model, progress
+    def __init__(self, view: View, model: LinearModel, progress: Progress) -> None:
+        self._view, self._model, self._progress = view, model, progress
         self._made: dict[str, Corrected | None] = {}
         self.failures: list[str] = []
 
@@ -271,7 +272,9 @@ class _Refits:
         chosen = [effects[name] for name in tried.names]
         made: Corrected | None = None
         try:
-            made = add_to_model(self._solution, chosen, tried, self._model, progress=say)
+            made = add_to_model(
+                self._view.solution, chosen, tried, self._model, view=self._view, progress=say
+            )
         except DataError as error:  # images less an effect that is not there may have no fit
             self.failures.append(f"No fit with {tried.label} in the model: {error}")
         self._made[tried.label] = made

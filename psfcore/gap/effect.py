@@ -165,7 +165,8 @@ class View:
 
     @cached_property
     def scenes(self) -> Sequence[Field]:
-        """The scene of every image as the others of its pointing show it, nothing hidden [y, x], DN/s.
+        """The scene of every image as the others of its pointing show it, as bright as its own, nothing hidden [y, x],
+        DN/s.
 
         A template made of the image's own scene would hold the noise that its residual holds, and fit it.
         """
@@ -175,8 +176,11 @@ class View:
         own, away = self._own(n)
         total, count = self._scene_sums[self.solution.transit.frames[n].fov]
         others = count - away
-        mean = np.where(others > 0, (total - own * away) / np.maximum(others, 1), own)
-        return np.asarray(mean, dtype=np.float32)
+        mean = (total - own * away) / np.maximum(others, 1)
+        both = (others > 0) & away
+        # Shutter and Sun are not steady to a percent: a copy of another image's light would leave that of what it adds.
+        brightness = _ratio(float(own[both].sum(dtype=np.float64)), float(mean[both].sum()))
+        return np.asarray(np.where(others > 0, mean * brightness, own), dtype=np.float32)
 
     def uncovered(self, n: int) -> Field:
         """Share of each pixel [y, x] that frame n's occulter leaves open.
@@ -215,6 +219,11 @@ class View:
         if weight is not None:
             lit *= slope.lanes(weight)
         return slope.field(slope.see(lit))
+
+
+def _ratio(one: float, other: float) -> float:
+    """Of sums of light; one where there is no light."""
+    return one / other if one > 0 and other > 0 else 1.0
 
 
 @dataclass(frozen=True, eq=False)

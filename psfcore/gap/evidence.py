@@ -89,10 +89,11 @@ def gather(
     solution: Solution,
     library: Sequence[Effect],
     *,
+    view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """The evidence of a solution on all effects of a library that these data can show."""
-    view = View(solution)
+    """The evidence of a solution on all effects of a library that these data can show. view: of it, where there is one."""
+    view = view or View(solution)
     changes, columns, untestable = _changes(view, library)
     base = tuple(range(solution.inversion.coordinates.size))
     columns = {name: tuple(c + len(base) for c in here) for name, here in columns.items()}

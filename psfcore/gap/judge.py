@@ -99,7 +99,7 @@ class Tried:
 
     p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show, and left_share:
     the largest share of what they showed before; none where it was not worth asking. explains: whether of what showed
-    most, little is left.
+    most, little is left. left_for_real: `left_chi2` of a real refit; none where there is none of the same images.
     """
 
     names: tuple[str, ...]
@@ -113,6 +113,7 @@ class Tried:
     left_p_value: float | None = None
     left_share: float | None = None
     explains: bool = False
+    left_for_real: Vector | None = None
 
     @property
     def label(self) -> str:
@@ -456,8 +457,11 @@ def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, 
 def _second(model: LinearModel, best: Tried, pairs: Sequence[Tried]) -> Tried | None:
     """Of pairs with an effect that is enough alone, the one that explains most more; none where that is within what a
     search finds in noise, or within what the first's own form may be wrong by: a share of what it explains in the discs,
-    and one of what it explains in the lit parts."""
+    and one of what it explains in the lit parts. What the first alone explains in the model for real, and not to first
+    order, is no second's."""
     alone, nothing = left_chi2(model, best.step), left_chi2(model, model.base)
+    if best.left_for_real is not None:
+        alone = np.minimum(alone, best.left_for_real)
     amiss = TEMPLATE_ERROR**2 * np.maximum(nothing - alone, 0.0)
     found: Tried | None = None
     most = 0.0
@@ -614,17 +618,20 @@ def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refit) ->
     unsure = np.array(tried.step.values) * TEMPLATE_ERROR
     unsure[: len(model.base.columns)] = 0.0
     left = _left(model, tried.step, unsure)
+    for_real = None
     if left.p_value < ENOUGH and tried.values:
         again = refit(tried)
         if again is not None and again.evidence.size == unsure.size:
             again = replace(again, floor=model.floor)
             step = again.fit(range(len(again.evidence.base), again.evidence.size))
             left = max(left, _left(again, step, unsure), key=lambda one: one.p_value)
+            for_real = left_chi2(again, step) if again.evidence.images == model.evidence.images else None
     return replace(
         tried,
         left_p_value=left.p_value,
         left_share=left.share_of(before),
         explains=left.of_most(before) < LEFT_SHARE,
+        left_for_real=for_real,
     )
 
 

@@ -40,7 +40,7 @@ RESTLESS = 4.0  # times the median block's chi2 a degree of freedom
 class LitBlocks:
     """Blocks of all images: (images, blocks) in DN/s.
 
-    levels: means, the hidden light put back. variance: of noise. free: which are away from disc and filled pixels. means: of the
+    levels: means, the hidden light put back. variance: of noise, and of a floor. free: which are away from disc and filled pixels. means: of the
     pointing's mean image. errors: (columns, images, blocks), what a unit of each column does. fov: pointing of each
     image. kind: images of one pointing, gain mode and exposure have one number. part: images that are used at all.
     """
@@ -61,7 +61,7 @@ class LitBlocks:
         steady = self.levels / (1 + gains[:, None])
         for fov in np.unique(self.fov):
             here = np.flatnonzero((self.fov == fov) & self.part)
-            weight = np.where(self.free[here], 1 / self._variance(here), 0.0)
+            weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
             images = (weight > 0).sum(axis=0)
             used = images >= LEAST_IMAGES
             if not used.any():
@@ -71,9 +71,7 @@ class LitBlocks:
             usual = max(float(np.median(spread[used])), 1.0)
             # What the detector does to faint signals shows in faint blocks: those are left alone.
             bright = used & (mean > float(np.median(mean[used])))
-            factor = np.where(bright & (spread > RESTLESS * usual), spread / usual, 1.0)
-            # The floor is part of what a block is weighed by: it is raised with the rest.
-            variance[here] = factor * self._variance(here) - (FLOOR * self.levels[here]) ** 2
+            variance[here] *= np.where(bright & (spread > RESTLESS * usual), spread / usual, 1.0)
         return replace(self, variance=variance)
 
     @cached_property
@@ -102,7 +100,7 @@ class LitBlocks:
             here = images[self.fov[images] == fov]
             if here.size < LEAST_IMAGES:
                 continue
-            weight = np.where(self.free[here], 1 / self._variance(here), 0.0)
+            weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
             weight[:, (weight > 0).sum(axis=0) < LEAST_IMAGES] = 0.0
             total = np.maximum(weight.sum(axis=0), 1e-300)
             design = np.zeros((size + count, here.size, self.levels.shape[1]))
@@ -119,9 +117,6 @@ class LitBlocks:
             freedom += int(used.sum() - used.any(axis=0).sum())
         return _without_gains(normal, score, chi2, freedom, size, width, used_images=int(images.size))
 
-    def _variance(self, images: NDArray[np.intp]) -> Matrix:
-        return np.asarray(self.variance[images] + (FLOOR * self.levels[images]) ** 2)
-
     def held_out(
         self, columns: Sequence[int], images: Sequence[int], fitted: Sequence[int]
     ) -> tuple[Vector, Matrix]:
@@ -136,12 +131,12 @@ class LitBlocks:
             if not self.part[n] or len(others) < LEAST_IMAGES - 1:
                 continue
             here = np.array(others)
-            weight = np.where(self.free[here], 1 / self._variance(here), 0.0)
+            weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
             total = weight.sum(axis=0)
             use = self.free[n] & ((weight > 0).sum(axis=0) >= LEAST_IMAGES - 1)
             if not use.any():
                 continue
-            w = 1 / (self._variance(np.array([n]))[0, use] + 1 / total[use])
+            w = 1 / (self.variance[n, use] + 1 / total[use])
             mean = self.means[n, use]
 
             def in_noise(differing: Matrix, w: Vector = w, mean: Vector = mean) -> Matrix:
@@ -210,7 +205,8 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
         levels.append(blocks(view.unocculted[n]))
         means.append(blocks(view.lit[n]))
         pixels = block_px(transit.shape) ** 2
-        variance.append(transit.noise.variance(means[-1], frame.exposure_s) / pixels)
+        noise = transit.noise.variance(means[-1], frame.exposure_s) / pixels
+        variance.append(noise + (FLOOR * levels[-1]) ** 2)
         place = solution.sky.found[n].place
         near = disc_distance(transit.shape, place) < place.radius_px + FREE_OF_DISC_PX
         if frame.filled is not None:

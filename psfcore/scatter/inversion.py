@@ -449,10 +449,7 @@ class _Solver:
         normal = np.sum([self._counts[n] * m.slopes.normal for n, m in measured.items()], axis=0)
         _check_determined(normal, self._total.shape)
         score = np.sum([self._counts[n] * m.score for n, m in measured.items()], axis=0)
-        step = np.linalg.solve(normal, score)
-        largest = np.array([p.largest_step for p in self._total.shape.parameters])
-        too_far = float((np.abs(step) / largest).max())
-        return (step, True) if too_far <= 1 else (step / too_far, False)
+        return self._total.shape.shortened(np.linalg.solve(normal, score))
 
     def _model(self, at: Vector, *, with_slopes: bool) -> _Model:
         kernel = self._total.kernel(at)

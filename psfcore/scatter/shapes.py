@@ -119,6 +119,12 @@ class Shape:
         """Coordinates of these values; a parameter that is not among them is at its start."""
         return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
 
+    def shortened(self, step: Vector) -> tuple[Vector, bool]:
+        """A step of the coordinates, shortened to the largest that each parameter may take; whether it is whole."""
+        largest = np.array([p.largest_step for p in self.parameters])
+        too_far = float((np.abs(step) / largest).max())
+        return (step, True) if too_far <= 1 else (step / too_far, False)
+
     def kernel(self, coordinates: Vector, size: int) -> Kernel:
         """Scatter kernel [y, x] of Eq. (1) on (size, size), centre at [size // 2, size // 2]."""
         values = self.values(coordinates)

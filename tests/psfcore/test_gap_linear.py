@@ -206,11 +206,13 @@ def test_what_was_taken_out_of_the_images_counts_against_the_prior_of_what_is_le
 def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_than_a_search_lets_it(
     evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def second(dark: float, smear: float) -> Tried | None:
+    def second(dark: float, smear: float, for_real: float = np.inf) -> Tried | None:
+        """for_real: what a refit of the first left in the discs."""
         model = with_residuals(evidence, {"dark_offset": dark, "column_smear": smear}, noise=1.0)
         best = max((fitted(model, [effect]) for effect in evidence.effects), key=lambda t: t.score)
         assert best.names == ("dark_offset",)
         before = _left(model, model.base, np.zeros(len(model.base.columns)))
+        best = replace(best, left_for_real=np.array([for_real, np.inf]))
         return _best_pair(model, best, before, no_refit, enough=True)
 
     smear = evidence.columns["column_smear"][0]
@@ -219,6 +221,10 @@ def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_t
     found = second(10.0, 8.0 * sigma)
     assert found is not None and set(found.names) == {"dark_offset", "column_smear"}
     assert second(10.0, 1.0 * sigma) is None
+    # What the first explains in the model for real, and not to first order, is no smear's.
+    both = with_residuals(evidence, {"dark_offset": 10.0, "column_smear": 8.0 * sigma}, noise=1.0)
+    discs = float(left_chi2(both, found.step)[0])
+    assert second(10.0, 8.0 * sigma, for_real=discs) is None
     # Of so large an offset the form's own error is larger than the smear,
     assert second(1000.0, 8.0 * sigma) is None
     # and so it is of one that explains as much in the discs, but not of one that does in the lit parts: the smear shows
