@@ -79,8 +79,8 @@ def add_to_model(
 ) -> Corrected:
     """Fit PSF and effects together, starting from the linear fit `found`.
 
-    view: of the solution, where there is one. Raises what `invert` raises, and DataError "effect-unseen" where none of
-    an effect is left.
+    view: of the solution, where there is one. Raises what `invert` raises in the first round, and DataError
+    "effect-unseen" where none of an effect is left.
     """
     transit = solution.transit
     # A form with a place of its own keeps the place that was found: it is looked for once.
@@ -107,7 +107,7 @@ def add_to_model(
         except DataError:
             if taken is None:
                 raise
-            break  # no fit after a step that was too long
+            break  # no fit, or nothing of the effect left, after a step that was too long
         steps, theta, start = seen.theta - theta, seen.theta, seen.start
         # Where light can be added alone, what would take it away does not act.
         acts = ~(_positive(held) & (theta <= 0))
@@ -162,7 +162,7 @@ def _look(
     model: LinearModel,
     progress: Progress,
 ) -> _Seen:
-    """out: the parameters of what was taken out of the images."""
+    """out: the parameters, of which those in_images were taken out of the images."""
     evidence = _with_noise_of(model.evidence, gather(current, held, progress=progress))
     again = replace(model, evidence=evidence)
     left = fitted(again, evidence.effects, any_sign=True)
@@ -236,8 +236,8 @@ def hold(effect: Effect, view: View) -> Effect:
 
 
 def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
-    """The evidence after an effect was taken out, with the noise of before: the light that is gone left its noise. So
-    are the means that percents are of."""
+    """The evidence after an effect was taken out, with the noise, and the blocks' floor, of before: the light that is
+    gone left its noise. So are the means that percents are of."""
     were = {disc.index: disc for disc in before.discs}
     discs = []
     for disc in after.discs:

@@ -222,15 +222,15 @@ class View:
 
 
 def _ratio(one: float, other: float) -> float:
-    """Of sums of light; one where there is no light."""
-    return one / other if one > 0 and other > 0 else 1.0
+    """Of sums of light; one where there is none to compare with."""
+    return max(one, 0.0) / other if other > 0 else 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
     """What one unit of one parameter does: change(n, images) to image n [y, x] in DN/s.
 
-    images: all images as they should be, or, for the lit part, their pointings' means. lit: whether it differs
+    images: all images as they should be, each as bright as it is, or, for the lit part, their pointings' means. lit: whether it differs
     between images of one pointing, so that the lit part shows it. disc: whether the discs do. numbers: how many numbers
     of its own were taken from the lit parts to make it, which its gain pays for.
     """

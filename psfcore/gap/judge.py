@@ -9,7 +9,8 @@ gain are less likely than ALARM, counted for how many were looked at. What lies 
 told from it, unless it does clearly worse on images held out of its fit.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
 TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
-sky's. Another is named beside it where it gains more than a search and that error let it.
+sky's. Another is named beside it where it gains more than a search and that error let it, and more than the first's
+real refit, where one was made, explains by itself.
 The linear model is good for a small gap alone: the best effect that is not enough in it is added to the model for
 real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
 Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
@@ -99,7 +100,7 @@ class Tried:
 
     p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show, and left_share:
     the largest share of what they showed before; none where it was not worth asking. explains: whether of what showed
-    most, little is left. left_for_real: `left_chi2` of a real refit; none where there is none of the same images.
+    most, little is left. left_for_real: `left_chi2` of a real refit; none where none was asked for, or it is not of the same images.
     """
 
     names: tuple[str, ...]

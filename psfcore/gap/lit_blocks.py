@@ -31,7 +31,7 @@ LEAST_BLOCKS = 5  # along the shorter side; smaller images have smaller blocks
 FREE_OF_DISC_PX = 20.0  # beyond its edge
 WIDEST_GAIN = 0.05
 LEAST_GAIN = 1e-5
-FLOOR = 5e-4
+FLOOR = 5e-4  # of a block's level: no template is more exact
 LEAST_IMAGES = 3
 RESTLESS = 4.0  # times the median block's chi2 a degree of freedom
 
@@ -40,9 +40,9 @@ RESTLESS = 4.0  # times the median block's chi2 a degree of freedom
 class LitBlocks:
     """Blocks of all images: (images, blocks) in DN/s.
 
-    levels: means, the hidden light put back. variance: of noise, and of a floor. free: which are away from disc and filled pixels. means: of the
-    pointing's mean image. errors: (columns, images, blocks), what a unit of each column does. fov: pointing of each
-    image. kind: images of one pointing, gain mode and exposure have one number. part: images that are used at all.
+    levels: means, the hidden light put back. variance: of noise, and of a floor. free: which are away from disc and
+    filled pixels. means: of the pointing's mean image. errors: (columns, images, blocks), what a unit of each column
+    does. fov: pointing of each image. kind: images of one pointing, gain mode and exposure have one number. part: images that are used at all.
     """
 
     levels: Matrix

@@ -282,28 +282,51 @@ def test_what_another_floor_cannot_tell_from_one_of_a_pair_is_in_the_answer(
     assert found.certain == ("dark_offset",) and set(found.tied) == {"column_smear", "persistence"}
 
 
+def about_fit_with(name: str, model: LinearModel, *, left: float) -> LinearModel:
+    """The model about a fit with an effect: so much of the residuals is left, to which the effect answers no more."""
+    evidence = model.evidence
+    first = len(evidence.base)
+    here = [*evidence.base, *evidence.columns[name]]
+    discs = tuple(
+        replace(
+            disc,
+            residual=disc.residual * left,
+            answers=disc.answers[here] * (np.arange(len(here)) < first)[:, None],
+        )
+        for disc in evidence.discs
+    )
+    lit = replace(evidence.lit, errors=evidence.lit.errors[here])
+    effects = tuple(effect for effect in evidence.effects if effect.name == name)
+    columns = {name: tuple(range(first, len(here)))}
+    return replace(model, evidence=replace(evidence, discs=discs, lit=lit, effects=effects, columns=columns))
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_what_a_refit_leaves_counts_where_it_is_of_the_same_images(evidence: Evidence, lost: int) -> None:
+    """An offset, and noise that it does not explain, so that a refit is asked for."""
+    model = with_residuals(evidence, {"dark_offset": 100.0}, noise=3.0)
+    again = about_fit_with("dark_offset", model, left=0.9)
+    discs = again.evidence.discs[lost:]
+    again = replace(again, evidence=replace(again.evidence, discs=discs))
+    tried = fitted(model, [effect for effect in evidence.effects if effect.name == "dark_offset"])
+    before = _left(model, model.base, np.zeros(len(model.base.columns)))
+    found = judging._with_left(model, tried, before, lambda tried: again)
+    if lost:
+        assert found.left_for_real is None
+    else:
+        nothing = left_chi2(model, model.base)[0]
+        assert found.left_for_real is not None
+        assert found.left_for_real[0] == pytest.approx(0.9**2 * nothing, rel=0.05)
+    assert judging._with_left(model, tried, before, no_refit).left_for_real is None
+
+
 @pytest.mark.parametrize("does", [True, False])
 def test_an_answer_that_does_not_do_it_in_the_model_for_real_is_none(evidence: Evidence, does: bool) -> None:
     model = with_residuals(evidence, {"dark_offset": 100.0})
-    first = len(evidence.base)
 
     def refit(tried: Tried) -> LinearModel:
         """About the fit with the effect: nothing is left, or all that was there."""
-        here = [*evidence.base, *evidence.columns[tried.names[0]]]
-        discs = tuple(
-            replace(
-                disc,
-                residual=disc.residual * (0.0 if does else 1.0),
-                answers=disc.answers[here] * (np.arange(len(here)) < first)[:, None],
-            )
-            for disc in model.evidence.discs
-        )
-        lit = replace(model.evidence.lit, errors=model.evidence.lit.errors[here])
-        effects = tuple(effect for effect in evidence.effects if effect.name == tried.names[0])
-        columns = {tried.names[0]: tuple(range(first, len(here)))}
-        return replace(
-            model, evidence=replace(model.evidence, discs=discs, lit=lit, effects=effects, columns=columns)
-        )
+        return about_fit_with(tried.names[0], model, left=0.0 if does else 1.0)
 
     found = judging.judge(model, refit)
     assert ("dark_offset" in found.answer) is does

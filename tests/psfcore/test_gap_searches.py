@@ -16,7 +16,7 @@ from psfcore.gap import correction
 from psfcore.gap import judge as judging
 from psfcore.gap.cells import sensitivities
 from psfcore.gap.correction import _with_noise_of, add_to_model, beyond, corrected
-from psfcore.gap.effect import Effect, View
+from psfcore.gap.effect import Effect, View, _ratio
 from psfcore.gap.evidence import gather
 from psfcore.gap.judge import fitted
 from psfcore.gap.library import LIBRARY
@@ -248,6 +248,18 @@ def test_a_share_of_light_is_never_less_than_none() -> None:
     with pytest.raises(DataError, match="expected column_smear to add light") as caught:
         add_to_model(found, [smear], below, model)
     assert caught.value.code == "effect-unseen"
+
+
+def test_a_scene_is_as_bright_as_the_image_s_own() -> None:
+    """The second image is 5 % brighter than the others of its pointing, which do not know it."""
+    frames = tuple(
+        replace(frame, pixels=frame.pixels * np.float32(1.05 if n == 1 else 1.0))
+        for n, frame in enumerate(clean().frames)
+    )
+    view = View(invert(replace(clean(), frames=frames)))
+    of_one, of_next = (float(view.expected[n].mean() / frames[n].pixels.mean()) for n in (1, 2))
+    assert of_one == pytest.approx(of_next, rel=2e-3)
+    assert _ratio(2.0, 4.0) == 0.5 and _ratio(-1.0, 4.0) == 0.0 and _ratio(1.0, 0.0) == 1.0
 
 
 def test_what_is_taken_out_of_an_image_is_as_bright_as_the_image() -> None:
