@@ -51,6 +51,9 @@ def test_the_total_psf_is_within_noise_and_diffraction_alone_is_not(arm_deg: flo
     # Some ten of the seventy distances' freedom go into the box.
     assert 0.6 < np.mean([one.total.chi2_per_distance for one in found]) < 1.15
     assert 0.8 < np.mean([one.total.reduced_chi2 for one in found]) < 1.25
+    # Of 90 flares this is 0.965 +- 0.024, and of one in thirty less than 0.9. Another processor's last digit of a
+    # logarithm draws another Poisson noise, and so another five of these.
+    assert np.mean([one.explained for one in found]) > 0.92
     for one in found:
         assert one.diffraction is not None and one.chi2_factor is not None and one.rms_factor is not None
         assert one.total.rms_pct < 5 and one.rms_factor > 1.7 and one.chi2_factor > 7
@@ -59,7 +62,7 @@ def test_the_total_psf_is_within_noise_and_diffraction_alone_is_not(arm_deg: flo
         assert one.total.matched_noise_pct is not None and 0.2 < one.total.matched_noise_pct < 3
         assert one.total.box.sum() == pytest.approx(flare_light(0).sum(), rel=0.1)
         assert (one.total.box >= 0).all()
-        assert one.explained > 0.9
+        assert one.explained > 0.8
 
 
 @pytest.mark.slow
