@@ -90,20 +90,16 @@ def add_to_model(
     units = [unit for _, _, unit in found.values.values()]
     in_images = _in_images(held, view)
     base = len(model.evidence.base)
-    current, start = solution, _stepped(solution, found.step.values[:base])
+    here, start = view, _stepped(solution, found.step.values[:base])
     least = np.inf
     taken: Corrected | None = None
     for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
         try:
             if in_images.any():
-                current = invert(
-                    corrected(transit, View(current), held, theta),
-                    solution.inversion.shape,
-                    start=start,
-                    threads=solution.threads,
-                    progress=progress,
-                )
-            seen = _look(current, held, theta, in_images, model, progress)
+                images = corrected(transit, here, held, theta)
+                shape, threads = solution.inversion.shape, solution.threads
+                here = View(invert(images, shape, start=start, threads=threads, progress=progress))
+            seen = _look(here, held, theta, in_images, model, progress)
         except DataError:
             if taken is None:
                 raise
@@ -123,7 +119,7 @@ def add_to_model(
         least = min(least, left_over)
         taken = Corrected(
             effects=tuple(held),
-            solution=current,
+            solution=here.solution,
             evidence=seen.model.evidence,
             model=seen.model,
             values={
@@ -155,7 +151,7 @@ class _Seen:
 
 
 def _look(
-    current: Solution,
+    view: View,
     held: Sequence[Effect],
     out: Vector,
     in_images: NDArray[np.bool_],
@@ -163,7 +159,7 @@ def _look(
     progress: Progress,
 ) -> _Seen:
     """out: the parameters, of which those in_images were taken out of the images."""
-    evidence = _with_noise_of(model.evidence, gather(current, held, progress=progress))
+    evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
     again = replace(model, evidence=evidence)
     left = fitted(again, evidence.effects, any_sign=True)
     found = np.array([value for value, _, _ in left.values.values()])
@@ -178,7 +174,7 @@ def _look(
     found -= again.pull_of_prior(left.step, out_already)[base:]
     # What was taken out of the images shows what is left of it, the rest shows all of it.
     theta = np.where(in_images, out + found, found)
-    return _Seen(again, left, theta, _stepped(current, left.step.values[:base]))
+    return _Seen(again, left, theta, _stepped(view.solution, left.step.values[:base]))
 
 
 def _stepped(current: Solution, step: Vector) -> Vector:

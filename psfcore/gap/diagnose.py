@@ -208,7 +208,7 @@ def _shrinking(
 
 def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
     """By a model with effects in it, all of which are fitted."""
-    return hold_out(model, range(len(model.evidence.base), model.evidence.size), scheme)
+    return hold_out(model, model.evidence.of_effects, scheme)
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:

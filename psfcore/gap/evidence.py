@@ -84,6 +84,11 @@ class Evidence:
         """How many columns there are."""
         return self.discs[0].answers.shape[0]
 
+    @property
+    def of_effects(self) -> range:
+        """The columns behind the base: about a refit those of the effects that are in it."""
+        return range(len(self.base), self.size)
+
 
 def gather(
     solution: Solution,

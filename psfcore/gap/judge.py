@@ -100,7 +100,8 @@ class Tried:
 
     p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show, and left_share:
     the largest share of what they showed before; none where it was not worth asking. explains: whether of what showed
-    most, little is left. left_for_real: `left_chi2` of a real refit; none where none was asked for, or it is not of the same images.
+    most, little is left. left_for_real: `left_chi2` of a real refit; none where none was asked for, or it is not of the
+    same images.
     """
 
     names: tuple[str, ...]
@@ -237,7 +238,7 @@ def _fails_for_real(model: LinearModel, tried: Tried, refit: Refit) -> bool:
     both = set(model.evidence.images) & set(real.evidence.images)
     real = replace(real, floor=model.floor)
     nothing, linear = (left_chi2(model, step, both) for step in (model.base, tried.step))
-    added = left_chi2(real, real.fit(range(len(real.evidence.base), real.evidence.size)), both)
+    added = left_chi2(real, real.fit(real.evidence.of_effects), both)
     most = int(np.argmax(nothing - linear))
     explained = float(nothing[most] - linear[most])
     return explained > 0 and float(nothing[most] - added[most]) < explained / 2
@@ -260,9 +261,7 @@ def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
     if linear is not None and fall(before, linear) > 0:
         return False
     real = refit(found.best)
-    after = (
-        None if real is None else hold_out(real, range(len(real.evidence.base), real.evidence.size), scheme)
-    )
+    after = None if real is None else hold_out(real, real.evidence.of_effects, scheme)
     tried = [one for one in (linear, after) if one is not None]
     return bool(tried) and all(fall(before, one) <= 0 for one in tried)
 
@@ -624,7 +623,7 @@ def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refit) ->
         again = refit(tried)
         if again is not None and again.evidence.size == unsure.size:
             again = replace(again, floor=model.floor)
-            step = again.fit(range(len(again.evidence.base), again.evidence.size))
+            step = again.fit(again.evidence.of_effects)
             left = max(left, _left(again, step, unsure), key=lambda one: one.p_value)
             for_real = left_chi2(again, step) if again.evidence.images == model.evidence.images else None
     return replace(

@@ -42,7 +42,8 @@ class LitBlocks:
 
     levels: means, the hidden light put back. variance: of noise, and of a floor. free: which are away from disc and
     filled pixels. means: of the pointing's mean image. errors: (columns, images, blocks), what a unit of each column
-    does. fov: pointing of each image. kind: images of one pointing, gain mode and exposure have one number. part: images that are used at all.
+    does. fov: pointing of each image. kind: images of one pointing, gain mode and exposure have one number. part: images
+    that are used at all.
     """
 
     levels: Matrix
