@@ -17,6 +17,7 @@ not depend on the number of threads.
 
 from __future__ import annotations
 
+import itertools
 import queue
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -33,7 +34,9 @@ from psfcore.fourier import needed_kernel
 
 BLOCK_ROWS = 2 * LANES
 SYMMETRIC_TO = 1e-7  # of the sum: below float32's own rounding of the transfer function
-_CHUNKS_A_THREAD = 4
+# Of small images and of large ones: handing out a chunk takes as long as a small block or two.
+_CHUNKS_A_THREAD = (2, 4)
+_BLOCKS_A_CHUNK = 8
 
 Single = NDArray[np.float32]
 # A method's own work on a block of rows between two transforms: (spectrum, first, last block, scratch).
@@ -80,7 +83,7 @@ class Engine:
         self.column_blocks = -(-(lx // 2 + 1) // LANES)
         self.lanes_shape = (self.row_blocks, nx, 2, LANES)
         self._spectrum = np.zeros((self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES), np.float32)
-        self._pool = ThreadPoolExecutor(threads)
+        self._pool = ThreadPoolExecutor(max(threads - 1, 1))
         self._scratch: queue.SimpleQueue[Scratch] = queue.SimpleQueue()
         for _ in range(threads):
             buffer = np.zeros(max(lx, ly) * 2 * LANES, np.float32)
@@ -185,7 +188,9 @@ class Engine:
 
     def run(self, work: Callable[[int, int, Scratch], Any], blocks: int) -> list[Any]:
         """Call ``work(start, stop, scratch)`` on ranges that cover all blocks, in as many threads as set."""
-        chunks = min(blocks, self.threads * _CHUNKS_A_THREAD) if self.threads > 1 else 1
+        few, many = _CHUNKS_A_THREAD
+        a_thread = min(max(blocks // (_BLOCKS_A_CHUNK * self.threads), few), many)
+        chunks = min(blocks, self.threads * a_thread) if self.threads > 1 else 1
         bounds = [blocks * n // chunks for n in range(chunks + 1)]
 
         def one(n: int) -> Any:
@@ -196,7 +201,25 @@ class Engine:
                 self._scratch.put(scratch)
 
         # One chunk is not worth handing to another thread.
-        return [one(0)] if chunks == 1 else list(self._pool.map(one, range(chunks)))
+        return [one(0)] if chunks == 1 else self._shared_out(one, chunks)
+
+    def _shared_out(self, one: Callable[[int], Any], chunks: int) -> list[Any]:
+        """Every chunk's result. This thread works too, and each takes the next chunk: where an image is small, waking
+        another for every chunk would take longer than the chunk."""
+        results: list[Any] = [None] * chunks
+        taken = itertools.count()
+
+        def work() -> None:
+            while (n := next(taken)) < chunks:
+                results[n] = one(n)
+
+        others = [self._pool.submit(work) for _ in range(self.threads - 1)]
+        try:
+            work()
+        finally:
+            for other in others:  # they write to the same spectrum
+                other.result()
+        return results
 
     @property
     def transfer_scale(self) -> int:

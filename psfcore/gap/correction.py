@@ -98,7 +98,9 @@ def add_to_model(
             if in_images.any():
                 images = corrected(transit, here, held, theta)
                 shape, threads = solution.inversion.shape, solution.threads
-                here = View(invert(images, shape, start=start, threads=threads, progress=progress))
+                near = start is not None
+                fit = invert(images, shape, start=start, near=near, threads=threads, progress=progress)
+                here = View(fit)
             seen = _look(here, held, theta, in_images, model, progress)
         except DataError:
             if taken is None:
@@ -137,12 +139,12 @@ def add_to_model(
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """What a fit shows of effects that were partly taken out of its images: the model about it, what is left of them
-    there, their parameters with what was taken out, and where the PSF's coordinates go beside them."""
+    there, their parameters with what was taken out, and where the PSF's coordinates go beside them: as `_stepped`."""
 
     model: LinearModel
     left: Tried
     theta: Vector
-    start: Vector
+    start: Vector | None
 
     @property
     def sigma(self) -> Vector:
@@ -177,9 +179,10 @@ def _look(
     return _Seen(again, left, theta, _stepped(view.solution, left.step.values[:base]))
 
 
-def _stepped(current: Solution, step: Vector) -> Vector:
-    """The coordinates of a fit after a step, as long as one of its own may be."""
-    return current.inversion.coordinates + current.inversion.shape.shortened(step)[0]
+def _stepped(current: Solution, step: Vector) -> Vector | None:
+    """The coordinates of a fit after a step; none where one so long is not to be believed, and the next fit starts anew."""
+    step, whole = current.inversion.shape.shortened(step)
+    return current.inversion.coordinates + step if whole else None
 
 
 def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:

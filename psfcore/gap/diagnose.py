@@ -128,8 +128,8 @@ def diagnose_solution(
     progress: Progress = lambda stage, step, steps: None,
 ) -> Diagnosis:
     """The diagnosis of a fit that was made already; arguments as in `diagnose`."""
-    expected = expected_gap(solution, seed=seed, floor=FLOOR, progress=progress)
     view = View(solution)
+    expected = expected_gap(view, seed=seed, floor=FLOOR, progress=progress)
     evidence = gather(solution, library, view=view, progress=progress)
     model = LinearModel(
         evidence,

@@ -24,7 +24,8 @@ Field = NDArray[np.float32]
 Vector = NDArray[np.float64]
 Stage = Literal["scene", "optics", "detector"]
 DISC_MARGIN_PX = 2.0
-KEPT_FIELDS = 4
+KEPT_BYTES = 2**25  # of one kind of field; a few fields are kept however large they are
+LEAST_KEPT = 4
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,10 @@ class EffectParameter:
 
 
 class _Fields(Sequence[Field]):
-    """Fields of all images, worked out where asked for; the last few are kept."""
+    """Fields of all images, worked out where asked for; those of thirty images of 512 px are kept, of larger ones the last.
+
+    Nobody writes to them.
+    """
 
     def __init__(self, count: int, field: Callable[[int], Field]) -> None:
         self._count, self._field = count, field
@@ -52,9 +56,10 @@ class _Fields(Sequence[Field]):
 
     def __getitem__(self, index):  # type: ignore[no-untyped-def]
         if index not in self._kept:
-            if len(self._kept) >= KEPT_FIELDS:
+            field = self._field(index)
+            if (len(self._kept) + 1) * field.nbytes > KEPT_BYTES and len(self._kept) >= LEAST_KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[index] = self._field(index)
+            self._kept[index] = field
         return self._kept[index]
 
 
@@ -196,7 +201,14 @@ class View:
         return out
 
     def lit_scene(self, n: int) -> Lanes:
-        """One of `scenes` less what the occulter hides of it, in the engine's order."""
+        """One of `scenes` less what the occulter hides of it, in the engine's order; to be read alone."""
+        return self._lit_scenes[n]
+
+    @cached_property
+    def _lit_scenes(self) -> Sequence[Lanes]:
+        return _Fields(len(self.solution.transit.frames), self._lit_scene)
+
+    def _lit_scene(self, n: int) -> Lanes:
         lit = self.solution.optics.lanes(self.scenes[n] * self.uncovered(n))
         put(lit, self.solution.sky.dark[n], 0.0)
         return lit
@@ -217,7 +229,7 @@ class View:
         """dH x of frame n, the scene times a weight of where its light is from [y, x], DN/s."""
         lit = self.lit_scene(n)
         if weight is not None:
-            lit *= slope.lanes(weight)
+            lit = lit * slope.lanes(weight)
         return slope.field(slope.see(lit))
 
 

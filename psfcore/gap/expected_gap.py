@@ -15,7 +15,7 @@ import numpy as np
 from psfcore.gap.effect import View
 from psfcore.gap.evidence import gather
 from psfcore.gap.linear_model import LinearModel
-from psfcore.scatter.inversion import Progress, Solution, invert
+from psfcore.scatter.inversion import Progress, invert
 from psfcore.transit.transit import Transit
 
 
@@ -45,17 +45,19 @@ def simulated(view: View, seed: int) -> Transit:
 
 
 def expected_gap(
-    solution: Solution, *, seed: int = 1, floor: float, progress: Progress = lambda stage, step, steps: None
+    view: View, *, seed: int = 1, floor: float, progress: Progress = lambda stage, step, steps: None
 ) -> ExpectedGap:
-    """What the estimator leaves on one simulation of the fitted model."""
+    """What the estimator leaves on one simulation of the fitted model. view: of the fit."""
+    solution = view.solution
 
     def say(stage: str, step: int, steps: int) -> None:
         progress(f"expected gap: {stage}", step, steps)
 
     again = invert(
-        simulated(View(solution), seed),
+        simulated(view, seed),
         solution.inversion.shape,
         start=solution.inversion.coordinates,
+        near=True,
         threads=solution.threads,
         progress=say,
     )

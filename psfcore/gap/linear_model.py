@@ -86,7 +86,17 @@ class LinearModel:
         return Whitened(disc.index, white @ disc.residual, disc.answers @ white, white)
 
     def equations(self, images: Sequence[int] | None = None) -> tuple[Matrix, Vector]:
-        """Normal matrix and score of all columns from some images (none: all)."""
+        """Normal matrix and score of all columns from some images (none: all); worked out once."""
+        key = None if images is None else tuple(images)
+        if key not in self._equations:
+            self._equations[key] = self._equations_of(images)
+        return self._equations[key]
+
+    @cached_property
+    def _equations(self) -> dict[tuple[int, ...] | None, tuple[Matrix, Vector]]:
+        return {}
+
+    def _equations_of(self, images: Sequence[int] | None) -> tuple[Matrix, Vector]:
         size = self.evidence.size
         normal, score = np.zeros((size, size)), np.zeros(size)
         for disc in self.discs:
@@ -95,11 +105,6 @@ class LinearModel:
                 score += disc.answers @ disc.residual
         lit = self.evidence.lit_equations(images)
         return normal + lit.normal / self.lit_scale, score + lit.score / self.lit_scale
-
-    @cached_property
-    def whole(self) -> tuple[Matrix, Vector]:
-        """`equations` of all images."""
-        return self.equations()
 
     @cached_property
     def patterns(self) -> tuple[Matrix, ...]:
@@ -114,7 +119,7 @@ class LinearModel:
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
         """The PSF's coordinates and these columns, from some equations (none: of all images)."""
         here = [*self.evidence.base, *columns]
-        normal, score = self.whole if equations is None else equations
+        normal, score = self.equations() if equations is None else equations
         normal, score = normal[np.ix_(here, here)] + np.diag(self._prior[here]), score[here]
         covariance = scaled_inverse(normal, weakest=WEAKEST)
         values = covariance @ score
@@ -147,7 +152,7 @@ class LinearModel:
             return np.zeros(0)
         others = [*self.evidence.base, *(column for column in columns if column not in self.of_fields)]
         here, first = [*others, *field], len(others)
-        normal = self.whole[0][np.ix_(here, here)]
+        normal = self.equations()[0][np.ix_(here, here)]
         cross = normal[:first, first:]
         known = scaled_inverse(normal[:first, :first] + np.diag(self._prior[others]), weakest=WEAKEST)
         width = self._prior[field] ** -0.5

@@ -74,7 +74,7 @@ def _blur(view: View, kernel: Kernel) -> Blur:
 
 def _ghost(view: View) -> Sequence[Change]:
     """A blurred copy, displaced to where the discs ask for it most, by a search over the field."""
-    return _copy(*place_search(view).copy())
+    return _copy(*place_search(view).copy)
 
 
 def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
@@ -91,7 +91,7 @@ def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
 
 
 def _held_ghost(view: View) -> Effect:
-    blur_px, dx, dy = place_search(view).copy()
+    blur_px, dx, dy = place_search(view).copy
     ghost = _held("ghost", lambda view: _copy(blur_px, dx, dy))
     return replace(
         ghost, cause=f"{ghost.cause[:-1]}: displaced by ({dx}, {dy}) px, blurred by {blur_px:g} px."

@@ -19,6 +19,7 @@ as copies and changes of the core do, r and T go on with their cells (`near_disc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -108,6 +109,7 @@ class PlaceSearch:
         means = np.array(of_discs, dtype=np.float64).T / self._sigma[:, None]
         return int(np.argmax(self._gain(means, 1.0, cells)))
 
+    @cached_property
     def copy(self) -> tuple[float, int, int]:
         """Blur (px) and displacement (whole pixels x, y) of a copy of each image that explains most of the residuals.
 

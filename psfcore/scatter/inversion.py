@@ -59,6 +59,7 @@ DARK_MARGIN_SIGMAS = 1.5
 LARGEST_DARK_MARGIN_PX = 2.5
 LEAST_DARK_PIXELS = 30
 LEAST_LEVEL = 0.2  # of a disc's mean: what a pixel is taken to hold at least, for its variance
+LONGEST_REACH = 4.0  # times a parameter's largest step
 LEAST_FRAMES = 3
 WEAKEST_DIRECTION = 1e-10  # of a normal matrix scaled to a unit diagonal
 
@@ -320,15 +321,18 @@ def invert(
     shape: Shape = SOFTENED_POWER_LAW,
     *,
     start: Vector | None = None,
+    near: bool = False,
     counts: Sequence[int] | None = None,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Solution:
     """Fit a shape of scatter to a transit.
 
-    start: coordinates; none: the shape's own. counts: how often each frame counts, 0 for one that is held out (it is
-    still looked at, as a neighbour in time and for its occulter's place); none: once each. Raises DataError "too-few-frames" (fewer than three with an occulter
-    in them), "transit-says-too-little" (the frames leave a parameter open).
+    start: coordinates; none: the shape's own. near: the start is a fit of nearly the same images: none of a few of them
+    goes before it, and occulters are looked for again only where the curve moves. counts: how often each frame counts, 0
+    for one that is held out (it is still looked at, as a neighbour in time and for its occulter's place); none: once
+    each. Raises DataError "too-few-frames" (fewer than three with an occulter in them), "transit-says-too-little" (the
+    frames leave a parameter open).
     """
     total = TotalPsf(transit.diffraction, shape, transit.shape, threads=threads)
     at = shape.start if start is None else np.asarray(start, dtype=np.float64)
@@ -338,10 +342,15 @@ def invert(
     sky.find(optics, kernel)
     solver = _Solver(sky, total, counts or [1] * len(transit.frames), threads, progress)
     frames = solver.taking_part()
-    if len(frames) > PILOT_FRAMES + LEAST_FRAMES:
-        spread = np.unique(np.linspace(0, len(frames) - 1, PILOT_FRAMES).round().astype(int))
-        at = solver.solve(at, [frames[k] for k in spread], PILOT_CONVERGED_POINTS)
-    at = solver.solve(at, frames, PILOT_CONVERGED_POINTS)
+    if near:
+        at = solver.solve(at, frames, CONVERGED_POINTS)
+        if solver.converged and solver.moved_points < PILOT_CONVERGED_POINTS:
+            return solver.solution(at)
+    else:
+        if len(frames) > PILOT_FRAMES + LEAST_FRAMES:
+            spread = np.unique(np.linspace(0, len(frames) - 1, PILOT_FRAMES).round().astype(int))
+            at = solver.solve(at, [frames[k] for k in spread], PILOT_CONVERGED_POINTS)
+        at = solver.solve(at, frames, PILOT_CONVERGED_POINTS)
     kernel = total.kernel(at)  # step (e) again, with a PSF that is nearly right
     sky.find(Optics(kernel, transit.shape, threads=threads), kernel)
     at = solver.solve(at, solver.taking_part(), CONVERGED_POINTS)
@@ -392,6 +401,12 @@ class _Solver:
         self.rounds: list[Round] = []
         self.converged = False
 
+    @property
+    def moved_points(self) -> float:
+        """How far the cumulative curve has moved since the first round, in points."""
+        first, last = (np.array(self.rounds[k].curve_pct) for k in (0, -1))
+        return float(np.abs(last - first).max())
+
     def taking_part(self) -> list[int]:
         """Indices of the frames with enough dark pixels; DataError "too-few-frames"."""
         left_out = self._sky.left_out()
@@ -414,6 +429,7 @@ class _Solver:
         kept: dict[int, _Slopes] = {}
         moved, self.converged = np.inf, False
         before: tuple[Vector, float] | None = None
+        reach = 1.0
         for _ in range(ROUNDS):
             if moved > SLOPES_KEPT_BELOW_POINTS or not kept:
                 kept = {}
@@ -422,11 +438,12 @@ class _Solver:
             kept = {n: m.slopes for n, m in measured.items()}
             chi2 = sum(self._counts[n] * m.chi2 for n, m in measured.items())
             if before is not None and chi2 > 1.2 * before[1]:
-                at, kept = (at + before[0]) / 2, {}  # too far: half-way back
-                before = (before[0], before[1])
+                at, kept, reach = (at + before[0]) / 2, {}, 1.0  # too far: half-way back
                 continue
             before = (at, chi2)
-            step, whole = self._step(measured, at)
+            step, whole = self._step(measured, reach)
+            # As long as steps go well they may be longer: two numbers that go hand in hand have a long way to go.
+            reach = 1.0 if whole else min(2 * reach, LONGEST_REACH)
             moved = float(np.abs(model.curve_slopes @ step).max())
             pixels = sum(self._counts[n] * m.residual.size for n, m in measured.items())
             self.rounds.append(
@@ -444,12 +461,13 @@ class _Solver:
                 break
         return at
 
-    def _step(self, measured: dict[int, _Measured], at: Vector) -> tuple[Vector, bool]:
-        """The Gauss-Newton step, shortened to the largest that each parameter may take; whether it is whole."""
+    def _step(self, measured: dict[int, _Measured], reach: float) -> tuple[Vector, bool]:
+        """The Gauss-Newton step, shortened to `reach` times the largest that each parameter may take; whether it is
+        whole."""
         normal = np.sum([self._counts[n] * m.slopes.normal for n, m in measured.items()], axis=0)
         _check_determined(normal, self._total.shape)
         score = np.sum([self._counts[n] * m.score for n, m in measured.items()], axis=0)
-        return self._total.shape.shortened(np.linalg.solve(normal, score))
+        return self._total.shape.shortened(np.linalg.solve(normal, score), reach)
 
     def _model(self, at: Vector, *, with_slopes: bool) -> _Model:
         kernel = self._total.kernel(at)

@@ -413,7 +413,7 @@ def test_a_copy_and_a_patch_are_found_where_they_are(clean: Transit) -> None:
         replace(f, pixels=f.pixels + 0.05 * displaced(gaussian_filter(f.pixels, 4.0), dx, dy))
         for f in clean.frames
     )
-    blur, x, y = PlaceSearch(View(invert(replace(clean, frames=frames)))).copy()
+    blur, x, y = PlaceSearch(View(invert(replace(clean, frames=frames)))).copy
     assert (x, y) == pytest.approx((dx, dy), abs=6) and blur in (2.0, 4.0, 8.0)
 
 

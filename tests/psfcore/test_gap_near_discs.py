@@ -118,7 +118,7 @@ def test_a_copy_s_place_and_blur_are_told_by_the_cells() -> None:
         replace(f, pixels=f.pixels + 0.06 * displaced(gaussian_filter(f.pixels, 8.0), dx, dy))
         for f in clean().frames
     )
-    blur, x, y = place_search(View(invert(replace(clean(), frames=frames)))).copy()
+    blur, x, y = place_search(View(invert(replace(clean(), frames=frames)))).copy
     assert (x, y) == pytest.approx((dx, dy), abs=4) and blur in (4.0, 8.0)
 
 
