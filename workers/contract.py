@@ -130,7 +130,7 @@ ShapeName = Literal[
 class PsfFit(Parameters):
     """Fit the diffuse scatter of an uploaded transit: a PSF version with its errors, curves and report."""
 
-    algorithm_version: ClassVar[int] = 2
+    algorithm_version: ClassVar[int] = 1
     transit_id: Identity = Field(description="id that the upload of the transit answered")
     shape: ShapeName = Field("softened-power-law", description="the formula that scatter is fitted with")
     as_published: bool = Field(
@@ -149,7 +149,7 @@ class PsfFit(Parameters):
 class CrossValidate(PsfFit):
     """How well a fit is known: blocks of images held out, the others drawn again, in many runs."""
 
-    algorithm_version: ClassVar[int] = 3
+    algorithm_version: ClassVar[int] = 2
     as_published: Literal[False] = False
     scheme: Literal["shared", "exact"] = Field(
         "shared", description="folds that share every reconstruction, or fits of their own (slow, fanned out)"
@@ -160,7 +160,7 @@ class CrossValidate(PsfFit):
 class Evaluate(Parameters):
     """Report on an uploaded transit: its PSF fitted, cross-validated and judged on images held out; or one given, judged."""
 
-    algorithm_version: ClassVar[int] = 2
+    algorithm_version: ClassVar[int] = 1
     transit_id: Identity = Field(description="id that the upload of the transit answered")
     psf_id: Identity | None = Field(
         None, description="a PSF of the catalogue, evaluated as it is; none: the transit is fitted"

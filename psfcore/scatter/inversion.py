@@ -59,7 +59,6 @@ DARK_MARGIN_SIGMAS = 1.5
 LARGEST_DARK_MARGIN_PX = 2.5
 LEAST_DARK_PIXELS = 30
 LEAST_LEVEL = 0.2  # of a disc's mean: what a pixel is taken to hold at least, for its variance
-LONGEST_REACH = 4.0  # times a parameter's largest step
 LEAST_FRAMES = 3
 WEAKEST_DIRECTION = 1e-10  # of a normal matrix scaled to a unit diagonal
 
@@ -429,7 +428,6 @@ class _Solver:
         kept: dict[int, _Slopes] = {}
         moved, self.converged = np.inf, False
         before: tuple[Vector, float] | None = None
-        reach = 1.0
         for _ in range(ROUNDS):
             if moved > SLOPES_KEPT_BELOW_POINTS or not kept:
                 kept = {}
@@ -438,12 +436,10 @@ class _Solver:
             kept = {n: m.slopes for n, m in measured.items()}
             chi2 = sum(self._counts[n] * m.chi2 for n, m in measured.items())
             if before is not None and chi2 > 1.2 * before[1]:
-                at, kept, reach = (at + before[0]) / 2, {}, 1.0  # too far: half-way back
+                at, kept = (at + before[0]) / 2, {}  # too far: half-way back
                 continue
             before = (at, chi2)
-            step, whole = self._step(measured, reach)
-            # As long as steps go well they may be longer: two numbers that go hand in hand have a long way to go.
-            reach = 1.0 if whole else min(2 * reach, LONGEST_REACH)
+            step, whole = self._step(measured)
             moved = float(np.abs(model.curve_slopes @ step).max())
             pixels = sum(self._counts[n] * m.residual.size for n, m in measured.items())
             self.rounds.append(
@@ -461,13 +457,12 @@ class _Solver:
                 break
         return at
 
-    def _step(self, measured: dict[int, _Measured], reach: float) -> tuple[Vector, bool]:
-        """The Gauss-Newton step, shortened to `reach` times the largest that each parameter may take; whether it is
-        whole."""
+    def _step(self, measured: dict[int, _Measured]) -> tuple[Vector, bool]:
+        """The Gauss-Newton step, shortened to the largest that each parameter may take; whether it is whole."""
         normal = np.sum([self._counts[n] * m.slopes.normal for n, m in measured.items()], axis=0)
         _check_determined(normal, self._total.shape)
         score = np.sum([self._counts[n] * m.score for n, m in measured.items()], axis=0)
-        return self._total.shape.shortened(np.linalg.solve(normal, score), reach)
+        return self._total.shape.shortened(np.linalg.solve(normal, score))
 
     def _model(self, at: Vector, *, with_slopes: bool) -> _Model:
         kernel = self._total.kernel(at)

@@ -119,10 +119,9 @@ class Shape:
         """Coordinates of these values; a parameter that is not among them is at its start."""
         return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
 
-    def shortened(self, step: Vector, reach: float = 1.0) -> tuple[Vector, bool]:
-        """A step of the coordinates, shortened to `reach` times the largest that each parameter may take; whether it is
-        whole."""
-        largest = reach * np.array([p.largest_step for p in self.parameters])
+    def shortened(self, step: Vector) -> tuple[Vector, bool]:
+        """A step of the coordinates, shortened to the largest that each parameter may take; whether it is whole."""
+        largest = np.array([p.largest_step for p in self.parameters])
         too_far = float((np.abs(step) / largest).max())
         return (step, True) if too_far <= 1 else (step / too_far, False)
 

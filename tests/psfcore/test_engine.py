@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psfcore.engine import Engine
+from psfcore.engine import BLOCK_ROWS, Engine, Scratch
 from psfcore.errors import DataError
 from psfcore.fft_kernels import LANES, forward, good_length, inverse, make_plan
 from psfcore.fourier import Convolver
@@ -79,6 +79,28 @@ def test_the_result_does_not_depend_on_the_threads() -> None:
     field = rng.random((300, 200))
     one, three = (Engine(kernel / kernel.sum(), field.shape, threads=n).apply(field) for n in (1, 3))
     assert np.array_equal(one, three)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_every_block_is_worked_on_once_and_results_come_in_their_order(threads: int) -> None:
+    engine = Engine(np.ones((3, 3)) / 9, (40 * BLOCK_ROWS, 8), threads=threads)
+    blocks = 40
+    parts = engine.run(lambda start, stop, scratch: list(range(start, stop)), blocks)
+    assert [block for part in parts for block in part] == list(range(blocks))
+
+
+@pytest.mark.parametrize("wrong", [0, 7])
+def test_what_fails_in_any_thread_is_raised_and_the_engine_goes_on(wrong: int) -> None:
+    engine = Engine(np.ones((3, 3)) / 9, (8 * BLOCK_ROWS, 8), threads=2)
+
+    def work(start: int, stop: int, scratch: Scratch) -> None:
+        if start <= wrong < stop:
+            raise ValueError("block")
+
+    for _ in range(3):
+        with pytest.raises(ValueError, match="block"):
+            engine.run(work, 8)
+    assert engine.run(lambda start, stop, scratch: stop - start, 8) == [2, 2, 2, 2]
 
 
 def test_a_delta_changes_nothing() -> None:

@@ -143,6 +143,24 @@ def test_any_start_leads_there() -> None:
     assert len(found.rounds) > len(solved_noise_free().inversion.rounds)
 
 
+def test_a_start_that_is_near_is_met_by_no_few_and_ends_there_too() -> None:
+    transit = noise_free(sky(images=24, size_px=112))
+    whole = invert(transit).inversion
+    near = invert(transit, start=whole.coordinates, near=True).inversion
+    assert near.converged
+    assert {r.frames for r in near.rounds} == {len(whole.frames)}
+    assert len(near.rounds) < len(whole.rounds)
+    np.testing.assert_allclose(near.curve_pct, whole.curve_pct, atol=0.02)
+
+
+def test_a_start_that_is_not_near_after_all_is_no_worse_for_it() -> None:
+    transit = noise_free(sky())
+    far = SOFTENED_POWER_LAW.coordinates({"b_px": 25.0, "c": 3.4, "total": 0.12})
+    found = invert(transit, start=far, near=True).inversion
+    assert found.converged
+    assert np.abs(off(found)).max() < 0.02  # occulters that were found with that PSF are looked for again
+
+
 def test_threads_change_nothing_and_progress_tells_stages() -> None:
     seen: list[tuple[str, int, int]] = []
     two = invert(observed(sky()).transit, threads=2, progress=lambda *at: seen.append(at)).inversion

@@ -173,3 +173,12 @@ def test_a_shape_that_is_not_there_is_named() -> None:
     assert shape_named("knee") is SHAPES["knee"]
     with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*'spiral'"):
         shape_named("spiral")
+
+
+def test_a_step_is_shortened_along_itself_to_the_largest_that_each_may_take() -> None:
+    step = np.array([4.0, 0.3, -0.4])  # eight times the largest of b
+    shorter, whole = SOFTENED_POWER_LAW.shortened(step)
+    assert not whole
+    np.testing.assert_allclose(shorter, step / 8)
+    same, whole = SOFTENED_POWER_LAW.shortened(shorter)
+    assert whole and np.array_equal(same, shorter)
