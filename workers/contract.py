@@ -181,7 +181,7 @@ class Evaluate(Parameters):
 class GapDiagnose(Parameters):
     """Diagnose the gap between an uploaded transit and the model fitted to it: is there one, where, and which effect."""
 
-    algorithm_version: ClassVar[int] = 3
+    algorithm_version: ClassVar[int] = 4
     transit_id: Identity = Field(description="id that the upload of the transit answered")
     psf_id: Identity | None = Field(
         None, description="a PSF of the catalogue that was fitted to a transit: the fit starts from it"

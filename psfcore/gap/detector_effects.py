@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
 
@@ -14,6 +15,7 @@ FAINT_DN = (30.0, 150.0)  # a mixture of both follows a loss at any faint level 
 # In mean waits between images: with a share of the last image, mixtures of these fade as traps do.
 FADES_IN = {"one_wait": 1, "three_waits": 3}
 LEAST_LEFT = 0.01  # what is left of an image after so long is too little to see
+DEEP_PX = 4.0  # from the rim of what was filled in: where its share is as stated
 FINEST = 5  # half waves across the field, of a smooth field's finest cosines
 
 
@@ -127,15 +129,20 @@ def _persistence(view: View) -> Sequence[Change]:
 
 
 def _filled(view: View) -> Sequence[Change]:
+    """What was filled in, or stayed clipped, is off by a share, and by one that grows from its rim inwards: what clipping
+    takes from a brightening does."""
     frames = view.solution.transit.frames
+    nothing = np.zeros(view.solution.transit.shape, np.float32)
 
-    def change(n: int, images: Sequence[Field]) -> Field:
+    def change(n: int, images: Sequence[Field], inside: bool) -> Field:
         filled = frames[n].filled
-        if filled is None:
-            return np.zeros(view.solution.transit.shape, np.float32)
-        return np.asarray(images[n] * filled)
+        if filled is None or not filled.any():
+            return nothing
+        depth = np.sqrt(distance_transform_edt(filled) / DEEP_PX) if inside else filled
+        return np.asarray(images[n] * depth, dtype=np.float32)
 
-    return [Change(change)]
+    # Blocks with such a pixel are no part of what the lit parts are compared by.
+    return [Change(lambda n, images, k=k: change(n, images, k), lit=False) for k in (False, True)]  # type: ignore[misc]
 
 
 def _nothing_filled(view: View) -> str | None:
@@ -168,6 +175,6 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("persistence", "detector", (_p("share", "", 0.01, True), *(_p(f"share_fading_in_{waits}", "", 0.01, True) for waits in FADES_IN)),
            "Shares of the images before are left in the next, and fade.",
            "a dark exposure after a bright one", ("time", "pointing"), _persistence),
-    Effect("saturation_fill", "detector", (_p("excess", "", 0.1),), "What was filled in for saturated pixels is wrong.",
+    Effect("saturation_fill", "detector", (_p("excess", "", 0.1), _p("excess_inside", "", 0.1)), "What was filled in for saturated pixels is wrong.",
            "a shorter exposure of the same time", ("pointing", "intensity"), _filled, _nothing_filled),
 )  # fmt: skip

@@ -18,7 +18,7 @@ from psfcore.gap.correction import Corrected, add_to_model, beyond
 from psfcore.gap.effect import Effect, View
 from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.expected_gap import ExpectedGap, expected_gap
-from psfcore.gap.judge import LEAST_IMAGES, Judgement, Tried, judge
+from psfcore.gap.judge import LEAST_IMAGES, Judgement, Tried, judge, label_of
 from psfcore.gap.library import LIBRARY
 from psfcore.gap.linear_model import FLOOR, LinearModel
 from psfcore.gap.measured_noise import MeasuredNoise, measured_noise
@@ -164,7 +164,12 @@ def diagnose_solution(
         corrected=fits,
         residual=before,
         residual_after=after if gone else None,
-        cautions=(*_cautions(solution, noise, evidence), *refits.failures, *_amiss(found)),
+        cautions=(
+            *_cautions(solution, noise, evidence),
+            *refits.failures,
+            *_amiss(found),
+            *_unexplained(found, evidence),
+        ),
     )
 
 
@@ -305,6 +310,16 @@ def _amiss(found: Judgement) -> tuple[str, ...]:
         f"{label.replace('_', ' ')} explains much of the gap to first order and less than half of that in the model for "
         "real: it is no answer, whatever its score."
         for label in found.amiss
+    )
+
+
+def _unexplained(found: Judgement, evidence: Evidence) -> tuple[str, ...]:
+    best = found.best
+    if found.verdict != "inconclusive" or best is None or not evidence.numbers_of(best.step.columns):
+        return ()
+    return (
+        f"{label_of(best.names).replace('_', ' ')} shows in the lit parts, and the discs, which do not answer to it, show a "
+        "gap of their own whose cause cannot be told.",
     )
 
 

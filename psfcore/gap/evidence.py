@@ -19,7 +19,7 @@ from psfcore.gap.effect import Change, Effect, View
 from psfcore.gap.lit_blocks import LitBlocks, LitEquations, blocks, lit_blocks
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.optics import Blur
-from psfcore.transit.occulter import FoundPlace
+from psfcore.transit.occulter import UNDESCRIBED, FoundPlace
 from psfcore.transit.transit import Frame
 
 Vector = NDArray[np.float64]
@@ -30,7 +30,8 @@ AT_ONCE = 16  # fields that are looked at together
 
 @dataclass(frozen=True)
 class Taken:
-    """How one image was taken: what the axes are made of."""
+    """How one image was taken: what the axes are made of. described: whether its neighbours in time show what is round its
+    occulter, so that this was found where it is."""
 
     file: str
     fov: int
@@ -40,6 +41,7 @@ class Taken:
     exposure_s: float
     gain_mode: str | None
     scattering_distance_px: float
+    described: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +201,7 @@ def _taken(frame: Frame, found: FoundPlace, distance_px: float) -> Taken:
         exposure_s=frame.exposure_s,
         gain_mode=frame.gain_mode,
         scattering_distance_px=distance_px,
+        described=found.chi2_per_pixel < UNDESCRIBED,
     )
 
 

@@ -382,7 +382,8 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
     cannot be said; the one alone where more than MOST_SECONDS could be the other. Its tried are the answer's alone.
 
     So too where the best was measured in the lit parts and leaves much there: a Sun that flickers faster than it is
-    followed. The discs do not show that, and what they show is judged by itself."""
+    followed. The discs do not show that, and what they show is judged by itself: two effects may be at work there, and
+    where it cannot be told which are, the verdict is inconclusive."""
     rest = beyond(best)
     if rest is None:
         return None
@@ -398,18 +399,27 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
     second = _judge(rest, no_refit, no_refit)
     if second.verdict == "none":
         return Judgement("attributed", best.names, second.p_value, (), (), best) if best.explains else None
-    if second.verdict not in ("attributed", "tie") or second.best is None or len(second.best.names) > 1:
+    measured = model.evidence.numbers_of(best.step.columns) > 0
+    if second.best is None or second.verdict not in ("attributed", "tie"):
+        # Occulters that are where they were found say that the discs' gap is not made by what changes in the lit parts.
+        found_well = all(model.evidence.taken[n].described for n in model.evidence.images)
+        return (
+            Judgement("inconclusive", (), second.p_value, (), (), best) if measured and found_well else None
+        )
+    if len(second.best.names) > 1 and not measured:
         return None
     if len(second.answer) > MOST_SECONDS and best.explains:
         return Judgement("attributed", best.names, second.p_value, (), (), best)
-    beside = (*second.best.names, *(name for name in second.answer if name not in second.best.names))
-    pairs = [fitted(model, [effects[name] for name in (*best.names, one)]) for one in beside]
-    if not all(_takes_part(one, pair) for one, pair in zip(beside, pairs, strict=True)):
+    beside = [second.best.names]
+    if len(second.best.names) == 1:
+        beside += [(name,) for name in second.answer if name not in second.best.names]
+    joint = [fitted(model, [effects[name] for name in (*best.names, *names)]) for names in beside]
+    if not all(_takes_part(name, one) for names, one in zip(beside, joint, strict=True) for name in names):
         return None
-    pair, *others = pairs
+    pair, *others = joint
     pair = replace(pair, left_p_value=second.best.left_p_value, left_share=second.best.left_share)
     answer = tuple(sorted({*best.names, *second.answer}))
-    certain = best.names if second.verdict == "tie" else ()
+    certain = (*best.names, *second.certain) if second.verdict == "tie" else ()
     return Judgement(second.verdict, answer, second.p_value, (pair, *others), (), pair, certain)
 
 

@@ -7,9 +7,11 @@ cause is not in the library, and what it looks like.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from psfcore.gap.detector_effects import cosine_parameters, cosines, fixed, flat, times_image
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
@@ -21,8 +23,11 @@ from psfcore.gap.optics_effects import (
     not_a_power_law,
     shape_slopes,
 )
+from psfcore.gap.scene_effects import COARSE_PX, RIDGE, STRUCTURE_PX, lit_on_coarse, on_pixels
 from psfcore.gap.search import place_search
 from psfcore.transit.occulter import coverage
+
+Plane = NDArray[np.float64]
 
 PATCH_SHARE = 0.08  # of the field: width of a patch of light or shadow
 PATCH_TRIALS = 60
@@ -120,6 +125,54 @@ def _shutter(view: View) -> Sequence[Change]:
     return [along(place) for place in view.places]
 
 
+def _readout_pattern(view: View) -> Sequence[Change]:
+    """What the lit parts show to be the same in every readout wherever the telescope points, for a pattern of 1 DN rms.
+
+    As DN/s it goes with one over the exposure, which the images of a pointing differ in.
+    """
+    frames = view.solution.transit.frames
+    readouts = np.array([1 / frame.exposure_s for frame in frames])
+    over, under, shown = (sum(some) for some in zip(*_in_pointings(view, readouts), strict=True))
+    least = max(RIDGE * float(np.max(under)), 1e-300)  # where few images show a place
+    pattern = gaussian_filter(over / (under + least), STRUCTURE_PX / COARSE_PX)
+    pattern -= pattern.mean()  # a level is another effect's
+    plane = on_pixels(pattern / max(float(pattern.std()), 1e-9), view.solution.transit.shape)
+    return [
+        Change(lambda n, _: plane * np.float32(readouts[n]), disc=False, numbers=int(np.count_nonzero(shown)))
+    ]
+
+
+def _in_pointings(view: View, readouts: Plane) -> Iterator[tuple[Plane, Plane, Plane]]:
+    """Of each pointing that tells, on coarse pixels: sums over its images of what goes with the readouts a second and of
+    their squares, the scene free; and of each block whether it tells."""
+    frames = view.solution.transit.frames
+    for fov in _pointings_of_exposures(view):
+        here = [n for n, frame in enumerate(frames) if frame.fov == fov]
+        seen, weight, free = lit_on_coarse(view, here)
+        total = np.maximum(weight.sum(axis=0), 1)
+        scene = (seen * weight).sum(axis=0) / total
+        a_second = readouts[here][:, None, None]
+        differing = a_second - (a_second * weight).sum(axis=0) / total
+        yield (
+            (weight * differing * (seen - scene)).sum(axis=0),
+            (weight * differing**2).sum(axis=0),
+            np.asarray(free > 1, dtype=np.float64),
+        )
+
+
+def _pointings_of_exposures(view: View) -> list[int]:
+    """Pointings whose images differ in exposure."""
+    frames = view.solution.transit.frames
+    kinds = {(frame.fov, frame.exposure_s) for frame in frames}
+    return [
+        fov for fov in sorted({f.fov for f in frames}) if sum(k[0] == fov for k in kinds) >= LEAST_EXPOSURES
+    ]
+
+
+def _no_pointing_of_exposures(view: View) -> str | None:
+    return None if _pointings_of_exposures(view) else "no pointing's images differ in exposure"
+
+
 def _one_exposure(view: View) -> str | None:
     exposures = {frame.exposure_s for frame in view.solution.transit.frames}
     return None if len(exposures) >= LEAST_EXPOSURES else "all images have one exposure"
@@ -169,6 +222,9 @@ PROBES: tuple[Effect, ...] = (
     _probe("bright_loss", "detector", _p("loss"), "bright pixels read out too low", ("intensity",), _bright),
     _probe("uneven_shutter", "detector", _p("x", "y"), "an exposure that differs across the field",
            ("exposure", "detector_x", "detector_y"), _shutter, _one_exposure),
+    _probe("readout_pattern", "detector", (EffectParameter("rms", "DN", 2.0, True),),
+           "a pattern that is the same in every readout", ("detector_x", "detector_y", "exposure"), _readout_pattern,
+           _no_pointing_of_exposures),
     _probe("lit_occulter", "scene", _p("level", "rim"), "an occulter that is not dark",
            ("radius_in_disc",), _lit_occulter),
     _probe("light_by_pointing", "scene", _p(*(f"{k}" for k in range(9))), "added light that differs by pointing",

@@ -49,7 +49,7 @@ def _beyond_field(view: View) -> Sequence[Change]:
         scene = _coarse(view.scenes[n])
         wide = np.pad(scene, ((pad_y, pad_y), (pad_x, pad_x)), mode="symmetric") * side
         seen = through.apply(wide.astype(np.float32))[pad_y : pad_y + ny, pad_x : pad_x + nx]
-        return _fine(seen, solution.transit.shape)
+        return on_pixels(seen, solution.transit.shape)
 
     frames = solution.transit.frames
     nothing = np.zeros(solution.transit.shape, np.float32)
@@ -119,7 +119,7 @@ def _evolution(view: View) -> Sequence[Change]:
         )
         unit = {n: np.asarray(plane / max(float(rms), 1e-9), np.float32) for n, plane in planes.items()}
         return Change(
-            lambda n, _: _fine(unit[n], nothing.shape) if n in unit else nothing,
+            lambda n, _: on_pixels(unit[n], nothing.shape) if n in unit else nothing,
             disc=False,
             numbers=sum(part.numbers(terms) for part in evolving),
         )
@@ -156,6 +156,24 @@ def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
     at = 2 * (time_s - time_s[0]) / max(float(time_s[-1] - time_s[0]), 1e-9) - 1
     degree = min(MOST_TERMS, len(images) // 2)
     basis = np.polynomial.legendre.legvander(at, degree)
+    seen, weight, free = lit_on_coarse(view, images)
+    level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
+    normal = np.einsum("nk,nyx,nl->yxkl", basis, weight, basis) + RIDGE * np.eye(degree + 1)
+    score = np.einsum("nk,nyx->yxk", basis, weight * (seen - level))
+    terms = np.moveaxis(np.linalg.solve(normal, score[..., None])[..., 0], -1, 0)
+    return _Evolving(
+        images=tuple(images),
+        basis=basis,
+        terms=np.array([gaussian_filter(plane, STRUCTURE_PX / COARSE_PX) for plane in terms]),
+        level=max(float(level.mean()), 1e-9),
+        free=free,
+    )
+
+
+def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
+    """Images of one pointing on coarse pixels, the hidden light put back and each as bright as their mean, DN/s
+    (images, y, x); one where they are away from their discs; and how many of them show each of the blocks."""
+    solution = view.solution
     planes, weights, free = [], [], []
     for n in images:
         place = solution.sky.found[n].place
@@ -168,19 +186,10 @@ def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
     # How bright an image is as a whole is not the Sun's structure.
     for one, use in zip(seen, weight > 0, strict=True):
         one /= one[use].sum() / max(float(level[use].sum()), 1e-9)
-    normal = np.einsum("nk,nyx,nl->yxkl", basis, weight, basis) + RIDGE * np.eye(degree + 1)
-    score = np.einsum("nk,nyx->yxk", basis, weight * (seen - level))
-    terms = np.moveaxis(np.linalg.solve(normal, score[..., None])[..., 0], -1, 0)
-    return _Evolving(
-        images=tuple(images),
-        basis=basis,
-        terms=np.array([gaussian_filter(plane, STRUCTURE_PX / COARSE_PX) for plane in terms]),
-        level=max(float(level.mean()), 1e-9),
-        free=np.sum(free, axis=0),
-    )
+    return seen, weight, np.sum(free, axis=0)
 
 
-def _fine(plane: Field, shape: tuple[int, ...]) -> Field:
+def on_pixels(plane: Field, shape: tuple[int, ...]) -> Field:
     """A coarse plane on the images' pixels."""
     fine = np.repeat(np.repeat(plane, COARSE_PX, axis=0), COARSE_PX, axis=1)
     return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)

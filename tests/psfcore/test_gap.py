@@ -152,6 +152,35 @@ def test_a_patch_of_light_is_nobodys_effect(clean: Transit) -> None:
     assert "patch of added light" in report["looks_like"][0]["form"]
 
 
+def test_a_pattern_of_the_readout_is_nobodys_effect(clean: Transit) -> None:
+    x = np.arange(clean.shape[1])
+    stripes = 20 * np.sin(2 * np.pi * x / 45) * np.ones((clean.shape[0], 1))
+    found = verdict(changed(clean, lambda n, f: f.pixels + stripes / f.exposure_s))
+    assert found.judgement.verdict == "unknown"
+    assert "same in every readout" in gap_report(found)["looks_like"][0]["form"]
+    (rms, *_) = found.judgement.probes[0].values.values()
+    assert rms[0] == pytest.approx(20 / np.sqrt(2), rel=0.2)
+
+
+def test_light_that_clipping_took_from_a_brightening_is_known_by_its_place(clean: Transit) -> None:
+    """One pointing's images are clipped round a place: nothing shows the scene there as it is."""
+    fov = 2
+    y, x = np.indices(clean.shape)
+    inside = 30 - np.hypot(y - 60, x - 80)
+    filled = inside > 0
+    lost = np.where(filled, np.sqrt(np.maximum(inside, 0)) / 7, 0.0)
+    frames = tuple(
+        replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=filled) if f.fov == fov else f
+        for f in clean.frames
+    )
+    found = verdict(replace(clean, frames=frames))
+    assert found.judgement.answer == ("saturation_fill",)
+    values = tried(found, "saturation_fill")
+    # Mostly inside, as it was taken.
+    assert values["excess_inside"][0] < -2 * values["excess_inside"][1]
+    assert abs(values["excess"][0]) < 3 * values["excess"][1]
+
+
 @pytest.mark.slow
 def test_brightness_that_wavers_from_image_to_image_is_no_gap(clean: Transit) -> None:
     rng = np.random.default_rng(3)

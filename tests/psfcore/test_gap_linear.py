@@ -368,6 +368,45 @@ def test_beside_an_effect_nothing_is_named_that_was_set_aside(evidence: Evidence
     assert found is None or found.answer in ((), ("dark_offset",))
 
 
+@pytest.mark.parametrize("found_well", [True, False])
+def test_a_gap_of_the_discs_is_not_laid_on_what_they_do_not_answer_to(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch, found_well: bool
+) -> None:
+    """The first was measured in the lit parts, and beside it the discs show a gap of unknown cause."""
+    column = evidence.columns["dark_offset"][0]
+    taken = tuple(replace(one, described=found_well or n > 0) for n, one in enumerate(evidence.taken))
+    measured = replace(evidence, numbers={column: 5}, taken=taken)
+    model = with_residuals(measured, {"dark_offset": 10.0})
+    first = fitted(model, [effect for effect in evidence.effects if effect.name == "dark_offset"])
+    unknown = Judgement("unknown", (), 1e-9, (), (), first)
+    monkeypatch.setattr(judging, "_judge", lambda *some: unknown)
+    found = judging._beside(model, first, lambda tried: model)
+    # Where an occulter may be elsewhere, what changes round it may make the gap after all.
+    assert (None if found is None else found.verdict) == ("inconclusive" if found_well else None)
+    nothing = replace(model, evidence=replace(model.evidence, numbers={}))
+    assert judging._beside(nothing, first, lambda tried: model) is None
+
+
+def test_beside_what_the_discs_do_not_answer_to_two_may_act_in_them(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = with_residuals(evidence, {"dark_offset": 10.0, "column_smear": 0.3})
+    two = fitted(model, evidence.effects)
+    monkeypatch.setattr(
+        judging, "_judge", lambda *some: Judgement("attributed", two.names, 1e-9, (two,), (), two)
+    )
+    first = fitted(model, ())
+    assert judging._beside(model, first, lambda tried: model) is None
+    lit = replace(model, evidence=replace(model.evidence, numbers={0: 5}))
+    found = judging._beside(lit, first, lambda tried: model)
+    assert found is not None and found.best is not None
+    assert (found.verdict, found.answer, found.best.names) == (
+        "attributed",
+        tuple(sorted(two.names)),
+        two.names,
+    )
+
+
 def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:
     model = LinearModel(evidence, 0.003)
     columns = [*evidence.base, *evidence.columns["dark_offset"]]
