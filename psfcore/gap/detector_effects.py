@@ -15,7 +15,7 @@ FAINT_DN = (30.0, 150.0)  # a mixture of both follows a loss at any faint level 
 # In mean waits between images: with a share of the last image, mixtures of these fade as traps do.
 FADES_IN = {"one_wait": 1, "three_waits": 3}
 LEAST_LEFT = 0.01  # what is left of an image after so long is too little to see
-DEEP_PX = 4.0  # from the rim of what was filled in: where its share is as stated
+DEEP_PX = 9.0  # so far in from its rim what was filled in is off by the share that is stated
 FINEST = 5  # half waves across the field, of a smooth field's finest cosines
 
 
@@ -138,8 +138,12 @@ def _filled(view: View) -> Sequence[Change]:
         filled = frames[n].filled
         if filled is None or not filled.any():
             return nothing
-        depth = np.sqrt(distance_transform_edt(filled) / DEEP_PX) if inside else filled
-        return np.asarray(images[n] * depth, dtype=np.float32)
+        if not inside:
+            return np.asarray(images[n] * filled)
+        depth = (np.sqrt(distance_transform_edt(filled)) - 1) / (
+            math.sqrt(DEEP_PX) - 1
+        )  # 0 in the rim's pixels
+        return np.asarray(images[n] * np.maximum(depth, 0.0), dtype=np.float32)
 
     # Blocks with such a pixel are no part of what the lit parts are compared by.
     return [Change(lambda n, images, k=k: change(n, images, k), lit=False) for k in (False, True)]  # type: ignore[misc]

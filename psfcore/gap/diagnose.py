@@ -18,7 +18,7 @@ from psfcore.gap.correction import Corrected, add_to_model, beyond
 from psfcore.gap.effect import Effect, View
 from psfcore.gap.evidence import Evidence, gather
 from psfcore.gap.expected_gap import ExpectedGap, expected_gap
-from psfcore.gap.judge import LEAST_IMAGES, Judgement, Tried, judge, label_of
+from psfcore.gap.judge import LEAST_IMAGES, Judgement, Tried, judge
 from psfcore.gap.library import LIBRARY
 from psfcore.gap.linear_model import FLOOR, LinearModel
 from psfcore.gap.measured_noise import MeasuredNoise, measured_noise
@@ -164,12 +164,7 @@ def diagnose_solution(
         corrected=fits,
         residual=before,
         residual_after=after if gone else None,
-        cautions=(
-            *_cautions(solution, noise, evidence),
-            *refits.failures,
-            *_amiss(found),
-            *_unexplained(found, evidence),
-        ),
+        cautions=(*_cautions(solution, noise, evidence), *refits.failures, *_amiss(found)),
     )
 
 
@@ -231,7 +226,7 @@ class _Refits:
         self.failures: list[str] = []
 
     def model(self, tried: Tried) -> LinearModel | None:
-        """The model about the refit with an effect, or a pair; none where there is no fit with it."""
+        """The model about the refit with an effect, or some together; none where there is no fit with it."""
         made = self._fit(tried)
         return None if made is None else made.model
 
@@ -313,16 +308,6 @@ def _amiss(found: Judgement) -> tuple[str, ...]:
     )
 
 
-def _unexplained(found: Judgement, evidence: Evidence) -> tuple[str, ...]:
-    best = found.best
-    if found.verdict != "inconclusive" or best is None or not evidence.numbers_of(best.step.columns):
-        return ()
-    return (
-        f"{label_of(best.names).replace('_', ' ')} shows in the lit parts, and the discs, which do not answer to it, show a "
-        "gap of their own whose cause cannot be told.",
-    )
-
-
 def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidence) -> tuple[str, ...]:
     """What a reader should know before believing a verdict."""
     out = []
@@ -340,6 +325,15 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
         out.append(
             f"{len(left_out)} images took no part: "
             + "; ".join(f"{k}: {v}" for k, v in list(left_out.items())[:3])
+        )
+    restless = [
+        evidence.taken[disc.index].file for disc in evidence.discs if not evidence.taken[disc.index].described
+    ]
+    if restless:
+        out.append(
+            f"What is round the occulters of {len(restless)} images is not what their neighbours in time show there "
+            f"({', '.join(restless[:3])}{', …' if len(restless) > 3 else ''}): these may be where they were not found, and what is "
+            "left in the discs come of that."
         )
     images = len(evidence.discs)
     if images < LEAST_IMAGES:

@@ -201,7 +201,7 @@ def _taken(frame: Frame, found: FoundPlace, distance_px: float) -> Taken:
         exposure_s=frame.exposure_s,
         gain_mode=frame.gain_mode,
         scattering_distance_px=distance_px,
-        described=found.chi2_per_pixel < UNDESCRIBED,
+        described=found.neighbours > 0 and found.chi2_per_pixel < UNDESCRIBED,
     )
 
 

@@ -22,7 +22,14 @@ from psfcore.gap.gap_plot import (
     slices_png,
     where_png,
 )
-from psfcore.gap.gap_report import AXIS_WORDS, fits_of, in_short_if_many, tied_words, words
+from psfcore.gap.gap_report import (
+    AXIS_WORDS,
+    discs_unexplained_words,
+    fits_of,
+    in_short_if_many,
+    tied_words,
+    words,
+)
 from psfcore.gap.judge import ALARM, ENOUGH, TIE
 from psfcore.gap.linear_model import FLOOR
 from psfcore.gap.where import DRAWS
@@ -261,6 +268,11 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
         parts.append(
             "None of them is the answer, nor are two together: what the best leaves still shows, or a form of a cause outside the library "
             "does clearly better."
+        )
+    elif found.judgement.discs_unexplained:
+        words = discs_unexplained_words(found.judgement)
+        parts.append(
+            f"No effect is named: {words}. Every occulter is where the images put it, so that no wrong place makes that gap."
         )
     elif report["verdict"] == "inconclusive":
         parts.append(

@@ -265,7 +265,7 @@ def draw_effects(axes: Any, report: Report) -> None:
 
 
 def _chosen(row: Report, report: Report) -> bool:
-    """Whether an effect, or a pair, is the answer, or one of those that are tied."""
+    """Whether an effect, or some together, are the answer, or one of those that are tied."""
     names, answer = set(row["name"].split(" + ")), set(report["answer"])
     if report["verdict"] != "tie":
         return names == answer

@@ -89,7 +89,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
 
 
 def _place(found: Diagnosis, tried: Tried) -> tuple[bool, bool]:
-    """Effects of an answer may each do little without the other, and go before what alone does more; of two that act
+    """Effects of an answer may each do little without the other, and go before what alone does more; of those that act
     together the one that was measured in the lit parts comes second, for it fits these whatever else acts on them."""
     best = found.judgement.best
     together = best is not None and len(best.names) > 1
@@ -219,6 +219,8 @@ def sentence(found: Diagnosis) -> str:
         return f"{lead}: no effect of the library explains it{close}."
     if judged.verdict == "tie":
         return f"{lead}: {tied_words(judged)}, which these data cannot tell apart; {would_separate(found)} would."
+    if judged.discs_unexplained:
+        return f"{lead}: {discs_unexplained_words(judged)}."
     if judged.verdict == "inconclusive":
         return (
             f"{lead} is likely (p = {judged.p_value:.2g}), but what causes it depends on what is taken for granted, or is "
@@ -255,6 +257,12 @@ def tied_words(judged: Judgement) -> str:
     among = " or ".join(words(name) for name in judged.tied)
     beside = " and ".join(words(name) for name in judged.certain)
     return f"{beside}, and beside it {among}" if beside else among
+
+
+def discs_unexplained_words(judged: Judgement) -> str:
+    """That what shows in the lit parts does not make the discs' gap."""
+    shown = words(judged.best.label) if judged.best is not None else "a change"
+    return f"{shown} shows in the lit parts, and what leaves a gap in the discs beside it cannot be told"
 
 
 def in_short_if_many(values: Sequence[float]) -> str | None:

@@ -21,7 +21,8 @@ So it is where the answer predicts images held out of its fit worse than nothing
 real explains less than half of what it does to first order is no answer: the verdict is given without it, and where a
 pair does, it is inconclusive. What was measured in the lit parts
 fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it, and where nothing else
-comes near it is the answer, however much it leaves. Of a pair, what would do in place of one is named too; where many would,
+comes near it is the answer, however much it leaves there. A gap of the discs is judged beside it by itself: one effect
+or two are named with it, and where none can be and every occulter was found well, the verdict is inconclusive. Of a pair, what would do in place of one is named too; where many would,
 the other alone.
 """
 
@@ -96,7 +97,7 @@ class Freedom:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """One effect, or two, fitted beside the PSF: values and errors by "effect.parameter", its gain, what is left.
+    """One effect, or some together, fitted beside the PSF: values and errors by "effect.parameter", its gain, what is left.
 
     p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show, and left_share:
     the largest share of what they showed before; none where it was not worth asking. explains: whether of what showed
@@ -133,7 +134,8 @@ class Judgement:
     """A verdict under one floor. tried: named effects, best first, the answer's pairs before them and what failed in the
     model for real behind, whose labels amiss holds. probes: best first.
 
-    certain: of a tie the effect that acts whichever of the others does beside it; none where one of them does alone.
+    certain: of a tie the effects that act whichever of the others does beside them; none where one of them does alone.
+    discs_unexplained: of `inconclusive`, whether it is because the discs show a gap that the best does not answer for.
     """
 
     verdict: Verdict
@@ -144,6 +146,7 @@ class Judgement:
     best: Tried | None
     certain: tuple[str, ...] = ()
     amiss: tuple[str, ...] = ()
+    discs_unexplained: bool = False
 
     @property
     def tied(self) -> tuple[str, ...]:
@@ -165,7 +168,7 @@ def no_refit(tried: Tried) -> LinearModel | None:
 def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit) -> Judgement:
     """The verdict under the model's floor, and twice with others.
 
-    refit, beyond: the model about a real refit with an effect or a pair, and the same with the effect always fitted and
+    refit, beyond: the model about a real refit with one effect or some, and the same with the effect always fitted and
     the rest of the library beside it. Each is asked at most once for the same.
     """
     once, further = _once(refit), _once(beyond)
@@ -217,12 +220,13 @@ def _confirmed(model: LinearModel, found: Judgement, once: Refit, further: Refit
         return found
     others = [_judge(replace(model, floor=model.floor * factor), once, further, LENIENT) for factor in FLOORS]
     if any(other.verdict in ("none", "inconclusive") for other in others):
-        return replace(found, verdict="inconclusive")
+        of_discs = any(other.discs_unexplained for other in others)
+        return replace(found, verdict="inconclusive", discs_unexplained=of_discs)
     if any((other.verdict == "unknown") != (found.verdict == "unknown") for other in others):
         return replace(found, verdict="inconclusive")
     every = (found, *others)
     answers = {name for one in every for name in one.answer}
-    if len({_of_two(one) for one in every}) > 1 or answers == set(found.answer):
+    if len({_acting(one) for one in every}) > 1 or answers == set(found.answer):
         return found
     certain = set.intersection(*(set(one.answer) - set(one.tied) for one in every))
     return replace(found, verdict="tie", answer=tuple(sorted(answers)), certain=tuple(sorted(certain)))
@@ -244,9 +248,9 @@ def _fails_for_real(model: LinearModel, tried: Tried, refit: Refit) -> bool:
     return explained > 0 and float(nothing[most] - added[most]) < explained / 2
 
 
-def _of_two(found: Judgement) -> bool:
-    """Whether two effects act."""
-    return found.best is not None and len(found.best.names) > 1
+def _acting(found: Judgement) -> int:
+    """How many effects act."""
+    return 0 if found.best is None else len(found.best.names)
 
 
 def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
@@ -288,20 +292,29 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
     if p_gap > lenient * ALARM or not named:
         return Judgement("none", (), p_gap, tuple(named), probes, named[0] if named else None)
     # What was measured in the lit parts fits them whatever the cause: it is behind where its score is.
-    measured = {t.label for t in named if evidence.numbers_of(t.step.columns)}
+    measured = {t.label for t in named if evidence.numbers_of(_own(model, t))}
     outdone = measured if _few_numbers_do(named, measured) else set()
     others, failed = _held_out_first(model, [t for t in named if t.label not in outdone])
     named = [*others, *(t for t in named if t.label in outdone)]
     failed |= outdone
     best = named[0] = _with_left(model, named[0], before, refit)
-    behind = measured | failed
-    rivals = max((t.score for t in (*named[1:], *probes) if t.label not in behind), default=0.0)
+    # So does a probe that was measured there; it counts beside another such alone, or where it explains clearly more.
+    fits_all = {t.label for t in probes if evidence.numbers_of(_own(model, t))}
+    probes = tuple(
+        t
+        for t in probes
+        if t.label not in fits_all or best.label in measured or best.gain < (1 - LEFT_SHARE) * t.gain
+    )
+    behind = measured | failed | (set() if best.label in measured else fits_all)
+    others_near = [t for t in (*named[1:], *probes) if t.label not in behind]
+    rivals = max((t.score for t in others_near), default=0.0)
     enough = _is_enough(best, rivals)
     if not enough and (best.explains or best.label in measured) and rivals < BEHIND * best.score:
         second = _beside(model, best, beyond)
         if second is not None:
             return replace(second, p_value=p_gap, tried=(*second.tried, *named), probes=probes)
-        if best.label in measured and rivals < UNRIVALLED * best.score:
+        of_few = max((t.score for t in others_near if t.label not in fits_all), default=0.0)
+        if best.label in measured and of_few < UNRIVALLED * best.score:
             # A Sun that changes faster than it is followed: much is left in the lit parts, and the discs' places,
             # found by what the neighbours show, are off.
             return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
@@ -399,28 +412,41 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
     second = _judge(rest, no_refit, no_refit)
     if second.verdict == "none":
         return Judgement("attributed", best.names, second.p_value, (), (), best) if best.explains else None
-    measured = model.evidence.numbers_of(best.step.columns) > 0
+    lit_alone = _lit_alone(model, best)
     if second.best is None or second.verdict not in ("attributed", "tie"):
         # Occulters that are where they were found say that the discs' gap is not made by what changes in the lit parts.
         found_well = all(model.evidence.taken[n].described for n in model.evidence.images)
-        return (
-            Judgement("inconclusive", (), second.p_value, (), (), best) if measured and found_well else None
-        )
-    if len(second.best.names) > 1 and not measured:
+        if not (lit_alone and found_well):
+            return None
+        return Judgement("inconclusive", (), second.p_value, (), (), best, discs_unexplained=True)
+    if len(second.best.names) > 1 and not lit_alone:
         return None
     if len(second.answer) > MOST_SECONDS and best.explains:
         return Judgement("attributed", best.names, second.p_value, (), (), best)
-    beside = [second.best.names]
+    instead = [t.names for t in second.tried if len(t.names) > 1 and set(t.names) <= set(second.answer)]
     if len(second.best.names) == 1:
-        beside += [(name,) for name in second.answer if name not in second.best.names]
+        instead = [(name,) for name in second.answer]
+    beside = dict.fromkeys((second.best.names, *instead))
     joint = [fitted(model, [effects[name] for name in (*best.names, *names)]) for names in beside]
-    if not all(_takes_part(name, one) for names, one in zip(beside, joint, strict=True) for name in names):
+    if not all(_takes_part(name, one) for one in joint for name in one.names):
         return None
     pair, *others = joint
     pair = replace(pair, left_p_value=second.best.left_p_value, left_share=second.best.left_share)
     answer = tuple(sorted({*best.names, *second.answer}))
     certain = (*best.names, *second.certain) if second.verdict == "tie" else ()
     return Judgement(second.verdict, answer, second.p_value, (pair, *others), (), pair, certain)
+
+
+def _own(model: LinearModel, tried: Tried) -> list[int]:
+    """The columns of what was tried, without those that are fitted beside it whatever is."""
+    return [column for column in tried.step.columns if column not in model.evidence.base]
+
+
+def _lit_alone(model: LinearModel, tried: Tried) -> bool:
+    """Whether an effect was measured in the lit parts and no disc answers to it."""
+    own = _own(model, tried)
+    silent = all(not disc.answers[own].any() for disc in model.evidence.discs)
+    return silent and model.evidence.numbers_of(own) > 0
 
 
 def _explains_more(probe: Tried, best: Tried) -> bool:

@@ -178,6 +178,9 @@ def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, ND
     for n in images:
         place = solution.sky.found[n].place
         near = disc_distance(solution.transit.shape, place) < place.radius_px + FREE_OF_DISC_PX
+        filled = solution.transit.frames[n].filled
+        if filled is not None:  # what another image shows
+            near = near | filled
         planes.append(_coarse(view.unocculted[n]))
         weights.append(_coarse((~near).astype(np.float32)) == 1)
         free.append(blocks(near.astype(np.float64)) == 0)
@@ -185,7 +188,8 @@ def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, ND
     level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
     # How bright an image is as a whole is not the Sun's structure.
     for one, use in zip(seen, weight > 0, strict=True):
-        one /= one[use].sum() / max(float(level[use].sum()), 1e-9)
+        if use.any():
+            one /= one[use].sum() / max(float(level[use].sum()), 1e-9)
     return seen, weight, np.sum(free, axis=0)
 
 

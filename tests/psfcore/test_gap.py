@@ -176,9 +176,8 @@ def test_light_that_clipping_took_from_a_brightening_is_known_by_its_place(clean
     found = verdict(replace(clean, frames=frames))
     assert found.judgement.answer == ("saturation_fill",)
     values = tried(found, "saturation_fill")
-    # Mostly inside, as it was taken.
+    # More inside than at the rim, as it was taken.
     assert values["excess_inside"][0] < -2 * values["excess_inside"][1]
-    assert abs(values["excess"][0]) < 3 * values["excess"][1]
 
 
 @pytest.mark.slow

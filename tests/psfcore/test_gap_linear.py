@@ -368,43 +368,66 @@ def test_beside_an_effect_nothing_is_named_that_was_set_aside(evidence: Evidence
     assert found is None or found.answer in ((), ("dark_offset",))
 
 
+@pytest.fixture(scope="module")
+def with_lit(solution: Solution) -> Evidence:
+    """Of three effects the first taken for one that was measured in the lit parts, which no disc answers to."""
+    gradient = [effect for effect in EFFECTS if effect.name == "intensity_gradient"]
+    found = gather(solution, (*gradient, *FEW))
+    own = list(found.columns["intensity_gradient"])
+    discs = []
+    for disc in found.discs:
+        answers = disc.answers.copy()
+        answers[own] = 0.0
+        discs.append(replace(disc, answers=answers))
+    found.lit.errors[own] = np.arange(found.lit.levels.shape[0])[:, None]
+    return replace(found, discs=tuple(discs), numbers=dict.fromkeys(own, 5))
+
+
 @pytest.mark.parametrize("found_well", [True, False])
 def test_a_gap_of_the_discs_is_not_laid_on_what_they_do_not_answer_to(
-    evidence: Evidence, monkeypatch: pytest.MonkeyPatch, found_well: bool
+    with_lit: Evidence, monkeypatch: pytest.MonkeyPatch, found_well: bool
 ) -> None:
-    """The first was measured in the lit parts, and beside it the discs show a gap of unknown cause."""
-    column = evidence.columns["dark_offset"][0]
-    taken = tuple(replace(one, described=found_well or n > 0) for n, one in enumerate(evidence.taken))
-    measured = replace(evidence, numbers={column: 5}, taken=taken)
-    model = with_residuals(measured, {"dark_offset": 10.0})
-    first = fitted(model, [effect for effect in evidence.effects if effect.name == "dark_offset"])
-    unknown = Judgement("unknown", (), 1e-9, (), (), first)
+    """Beside what shows in the lit parts the discs show a gap of unknown cause."""
+    taken = tuple(replace(one, described=found_well or n > 0) for n, one in enumerate(with_lit.taken))
+    model = LinearModel(replace(with_lit, taken=taken), FLOOR)
+    first, other = (fitted(model, [effect], any_sign=True) for effect in with_lit.effects[:2])
+    unknown = Judgement("unknown", (), 1e-9, (), (), other)
     monkeypatch.setattr(judging, "_judge", lambda *some: unknown)
     found = judging._beside(model, first, lambda tried: model)
     # Where an occulter may be elsewhere, what changes round it may make the gap after all.
-    assert (None if found is None else found.verdict) == ("inconclusive" if found_well else None)
-    nothing = replace(model, evidence=replace(model.evidence, numbers={}))
-    assert judging._beside(nothing, first, lambda tried: model) is None
+    if found_well:
+        assert found is not None and (found.verdict, found.discs_unexplained) == ("inconclusive", True)
+    else:
+        assert found is None
+    assert judging._beside(model, other, lambda tried: model) is None
 
 
 def test_beside_what_the_discs_do_not_answer_to_two_may_act_in_them(
-    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+    with_lit: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = with_residuals(evidence, {"dark_offset": 10.0, "column_smear": 0.3})
-    two = fitted(model, evidence.effects)
-    monkeypatch.setattr(
-        judging, "_judge", lambda *some: Judgement("attributed", two.names, 1e-9, (two,), (), two)
-    )
-    first = fitted(model, ())
-    assert judging._beside(model, first, lambda tried: model) is None
-    lit = replace(model, evidence=replace(model.evidence, numbers={0: 5}))
-    found = judging._beside(lit, first, lambda tried: model)
-    assert found is not None and found.best is not None
-    assert (found.verdict, found.answer, found.best.names) == (
-        "attributed",
-        tuple(sorted(two.names)),
-        two.names,
-    )
+    model = with_residuals(with_lit, {"dark_offset": 10.0, "column_smear": 0.3})
+    # All parameters of the first are kept, as a Sun's are that changes much.
+    monkeypatch.setattr(judging, "_not_worth_its_numbers", lambda *some: None)
+    first, two = fitted(model, with_lit.effects[:1]), fitted(model, with_lit.effects[1:])
+    for verdict, certain in (("attributed", ()), ("tie", ("dark_offset",))):
+        second = Judgement(verdict, two.names, 1e-9, (two,), (), two, certain)  # type: ignore[arg-type]
+        monkeypatch.setattr(judging, "_judge", lambda *some, second=second: second)
+        found = judging._beside(model, first, lambda tried: model)
+        assert found is not None and found.best is not None
+        assert found.verdict == verdict and found.best.names == (*first.names, *two.names)
+        assert set(found.answer) == {*first.names, *two.names}
+        assert found.certain == ((*first.names, "dark_offset") if certain else ())
+    alone = fitted(model, with_lit.effects[1:2])
+    assert judging._beside(model, alone, lambda tried: model) is None  # discs answer to it
+
+
+def test_what_is_fitted_beside_an_effect_does_not_make_it_one_of_the_lit_parts(with_lit: Evidence) -> None:
+    """An offset that leaves much unexplained, beside what was measured in the lit parts and is always fitted."""
+    base = (*with_lit.base, *with_lit.columns["intensity_gradient"])
+    rest = replace(with_lit, base=base, effects=with_lit.effects[1:])
+    found = judging._judge(with_residuals(rest, {"dark_offset": 30.0}, noise=3.0), no_refit, no_refit)
+    assert found.best is not None and found.best.names == ("dark_offset",)
+    assert found.verdict == "unknown"
 
 
 def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:
