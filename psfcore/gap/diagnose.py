@@ -332,8 +332,8 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
     if restless:
         out.append(
             f"What is round the occulters of {len(restless)} images is not what their neighbours in time show there "
-            f"({', '.join(restless[:3])}{', …' if len(restless) > 3 else ''}): these may be where they were not found, and what is "
-            "left in the discs come of that."
+            f"({', '.join(restless[:3])}{', …' if len(restless) > 3 else ''}): they may be elsewhere than "
+            "where they were found, and what is left in the discs may come of that."
         )
     images = len(evidence.discs)
     if images < LEAST_IMAGES:

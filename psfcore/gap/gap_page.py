@@ -270,9 +270,8 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
             "does clearly better."
         )
     elif found.judgement.discs_unexplained:
-        words = discs_unexplained_words(found.judgement)
         parts.append(
-            f"No effect is named: {words}. Every occulter is where the images put it, so that no wrong place makes that gap."
+            f"No effect is named: {discs_unexplained_words(found.judgement)}. Every occulter is where the images put it, so that no wrong place makes that gap."
         )
     elif report["verdict"] == "inconclusive":
         parts.append(

@@ -22,8 +22,8 @@ real explains less than half of what it does to first order is no answer: the ve
 pair does, it is inconclusive. What was measured in the lit parts
 fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it, and where nothing else
 comes near it is the answer, however much it leaves there. A gap of the discs is judged beside it by itself: one effect
-or two are named with it, and where none can be and every occulter was found well, the verdict is inconclusive. Of a pair, what would do in place of one is named too; where many would,
-the other alone.
+or two are named with it, and where none can be and every occulter was found well, the verdict is inconclusive. Of a
+pair, what would do in place of one is named too; where many would, the other alone.
 """
 
 from __future__ import annotations

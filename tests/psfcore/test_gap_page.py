@@ -151,6 +151,16 @@ def test_every_verdict_has_a_page_that_says_what_it_means(
     assert ("a patch of added light" in text) is (verdict in ("unknown", "inconclusive"))
 
 
+def test_a_gap_of_the_discs_beside_what_shows_in_the_lit_parts_is_told_apart(coarse: None) -> None:
+    diagnosis = judged("inconclusive")
+    diagnosis = replace(diagnosis, judgement=replace(diagnosis.judgement, discs_unexplained=True))
+    report = report_of(diagnosis)
+    told = "dark offset shows in the lit parts, and what leaves a gap in the discs beside it cannot be told"
+    assert told in report["sentence"] and "taken for granted" not in report["sentence"]
+    text = text_of(gap_page(diagnosis, report).html())
+    assert f"No effect is named: {told}." in text and "taken for granted" not in text
+
+
 def test_a_tie_beside_an_effect_that_is_certain_says_which_is_which(coarse: None) -> None:
     both = judged("tie", "core_blur", "dark_offset", "gain_mismatch")
     both = replace(both, judgement=replace(both.judgement, certain=("dark_offset",)))
