@@ -140,9 +140,8 @@ def _filled(view: View) -> Sequence[Change]:
             return nothing
         if not inside:
             return np.asarray(images[n] * filled)
-        depth = (np.sqrt(distance_transform_edt(filled)) - 1) / (
-            math.sqrt(DEEP_PX) - 1
-        )  # 0 in the rim's pixels
+        # 0 in the rim's own pixels: those are 1 px in.
+        depth = (np.sqrt(distance_transform_edt(filled)) - 1) / (math.sqrt(DEEP_PX) - 1)
         return np.asarray(images[n] * np.maximum(depth, 0.0), dtype=np.float32)
 
     # Blocks with such a pixel are no part of what the lit parts are compared by.

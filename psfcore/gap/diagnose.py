@@ -331,7 +331,7 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
     ]
     if restless:
         out.append(
-            f"What is round the occulters of {len(restless)} images is not what their neighbours in time show there "
+            f"What is round the occulters of {len(restless)} images their neighbours in time do not show, or not as it is "
             f"({', '.join(restless[:3])}{', …' if len(restless) > 3 else ''}): they may be elsewhere than "
             "where they were found, and what is left in the discs may come of that."
         )

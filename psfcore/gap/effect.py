@@ -243,8 +243,8 @@ class Change:
     """What one unit of one parameter does: change(n, images) to image n [y, x] in DN/s.
 
     images: all images as they should be, each as bright as it is, or, for the lit part, their pointings' means. lit:
-    whether it differs between images of one pointing where these are compared, so that the lit part shows it. disc: whether the discs do.
-    numbers: how many numbers of its own were taken from the lit parts to make it, which its gain pays for.
+    whether it differs between images of one pointing where these are compared, so that the lit part shows it. disc:
+    whether the discs do. numbers: how many numbers of its own were taken from the lit parts to make it, which its gain pays for.
     """
 
     change: Callable[[int, Sequence[Field]], Field]

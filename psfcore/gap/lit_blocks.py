@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.gap.effect import View
-from psfcore.scatter.inversion import Progress
+from psfcore.scatter.inversion import Progress, Solution
 from psfcore.transit.occulter import disc_distance
 
 Matrix = NDArray[np.float64]
@@ -196,6 +196,13 @@ def blocks(plane: NDArray[np.floating]) -> Vector:
     return np.asarray(cut.reshape(rows, edge, columns, edge).mean(axis=(1, 3), dtype=np.float64).ravel())
 
 
+def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:
+    """Which pixels [y, x] of image n do not show what its pointing's other images do: round its disc, and filled in."""
+    place, filled = solution.sky.found[n].place, solution.transit.frames[n].filled
+    near = disc_distance(solution.transit.shape, place) < place.radius_px + FREE_OF_DISC_PX
+    return near if filled is None else near | filled
+
+
 def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
     """Blocks of all images, with room for the errors of some columns; the caller fills those in."""
     solution = view.solution
@@ -208,11 +215,7 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
         pixels = block_px(transit.shape) ** 2
         noise = transit.noise.variance(means[-1], frame.exposure_s) / pixels
         variance.append(noise + (FLOOR * levels[-1]) ** 2)
-        place = solution.sky.found[n].place
-        near = disc_distance(transit.shape, place) < place.radius_px + FREE_OF_DISC_PX
-        if frame.filled is not None:
-            near = near | frame.filled
-        free.append(blocks(near.astype(np.float64)) == 0)
+        free.append(blocks(not_compared(solution, n).astype(np.float64)) == 0)
     kinds = [(f.fov, f.gain_mode, f.exposure_s) for f in transit.frames]
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     shape = np.shape(levels)

@@ -11,9 +11,9 @@ from scipy.ndimage import gaussian_filter
 
 from psfcore.fourier import Convolver
 from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
-from psfcore.gap.lit_blocks import FREE_OF_DISC_PX, blocks
+from psfcore.gap.lit_blocks import blocks, not_compared
 from psfcore.gap.search import coarse_kernel
-from psfcore.transit.occulter import coverage, disc_distance
+from psfcore.transit.occulter import coverage
 from psfcore.transit.transit import Place
 
 Planes = NDArray[np.float64]
@@ -172,18 +172,13 @@ def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
 
 def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
     """Images of one pointing on coarse pixels, the hidden light put back and each as bright as their mean, DN/s
-    (images, y, x); one where they are away from their discs; and how many of them show each of the blocks."""
-    solution = view.solution
+    (images, y, x); one where they can be compared; and how many of them show each of the blocks."""
     planes, weights, free = [], [], []
     for n in images:
-        place = solution.sky.found[n].place
-        near = disc_distance(solution.transit.shape, place) < place.radius_px + FREE_OF_DISC_PX
-        filled = solution.transit.frames[n].filled
-        if filled is not None:  # what another image shows
-            near = near | filled
+        out = not_compared(view.solution, n)
         planes.append(_coarse(view.unocculted[n]))
-        weights.append(_coarse((~near).astype(np.float32)) == 1)
-        free.append(blocks(near.astype(np.float64)) == 0)
+        weights.append(_coarse((~out).astype(np.float32)) == 1)
+        free.append(blocks(out.astype(np.float64)) == 0)
     seen, weight = np.array(planes, dtype=np.float64), np.array(weights, dtype=np.float64)
     level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
     # How bright an image is as a whole is not the Sun's structure.
