@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from psfcore.errors import DataError
 from psfcore.header import FitsLimits
 from service.cli_options import FILE, user_errors
 from workers.settings import Settings
@@ -86,24 +87,29 @@ def blind(
 
     with user_errors(), alone_in(output):
         plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct)
-        made = make_set(output, plan, scenes=_planes(scenes), processes=processes, progress=say)
+        made, not_made = make_set(output, plan, scenes=_planes(scenes), processes=processes, progress=say)
+        numbers = [number for number in plan.numbers if number not in not_made]
+        if not numbers:
+            why = next(iter(not_made.values()))
+            raise DataError("no-case-made", f"expected cases that can be made; of {cases} none could: {why}")
         if make_only:
-            click.echo(f"{output}: {cases} cases made and sealed")
+            click.echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
             return
-        run_set(made, plan.numbers, DIAGNOSE, processes=processes, keep=keep, progress=say)
-        click.echo(_score(made, plan.numbers))
+        run_set(made, numbers, DIAGNOSE, processes=processes, keep=keep, progress=say)
+        click.echo(_score(made, numbers, not_made))
 
 
 COMMANDS = (blind,)
 
 
-def _score(made: BlindSet, numbers: range) -> str:
+def _score(made: BlindSet, numbers: list[int], not_made: dict[int, str]) -> str:
     """Open the seals, write score.json, score.txt and score.png beside the cases; the table."""
     from psfcore.blind.running import judged_cases
     from psfcore.blind.scoring import score, table
     from psfcore.blind.scoring_plot import score_png
 
-    found = score(*judged_cases(made, numbers))
+    judged, failures = judged_cases(made, numbers)
+    found = score(judged, not_made | failures)
     text = table(found)
     (made.folder / "score.json").write_text(json.dumps(found.to_json(), indent=1, allow_nan=False), "utf-8")
     (made.folder / "score.txt").write_text(text + "\n", "utf-8")

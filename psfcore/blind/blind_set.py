@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.blind.cases import draw_case
+from psfcore.blind.cases import Case, draw_case
 from psfcore.blind.making import make, seal_of, sealed, write_transit
 from psfcore.errors import DataError
 from psfcore.whole_files import write_whole
@@ -53,6 +53,16 @@ class SetPlan:
     def numbers(self) -> range:
         """The cases' numbers."""
         return range(self.first, self.first + self.cases)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A case that was made and sealed, or why it could not be."""
+
+    case: int
+    seconds: float
+    seal: str = ""
+    why_not: str = ""
 
 
 @dataclass(frozen=True)
@@ -128,27 +138,34 @@ def make_set(
     scenes: Sequence[Plane] = (),
     processes: int = 1,
     progress: Progress = lambda line: None,
-) -> BlindSet:
-    """Make and seal all cases of a set that are not there yet.
+) -> tuple[BlindSet, dict[int, str]]:
+    """Make and seal all cases of a set that are not there yet; the set, and why by case where one cannot be made.
 
     scenes: images [y, x] in DN/s to take scenes from. Raises DataError "other-set" where the folder holds a set made
-    otherwise, and what making a case raises.
+    otherwise, and what drawing a case raises, before any is made.
     """
     made = BlindSet(folder)
     _remember(made, plan)
     (folder / "truth").mkdir(parents=True, exist_ok=True)
     sealed_before = made.seals()
     missing = [n for n in plan.numbers if not (n in sealed_before and made.truth_file(n).is_file())]
+    cases = [_drawn(plan, number) for number in missing]
     for number in missing:
         shutil.rmtree(made.case_folder(number), ignore_errors=True)  # half made
-    for done, (number, seal, seconds) in enumerate(_made(made, plan, missing, scenes, processes), 1):
+    not_made: dict[int, str] = {}
+    for done, attempt in enumerate(_made(made, cases, scenes, processes), 1):
+        so_far = f"in {attempt.seconds:.1f} s ({done} of {len(missing)})"
+        if attempt.why_not:
+            not_made[attempt.case] = attempt.why_not
+            progress(f"could not make case {attempt.case:04d} {so_far}: {attempt.why_not}")
+            continue
         _end_cut_line(made.seals_file)
         with made.seals_file.open("a", encoding="utf-8") as seals:
-            seals.write(json.dumps({"case": number, "sha256": seal}) + "\n")
+            seals.write(json.dumps({"case": attempt.case, "sha256": attempt.seal}) + "\n")
             seals.flush()
             os.fsync(seals.fileno())
-        progress(f"made case {number:04d} in {seconds:.1f} s ({done} of {len(missing)})")
-    return made
+        progress(f"made case {attempt.case:04d} {so_far}")
+    return made, not_made
 
 
 def _remember(made: BlindSet, plan: SetPlan) -> None:
@@ -187,17 +204,17 @@ def _end_cut_line(file: Path) -> None:
 
 
 def _made(
-    made: BlindSet, plan: SetPlan, numbers: Sequence[int], scenes: Sequence[Plane], processes: int
-) -> Iterator[tuple[int, str, float]]:
-    """Case, seal and seconds of each, as they come."""
-    if processes <= 1 or len(numbers) <= 1:
-        yield from (_make_one(made, plan, number, scenes) for number in numbers)
+    made: BlindSet, cases: Sequence[Case], scenes: Sequence[Plane], processes: int
+) -> Iterator[_Attempt]:
+    """Each case's making, as they come."""
+    if processes <= 1 or len(cases) <= 1:
+        yield from (_make_one(made, case, scenes) for case in cases)
         return
     # Fork would carry this process's threads' locks along.
     with ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_end_with_parent
     ) as pool:
-        waiting = [pool.submit(_make_one, made, plan, number, scenes) for number in numbers]
+        waiting = [pool.submit(_make_one, made, case, scenes) for case in cases]
         for future in as_completed(waiting):
             yield future.result()
 
@@ -214,9 +231,8 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _make_one(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane]) -> tuple[int, str, float]:
-    started = time.perf_counter()
-    case = draw_case(
+def _drawn(plan: SetPlan, number: int) -> Case:
+    return draw_case(
         plan.seed,
         number,
         plan.size_px,
@@ -226,8 +242,15 @@ def _make_one(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane
         built_diffraction=plan.built_diffraction,
         left_pct=plan.left_pct,
     )
-    result = make(case, scenes)
-    write_transit(result, case.plan, made.transit(number))
+
+
+def _make_one(made: BlindSet, case: Case, scenes: Sequence[Plane]) -> _Attempt:
+    started = time.perf_counter()
+    try:
+        result = make(case, scenes)
+    except DataError as error:
+        return _Attempt(case.number, time.perf_counter() - started, why_not=f"{error.code}: {error.message}")
+    write_transit(result, case.plan, made.transit(case.number))
     seal, kept = sealed(result.truth)
-    write_whole(made.truth_file(number), json.dumps(kept, allow_nan=False))
-    return number, seal, time.perf_counter() - started
+    write_whole(made.truth_file(case.number), json.dumps(kept, allow_nan=False))
+    return _Attempt(case.number, time.perf_counter() - started, seal)

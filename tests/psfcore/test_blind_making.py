@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.blind.blind_set import BlindSet, SetPlan, _end_cut_line, alone_in, make_set
-from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE, case_scenes, draw_case
+from psfcore.blind.blind_set import BlindSet, Plane, SetPlan, _end_cut_line, alone_in, make_set
+from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE, Case, case_scenes, draw_case
 from psfcore.blind.effects import EFFECTS, KNOWN
-from psfcore.blind.making import make
+from psfcore.blind.making import Made, make
 from psfcore.errors import DataError
 from psfcore.header import FitsLimits
 from psfcore.transit.folder import read_transit
@@ -26,7 +27,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> BlindSet:
     plan = SetPlan(
         2, 3, SIZE_PX, IMAGES, only=("intensity_gradient", "saturation_fill"), built_diffraction=False
     )
-    return make_set(tmp_path_factory.mktemp("blind") / "set", plan)
+    return make_set(tmp_path_factory.mktemp("blind") / "set", plan)[0]
 
 
 def test_kinds_come_in_their_shares_and_effects_in_turn() -> None:
@@ -182,3 +183,24 @@ def test_made_cases_are_not_made_again(made: BlindSet) -> None:
     )
     make_set(made.folder, plan)
     assert (made.truth_file(0).read_bytes(), made.seals_file.read_bytes()) == before
+
+
+def test_a_case_that_cannot_be_made_is_named_and_the_others_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = SetPlan(3, 3, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
+
+    def make_but_one(case: Case, scenes: Sequence[Plane]) -> Made:
+        if case.number == 1:
+            raise DataError("bad-scene", "expected a scene with light; got none")
+        return make(case, scenes)
+
+    monkeypatch.setattr("psfcore.blind.blind_set.make", make_but_one)
+    said: list[str] = []
+    made, not_made = make_set(tmp_path, plan, progress=said.append)
+    assert not_made == {1: "bad-scene: expected a scene with light; got none"}
+    assert [made.is_made(number) for number in plan.numbers] == [True, False, True]
+    assert sum("could not make case 0001" in line for line in said) == 1
+    monkeypatch.undo()
+    assert make_set(tmp_path, plan)[1] == {}, "the next run tries it again"
+    assert made.is_made(1)

@@ -10,6 +10,7 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
+from psfcore.errors import DataError
 from service.cli_gap_blind import blind
 
 SMALL = ["--size", "128", "--images", "9", "--synthetic", "--processes", "1"]
@@ -27,7 +28,7 @@ def test_a_set_is_made_and_sealed_and_another_is_not_mixed_in(tmp_path: Path) ->
     fits.PrimaryHDU((400 + 80 * rng.random((300, 300))).astype("f4"), header).writeto(image)
     made = run("--cases", 1, "--clean-only", "--make-only", "--scenes", image, "-o", folder, *SMALL)
     assert made.exit_code == 0, made.output
-    assert "1 cases made and sealed" in made.output
+    assert "1 of 1 cases made and sealed" in made.output
     assert len((folder / "seals.jsonl").read_text().splitlines()) == 1
     assert len(list((folder / "cases" / "0000" / "transit").glob("0*.fits"))) == 9
     other = run("--cases", 1, "--seed", 9, "--clean-only", "--make-only", "-o", folder, *SMALL)
@@ -49,6 +50,18 @@ def test_bad_input_is_said_in_a_line(arguments: list[str], said: str, tmp_path: 
     assert said in answer.output
     assert "Traceback" not in answer.output
     assert not (tmp_path / "set" / "cases").exists()
+
+
+def test_where_no_case_can_be_made_that_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def cannot(case: object, scenes: object) -> None:
+        raise DataError("bad-scene", "expected a scene with light for pointing 2; got none")
+
+    monkeypatch.setattr("psfcore.blind.blind_set.make", cannot)
+    answer = run("--cases", 2, "--clean-only", "-o", tmp_path / "set", *SMALL)
+    assert answer.exit_code == 1
+    assert "could not make case 0001" in answer.output
+    assert "expected cases that can be made; of 2 none could: bad-scene: expected a scene" in answer.output
+    assert "Traceback" not in answer.output
 
 
 @pytest.mark.slow
