@@ -133,7 +133,11 @@ def worker(
 @NOISE
 @SATURATION
 @click.option(
-    "--errors", "error_draws", type=click.IntRange(0, 64), default=0, help="Noise draws for an ERROR plane"
+    "--errors",
+    "error_draws",
+    type=click.IntRange(0, 64),
+    default=0,
+    help="Noise draws for an ERROR plane: 2 or more, with --noise",
 )
 @click.option("--preview", type=OUTPUT, help="Write a picture too (PNG)")
 @click.option("--effects", type=OUTPUT, help="And one of all effects (PNG)")

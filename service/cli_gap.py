@@ -52,13 +52,18 @@ def gap() -> None:
 @click.option("--json", "report_file", type=OUTPUT, help="Write the report (schema gap/1)")
 @click.option("--html", "page_file", type=OUTPUT, help="Write it as a page to read")
 @PLOT
-@click.option("--psf", metavar="ID|FILE", help="A PSF fitted to a transit, to start the fit from")
 @click.option(
-    "--corrected", "corrected_file", type=OUTPUT, help="Write the PSF with the answer in the model (FITS)"
+    "--psf", metavar="ID|FILE", help="A PSF fitted to a transit: its shape is fitted, from its values"
+)
+@click.option(
+    "--corrected",
+    "corrected_file",
+    type=OUTPUT,
+    help="Write the PSF with the answer in the model, of a tie with the best of those tied (FITS)",
 )
 @click.option(
     "--effects",
-    metavar="FILE.py|MODULE",
+    metavar="FILE.py|MODULE[,...]",
     help="Try effects of your own too; their code is run. With --local: a service has HELIOPSF_GAP_EFFECTS",
 )
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Of all draws")
@@ -132,7 +137,8 @@ def _service(server: str | None, local: bool, effects: str | None) -> Iterator[O
 
 def _lines(report: dict[str, Any]) -> list[str]:
     """What is said of a report on a terminal."""
-    answer = f" ({', '.join(report['answer'])})" if report["answer"] else ""
+    so_far = "best so far: " if report["verdict"] == "inconclusive" else ""
+    answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
     out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
     together = report.get("together", ())  # reports of earlier versions have none
     for effect in [*together, *report["effects"]][:SHOWN]:

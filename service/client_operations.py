@@ -85,7 +85,7 @@ class Operations(ABC):
     ) -> dict[str, Any]:
         """Upload an image, have it deconvolved and download the product; returns its description.
 
-        ``noise``: (DN a detected photon, DN rms of the readout). ``error_draws``: 4 or more add an ERROR plane.
+        ``noise``: (DN a detected photon, DN rms of the readout). ``error_draws``: 2 or more add an ERROR plane, and need ``noise``.
         ``effects``: where to write the picture of difference, ratio and histogram.
         ``method_parameters``: what the method takes, as ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
         """

@@ -105,9 +105,18 @@ class Deconvolve(Parameters):
         None, gt=0, allow_inf_nan=False, description="DN of one exposure; none: the instrument's, if known"
     )
     error_draws: int = Field(
-        0, ge=0, le=64, description="noise draws for an ERROR plane (4 or more; each costs one deconvolution)"
+        0,
+        ge=0,
+        le=64,
+        description="noise draws for an ERROR plane (0, or 2 and more; each costs one deconvolution)",
     )
     effects_picture: bool = Field(False, description="also draw difference, ratio and histogram")
+
+    @model_validator(mode="after")
+    def _a_spread(self) -> Deconvolve:
+        if self.error_draws == 1:
+            raise ValueError("error_draws: expected 0, or 2 and more; got 1, which shows no spread")
+        return self
 
     @model_validator(mode="after")
     def _one_choice(self) -> Deconvolve:
@@ -311,6 +320,7 @@ class ResolvedGapDiagnose(GapDiagnose):
 
     diffraction_recipe: PsfBuild | None = None
     added_effects: tuple[str, ...] = ()
+    added_effects_sha256: tuple[str, ...] = ()  # of their texts: another text is another diagnosis
 
 
 # Jobs on an uploaded transit, as the worker gets them.
@@ -409,11 +419,15 @@ def diffraction_identity(request: ResolvedOnTransit) -> str | None:
 
 
 def _transit_identity(kind: str, request: ResolvedOnTransit) -> str:
+    # The diffraction's identity says what it is; the recipe only how to make it. Without added effects the identity is
+    # what it was before their texts counted.
+    beside = {"diffraction_recipe"}
+    if isinstance(request, ResolvedGapDiagnose) and not request.added_effects_sha256:
+        beside.add("added_effects_sha256")
     return canonical_hash(
         {
             "kind": kind,
-            # The diffraction's identity says what it is; the recipe only how to make it.
-            "request": request.model_dump(mode="json", exclude={"diffraction_recipe"}),
+            "request": request.model_dump(mode="json", exclude=beside),
             "diffraction": diffraction_identity(request),
             "algorithm_version": request.algorithm_version,
         }

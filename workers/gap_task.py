@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from psfcore.errors import DataError
@@ -10,6 +11,7 @@ from psfcore.fits_io import write_psf
 from psfcore.gap.added_effects import Added, added_effects, library_with
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
+from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.gap.gap_page import gap_page
 from psfcore.gap.gap_plot import gap_png
 from psfcore.gap.gap_report import gap_report
@@ -52,9 +54,14 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
         progress=context.report,
     )
     provenance = _provenance(context, request, identity, parent, added)
-    corrected = (
-        _save_psf(context, identity, found, provenance) if request.correct and found.corrected else None
-    )
+    corrected = None
+    if request.correct and found.corrected:
+        try:
+            corrected = _save_psf(context, identity, found, provenance)
+        except DataError as error:
+            # An added effect may answer for images and not for a point alone: its diagnosis stands.
+            caution = f"The PSF with the answer in the model could not be made: {error.message}"
+            found = replace(found, cautions=(*found.cautions, caution))
     _save(context, request, identity, found, provenance, corrected)
     return identity
 
@@ -67,6 +74,17 @@ def _check_effects(context: Context, request: ResolvedGapDiagnose) -> None:
             f"expected the effects that the job was taken with ({', '.join(request.added_effects) or 'none'}); this worker "
             f"adds {', '.join(context.settings.added_effects) or 'none'}: submit the job again",
         )
+    here = tuple(sha256_of_source(source) for source in request.added_effects)
+    if here != request.added_effects_sha256:
+        raise DataError(
+            "effects-changed",
+            f"expected the texts that the job was taken with ({_short(request.added_effects_sha256)}); this worker's are "
+            f"others ({_short(here)}), or were changed since: submit the job again",
+        )
+
+
+def _short(hashes: tuple[str, ...]) -> str:
+    return ", ".join(one[:12] for one in hashes) or "not noted"
 
 
 def _provenance(

@@ -9,6 +9,7 @@ from pathlib import PurePath
 from typing import Any
 
 from psfcore.errors import DataError
+from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.header import HeaderSummary
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import parse_instrument
@@ -230,6 +231,7 @@ def _diagnosis(
     return ResolvedGapDiagnose(
         diffraction_recipe=_diffraction_of(summary, asked),
         added_effects=added_effects,
+        added_effects_sha256=tuple(sha256_of_source(source) for source in added_effects),
         **asked.model_dump(mode="json"),
     )
 

@@ -114,7 +114,7 @@ class Settings(BaseSettings):
 
     gap_effects: str = Field(
         "",
-        description="modules of effects that a gap's diagnosis tries too, separated by commas; their code is run",
+        description="modules, or files that end in .py, of effects that a gap's diagnosis tries too, separated by commas; their code is run",
     )
 
     @field_validator("worker_queues")

@@ -2,9 +2,10 @@
 
 DIR/set.json                  how the set was made: seed, sizes, number of cases
 DIR/cases/NNNN/transit/       what a diagnosis gets
-DIR/cases/NNNN/report.json    what it said (gap/1); run.json: time, memory; failure.json in place of a report
+DIR/cases/NNNN/report.json    what it said (gap/1); run.json: time, memory, and why there is no report
 DIR/truth/NNNN.json           salt and truth
 DIR/seals.jsonl               {"case", "sha256"}, a line a case
+DIR/score.json, .txt, .png    the figures, the table, the picture; made anew by each run
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SetPlan:
-    """How a set is made. first: the number of its first case; the others: as draw_case has them."""
+    """How a set is made. first: the number of its first case; scenes: SHA-256 of the images that scenes are taken from, in
+    their order; the others: as draw_case has them."""
 
     cases: int
     seed: int
@@ -48,6 +50,7 @@ class SetPlan:
     clean_only: bool = False
     built_diffraction: bool = True
     left_pct: tuple[float, ...] = ()
+    scenes: tuple[str, ...] = ()
 
     @property
     def numbers(self) -> range:
@@ -110,7 +113,7 @@ class BlindSet:
         return found
 
     def truth(self, number: int) -> dict[str, Any]:
-        """A case's truth, after its seal was checked. Raises DataError "broken-seal"."""
+        """A case's truth, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
         seal = self.seals().get(number)
         try:
             kept = json.loads(self.truth_file(number).read_text("utf-8"))
@@ -127,7 +130,10 @@ class BlindSet:
         return truth
 
     def is_made(self, number: int) -> bool:
-        """Whether a case was made and sealed; its transit may have been deleted after the report."""
+        """Whether a case was made and sealed; its transit may have been deleted after the report.
+
+        Raises DataError "bad-seals".
+        """
         return self.truth_file(number).is_file() and number in self.seals()
 
 
@@ -142,7 +148,7 @@ def make_set(
     """Make and seal all cases of a set that are not there yet; the set, and why by case where one cannot be made.
 
     scenes: images [y, x] in DN/s to take scenes from. Raises DataError "other-set" where the folder holds a set made
-    otherwise, and what drawing a case raises, before any is made.
+    otherwise, "bad-seals", and what drawing a case raises, before any is made.
     """
     made = BlindSet(folder)
     _remember(made, plan)
@@ -173,7 +179,7 @@ def _remember(made: BlindSet, plan: SetPlan) -> None:
     about = json.loads(json.dumps(asdict(plan)))
     file = made.folder / "set.json"
     if file.is_file():
-        before = json.loads(file.read_text("utf-8"))
+        before = {"scenes": []} | json.loads(file.read_text("utf-8"))  # sets made earlier do not say
         same = {key: value for key, value in before.items() if key != "cases"}
         if same != {key: value for key, value in about.items() if key != "cases"}:
             raise DataError(

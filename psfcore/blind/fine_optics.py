@@ -4,7 +4,7 @@
     s_fine(r) = a / FINE^2 / (b + r)^c off the centre                                                    Eq. (2)
 
 k is the fine kernel, K what an evenly lit detector pixel sends to another. The fine centre takes what makes the
-boxed centre 1 - total, so that the boxed scatter is what the definition of scatter says but for its curvature within
+boxed centre 1 - total, so that the boxed scatter is a law on detector pixels but for its curvature within
 a pixel.
 
 | symbol | name | unit |

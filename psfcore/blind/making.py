@@ -51,7 +51,10 @@ class Made:
 
 
 def make(case: Case, images: Sequence[Plane] = ()) -> Made:
-    """Draw scenes, set strengths, observe, measure. images: to take scenes from. Raises DataError."""
+    """Draw scenes, set strengths, observe, measure. images: to take scenes from.
+
+    Raises DataError "bad-scene", and as `psfcore.scatter.inversion.invert` does.
+    """
     sky = Sky(case.plan, fine_optics(case.law, case.glass, case.plan.size_px), case_scenes(case, images))
     diffraction = boxed_glass(case.glass)
     clean = Chain(sky, ())

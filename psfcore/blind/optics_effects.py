@@ -105,7 +105,7 @@ class WideHalo(Effect):
             return optics
         x, y = optics.offsets_px
         r = np.hypot(x, y)
-        if self.moffat:  # half of the light within about 0.8 scales
+        if self.moffat:  # half of the light within 0.88 scales
             halo = (1 + (r / self.scale_px) ** 2) ** -2.2 * 1.2 / (np.pi * self.scale_px**2)
         else:
             halo = np.exp(-r / self.scale_px) / (2 * np.pi * self.scale_px**2)
@@ -251,7 +251,7 @@ class MeshPitch(Effect):
 
 @dataclass(frozen=True)
 class FieldDependentScatter(Effect):
-    """The amount of scatter depends on where the light comes from: a tilt and a bowl, both by `strength` at the edge."""
+    """The amount of scatter depends on where the light comes from: a tilt by `strength` at the edge, and a bowl."""
 
     angle_deg: float = 0.0
     bowl: float = 0.5

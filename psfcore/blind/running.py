@@ -1,7 +1,7 @@
 """Diagnosing a blind set: every case in a process of its own that sees a copy of the transit and nothing else.
 
 The copy lies in a temporary folder without the case's number, the process runs there, and the report comes back when
-it is whole. A case that has one is not diagnosed again; a failure is kept apart and tried again with the next run.
+it is whole. A case that has one is not diagnosed again; a failure stands in run.json and is tried again with the next run.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def run_set(
     """Diagnose the cases that have no report yet; the runs of those, by case.
 
     command: a program and its arguments, with {transit} and {report} in place of the paths. keep: transits stay once
-    there is a report. Raises DataError "bad-command", and "not-sealed" where a case has no seal.
+    there is a report. Raises DataError "bad-command", "bad-seals", and "not-sealed" where a case has no seal.
     """
     if not all(any(mark in part for part in command) for mark in ("{transit}", "{report}")):
         raise DataError("bad-command", f"expected {{transit}} and {{report}} in the command; got {command}")
@@ -107,7 +107,7 @@ def run_of(made: BlindSet, number: int) -> Run | None:
 def judged_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[Judged], dict[int, str]]:
     """Every case that has a report beside its truth, whose seal is checked; and why the others have none.
 
-    Raises DataError "broken-seal".
+    Raises DataError "broken-seal", "bad-seals".
     """
     judged, failures = [], {}
     for number in numbers:

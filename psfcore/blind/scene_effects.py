@@ -56,7 +56,7 @@ class OcculterMotion(Effect):
 
 @dataclass(frozen=True)
 class SceneEvolution(Effect):
-    """Patches brighten and fade, each with its own phase and period of half the pointing to twice it."""
+    """Patches brighten and fade, each with its own phase, all with one period."""
 
     seed: int = 0
     patch: float = 0.05

@@ -21,6 +21,7 @@ import numpy as np
 
 from psfcore.errors import DataError
 from psfcore.gap.effect import Change, Effect, Field, View
+from psfcore.gap.effect_sources import is_file, sha256_of_source
 from psfcore.gap.library import LIBRARY
 
 NAME = "EFFECTS"
@@ -53,15 +54,21 @@ def library_with(added: Sequence[Added]) -> tuple[Effect, ...]:
 
 
 def _added(source: str) -> Added:
+    sha256 = sha256_of_source(source)
     with _theirs(source):
-        module = _of_file(Path(source)) if source.endswith(".py") else importlib.import_module(source)
+        module = _of_file(Path(source)) if is_file(source) else _of_name(source)
     found = getattr(module, NAME, None)
     if not isinstance(found, (tuple, list)) or not found or not all(isinstance(e, Effect) for e in found):
         raise _bad(source, f"expected {NAME}, a tuple of Effect; got {_words(found)}")
     for effect in found:
         _check(effect, source)
-    text = Path(module.__file__).read_bytes() if module.__file__ else b""
-    return Added(source, hashlib.sha256(text).hexdigest(), tuple(_guarded(e, source) for e in found))
+    return Added(source, sha256, tuple(_guarded(e, source) for e in found))
+
+
+def _of_name(name: str) -> ModuleType:
+    """The module of a name, read anew: a worker that imported it before would run what it was then."""
+    before = sys.modules.get(name)
+    return importlib.import_module(name) if before is None else importlib.reload(before)
 
 
 def _of_file(path: Path) -> ModuleType:
@@ -102,7 +109,7 @@ def _line(error: Exception, source: str) -> str:
     """Where in the source's file an error arose, in words; nothing where that is not known."""
     if isinstance(error, SyntaxError):
         return ""  # says so itself
-    name = Path(source).name if source.endswith(".py") else f"{source.rpartition('.')[2]}.py"
+    name = Path(source).name if is_file(source) else f"{source.rpartition('.')[2]}.py"
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name == name]
     return f" (line {lines[-1]})" if lines else ""
 

@@ -35,7 +35,7 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
     """The PSF with the answer's effects in the model, on the full reach; components DIFFRACTION and SCATTER beside it.
 
     provenance: what made it and its parents; effects, their parameters, the gap and the inputs are added here. Raises
-    DataError "no-answer" where no effect was added to the model.
+    DataError "no-answer" where no effect was added to the model, "bad-effects" of what somebody added, and as `Psf` does.
     """
     if not found.corrected:
         raise DataError(

@@ -79,8 +79,8 @@ def add_to_model(
 ) -> Corrected:
     """Fit PSF and effects together, starting from the linear fit `found`.
 
-    view: of the solution, where there is one. Raises what `invert` raises in the first round, and DataError
-    "effect-unseen" where none of an effect is left.
+    view: of the solution, where there is one. Raises what `invert` raises before a round was good, and DataError
+    "effect-unseen" where none of an effect is left, "bad-effects" of what somebody added.
     """
     transit = solution.transit
     # A form with a place of its own keeps the place that was found: it is looked for once.
@@ -219,7 +219,10 @@ def beyond(
     *,
     progress: Progress = lambda stage, step, steps: None,
 ) -> LinearModel:
-    """The model about a fit with effects in it, which are always fitted, and how it answers to others of a library."""
+    """The model about a fit with effects in it, which are always fitted, and how it answers to others of a library.
+
+    Raises DataError "bad-effects" of what somebody added.
+    """
     names = {effect.name for effect in added.effects}
     others = [effect for effect in library if effect.name not in names]
     evidence = gather(added.solution, (*added.effects, *others), progress=progress)

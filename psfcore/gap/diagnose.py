@@ -1,8 +1,9 @@
 """The diagnosis of a transit: noise, fit, expected gap, evidence, verdict, real refits, where, and how far it shrinks.
 
-In this order, each once: the noise that the images show; the PSF fitted; what the same fit leaves on its own
+In this order: the noise that the images show; the PSF fitted; what the same fit leaves on its own
 simulation; how discs and lit parts answer to every effect; the verdict; the answer's effects added to the model for
-real, and with a tie each of its effects; closure and gap on images held out.
+real, and with a tie those it lies between, at most MOST_REFITS (the verdict asks for such fits too, each made once);
+closure and gap on images held out.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from psfcore.gap.judge import LEAST_IMAGES, Judgement, Tried, judge
 from psfcore.gap.library import LIBRARY
 from psfcore.gap.linear_model import FLOOR, LinearModel
 from psfcore.gap.measured_noise import MeasuredNoise, measured_noise
+from psfcore.gap.scene_effects import MOST_POINTINGS
 from psfcore.gap.where import Axis, where
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Progress, Solution, invert
@@ -92,7 +94,7 @@ def diagnose(
 
     start: the shape's coordinates that the fit starts from; none: its own. refit: add the answer's effects to the model
     for real. seed: of the simulation and of the intervals. Raises DataError as `psfcore.scatter.inversion.invert` does,
-    "bad-library" where an answerable effect is missing.
+    "bad-library" where an answerable effect is missing, "bad-effects" of what somebody added.
     """
     if not any(effect.named for effect in library):
         raise DataError("bad-library", "expected at least one effect that can be an answer; got none")
@@ -108,7 +110,7 @@ def diagnose(
 def start_of(psf: Psf) -> tuple[Shape, Vector]:
     """The shape that a PSF was fitted with, and its coordinates: where `diagnose` may start.
 
-    Raises DataError "psf-not-fitted" where it was not fitted to a transit.
+    Raises DataError "psf-not-fitted" where it was not fitted to a transit, "unknown-shape" where not with one known here.
     """
     if psf.fitted is None:
         raise DataError(
@@ -127,7 +129,7 @@ def diagnose_solution(
     refit: bool = True,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Diagnosis:
-    """The diagnosis of a fit that was made already; arguments as in `diagnose`."""
+    """The diagnosis of a fit that was made already; arguments and errors as in `diagnose`."""
     view = View(solution)
     expected = expected_gap(view, seed=seed, floor=FLOOR, progress=progress)
     evidence = gather(solution, library, view=view, progress=progress)
@@ -313,7 +315,8 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
     out = []
     if noise is None:
         out.append(
-            "No two images of one pointing, gain mode and exposure follow each other: the stated noise could not be checked."
+            "The stated noise could not be checked: too few images of one pointing, gain mode and exposure follow each other, or "
+            "what differs between them has no noise's form."
         )
     elif not noise.agrees:
         out.append(
@@ -340,7 +343,12 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
         out.append(
             f"With {images} images nothing can be held out: closure and the gap held out are not given."
         )
-    if len({taken.fov for taken in evidence.taken}) == 1:
+    aimed = len({taken.fov for taken in evidence.taken})
+    if aimed > MOST_POINTINGS:
+        out.append(
+            f"Light from outside the field is looked for in the first {MOST_POINTINGS} of {aimed} pointings alone."
+        )
+    if aimed == 1:
         out.append(
             "One pointing alone: what differs between pointings cannot be told, and none can be left out."
         )

@@ -257,11 +257,12 @@ class Change:
 class Effect:
     """One effect: its physical cause, what would settle it, and the axes along which it shows.
 
-    changes(view): one a parameter. why_not(view): why these data cannot show it, or None. trials: how many places
-    were looked at for the best, about, which its gain pays for. named: whether it may be an answer; if not, it is a
-    probe: a form that gaps of unknown cause have, which says that the cause is not in the library. held(view): of an
-    effect that searches for a place, the same with that place held. field: whether its parameters are those of a random
-    field, each about as large as is likely: its gain pays for what was learned of them, not for how many they are.
+    changes(view): one a parameter; where there are fewer or more, as of what is fitted by pointing, the first ones'.
+    why_not(view): why these data cannot show it, or None. trials: how many places were looked at for the best, about,
+    which its gain pays for. named: whether it may be an answer; if not, it is a probe: a form that gaps of unknown cause
+    have, which says that the cause is not in the library. held(view): of an effect that searches for a place, the same
+    with that place held. field: whether its parameters are those of a random field, each about as large as is likely:
+    its gain pays for what was learned of them, not for how many they are.
     """
 
     name: str

@@ -99,7 +99,10 @@ def gather(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """The evidence of a solution on all effects of a library that these data can show. view: of it, where there is one."""
+    """The evidence of a solution on all effects of a library that these data can show. view: of it, where there is one.
+
+    Raises DataError "bad-effects" of what somebody added.
+    """
     view = view or View(solution)
     changes, columns, untestable = _changes(view, library)
     base = tuple(range(solution.inversion.coordinates.size))

@@ -47,7 +47,10 @@ def simulated(view: View, seed: int) -> Transit:
 def expected_gap(
     view: View, *, seed: int = 1, floor: float, progress: Progress = lambda stage, step, steps: None
 ) -> ExpectedGap:
-    """What the estimator leaves on one simulation of the fitted model. view: of the fit."""
+    """What the estimator leaves on one simulation of the fitted model. view: of the fit.
+
+    Raises DataError as `psfcore.scatter.inversion.invert` does.
+    """
     solution = view.solution
 
     def say(stage: str, step: int, steps: int) -> None:

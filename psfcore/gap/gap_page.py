@@ -30,7 +30,7 @@ from psfcore.gap.gap_report import (
     tied_words,
     words,
 )
-from psfcore.gap.judge import ALARM, ENOUGH, TIE
+from psfcore.gap.judge import ALARM, ENOUGH, TIE, TIE_SHARE
 from psfcore.gap.linear_model import FLOOR
 from psfcore.gap.where import DRAWS
 from psfcore.page import (
@@ -95,9 +95,10 @@ def gap_page(found: Diagnosis, report: Report) -> Page:
 def _found(found: Diagnosis, report: Report) -> list[Part]:
     gap = report["gap"]
     answer = ", ".join(words(name) for name in report["answer"]) or "none"
+    unsure = report["verdict"] == "inconclusive" and bool(report["answer"])
     values = [
         Value("verdict", report["verdict"], meaning=VERDICTS[report["verdict"]]),
-        Value("answer", answer, meaning=_answer_meaning(report)),
+        Value("best so far" if unsure else "answer", answer, meaning=_answer_meaning(report)),
         Value(
             "p-value of there being no gap",
             f"{gap['p_value']:.2g}",
@@ -271,7 +272,7 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
         )
     elif found.judgement.discs_unexplained:
         parts.append(
-            f"No effect is named: {discs_unexplained_words(found.judgement)}. Every occulter is where the images put it, so that no wrong place makes that gap."
+            f"No effect is the answer: {discs_unexplained_words(found.judgement)}. Every occulter is where the images put it, so that no wrong place makes that gap."
         )
     elif report["verdict"] == "inconclusive":
         parts.append(
@@ -280,7 +281,8 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
         )
     elif report["ties"]:
         parts.append(
-            f"Tied: {tied_words(found.judgement)}. Their scores lie within {TIE:g} of one another, or change places with what is taken for granted."
+            f"Tied: {tied_words(found.judgement)}. Their scores lie within {TIE:g} of one another, or within {100 * TIE_SHARE:g} % of what the best gains (more "
+            "widely where a place was searched for), or change places with what is taken for granted."
         )
     if report["verdict"] != "none":
         parts.append(_effects_figure(report))
@@ -295,7 +297,7 @@ def _effects_figure(report: Report) -> Figure:
         effects_png(report),
         f"Effects of the library, best first (at most {MOST_EFFECTS}), what fails in the model for real last: the share of the gap that each closes on images held out, with its "
         "90 % interval; bars and intervals that leave the chart are cut, with an arrow. Blue: the answer, or what is tied. A wrong effect may close much of a gap too, so that the score decides: by how much chi2 falls, "
-        f"less what its parameters and a search for its place gain from noise; what lies within {TIE:g} of the best is tied with it.",
+        f"less what its parameters and a search for its place gain from noise; what lies within {TIE:g}, or {100 * TIE_SHARE:g} % of what the best gains, is tied with it.",
         "Bars of held-out closure by effect",
     )
 

@@ -5,8 +5,8 @@ Gains of effects are compared after what their parameters, and a search over man
     score = gain - PENALTY parameters - cost of a field - 2 ln trials       Eq. (1)
 
 There is a gap where patterns that any gap makes (`patterns`), the discs' means, all cells, the lit blocks or an effect's
-gain are less likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect cannot be
-told from it, unless it does clearly worse on images held out of its fit.
+gain are less likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect, or
+within TIE_SHARE of its gain, cannot be told from it (more widely where a place was searched for), unless it does clearly worse on images held out of its fit.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
 TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
 sky's. Another is named beside it where it gains more than a search and that error let it, and more than the first's
@@ -134,6 +134,7 @@ class Judgement:
     """A verdict under one floor. tried: named effects, best first, the answer's pairs before them and what failed in the
     model for real behind, whose labels amiss holds. probes: best first.
 
+    answer: of `inconclusive` what would be one, for what fits best and is not sure enough; often none.
     certain: of a tie the effects that act whichever of the others does beside them; none where one of them does alone.
     discs_unexplained: of `inconclusive`, whether it is because the discs show a gap that the best does not answer for.
     """
@@ -551,7 +552,7 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
     columns = {
         column: (effect, parameter)
         for effect in effects
-        # A probe may have fewer changes than parameters: one for each pointing that there is.
+        # What is fitted by pointing has a change for each that there is: fewer or more than it has parameters.
         for column, parameter in zip(model.evidence.columns[effect.name], effect.parameters, strict=False)
     }
     step = model.fit(tuple(columns))

@@ -179,7 +179,7 @@ def _one_exposure(view: View) -> str | None:
 
 
 def _lit_occulter(view: View) -> Sequence[Change]:
-    """The occulter not dark: a share of the mean light on its disc, and more towards its rim."""
+    """The occulter not dark: light of its own on its disc, DN/s, evenly and more towards its rim."""
     optics, shape = view.solution.optics, view.solution.transit.shape
 
     def disc(n: int, power: int) -> Field:

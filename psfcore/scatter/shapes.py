@@ -11,7 +11,7 @@ Every shape is a falloff f(dx, dy), light at the centre going to (dx, dy), and i
     two power laws                Eq. (2) + a second, (b_2 + r)^-c                     Eq. (6)
     core                          Eq. (2) + a Gaussian                                 Eq. (7)
 
-In Eq. (3) the stretch s at angle t of the definitions is ln(1 + s) = hypot(p, q), 2 t = atan2(q, p): two numbers
+In Eq. (3) a stretch by 1 + s along the angle t has ln(1 + s) = hypot(p, q), 2 t = atan2(q, p): two numbers
 that are smooth where nothing is stretched, as an angle is not. In Eq. (6) and (7) the share is of the total.
 
 A fit moves in coordinates that know no bounds: the logarithm of a positive number, the logit of a share.

@@ -15,6 +15,7 @@ from psfcore import gap
 from psfcore.errors import DataError
 from psfcore.gap.added_effects import added_effects, library_with
 from psfcore.gap.effect import Effect, View
+from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.gap.evidence import gather
 from psfcore.gap.library import LIBRARY
 from tests.gap_files import EDGE_GLOW as GLOW
@@ -37,7 +38,7 @@ def test_a_file_s_effects_come_after_the_library_with_the_file_s_hash(tmp_path: 
     (added,) = added_effects([source])
     assert [effect.name for effect in library_with([added])] == [*(e.name for e in LIBRARY), "edge_glow"]
     assert added.source == source
-    assert added.sha256 == hashlib.sha256(Path(source).read_bytes()).hexdigest()
+    assert added.sha256 == hashlib.sha256(Path(source).read_bytes()).hexdigest() == sha256_of_source(source)
     assert library_with([]) == LIBRARY
 
 
@@ -56,6 +57,9 @@ def test_a_module_does_as_well_and_a_changed_file_is_read_anew(
     written(tmp_path, name="my_effects_module.py")
     monkeypatch.syspath_prepend(tmp_path)
     assert one_of("my_effects_module").name == "edge_glow"
+    assert sha256_of_source("my_effects_module") == added_effects(["my_effects_module"])[0].sha256
+    written(tmp_path, GLOW.replace("edge_glow", "module_glow"), name="my_effects_module.py")
+    assert one_of("my_effects_module").name == "module_glow", "read anew, though it was imported before"
     monkeypatch.delitem(sys.modules, "my_effects_module")
     source = written(tmp_path)
     assert one_of(source).name == "edge_glow"
@@ -112,7 +116,9 @@ def test_two_sources_may_not_have_one_name(tmp_path: Path) -> None:
     assert "other.py" in caught.value.message
 
 
-@pytest.mark.parametrize("source", ["nowhere.py", "no_such_module_anywhere", "..relative", ""])
+@pytest.mark.parametrize(
+    "source", ["nowhere.py", "no_such_module_anywhere", "no_such.module", "sys", "..relative", ""]
+)
 def test_a_source_that_is_not_there_is_told(source: str) -> None:
     with pytest.raises(DataError, match=f"effects of {source}") as caught:
         added_effects([source])

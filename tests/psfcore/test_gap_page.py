@@ -158,7 +158,7 @@ def test_a_gap_of_the_discs_beside_what_shows_in_the_lit_parts_is_told_apart(coa
     told = "dark offset shows in the lit parts, and what leaves a gap in the discs beside it cannot be told"
     assert told in report["sentence"] and "taken for granted" not in report["sentence"]
     text = text_of(gap_page(diagnosis, report).html())
-    assert f"No effect is named: {told}." in text and "taken for granted" not in text
+    assert f"No effect is the answer: {told}." in text and "taken for granted" not in text
 
 
 def test_a_tie_beside_an_effect_that_is_certain_says_which_is_which(coarse: None) -> None:

@@ -292,6 +292,7 @@ REQUESTS = [
     job("steps without end", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "linear", "steps": 10**9}),
     job("a margin without end", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "linear", "margin_px": 10**9}),
     job("draws without end", 422, "invalid-request", "deconvolve", image_id=A, error_draws=10**9),
+    job("a draw that shows no spread", 422, "invalid-request", "deconvolve", image_id=A, error_draws=1),
     job("a PSF without end", 422, "invalid-request", "psf-build", instrument="hri_euv", size=2**31),
     job("TOML: lists in lists", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "[" * DEEP),
     job("TOML: tables in tables", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "{b=" * DEEP),

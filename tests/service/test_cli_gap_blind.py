@@ -34,6 +34,11 @@ def test_a_set_is_made_and_sealed_and_another_is_not_mixed_in(tmp_path: Path) ->
     other = run("--cases", 1, "--seed", 9, "--clean-only", "--make-only", "-o", folder, *SMALL)
     assert other.exit_code == 1
     assert "holds a set made with" in other.output
+    drawn = run("--cases", 1, "--clean-only", "--make-only", "-o", folder, *SMALL)
+    assert drawn.exit_code == 1, "scenes of that image are not mixed with drawn ones"
+    assert "other-set" not in drawn.output and "holds a set made with" in drawn.output
+    again = run("--cases", 1, "--clean-only", "--make-only", "--scenes", image, "-o", folder, *SMALL)
+    assert again.exit_code == 0 and "made case" not in again.output
 
 
 @pytest.mark.parametrize(
@@ -42,6 +47,7 @@ def test_a_set_is_made_and_sealed_and_another_is_not_mixed_in(tmp_path: Path) ->
         (["--only", "gremlins"], "expected one of anisotropic_scatter"),
         (["--size", "32"], "--size"),
         (["--cases", "0"], "--cases"),
+        (["--clean-only", "--only", "ghost"], "expected one of --clean-only and --only"),
     ],
 )
 def test_bad_input_is_said_in_a_line(arguments: list[str], said: str, tmp_path: Path) -> None:

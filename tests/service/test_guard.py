@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import uvicorn
@@ -99,6 +100,15 @@ def test_a_page_of_another_site_changes_nothing(
 # Rates ----------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def one_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock that counts go by, at the fifth second of a minute: over the end of one a caller may ask once more."""
+    ahead = 5 - time.time() % 60
+    clock = SimpleNamespace(time=lambda: time.time() + ahead)
+    monkeypatch.setattr("limits.storage.memory.time", clock)
+
+
+@pytest.mark.usefixtures("one_minute")
 def test_each_caller_has_rates_of_its_own(settings: Settings) -> None:
     with keyed(settings, reads_per_minute=5, submissions_per_minute=3) as service:
         ann, bob = service.client("ann"), service.client("bob")
@@ -121,6 +131,7 @@ def test_each_caller_has_rates_of_its_own(settings: Settings) -> None:
         assert [ann.post("/v1/jobs", json={}).status_code for _ in range(4)] == [422, 422, 422, 429]
 
 
+@pytest.mark.usefixtures("one_minute")
 def test_who_tries_keys_is_not_let_try_without_end(settings: Settings) -> None:
     with keyed(settings, reads_per_minute=5) as service:
         tried = [service.api.get("/v1/jobs", headers=bearer(f"x{n}")).status_code for n in range(7)]
@@ -128,6 +139,7 @@ def test_who_tries_keys_is_not_let_try_without_end(settings: Settings) -> None:
         assert service.client("ann").get("/v1/jobs").status_code == 200
 
 
+@pytest.mark.usefixtures("one_minute")
 def test_bytes_sent_in_are_counted(settings: Settings, image_file: Path) -> None:
     content = image_file.read_bytes() + bytes(600_000)
     with keyed(settings, upload_mib_per_minute=3) as service:

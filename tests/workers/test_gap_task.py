@@ -215,6 +215,44 @@ def test_a_worker_runs_its_own_operator_s_effects_and_no_others(
     worker.close()
 
 
+def test_effects_whose_text_was_changed_are_another_diagnosis_and_refused_by_an_earlier_job(
+    transit: Path, asked: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text(EDGE_GLOW)
+    local = service_in(tmp_path / "data", str(mine))
+    first = local.diagnose_gap(transit, correct=False)
+    assert local.diagnose_gap(transit, correct=False)["id"] == first["id"] and len(asked) == 1
+    mine.write_text(EDGE_GLOW.replace("5.0", "6.0"))
+    assert local.diagnose_gap(transit, correct=False)["id"] != first["id"] and len(asked) == 2
+    waiting = local.submit("gap-diagnose", transit_id=local.upload_transit(transit)["id"])
+    mine.write_text(EDGE_GLOW.replace("5.0", "7.0"))
+    with pytest.raises(ServiceError, match="or were changed since: submit the job again") as caught:
+        local.wait(waiting)
+    assert caught.value.code == "effects-changed" and len(asked) == 2
+    mine.unlink()
+    with pytest.raises(DataError, match="expected a Python file") as gone:
+        local.submit("gap-diagnose", transit_id=local.upload_transit(transit)["id"])
+    assert gone.value.code == "bad-effects"
+    local.close()
+
+
+def test_a_diagnosis_stands_where_the_psf_of_its_answer_cannot_be_made(
+    transit: Path, asked: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cannot(*_: object, **__: object) -> None:
+        raise DataError("bad-effects", "effects of mine: no image of a point")
+
+    monkeypatch.setattr("workers.gap_task.corrected_psf", cannot)
+    local = service_in(tmp_path / "data")
+    found = local.diagnose_gap(transit, tmp_path / "r.json", page=tmp_path / "r.html")
+    assert found["details"]["corrected_psf_id"] is None
+    told = json.loads((tmp_path / "r.json").read_text())["cautions"]
+    assert told[-1].endswith("could not be made: effects of mine: no image of a point")
+    assert "no image of a point" in (tmp_path / "r.html").read_text()
+    local.close()
+
+
 def test_diagnoses_of_other_parameters_are_others() -> None:
     first = ResolvedGapDiagnose(transit_id="a" * 64)
     others: tuple[dict[str, Any], ...] = (
@@ -225,6 +263,7 @@ def test_diagnoses_of_other_parameters_are_others() -> None:
         {"noise": {"photon_gain_dn": 1.0, "read_noise_dn": 2.0}},
         {"transit_id": "c" * 64},
         {"added_effects": ("mine",)},
+        {"added_effects": ("mine",), "added_effects_sha256": ("d" * 64,)},
     )
     identities = {gap_identity(ResolvedGapDiagnose(**({"transit_id": "a" * 64} | other))) for other in others}
     assert len(identities | {gap_identity(first)}) == len(others) + 1
