@@ -52,7 +52,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first; refuse tests of one id: of these, side by side, one alone is run and nobody sees it."""
     twice = [name for name, count in Counter(item.nodeid for item in items).items() if count > 1]
     if twice:
-        raise pytest.UsageError(f"expected an id of its own for each test; got several of {', '.join(twice[:5])}")
+        raise pytest.UsageError(
+            f"expected an id of its own for each test; got several of {', '.join(twice[:5])}"
+        )
     rank = {REPOSITORY / "tests" / name: place for place, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: rank.get(item.path, len(rank)))
 

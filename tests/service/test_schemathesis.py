@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import httpx
 import pytest
@@ -52,6 +53,7 @@ CHECKS = [
     ignored_auth,
 ]
 SCHEMA = schemathesis.openapi.from_dict(json.loads(description()))
+LONGEST_ADDRESS = 60_000  # characters
 KNOWN: dict[str, str] = {}
 FILES: dict[str, bytes] = {}
 
@@ -136,6 +138,9 @@ def _known(name: str, value: Any) -> Any:
 
 def ask(case: Any, service: dict[str, Any]) -> None:
     """Send a request as it was made up, and look at the answer."""
+    if len(case.formatted_path) + len(urlencode(case.query or {}, doseq=True)) > LONGEST_ADDRESS:
+        # The server reads 64 KiB of one and hangs up while the rest is sent: its answer may be lost on the way.
+        return
     case.call_and_validate(
         base_url=service["base_url"], headers=service["headers"], checks=CHECKS, allow_redirects=False
     )
