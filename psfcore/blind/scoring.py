@@ -24,7 +24,8 @@ Rows, each with its cases. An answer is what the verdict `attributed` or `tie` n
 - closure as a share: single known effects at 2 % that have an answer; closure of the first effect over closure of the
   true effect's own entry, where that is a tenth or more; the median, 1 where the first is the truth.
 - interval: the same cases, the true effect's own ci90 holds Eq. (2).
-- strongest axis: single known effects at 2 % whose verdict is not `none`; the first of `where` is one of its effect's.
+- strongest axis: single known effects of AXES at 2 % whose verdict is not `none`; the first of `where` is one of its
+  effect's. What clipping takes has none: where it shows goes with the exposure and where the Sun is bright.
 - time: wall time of the slowest, s.
 """
 
