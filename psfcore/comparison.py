@@ -26,7 +26,7 @@ class Comparison:
 
 def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
     """Compare two arrays of numbers; NaN is the same as NaN."""
-    hashes = (_sha256(first), _sha256(again))
+    hashes = (array_sha256(first), array_sha256(again))
     kinds = {array.dtype.newbyteorder("<") for array in (first, again)}
     same = first.shape == again.shape and len(kinds) == 1 and hashes[0] == hashes[1]
     if first.shape != again.shape:
@@ -43,6 +43,7 @@ def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
     return Comparison(same, relative, count, hashes)
 
 
-def _sha256(array: NDArray[Any]) -> str:
+def array_sha256(array: NDArray[Any]) -> str:
+    """SHA-256 (hex) of an array's numbers, whatever their order of bytes and their place in memory."""
     plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return hashlib.sha256(plain.tobytes()).hexdigest()

@@ -5,7 +5,6 @@ Everything numerical is imported by the command, so that the others start fast.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 from pathlib import Path
@@ -89,10 +88,8 @@ def blind(
     if clean_only and only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
     with user_errors(), alone_in(output):
-        planes = _planes(scenes)
-        hashes = tuple(hashlib.sha256(plane.tobytes()).hexdigest() for plane in planes)
-        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct, hashes)
-        made, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
+        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct)
+        made, not_made = make_set(output, plan, scenes=_planes(scenes), processes=processes, progress=say)
         numbers = [number for number in plan.numbers if number not in not_made]
         if not numbers:
             why = next(iter(not_made.values()))

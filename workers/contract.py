@@ -410,7 +410,9 @@ def evaluate_identity(request: ResolvedEvaluate) -> str:
 
 def gap_identity(request: ResolvedGapDiagnose) -> str:
     """Identity of a diagnosis: the transit's bytes, the PSF's and the diffraction's identity, parameters, version."""
-    return _transit_identity("gap-diagnose", request)
+    # Without added effects the identity is what it was before their texts counted.
+    beside = () if request.added_effects_sha256 else ("added_effects_sha256",)
+    return _transit_identity("gap-diagnose", request, beside)
 
 
 def diffraction_identity(request: ResolvedOnTransit) -> str | None:
@@ -418,16 +420,13 @@ def diffraction_identity(request: ResolvedOnTransit) -> str | None:
     return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
 
 
-def _transit_identity(kind: str, request: ResolvedOnTransit) -> str:
-    # The diffraction's identity says what it is; the recipe only how to make it. Without added effects the identity is
-    # what it was before their texts counted.
-    beside = {"diffraction_recipe"}
-    if isinstance(request, ResolvedGapDiagnose) and not request.added_effects_sha256:
-        beside.add("added_effects_sha256")
+def _transit_identity(kind: str, request: ResolvedOnTransit, beside: tuple[str, ...] = ()) -> str:
+    """beside: what of the request does not count."""
     return canonical_hash(
         {
             "kind": kind,
-            "request": request.model_dump(mode="json", exclude=beside),
+            # The diffraction's identity says what it is; the recipe only how to make it.
+            "request": request.model_dump(mode="json", exclude={"diffraction_recipe", *beside}),
             "diffraction": diffraction_identity(request),
             "algorithm_version": request.algorithm_version,
         }

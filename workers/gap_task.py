@@ -11,7 +11,6 @@ from psfcore.fits_io import write_psf
 from psfcore.gap.added_effects import Added, added_effects, library_with
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
-from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.gap.gap_page import gap_page
 from psfcore.gap.gap_plot import gap_png
 from psfcore.gap.gap_report import gap_report
@@ -39,8 +38,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
     identity = gap_identity(request)
     if context.catalogue.get(ReportRow, identity, context.owner) is not None:
         return identity
-    _check_effects(context, request)
-    added = added_effects(request.added_effects)
+    added = _added(context, request)
     parent = given_psf(context, request.psf_id)
     shape, start = (SOFTENED_POWER_LAW, None) if parent is None else start_of(parent)
     transit, _ = load_transit(context, request)
@@ -66,21 +64,23 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
     return identity
 
 
-def _check_effects(context: Context, request: ResolvedGapDiagnose) -> None:
-    """The worker runs code that its own operator names, never what a job says."""
+def _added(context: Context, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
+    """The effects that are added. The worker runs code that its own operator names, never what a job says."""
     if request.added_effects != context.settings.added_effects:
         raise DataError(
             "effects-changed",
             f"expected the effects that the job was taken with ({', '.join(request.added_effects) or 'none'}); this worker "
             f"adds {', '.join(context.settings.added_effects) or 'none'}: submit the job again",
         )
-    here = tuple(sha256_of_source(source) for source in request.added_effects)
+    added = added_effects(request.added_effects)
+    here = tuple(one.sha256 for one in added)
     if here != request.added_effects_sha256:
         raise DataError(
             "effects-changed",
             f"expected the texts that the job was taken with ({_short(request.added_effects_sha256)}); this worker's are "
             f"others ({_short(here)}), or were changed since: submit the job again",
         )
+    return added
 
 
 def _short(hashes: tuple[str, ...]) -> str:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from psfcore.blind.cases import Case, draw_case
 from psfcore.blind.making import make, seal_of, sealed, write_transit
+from psfcore.comparison import array_sha256
 from psfcore.errors import DataError
 from psfcore.whole_files import write_whole
 
@@ -38,8 +39,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SetPlan:
-    """How a set is made. first: the number of its first case; scenes: SHA-256 of the images that scenes are taken from, in
-    their order; the others: as draw_case has them."""
+    """How a set is made. first: the number of its first case; the others: as draw_case has them."""
 
     cases: int
     seed: int
@@ -50,7 +50,6 @@ class SetPlan:
     clean_only: bool = False
     built_diffraction: bool = True
     left_pct: tuple[float, ...] = ()
-    scenes: tuple[str, ...] = ()
 
     @property
     def numbers(self) -> range:
@@ -148,10 +147,10 @@ def make_set(
     """Make and seal all cases of a set that are not there yet; the set, and why by case where one cannot be made.
 
     scenes: images [y, x] in DN/s to take scenes from. Raises DataError "other-set" where the folder holds a set made
-    otherwise, "bad-seals", and what drawing a case raises, before any is made.
+    otherwise or from other scenes, "bad-seals", and what drawing a case raises, before any is made.
     """
     made = BlindSet(folder)
-    _remember(made, plan)
+    _remember(made, plan, scenes)
     (folder / "truth").mkdir(parents=True, exist_ok=True)
     sealed_before = made.seals()
     missing = [n for n in plan.numbers if not (n in sealed_before and made.truth_file(n).is_file())]
@@ -174,9 +173,9 @@ def make_set(
     return made, not_made
 
 
-def _remember(made: BlindSet, plan: SetPlan) -> None:
+def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
     """Write how the set is made, or see that it is the same."""
-    about = json.loads(json.dumps(asdict(plan)))
+    about = json.loads(json.dumps(asdict(plan) | {"scenes": [array_sha256(scene) for scene in scenes]}))
     file = made.folder / "set.json"
     if file.is_file():
         before = {"scenes": []} | json.loads(file.read_text("utf-8"))  # sets made earlier do not say

@@ -245,7 +245,7 @@ class GainMismatch(Effect):
     def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
         if moment.shot.gain_mode != COMBINED:
             return dn
-        # Of the whole image, faint pixels too, though a combined image has these from the high gain: as the library has it.
+        # Faint pixels too, though a combined image has these from the high gain: as the library has it.
         return dn * (1 + self.sign * self.strength)
 
 

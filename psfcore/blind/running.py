@@ -1,7 +1,8 @@
 """Diagnosing a blind set: every case in a process of its own that sees a copy of the transit and nothing else.
 
 The copy lies in a temporary folder without the case's number, the process runs there, and the report comes back when
-it is whole. A case that has one is not diagnosed again; a failure stands in run.json and is tried again with the next run.
+it is whole. A case that has one is not diagnosed again; a failure stands in run.json and is tried again with the
+next run.
 """
 
 from __future__ import annotations

@@ -244,7 +244,8 @@ class Change:
 
     images: all images as they should be, each as bright as it is, or, for the lit part, their pointings' means. lit:
     whether it differs between images of one pointing where these are compared, so that the lit part shows it. disc:
-    whether the discs do. numbers: how many numbers of its own were taken from the lit parts to make it, which its gain pays for.
+    whether the discs do. numbers: how many numbers of its own were taken from the lit parts to make it, which its gain
+    pays for.
     """
 
     change: Callable[[int, Sequence[Field]], Field]

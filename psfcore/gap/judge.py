@@ -6,7 +6,8 @@ Gains of effects are compared after what their parameters, and a search over man
 
 There is a gap where patterns that any gap makes (`patterns`), the discs' means, all cells, the lit blocks or an effect's
 gain are less likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect, or
-within TIE_SHARE of its gain, cannot be told from it (more widely where a place was searched for), unless it does clearly worse on images held out of its fit.
+within TIE_SHARE of its gain, cannot be told from it (more widely where a place was searched for), unless it does
+clearly worse on images held out of its fit.
 An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
 TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
 sky's. Another is named beside it where it gains more than a search and that error let it, and more than the first's

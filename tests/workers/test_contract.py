@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
+from psfcore.deconvolve.error_planes import SMALLEST_DRAWS
 from psfcore.errors import DataError
 from workers.contract import (
+    Deconvolve,
     JobRequest,
     PsfBuild,
     ResolvedDeconvolve,
@@ -72,3 +74,13 @@ def test_a_built_psf_is_identified_by_its_parameters() -> None:
 def test_requests_that_cannot_be_meant_are_refused(body: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         TypeAdapter(JobRequest).validate_python(body)
+
+
+def test_draws_of_errors_are_none_or_as_many_as_show_a_spread() -> None:
+    asked = {"image_id": "a" * 64, "psf_id": "b" * 64, "method": {"name": "linear"}}
+    for draws in range(SMALLEST_DRAWS + 1):
+        if 0 < draws < SMALLEST_DRAWS:
+            with pytest.raises(ValidationError, match="shows no spread"):
+                Deconvolve.model_validate(asked | {"error_draws": draws})
+        else:
+            assert Deconvolve.model_validate(asked | {"error_draws": draws}).error_draws == draws
