@@ -28,22 +28,22 @@ test-full: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests
 
 bench: $(DEV)
-	$(BIN)/python -m tests.bench
-	$(BIN)/python -m tests.bench_ring_sums --quick
-	$(BIN)/python -m tests.bench_fit
-	$(BIN)/python -m tests.bench_crossval
-	$(BIN)/python -m tests.bench_bulk --images 24
+	$(BIN)/python -m benchmarks.deconvolution
+	$(BIN)/python -m benchmarks.ring_sums --quick
+	$(BIN)/python -m benchmarks.fit
+	$(BIN)/python -m benchmarks.cross_validation
+	$(BIN)/python -m benchmarks.bulk --images 24
 
 # What others use, in an environment of its own, timed in turn with ours on the same data.
 bench-peers: $(DEV)
 	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9'
-	$(BIN)/python -m tests.bench_peers .venv-peers/bin/python
+	$(BIN)/python -m benchmarks.peers .venv-peers/bin/python
 
 # Jobs while workers, Redis, PostgreSQL and the service are killed at random; needs both servers' programs.
 chaos: $(DEV)
-	$(BIN)/python -m tests.chaos
-	$(BIN)/python -m tests.chaos --seed 2 --redis-keeps
+	$(BIN)/python -m studies.chaos
+	$(BIN)/python -m studies.chaos --seed 2 --redis-keeps
 
 # The gap diagnosis on cases whose effect it does not know: hours. Goes on where it was stopped.
 blind: $(RUN)
@@ -54,6 +54,7 @@ lint: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m pytest -q tests/house
 
 openapi: $(DEV)
 	$(BIN)/python -m service.openapi openapi/openapi.json

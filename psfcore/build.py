@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.combined import DIFFRACTION, available_parts, diffraction_patterns
 from psfcore.errors import DataError
-from psfcore.fourier import linear_convolve
 from psfcore.instruments.model import Instrument
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel

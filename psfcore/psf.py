@@ -15,19 +15,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from astropy.io.fits import Header
 from numpy.typing import ArrayLike, NDArray
 
 from psfcore.errors import DataError
-from psfcore.header import optional_number, optional_text
-from psfcore.image import Image
 
 REACH_GRID_PX = 2048
 LARGEST_SUM = 1 + 1e-3
 SMALLEST_SUM = 0.05
 PLATE_SCALE_TOLERANCE = 0.01
 CENTRE_TOLERANCE = 1e-3  # of the largest weight: pixels that share the peak may differ by rounding
-_ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0}
 
 Kernel = NDArray[np.float64]
 
@@ -165,25 +161,3 @@ def radial_profile(kernel: Kernel) -> tuple[NDArray[np.float64], NDArray[np.floa
     mean = np.bincount(ring, weights=kernel.ravel()) / np.maximum(count, 1)
     occupied = count > 0
     return np.flatnonzero(occupied).astype(np.float64), mean[occupied]
-
-
-def check_compatible(image: Image, psf: Psf) -> None:
-    """Raise DataError "plate-scale-mismatch" when the scales are known and differ by over 1 %."""
-    if psf.plate_scale_arcsec is None:
-        return
-    for axis in (1, 2):
-        scale = plate_scale_arcsec(image.header, axis)
-        if scale is None:
-            continue
-        if abs(scale / psf.plate_scale_arcsec - 1) > PLATE_SCALE_TOLERANCE:
-            wanted = f"{psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it"
-            raise DataError(
-                "plate-scale-mismatch", f"expected {wanted}; got CDELT{axis} = {scale:g} arcsec/px"
-            )
-
-
-def plate_scale_arcsec(header: Header, axis: int = 1) -> float | None:
-    """|CDELT| of an axis in arcsec/px; None where there is none, or CUNIT is no angle. No CUNIT: arcsec."""
-    step = optional_number(header, f"CDELT{axis}")
-    factor = _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{axis}") or "arcsec").lower())
-    return None if not step or factor is None else abs(step) * factor

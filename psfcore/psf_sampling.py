@@ -29,9 +29,10 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.header import optional_text
+from psfcore.fits.header import optional_text, plate_scale_arcsec
+from psfcore.image import Image
 from psfcore.instruments.files import match_instrument
-from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred, plate_scale_arcsec
+from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred
 
 LARGEST_FACTOR = 64
 Kernel = NDArray[np.float64]
@@ -40,6 +41,21 @@ Kernel = NDArray[np.float64]
 def psf_for_image(psf: Psf, header: Header) -> Psf:
     """The PSF on the pixels of an image with this header: `psf` itself, or rebinned by its `binning_factor`."""
     return rebinned(psf, binning_factor(psf, header))
+
+
+def check_compatible(image: Image, psf: Psf) -> None:
+    """Raise DataError "plate-scale-mismatch" when the scales are known and differ by over 1 %."""
+    if psf.plate_scale_arcsec is None:
+        return
+    for axis in (1, 2):
+        scale = plate_scale_arcsec(image.header, axis)
+        if scale is None:
+            continue
+        if abs(scale / psf.plate_scale_arcsec - 1) > PLATE_SCALE_TOLERANCE:
+            wanted = f"{psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it"
+            raise DataError(
+                "plate-scale-mismatch", f"expected {wanted}; got CDELT{axis} = {scale:g} arcsec/px"
+            )
 
 
 def binning_factor(psf: Psf, header: Header) -> int:

@@ -7,40 +7,24 @@ from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
 
-from service import (
-    affected,
-    bulk,
-    bulk_results,
-    contexts,
-    description,
-    docs,
-    events,
-    guard,
-    health,
-    images,
-    jobs,
-    lineage,
-    metrics,
-    observation,
-    problems,
-    products,
-    psf_choice,
-    psf_queries,
-    psf_status,
-    psfs,
-    reports,
-    transits,
-    uws,
-)
-from service.access import Access
-from service.rates import Rates
-from service.state import State
-from service.streams import Streams
-from workers import queue
-from workers.catalogue import Catalogue
-from workers.reconciler import Reconciler
+from service.api import bulk, bulk_results, events, images, jobs, lineage, products, reports, transits
+from service.api.psfs import affected, contexts
+from service.api.psfs import choice as psf_choice
+from service.api.psfs import curves as psf_queries
+from service.api.psfs import status as psf_status
+from service.api.psfs import versions as psfs
+from service.http import description, guard, observation, problems
+from service.http.access import Access
+from service.http.rates import Rates
+from service.http.state import State
+from service.http.streams import Streams
+from service.operation import docs, health, metrics
+from service.uws import routes as uws
+from workers.broker import app as queue
+from workers.broker.reconciler import Reconciler
+from workers.catalogue.catalogue import Catalogue
+from workers.files.opened import open_store
 from workers.settings import Settings, software_version
-from workers.store import open_store
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:

@@ -13,23 +13,23 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from psfcore.errors import DataError
-from psfcore.header import FitsLimits, read_summary
+from psfcore.fits.cutout import cutout
+from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.tables import lookup as psf_lookup
 from psfcore.transit.archive import list_archive
-from service import psf_lookup
-from service.client import Operations, Progress, ServiceError, as_archive
-from service.jobs import JobView
-from service.products import ProductView
-from service.psf_cutout import cutout
-from service.psfs import PsfView
-from service.reports import ReportView
-from service.transits import TransitDetails
-from workers.catalogue import Catalogue
-from workers.contract import JobRequest, Phase
-from workers.intake import image_row, resolve, transit_row, uploaded_psf_row
-from workers.runner import Runner
+from service.api.jobs import JobView
+from service.api.products import ProductView
+from service.api.psfs.versions import PsfView
+from service.api.reports import ReportView
+from service.api.transits import TransitDetails
+from service.client.http import Operations, Progress, ServiceError, as_archive
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
+from workers.contract.contract import JobRequest, Phase
+from workers.files.store import Store
+from workers.intake.requests import image_row, resolve, transit_row, uploaded_psf_row
+from workers.run.runner import Runner
 from workers.settings import Settings
-from workers.store import Store
-from workers.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
 
 
 class LocalService(Operations):

@@ -18,10 +18,10 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
-from service.access import check_can_serve
 from service.app import create_app
+from service.http.access import check_can_serve
 from workers import logs
-from workers.catalogue import Catalogue
+from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)

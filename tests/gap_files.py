@@ -13,16 +13,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psfcore.gap import added_effects, gap_plot
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis
+from psfcore.gap.library import added as added_effects
+from psfcore.gap.report import plot as gap_plot
 from psfcore.psf import Psf, crop_centred
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.simulate.transit_files import write
-from tests.psfcore.small_gaps import FEW, QUICK
+from tests.psfcore.gap.small_gaps import FEW, QUICK
 from tests.transit_files import TRUTH, diffraction
-from workers import gap_task
+from workers.tasks import gap as gap_task
 
 SIZE_PX = 96
 GLOW_DN_S = 25.0

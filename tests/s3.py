@@ -12,8 +12,9 @@ import pytest
 import s3fs
 from moto.server import ThreadedMotoServer
 
+from workers.files.opened import open_store
+from workers.files.store import Store
 from workers.settings import Settings
-from workers.store import Store, open_store
 
 
 @contextmanager

@@ -9,8 +9,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from psfcore.fits_io import write_psf
-from psfcore.fourier import Convolver, linear_convolve
+from psfcore.convolution.convolver import Convolver, linear_convolve
+from psfcore.fits.fits_io import write_psf
 from psfcore.noise import Noise
 from psfcore.psf import Psf, crop_centred
 from psfcore.scatter.power_law import scatter_kernel

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from workers.catalogue import Catalogue
-from workers.schema import Schema
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.schema import Schema
 
 RUN_REVISIONS = Schema.upgrade
 

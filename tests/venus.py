@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.conditions import Conditions
-from psfcore.deconvolve.methods import method_named
-from psfcore.fits_io import read_image
-from psfcore.header import FitsLimits
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.fits.fits_io import read_image
+from psfcore.fits.header import FitsLimits
 from psfcore.psf import Psf
 from psfcore.scatter.power_law import scatter_kernel
 

@@ -13,10 +13,10 @@ from tempfile import TemporaryFile
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from workers import queue
-from workers.catalogue import Catalogue
+from workers.broker import app as queue
+from workers.catalogue.catalogue import Catalogue
+from workers.files.store import Store
 from workers.settings import Settings
-from workers.store import Store
 
 
 class Unusable(Exception):

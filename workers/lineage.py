@@ -10,9 +10,9 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, ValidationError
 
 from psfcore.errors import DataError
-from workers.catalogue import Catalogue
-from workers.contract import ResolvedDeconvolve, ResolvedGapDiagnose, ResolvedPsfFit, ResolvedRerun
-from workers.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow, TransitRow
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow, TransitRow
+from workers.contract.contract import ResolvedDeconvolve, ResolvedGapDiagnose, ResolvedPsfFit, ResolvedRerun
 
 MOST_DEEP = 16
 MOST_THINGS = 200

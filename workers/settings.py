@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from psfcore.transit.archive import ArchiveLimits
-from workers.urgency import Queue, queues_named
+from workers.contract.queues import Queue, queues_named
 
 EMBEDDED_BROKER = "filesystem://"
 

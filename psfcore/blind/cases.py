@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.blind.effect import Effect
-from psfcore.blind.effects import KNOWN, UNKNOWN, effect_named
-from psfcore.blind.fine_optics import FINE, INSTRUMENT, SYNTHETIC, Glass
-from psfcore.blind.scene_effects import patches
+from psfcore.blind.effects.effect import Effect
+from psfcore.blind.effects.fine_optics import FINE, INSTRUMENT, SYNTHETIC, Glass
+from psfcore.blind.effects.registry import KNOWN, UNKNOWN, effect_named
+from psfcore.blind.effects.scene import patches
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.simulate.plan import WEST, Plan, Shot, default_plan

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.blind.effect import Earlier, Effect, Moment, acts_on
-from psfcore.blind.fine_optics import FINE, FineOptics
+from psfcore.blind.effects.effect import Earlier, Effect, Moment, acts_on
+from psfcore.blind.effects.fine_optics import FINE, FineOptics
 from psfcore.simulate.disc import behind, binned, covered_share
 from psfcore.simulate.plan import HIGH, Plan
 from psfcore.transit.transit import Place

@@ -40,7 +40,7 @@ from statistics import mean, median
 from typing import Any
 
 from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE
-from psfcore.blind.effects import KNOWN, UNKNOWN
+from psfcore.blind.effects.registry import KNOWN, UNKNOWN
 
 SCHEMA = "gap-blind/1"
 Z95 = 1.959963984540054

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.edges import Edges
-from psfcore.engine import Engine
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.psf import Psf

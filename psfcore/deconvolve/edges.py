@@ -26,7 +26,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.engine import BLOCK_ROWS
+from psfcore.convolution.engine import BLOCK_ROWS
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
 from psfcore.psf import Psf

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.engine import Engine
+from psfcore.convolution.engine import Engine
+from psfcore.convolution.fft_kernels import LANES
 from psfcore.errors import DataError
-from psfcore.fft_kernels import LANES
 
 LARGEST_GROWTH = 10.0
 

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
+from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
+from psfcore.convolution.fft_kernels import LANES, forward, inverse
 from psfcore.deconvolve.problem import Problem, first_estimate
-from psfcore.engine import buffer_from_spectrum, spectrum_from_buffer
 from psfcore.errors import DataError
-from psfcore.fft_kernels import LANES, forward, inverse
 
 # float32's resolution of the brightest pixel: below it the transform's rounding decides, and a floor
 # there keeps denormal numbers, which are slow, out of the loop.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.edges import (
     FLAGGED_SHARE,
@@ -19,9 +20,9 @@ from psfcore.deconvolve.edges import (
 )
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.stopping import Ended, Iteration, Judgement, Stop, check_steps, judgement, run
-from psfcore.engine import Engine
 from psfcore.image import Image, MaskBit
-from psfcore.psf import Psf, check_compatible
+from psfcore.psf import Psf
+from psfcore.psf_sampling import check_compatible
 
 # A starting value is taken from trusted neighbours where the PSF gathers at least this share of its light there.
 _ENOUGH_NEIGHBOURS = 1e-4

@@ -22,9 +22,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, Progress
 from psfcore.deconvolve.edges import Domain
-from psfcore.engine import Engine
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.noise import dn_per_unit

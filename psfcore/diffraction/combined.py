@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.airy import airy_kernel
 from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, rotated_mesh_kernel
 from psfcore.diffraction.pupil import Pupil, entrance_pupil
-from psfcore.fourier import linear_convolve
 from psfcore.instruments.model import Instrument, Line, Mesh
 
 MOST_SAMPLES = 32

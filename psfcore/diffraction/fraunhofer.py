@@ -47,8 +47,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
+from psfcore.convolution.convolver import transform_axis
 from psfcore.diffraction.pupil import MaskGrid, Pupil
-from psfcore.fourier import transform_axis
 
 STRIP_ROWS = 16
 SURVEY_CELLS = 4096  # across the pupil

@@ -38,8 +38,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from psfcore.convolution.convolver import ChirpTransform
 from psfcore.errors import DataError
-from psfcore.fourier import ChirpTransform
 from psfcore.instruments.model import Aperture, Mirror
 
 SAMPLING_MARGIN = 1.5

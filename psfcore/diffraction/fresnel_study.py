@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.best_focus import BestFocus, best_focus
 from psfcore.diffraction.fresnel import (
     SAMPLING_MARGIN,
@@ -53,7 +54,6 @@ from psfcore.diffraction.light_path import (
 )
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
-from psfcore.fourier import linear_convolve
 from psfcore.instruments.model import Instrument
 
 DISTANCES_MM = (50.0, 100.0, 200.0, 273.0, 400.0, 500.0, 550.0)

@@ -14,17 +14,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.gap.closure import HeldOut, Interval, closure, fall, gap, hold_out, pointings, time_blocks
-from psfcore.gap.correction import Corrected, add_to_model, beyond
 from psfcore.gap.effect import Effect, View
-from psfcore.gap.evidence import Evidence, gather
-from psfcore.gap.expected_gap import ExpectedGap, expected_gap
-from psfcore.gap.judge import LEAST_IMAGES, Judgement, Tried, judge
-from psfcore.gap.library import LIBRARY
-from psfcore.gap.linear_model import FLOOR, LinearModel
-from psfcore.gap.measured_noise import MeasuredNoise, measured_noise
-from psfcore.gap.scene_effects import MOST_POINTINGS
-from psfcore.gap.where import Axis, where
+from psfcore.gap.evidence.evidence import Evidence, gather
+from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
+from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
+from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.library.scene import MOST_POINTINGS
+from psfcore.gap.verdict.closure import (
+    HeldOut,
+    Interval,
+    closure,
+    fall,
+    gap,
+    hold_out,
+    pointings,
+    time_blocks,
+)
+from psfcore.gap.verdict.correction import Corrected, add_to_model, beyond
+from psfcore.gap.verdict.judge import LEAST_IMAGES, Judgement, Tried, judge
+from psfcore.gap.verdict.where import Axis, where
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named

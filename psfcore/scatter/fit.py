@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.fourier import Convolver
+from psfcore.convolution.convolver import Convolver
 from psfcore.psf import (
     REACH_GRID_PX,
     FittedShape,
@@ -27,16 +27,16 @@ from psfcore.psf import (
     cumulative_curve,
     encircled_energy,
 )
-from psfcore.scatter.cross_validation import ONE_SIGMA, TWO_SIGMA
-from psfcore.scatter.equations import Drawn, Lines, free_fit
+from psfcore.scatter.as_published.equations import Drawn, Lines, free_fit
+from psfcore.scatter.as_published.published import AS_PUBLISHED, MENDED_ALONE, Published, invert_as_published
+from psfcore.scatter.as_published.ring_sums import segment_sums
+from psfcore.scatter.as_published.segments import Segments, shells_as_published
 from psfcore.scatter.inversion import Inversion, Progress, Solution, invert
 from psfcore.scatter.optics import Blur, pick
-from psfcore.scatter.published import AS_PUBLISHED, MENDED_ALONE, Published, invert_as_published
-from psfcore.scatter.ring_sums import segment_sums
-from psfcore.scatter.segments import Segments, shells_as_published
-from psfcore.scatter.shape_comparison import ComparedShape, compare_shapes
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named, stretch_of
 from psfcore.scatter.total_psf import CURVE_RADII_PX
+from psfcore.scatter.validation.cross_validation import ONE_SIGMA, TWO_SIGMA
+from psfcore.scatter.validation.shape_comparison import ComparedShape, compare_shapes
 from psfcore.transit.first_guess import FirstGuess, first_guess
 from psfcore.transit.occulter import disc_distance
 from psfcore.transit.transit import Transit

@@ -14,11 +14,11 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from psfcore.plots import INK
+from psfcore.drawing.plots import INK
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
+from psfcore.scatter.as_published.published import Published
 from psfcore.scatter.fit import ONE_SIGMA, TWO_SIGMA, Curve, FreeShells, TransitFit, sentence
 from psfcore.scatter.inversion import CONVERGED_POINTS
-from psfcore.scatter.published import Published
 from psfcore.transit.first_guess import ESTIMATORS
 
 Vector = NDArray[np.float64]

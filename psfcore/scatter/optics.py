@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.linear import inverse_filter
-from psfcore.engine import BLOCK_ROWS, Engine
-from psfcore.fft_kernels import LANES
+from psfcore.convolution.engine import BLOCK_ROWS, Engine
+from psfcore.convolution.fft_kernels import LANES
+from psfcore.deconvolve.methods.linear import inverse_filter
 
 Lanes = NDArray[np.float32]
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # rows, columns

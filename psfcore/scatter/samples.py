@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from psfcore.deconvolve.error_planes import sigma_points
+from psfcore.convolution.convolver import Convolver
+from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.errors import DataError
-from psfcore.fourier import Convolver
 from psfcore.psf import Psf
 from psfcore.scatter.shapes import shape_named
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.fourier import Convolver
+from psfcore.convolution.convolver import Convolver
 from psfcore.psf import REACH_GRID_PX, encircled_energy
 from psfcore.scatter.shapes import Shape, Vector
 

@@ -33,8 +33,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.fourier import Convolver
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, encircled_energy
 from psfcore.simulate.disc import fully_dark
 from psfcore.simulate.plan import HIGH

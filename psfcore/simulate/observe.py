@@ -14,8 +14,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from psfcore.fits_io import write_image
-from psfcore.fourier import Convolver
+from psfcore.convolution.convolver import Convolver
+from psfcore.fits.fits_io import write_image
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.simulate.scene import solar_scene

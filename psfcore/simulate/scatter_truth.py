@@ -25,8 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import linear_convolve
 from psfcore.errors import DataError
-from psfcore.fourier import linear_convolve
 from psfcore.psf import REACH_GRID_PX, crop_centred
 
 Kernel = NDArray[np.float64]

@@ -22,8 +22,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.fourier import Convolver
 from psfcore.psf import REACH_GRID_PX
 from psfcore.simulate.disc import Behind, behind, binned
 from psfcore.simulate.plan import Plan

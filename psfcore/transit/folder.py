@@ -17,13 +17,13 @@ import numpy as np
 from astropy.io.fits import Header
 
 from psfcore.errors import DataError
-from psfcore.fits_io import read_image, read_plane
-from psfcore.header import FitsLimits, HeaderSummary, read_summary
+from psfcore.fits.fits_io import read_image, read_plane
+from psfcore.fits.gain import saturation_for
+from psfcore.fits.header import FitsLimits, HeaderSummary, plate_scale_arcsec, read_summary
 from psfcore.instruments.files import instrument_names
-from psfcore.instruments.gain import saturation_for
 from psfcore.instruments.model import Instrument, load_instrument
 from psfcore.noise import Noise
-from psfcore.psf import CENTRE_TOLERANCE, plate_scale_arcsec
+from psfcore.psf import CENTRE_TOLERANCE
 from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest, read_manifest
 from psfcore.transit.prepare import Exposure, Prepared, exposure_of, prepare
 from psfcore.transit.transit import Kernel, Place, Transit, check_reaches_in

@@ -30,9 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.fourier import Convolver
+from psfcore.convolution.convolver import Convolver
+from psfcore.least_squares import scaled_inverse
 from psfcore.noise import Noise
-from psfcore.normal_equations import scaled_inverse
 from psfcore.transit.transit import Frame, Place
 
 Plane = NDArray[np.float64]

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from psfcore import fft_kernels
 from psfcore.compiled import MARK, KernelFiles, compiled
+from psfcore.convolution import fft_kernels
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import (
-    check_compatible,
     crop_centred,
     crop_or_pad,
     cumulative_curve,
     encircled_energy,
     radial_profile,
 )
+from psfcore.psf_sampling import check_compatible
 from tests.psfcore.conftest import delta, gaussian, make_psf
 
 

@@ -7,9 +7,10 @@ import pytest
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.errors import DataError
-from psfcore.fourier import Convolver, linear_convolve
-from psfcore.psf import Psf, crop_centred, plate_scale_arcsec
+from psfcore.fits.header import plate_scale_arcsec
+from psfcore.psf import Psf, crop_centred
 from psfcore.psf_sampling import psf_for_image, rebinned, rebinned_kernel
 from psfcore.scatter.power_law import scatter_kernel
 from tests.psfcore.conftest import delta, gaussian, make_psf

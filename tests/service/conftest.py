@@ -10,12 +10,12 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from tests.tables import copied_tables
-from workers.catalogue import Catalogue
-from workers.contract import Phase
-from workers.runner import Runner
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.contract.contract import Phase
+from workers.files.store import Store
+from workers.run.runner import Runner
 from workers.settings import Settings
-from workers.store import Store
-from workers.tables import DEFAULT_OWNER, JobRow
 
 
 @pytest.fixture(scope="package", autouse=True)

@@ -10,12 +10,20 @@ from typing import Any
 
 from sqlalchemy import event, text
 
-from workers import psf_choice
-from workers.affected_rows import Place
-from workers.catalogue import Catalogue
+from workers.catalogue.affected import Place
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.psfs import PsfFilter
+from workers.catalogue.tables import (
+    ImageRow,
+    JobRow,
+    ProductRow,
+    PsfContextRow,
+    PsfRow,
+    ReportRow,
+    TransitRow,
+)
+from workers.intake import psf_choice
 from workers.lineage import lineage
-from workers.psf_rows import PsfFilter
-from workers.tables import ImageRow, JobRow, ProductRow, PsfContextRow, PsfRow, ReportRow, TransitRow
 
 OWNER = "local"
 LINES = 200  # 20 instruments, 5 channels, 2 kinds

@@ -19,7 +19,7 @@ import pytest
 from sqlalchemy import create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 
-from service.client import Heliopsf
+from service.client.http import Heliopsf
 
 POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
 # A lost worker is noticed soon, so that tests need not wait as long as an operator would.

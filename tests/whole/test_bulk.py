@@ -14,11 +14,11 @@ import pytest
 from click.testing import CliRunner
 from sqlalchemy import create_engine, select
 
-from service.cli import main
+from service.cli.main import main
 from tests.conftest import write_image
 from tests.whole import stack as stacks
 from tests.whole.stack import EMBEDDED_FIRST, SERVED_FIRST, Missing, Stack, wait_for
-from workers.bulk_tables import BulkItemRow
+from workers.catalogue.bulk_tables import BulkItemRow
 from workers.settings import Settings
 
 IMAGES = 12

@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tests.conftest import write_image
 from tests.whole.stack import MODES, Missing, Stack, wait_for
-from workers.catalogue import Catalogue
+from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 pytestmark = pytest.mark.slow

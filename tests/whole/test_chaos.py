@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests import chaos
+from studies import chaos
 from tests.whole.stack import Missing
 
 

@@ -13,8 +13,8 @@ from sqlalchemy import create_engine, func, select
 from tests.transit_files import write_simulated
 from tests.whole import stack as stacks
 from tests.whole.stack import Missing, Stack, wait_for
-from workers.catalogue import Catalogue
-from workers.tables import PartRow
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import PartRow
 
 RUNS, BLOCKS = 12, 3
 

@@ -14,9 +14,9 @@ import pytest
 
 from tests.whole.many_rows import QUESTIONS, Archive, Size, fill, plan, statements
 from tests.whole.stack import Missing, postgres_database
-from workers.catalogue import Catalogue
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import Base
 from workers.settings import Settings
-from workers.tables import Base
 
 FEW = Size(psfs=1_000, products=1_000)
 MANY = Size(psfs=100_000, products=1_000_000)

@@ -11,11 +11,11 @@ from sqlalchemy import create_engine, func, select
 
 from tests.conftest import write_image
 from tests.whole.stack import MODES, Missing, Stack, wait_for
-from workers.catalogue import Catalogue
-from workers.contract import Phase
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import JobRow
+from workers.contract.contract import Phase
+from workers.contract.queues import Queue
 from workers.settings import Settings
-from workers.tables import JobRow
-from workers.urgency import Queue
 
 WAITING = 1000
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from service.client import ServiceError
+from service.client.http import ServiceError
 from tests.conftest import write_psf
 from tests.whole import stack as stacks
 from tests.whole.stack import Stack

@@ -12,7 +12,7 @@ import psutil
 import pytest
 from astropy.io import fits
 
-from service.client import ServiceError
+from service.client.http import ServiceError
 from tests.conftest import write_image
 from tests.whole import stack as stacks
 from tests.whole.stack import EMBEDDED_FIRST, Missing, Stack, wait_for

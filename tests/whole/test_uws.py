@@ -16,7 +16,7 @@ from pyvo.dal import DALQueryError, DALServiceError
 from pyvo.dal.tap import AsyncTAPJob
 from pyvo.io.uws import parse_job_list
 
-from service.client import ServiceError
+from service.client.http import ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image
 from tests.whole import stack as stacks
 from tests.whole.stack import Stack, wait_for

@@ -13,12 +13,12 @@ from pyvo.dal import DALServiceError
 from pyvo.dal.tap import AsyncTAPJob
 from pyvo.io.uws import parse_job_list
 
-from service.client import Heliopsf
+from service.client.http import Heliopsf
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.whole import stack as stacks
 from tests.whole.stack import Stack, wait_for
-from workers.catalogue import Catalogue
-from workers.keys import Scope
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.keys import Scope
 from workers.settings import Settings
 
 BUILD = {"KIND": "psf-build", "instrument_file": SMALL_INSTRUMENT, "size": "128"}

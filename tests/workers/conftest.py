@@ -11,7 +11,7 @@ import pytest
 from service.local import LocalService
 from tests.tables import copied_tables
 from tests.whole.stack import Missing, postgres_database
-from workers.catalogue import Catalogue
+from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 

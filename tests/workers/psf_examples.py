@@ -6,12 +6,12 @@ import hashlib
 import time
 from typing import Any
 
-from workers.catalogue import Catalogue
-from workers.psf_lines import line_of
-from workers.psf_rows import StatusAsked
-from workers.psf_status import PsfStatus
-from workers.tables import ProductRow, PsfRow
-from workers.validity import Validity
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.psfs import StatusAsked
+from workers.catalogue.tables import ProductRow, PsfRow
+from workers.versions.series import line_of
+from workers.versions.status import PsfStatus
+from workers.versions.validity import Validity
 
 OWNER = "local"
 ALWAYS = Validity()

@@ -1,0 +1,222 @@
+"""How fast an archive is worked through: two workers against one, what the service adds to the work, and what a kill costs.
+
+    python -m benchmarks.bulk [--images 200] [--size 2048] [--steps 5]
+
+Workers of one thread each on Redis and PostgreSQL (where this machine has none, the processes of a service's own
+worker). Beside it the same work by bare processes without any service, as this machine lets one and two of them run:
+what else it does slows both alike. Overhead is all that a worker's time holds beside deconvolving and looking at what
+that did (reading, checking, writing, hashes, rows, messages), over that; each worker's first image, for which it loads
+its kernels and the PSF, is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from astropy.io import fits
+
+from psfcore.build import build_psf
+from psfcore.deconvolve.assess.contact_sheet import treat
+from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.fits.fits_io import read_image, read_psf, write_psf
+from psfcore.fits.header import FitsLimits
+from psfcore.instruments.model import load_instrument
+from psfcore.simulate.observe import demo_image
+from tests.whole import stack as stacks
+from tests.whole.stack import Missing, Stack, wait_for
+from tests.whole.test_bulk import items, kill_everything
+
+LIMITS = FitsLimits(max_pixels=2**24)
+MARK = b"BENCH   =              1000000"
+
+
+def make_archive(folder: Path, images: int, size: int) -> Path:
+    """Images of one scene that differ in a card, so that each is a file of its own; returns the PSF's file."""
+    instrument = load_instrument("hri_euv")
+    psf = build_psf(instrument, threads=os.cpu_count() or 1)
+    write_psf(folder / "psf.fits", psf, instrument_file=b"")
+    demo_image(folder / "one.fits", psf, size=size)
+    fits.setval(folder / "one.fits", "BENCH", value=1_000_000)
+    content = (folder / "one.fits").read_bytes()
+    at = content.index(MARK) + len(MARK)
+    (folder / "archive").mkdir()
+    for number in range(images):
+        changed = content[: at - 7] + str(1_000_001 + number).encode() + content[at:]
+        (folder / "archive" / f"{number:04}.fits").write_bytes(changed)
+    return folder / "psf.fits"
+
+
+@contextmanager
+def running(folder: Path, workers: int, archive: Path) -> Iterator[Stack]:
+    """A service with so many workers of one thread each."""
+    folder.mkdir()
+    os.environ |= {
+        "HELIOPSF_WORKER_THREADS": "1",
+        "HELIOPSF_BULK_ROOTS": str(archive),
+        "OMP_NUM_THREADS": "1",
+    }
+    with ExitStack() as resources:
+        try:
+            os.environ["HELIOPSF_WORKER_PROCESSES"] = "1"
+            stack = resources.enter_context(stacks.served(folder, workers=workers))
+        except Missing as missing:
+            print(f"{missing}: a service with processes of its own worker instead", flush=True)
+            os.environ["HELIOPSF_WORKER_PROCESSES"] = str(workers)
+            stack = resources.enter_context(stacks.embedded(folder))
+        yield stack
+    shutil.rmtree(folder)
+
+
+def submit(stack: Stack, archive: Path, psf: Path, steps: int) -> dict[str, Any]:
+    method = {"name": "richardson-lucy", "steps": steps}
+    psf_id = stack.client.upload_psf(psf)["id"]
+    return stack.client.submit_bulk(files=[f"{archive}/*.fits"], psf_id=psf_id, method=method)
+
+
+def by_worker(rows: Sequence[Any]) -> list[list[Any]]:
+    """Images by the turn that did them, in the order of time."""
+    found: dict[str, list[Any]] = {}
+    for row in sorted(rows, key=lambda row: row.taken_at):
+        found.setdefault(row.job_id, []).append(row)
+    return list(found.values())
+
+
+def pace(rows: Sequence[Any]) -> float:
+    """Images a second, from when each worker had done its first one."""
+    warm = max(of_worker[0].ended_at for of_worker in by_worker(rows))
+    done = [row.ended_at for row in rows if row.ended_at > warm]
+    return len(done) / (max(done) - warm)
+
+
+def overhead(rows: Sequence[Any]) -> tuple[float, float]:
+    """What a worker's time holds beside the kernels, over them, and of it what lies between two images."""
+    span = kernel = between = 0.0
+    for of_worker in by_worker(rows):
+        for before, row in pairwise(of_worker):
+            span += row.ended_at - before.ended_at
+            kernel += row.statistics["kernel_seconds"]
+            between += row.taken_at - before.ended_at
+    return (span - kernel) / kernel, between / kernel
+
+
+def worked_through(folder: Path, workers: int, archive: Path, psf: Path, steps: int) -> float:
+    """Images a second by the service."""
+    with running(folder, workers, archive) as stack:
+        bulk = submit(stack, archive, psf, steps)
+        end = stack.client.wait_for_bulk(bulk["id"])
+        assert end["images"]["done"] == end["images"]["total"] > 0, end
+        rows = items(stack)
+    found, (all_of_it, between) = pace(rows), overhead(rows)
+    print(
+        f"{workers} worker{'s' if workers > 1 else ' '}: {3600 * found:8.0f} images an hour, {1 / found:6.2f} s an image; "
+        f"overhead {100 * all_of_it:.1f} % of the kernels' time, {100 * between:.2f} % of it between images",
+        flush=True,
+    )
+    return found
+
+
+def bare(archive: Path, psf: Path, steps: int, processes: int, images: int) -> float:
+    """Images a second by processes that do nothing else, each on images of its own."""
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.bulk",
+        "--bare",
+        str(archive),
+        str(psf),
+        str(steps),
+        str(images),
+    ]
+    started = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
+    times = [float(process.communicate()[0].split()[-1]) for process in started]
+    return sum(images / took for took in times)
+
+
+def bare_process(archive: str, psf_file: str, steps: int, images: int) -> None:
+    """What a worker does of an image that is psfcore's: read, deconvolve, look at what that did."""
+    psf = read_psf(psf_file, LIMITS, parts=False)
+    conditions = Conditions(threads=1, engine_for=EngineCache())
+    paths = sorted(Path(archive).iterdir())[: images + 1]
+    started = 0.0
+    for number, path in enumerate(paths):
+        if number == 1:  # the first loads the kernels and the PSF
+            started = time.perf_counter()
+        treat(path.name, read_image(path, LIMITS), psf, conditions=conditions, steps=steps)
+    print(time.perf_counter() - started)
+
+
+def killed(folder: Path, archive: Path, psf: Path, steps: int) -> None:
+    """Everything killed twice; what was done is not done again."""
+    with running(folder, 2, archive) as stack:
+        bulk = submit(stack, archive, psf, steps)
+        images, own_workers = len(list(archive.iterdir())), len(stack.workers)
+        kept: dict[int, float] = {}
+        for part in (1, 2):
+            wait_for(
+                lambda part=part: stack.client.bulk(bulk["id"])["images"]["done"] >= part * images // 3,  # type: ignore[misc]
+                "some are done",
+                timeout_s=3600.0,
+            )
+            kept |= {row.position: row.ended_at for row in items(stack) if row.state == "done"}
+            kill_everything(stack)
+            stack.start_server()
+            stack.workers.clear()
+            for _ in range(own_workers):
+                stack.start_worker()
+        stack.client.wait_for_bulk(bulk["id"])
+        rows = items(stack)
+        begun = sum(row.attempts for row in rows)
+        again = [row for row in rows if row.position in kept and row.ended_at != kept[row.position]]
+        products = len(list(stack.client.products()))
+    assert not again and products == len(rows) == images
+    print(
+        f"workers and server killed twice: {images} images, {products} products, none done twice, "
+        f"{begun - images} begun again",
+        flush=True,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--images", type=int, default=200)
+    parser.add_argument("--size", type=int, default=2048)
+    parser.add_argument("--steps", type=int, default=5)
+    parser.add_argument("--bare", nargs=4, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.bare:
+        archive, psf, steps, images = asked.bare
+        bare_process(archive, psf, int(steps), int(images))
+        return
+    with TemporaryDirectory(prefix="heliopsf-bench-") as temporary:
+        folder = Path(temporary)
+        psf = make_archive(folder, asked.images, asked.size)
+        archive = folder / "archive"
+        print(f"{asked.images} images of {asked.size} px, {asked.steps} steps", flush=True)
+        few = max(2, min(asked.images // 4, 20))
+        alone, together = (bare(archive, psf, asked.steps, processes, few) for processes in (1, 2))
+        print(
+            f"bare processes: {1 / alone:.2f} s an image, two are {together / alone:.2f} times as fast",
+            flush=True,
+        )
+        one, two = (
+            worked_through(folder / f"by-{workers}", workers, archive, psf, asked.steps) for workers in (1, 2)
+        )
+        print(f"two workers are {two / one:.2f} times as fast as one", flush=True)
+        for path in sorted(archive.iterdir())[max(12, asked.images // 4) :]:
+            path.unlink()
+        killed(folder / "killed", archive, psf, asked.steps)
+
+
+if __name__ == "__main__":
+    main()

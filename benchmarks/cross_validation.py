@@ -1,0 +1,173 @@
+"""How long a cross-validation takes, how near the quick scheme comes to the exact one, and what a lost worker costs.
+
+    python -m benchmarks.cross_validation [--full]
+
+30 simulated images of 512 px. Shared scheme: 100 folds in this process. Exact scheme: ten folds by two worker
+processes of one thread each, on Redis and PostgreSQL (where this machine has none, by the two processes of a service
+with its worker beside it), then the same with one of the two killed half-way, from Redis and PostgreSQL alone.
+Times as ratios to 1 F (see tests/bench.py). 100 exact folds are reckoned from the ten; --full runs them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.deconvolution import THREADS, reference
+from psfcore.fits.header import FitsLimits
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.validation.cross_validation import FoldFit, bands, draws, shared_fits
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
+from psfcore.simulate.transit_files import write
+from psfcore.transit.folder import read_transit
+from studies.transits import diffraction, drawn_truth
+from tests.whole import stack as stacks
+from tests.whole.stack import Missing, Stack
+from tests.whole.test_crossval import Parts, kill_worker_of
+
+IMAGES, SIZE_PX, FOLDS, RUNS = 30, 512, 10, 10
+ONE_THREAD_EACH = {"HELIOPSF_WORKER_THREADS": "1"}
+WAIT_S = 0.25
+
+
+def shared(folder: Path, f_s: float) -> tuple[FoldFit, ...]:
+    """100 folds by the shared scheme, in this process."""
+    transit = read_transit(folder, FitsLimits(max_pixels=(2 * SIZE_PX) ** 2))
+    start = time.perf_counter()
+    solution = invert(transit, threads=THREADS)
+    fitted = time.perf_counter() - start
+    fits = shared_fits(solution, draws(IMAGES, runs=RUNS))
+    told(f"shared scheme, {len(fits)} folds with free fits ({fitted:.0f} s of it the fit)", start, f_s)
+    return fits
+
+
+def told(what: str, start: float, f_s: float) -> None:
+    took = time.perf_counter() - start
+    print(f"{what}: {took:.0f} s = {took / f_s:.0f} F", flush=True)
+
+
+@contextmanager
+def two_workers(folder: Path) -> Iterator[Stack]:
+    """Two worker processes, by servers of their own where this machine has them."""
+    os.environ.update(ONE_THREAD_EACH)
+    folder.mkdir()
+    try:
+        with stacks.served(folder, workers=2) as stack:
+            yield stack
+    except Missing as missing:
+        print(f"{missing}: a service with two processes of its own worker instead")
+        os.environ["HELIOPSF_WORKER_PROCESSES"] = "2"
+        with stacks.embedded(folder) as stack:
+            yield stack
+
+
+def exact(stack: Stack, transit_id: str, runs: int, seed: int, f_s: float) -> tuple[FoldFit, ...]:
+    """Folds by the exact scheme."""
+    start = time.perf_counter()
+    job = stack.client.submit("cross-validate", transit_id=transit_id, scheme="exact", runs=runs, seed=seed)
+    first: float | None = None
+    while (row := stack.client.job(job["id"]))["phase"] in ("QUEUED", "EXECUTING"):
+        if first is None and row["progress"]["stage"] == "folds" and row["progress"]["step"] >= 1:
+            first = time.perf_counter()
+            done = row["progress"]["step"]
+        time.sleep(WAIT_S)
+    folds = folds_of(stack, stack.client.wait(row))
+    told(f"exact scheme, {len(folds)} folds by two workers", start, f_s)
+    if first is not None and len(folds) < FOLDS * RUNS:
+        a_fold = (time.perf_counter() - first) / (len(folds) - done)
+        whole = first - start + a_fold * (FOLDS * RUNS - done)
+        print(
+            f"  {first - start:.0f} s to the first, {a_fold:.1f} s a fold from then on: "
+            f"{FOLDS * RUNS} folds in {whole / 60:.1f} min = {whole / f_s:.0f} F",
+            flush=True,
+        )
+    return folds
+
+
+def folds_of(stack: Stack, job: dict[str, Any]) -> tuple[FoldFit, ...]:
+    report = stack.data.parent / "report.json"
+    stack.client.download(stack.client.get(job["result"])["file"], report)
+    return tuple(FoldFit.from_json(fold) for fold in json.loads(report.read_text())["folds"])
+
+
+def compared(exactly: tuple[FoldFit, ...], quickly: tuple[FoldFit, ...]) -> None:
+    """Bands of the same folds by both schemes."""
+    radii = np.arange(len(exactly[0].curve_pct), dtype=np.float64)
+    one, other = (bands(fits, radii) for fits in (exactly, quickly))
+    widths = [b.curve_pct[3] - b.curve_pct[1] for b in (one, other)]
+    half = widths[1] / 2
+    apart = np.abs(one.curve_pct[2] - other.curve_pct[2]) / half
+    each = np.abs(np.subtract([f.curve_pct for f in exactly], [f.curve_pct for f in quickly])) / half
+    print(
+        f"  widths of the 1 sigma bands, exact over shared: {(widths[0] / widths[1]).min():.2f} to "
+        f"{(widths[0] / widths[1]).max():.2f}; medians {apart.max():.2f} half-widths apart at most, single folds "
+        f"{np.median(each):.2f} (median) and {each.max():.2f} (at most)"
+    )
+    print(
+        f"  held-out rms {one.held_out['rms_pct']:.3f} % exact, {other.held_out['rms_pct']:.3f} % shared",
+        flush=True,
+    )
+    if one.shells is not None and other.shells is not None:
+        print(
+            f"  free fit less formula near the centre: {one.shells.near_centre.points:+.2f} exact, "
+            f"{other.shells.near_centre.points:+.2f} shared, +- {other.shells.near_centre.sigma:.2f} points"
+        )
+
+
+def with_one_killed(stack: Stack, transit_id: str, undisturbed: tuple[FoldFit, ...], f_s: float) -> None:
+    """Other folds, the worker that helps killed when half of them are done; none may be lost or counted twice."""
+    if not stack.workers:
+        print("one worker killed half-way: not measured without Redis and PostgreSQL")
+        return
+    parts = Parts(stack)
+    before = parts.done()
+    start = time.perf_counter()
+    job = stack.client.submit("cross-validate", transit_id=transit_id, scheme="exact", runs=1, seed=2)
+    while parts.done() - before < FOLDS // 2 or parts.taken() < 2:
+        time.sleep(WAIT_S)
+    kill_worker_of(stack, job["id"], own=False)
+    found = folds_of(stack, stack.client.wait(job))
+    told(f"the same with one of the two killed when {FOLDS // 2} were done", start, f_s)
+    expected = [(fit.run, fit.fold) for fit in undisturbed]
+    assert [(fit.run, fit.fold) for fit in found] == expected
+    assert parts.done() - before == FOLDS
+    parts.close()
+    print("  no fold was lost, none counted twice", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--full", action="store_true", help="run 100 exact folds too")
+    asked = parser.parse_args()
+    f_s = reference()
+    print(f"1 F = {f_s:.3f} s", flush=True)
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "transit"
+        write(
+            simulate(
+                default_plan(IMAGES, SIZE_PX), drawn_truth(1), diffraction(2 * SIZE_PX), 1, threads=THREADS
+            ),
+            folder,
+        )
+        quickly = shared(folder, f_s)
+        with two_workers(Path(temporary) / "stack") as stack:
+            transit_id = stack.client.upload_transit(folder)["id"]
+            exactly = exact(stack, transit_id, 1, 1, f_s)
+            compared(exactly, quickly[:FOLDS])
+            if asked.full:
+                compared(exact(stack, transit_id, RUNS, 1, f_s), quickly)
+            with_one_killed(stack, transit_id, exactly, f_s)
+
+
+if __name__ == "__main__":
+    main()

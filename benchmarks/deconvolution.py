@@ -1,0 +1,157 @@
+"""`make bench`: times as ratios to a reference transform of the same run, called 1 F.
+
+1 F is one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers. The machine's other work slows both
+alike, so the ratio says more than the seconds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import scipy.fft
+
+from benchmarks.peers import peak_gib
+from psfcore.build import build_psf
+from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
+from psfcore.diffraction.fraunhofer import FEWEST_SAMPLES, far_field
+from psfcore.diffraction.pupil import entrance_pupil
+from psfcore.drawing.plots import preview_png
+from psfcore.fits.fits_io import read_image
+from psfcore.fits.header import FitsLimits
+from psfcore.instruments.model import load_instrument
+from psfcore.psf import Psf
+from psfcore.simulate.observe import demo_image
+from tests.whole import stack as stacks
+
+THREADS = os.cpu_count() or 1
+
+
+def seconds(work: Callable[[], object], repeats: int = 1) -> float:
+    """The shortest of some runs."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def reference() -> float:
+    """1 F in seconds."""
+    field = np.random.default_rng(0).random((4096, 4096), dtype=np.float32)
+
+    def pair() -> None:
+        scipy.fft.irfft2(scipy.fft.rfft2(field, workers=2), s=field.shape, workers=2)
+
+    return seconds(pair, 5)
+
+
+def row(what: str, took_s: float, f_s: float, note: str = "") -> None:
+    print(f"{what:<52} {took_s:8.2f} s {took_s / f_s:8.1f} F   peak so far {peak_gib():.2f} GiB  {note}")
+
+
+def round_trip_s(stack: stacks.Stack, image: Path, output: Path) -> tuple[float, float]:
+    """Upload, job and download in seconds, for a product that is new and for one that is there."""
+    stack.client.build_psf("hri_euv")
+    # Another step count, so that the worker has its kernels loaded and the product is not there yet.
+    stack.client.deconvolve(image, steps=1)
+    # Levels that no pixel reaches: the same work, but another product each time.
+    levels = iter((1e9, 2e9, 3e9))
+    new = seconds(lambda: stack.client.deconvolve(image, output, saturation_dn=next(levels)), 3)
+    return new, seconds(lambda: stack.client.deconvolve(image, output, saturation_dn=3e9), 3)
+
+
+def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, folder: Path) -> None:
+    """The same deconvolution over HTTP, embedded and with Redis and PostgreSQL; the PSF is built before."""
+    for name, mode in (("embedded", stacks.embedded), ("Redis and PostgreSQL", stacks.served)):
+        place = folder / name.split()[0]
+        place.mkdir()
+        with ExitStack() as resources:
+            try:
+                stack = resources.enter_context(mode(place))
+            except stacks.Missing as missing:
+                print(f"left out: {missing}")
+                continue
+            took, again = round_trip_s(stack, image, place / "out.fits")
+        row(f"HTTP round trip, {name}", took, f_s, f"over the psfcore call: {took - in_process_s:+.2f} s")
+        row(f"  an equal request again, {name}", again, f_s)
+
+
+def builds(f_s: float) -> None:
+    """PSF builds, and the far field beside one plain transform of its padded pupil, each in a process of its own."""
+    for what in ("build 2048", "build 4096", "far field 1024", "plain padded transform 1024"):
+        answer = subprocess.run(
+            [sys.executable, "-m", "benchmarks.deconvolution", what],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        measured = json.loads(answer.stdout.splitlines()[-1])
+        print(
+            f"{'hri_euv, ' + what:<52} {measured['seconds']:8.2f} s {measured['seconds'] / f_s:8.1f} F   "
+            f"peak {measured['peak_gib']:.2f} GiB"
+        )
+
+
+def one_build(what: str) -> None:
+    """One line of ``builds``, as JSON."""
+    instrument = load_instrument("hri_euv")
+    if what.startswith("build"):
+        took = seconds(lambda: build_psf(instrument, size=int(what.split()[1]), threads=THREADS))
+    elif what.startswith("far field"):
+        optics = {
+            "wavelength_angstrom": instrument.wavelength_angstrom,
+            "focal_length_mm": instrument.focal_length_mm,
+            "pixel_pitch_um": instrument.detector.pixel_pitch_um,
+        }
+        pupil = entrance_pupil(instrument.aperture, mount=instrument.mount)
+        took = seconds(lambda: far_field(pupil, **optics, size=1024, threads=THREADS))
+    else:
+        padded = np.zeros((FEWEST_SAMPLES * 1024, FEWEST_SAMPLES * 1024), np.float32)
+        took = seconds(lambda: scipy.fft.rfft2(padded, workers=2))
+    print(json.dumps({"seconds": took, "peak_gib": peak_gib()}))
+
+
+def main() -> None:
+    f_s = reference()
+    print(f"1 F = {f_s:.3f} s, {THREADS} threads")
+    if "--quick" not in sys.argv:
+        builds(f_s)
+    psf = build_psf(load_instrument("hri_euv"), threads=THREADS)
+    with TemporaryDirectory(prefix="heliopsf-bench-") as name:
+        folder = Path(name)
+        path = folder / "image.fits"
+        demo_image(path, psf, size=2048)
+        image = read_image(path, FitsLimits(max_pixels=2**24))
+        richardson_lucy(image, psf, steps=1, threads=THREADS)
+        results = []
+        published_s = seconds(lambda: results.append(richardson_lucy(image, psf, threads=THREADS)))
+        row("Richardson-Lucy as published, 2048 px image and PSF", published_s, f_s)
+        conditions = Conditions(threads=THREADS, engine_for=EngineCache())
+        default = method_named("richardson-lucy")
+        default(image, psf, conditions, steps=1)
+        core_s = seconds(lambda: default(image, psf, conditions))
+        row("the same by default (edges mirrored, PSF prepared)", core_s, f_s)
+        picture_s = seconds(
+            lambda: preview_png(image.pixels, results[0].pixels, folder / "p.png", title="bench")
+        )
+        row("preview, 2048 px", picture_s, f_s)
+        http_round_trip(path, psf, core_s, f_s, folder)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] not in ([], ["--quick"]):
+        one_build(sys.argv[1])
+    else:
+        main()

@@ -1,0 +1,150 @@
+"""How long a fit takes, and that the quick way gives what the straightforward one gives.
+
+    python -m benchmarks.fit [--full] [--folder DIR]
+
+Quick: 30 images of 512 px, as a ratio to 1 F (see tests/bench.py), and nine images of 256 px solved a second time the
+straightforward way: SciPy's transforms in float64, every scene from scratch in thirty steps, slopes by finite
+differences of the whole model, all images in every round. --full: 126 images of 2048 px (4 GB are written into DIR
+or the temporary folder, once), with its peak memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+from tempfile import gettempdir
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.deconvolution import THREADS, reference
+from benchmarks.peers import peak_gib
+from psfcore.convolution.convolver import Convolver
+from psfcore.fits.header import FitsLimits
+from psfcore.psf import cumulative_curve
+from psfcore.scatter.fit import fit_transit, sentence
+from psfcore.scatter.inversion import LEAST_LEVEL, Solution, invert
+from psfcore.scatter.total_psf import TotalPsf
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
+from psfcore.simulate.transit_files import write
+from psfcore.transit.folder import read_transit
+from studies.transits import diffraction, drawn_truth
+
+SCENE_STEPS = 30
+STRAIGHT_ROUNDS = 4
+
+
+def fit_of_512(f_s: float) -> None:
+    """30 images of 512 px, everything that `heliopsf psf fit` computes."""
+    transit = simulate(default_plan(30, 512), drawn_truth(1), diffraction(1024), 1, threads=THREADS).transit
+    fit_transit(simulate(default_plan(9, 128), drawn_truth(1), diffraction(256), 1).transit)  # compiles
+    start = time.perf_counter()
+    fit_transit(transit, threads=THREADS)
+    took = time.perf_counter() - start
+    print(f"fit of 30 images of 512 px: {took:.1f} s = {took / f_s:.0f} F", flush=True)
+
+
+def against_straightforward() -> None:
+    """The curve of nine images of 256 px both ways."""
+    simulated = simulate(
+        default_plan(9, 256, brightness=3.0), drawn_truth(2), diffraction(512), 2, threads=THREADS
+    )
+    solution = invert(simulated.transit, threads=THREADS)
+    start = time.perf_counter()
+    curve = straightforward(solution)
+    took = time.perf_counter() - start
+    worst = np.abs(curve - solution.inversion.curve_pct).max()
+    print(
+        f"quick against straightforward, 9 images of 256 px: the curves differ by {worst:.4f} points at most "
+        f"(stated error {solution.inversion.curve_sigma.min():.2f} or more; the straightforward way took {took:.0f} s)",
+        flush=True,
+    )
+
+
+def straightforward(solution: Solution) -> NDArray[np.float64]:
+    """The cumulative curve where Eq. (2) of `inversion` is least, from its start, with the same dark pixels."""
+    transit, inversion = solution.transit, solution.inversion
+    total = TotalPsf(transit.diffraction, inversion.shape, transit.shape, threads=THREADS)
+
+    def expected(at: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        see = Convolver(total.kernel(at), transit.shape, dtype=np.float64, threads=THREADS)
+        out = []
+        for n in solution.part:
+            x = transit.frames[n].pixels.astype(np.float64)
+            for _ in range(SCENE_STEPS):  # Richardson's iteration: the PSF's transform lies between 0.3 and 1
+                x = x + (transit.frames[n].pixels - see.apply(x))
+            x[solution.sky.dark[n]] = 0.0
+            out.append(np.asarray(see.apply(x))[solution.sky.dark[n]])
+        return out
+
+    at = inversion.shape.start
+    for _ in range(STRAIGHT_ROUNDS):
+        here = expected(at)
+        slopes = []
+        for k in range(at.size):
+            step = np.zeros_like(at)
+            step[k] = 1e-3
+            slopes.append(
+                [(a - b) / 2e-3 for a, b in zip(expected(at + step), expected(at - step), strict=True)]
+            )
+        normal, score = np.zeros((at.size, at.size)), np.zeros(at.size)
+        for k, n in enumerate(solution.part):
+            frame = transit.frames[n]
+            level = np.maximum(here[k], LEAST_LEVEL * here[k].mean())
+            weight = 1 / transit.noise.variance(level, frame.exposure_s)
+            answers = np.array([slope[k] for slope in slopes])
+            normal += (answers * weight) @ answers.T
+            score += (answers * weight) @ (frame.pixels[solution.sky.dark[n]] - here[k])
+        at = at + np.linalg.solve(normal, score)
+    return cumulative_curve(total.kernel(at), total.radii_px)
+
+
+def full_size(folder: Path, f_s: float) -> None:
+    """126 images of 2048 px, in a process of its own for its memory."""
+    where = folder / "heliopsf-bench-126x2048"
+    if not (where / "transit.json").is_file():
+        plan = default_plan(126, 2048)
+        write(simulate(plan, drawn_truth(3), diffraction(2048), 3, threads=THREADS), where)
+    told = subprocess.run(
+        [sys.executable, "-m", "benchmarks.fit", "--one", str(where)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    took, gib, sentence = told.stdout.strip().split("\n")
+    print(f"fit of 126 images of 2048 px: {float(took):.0f} s = {float(took) / f_s:.0f} F, {gib} GiB")
+    print(f"  {sentence}", flush=True)
+
+
+def one(folder: Path) -> None:
+    start = time.perf_counter()
+    transit = read_transit(folder, FitsLimits(max_pixels=4096 * 4096))
+    found = fit_transit(transit, threads=THREADS)
+    print(time.perf_counter() - start)
+    print(f"{peak_gib():.2f}")
+    print(sentence(found))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--folder", type=Path, default=Path(gettempdir()))
+    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.one:
+        one(asked.one)
+        return
+    f_s = reference()
+    print(f"1 F = {f_s:.3f} s", flush=True)
+    fit_of_512(f_s)
+    against_straightforward()
+    if asked.full:
+        full_size(asked.folder, f_s)
+
+
+if __name__ == "__main__":
+    main()

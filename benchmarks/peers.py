@@ -1,0 +1,167 @@
+"""`make bench-peers`: twenty Richardson-Lucy steps by heliopsf and by what people use today, in turn on the same data.
+
+A 2048 x 2048 image, a 4096 x 4096 PSF. Each runs in a process of its own, so that its peak of memory is its own; the
+reference of the same run, 1 F, is one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers. Peers live in an
+environment of their own (`.venv-peers`), and one that is not installed is left out and named.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+STEPS = 20
+IMAGE_PX, PSF_PX = 2048, 4096
+REPOSITORY = Path(__file__).parents[1]
+
+
+def heliopsf(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
+    from astropy.io.fits import Header
+
+    from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
+    from psfcore.image import Image
+    from psfcore.psf import Psf
+
+    seen = Image(image.astype(float), np.zeros(image.shape, np.uint8), Header(), "DN/s", 1.0)
+    kernel = Psf(psf.astype(float), "bench", "1", None, "draft", None, None)
+    return richardson_lucy(seen, kernel, steps=STEPS, threads=os.cpu_count() or 1).pixels
+
+
+def scipy_fft(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
+    """The plain way, float32, two workers, image and PSF on the padded plane."""
+    import scipy.fft
+
+    image, psf = image.astype(np.float32), psf.astype(np.float32)
+    shape = psf.shape
+    transfer = scipy.fft.rfft2(np.fft.ifftshift(psf), workers=2)
+    ny, nx = image.shape
+    padded = np.zeros(shape, np.float32)
+    padded[:ny, :nx] = image
+    estimate = padded.copy()
+    floor = np.float32(2.0**-23 * image.max())
+    for _ in range(STEPS):
+        model = scipy.fft.irfft2(scipy.fft.rfft2(estimate, workers=2) * transfer, s=shape, workers=2)
+        ratio = padded / np.maximum(model, floor)
+        estimate *= scipy.fft.irfft2(scipy.fft.rfft2(ratio, workers=2) * transfer.conj(), s=shape, workers=2)
+    return estimate[:ny, :nx]
+
+
+def scikit_image(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
+    from skimage.restoration import richardson_lucy
+
+    odd = psf[1:, 1:]  # its centre is the middle of an odd array
+    start = image.astype(np.float32) / image.max()
+    return richardson_lucy(start, odd.astype(np.float32), num_iter=STEPS, clip=False) * image.max()
+
+
+def aiapy(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
+    """Its own loop: double precision, circular, so image and PSF are padded first."""
+    import astropy.units as u
+    import sunpy.map
+    from aiapy.psf import deconvolve
+
+    padded = np.zeros(psf.shape)
+    padded[: image.shape[0], : image.shape[1]] = image
+    header = {"ctype1": "HPLN-TAN", "ctype2": "HPLT-TAN", "cunit1": "arcsec", "cunit2": "arcsec"}
+    header |= {"cdelt1": 0.6, "cdelt2": 0.6, "crpix1": 1, "crpix2": 1, "crval1": 0, "crval2": 0}
+    header |= {"telescop": "SDO/AIA", "instrume": "AIA_3", "wavelnth": 171, "waveunit": "angstrom"}
+    header |= {"date-obs": "2020-01-01T00:00:00", "hgln_obs": 0, "hglt_obs": 0, "dsun_obs": u.AU.to(u.m)}
+    done = deconvolve(sunpy.map.Map(padded, header), psf=psf, iterations=STEPS)
+    return np.asarray(done.data)[: image.shape[0], : image.shape[1]]
+
+
+CONTENDERS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "heliopsf": heliopsf,
+    "scipy.fft, two workers": scipy_fft,
+    "scikit-image": scikit_image,
+    "aiapy": aiapy,
+}
+
+
+def data() -> tuple[np.ndarray, np.ndarray]:
+    """A textured image and a PSF with the paper's softened power law and a sharp core."""
+    rng = np.random.default_rng(0)
+    y, x = np.indices((PSF_PX, PSF_PX), dtype=np.float32) - PSF_PX // 2
+    psf = 0.1525 / (6.15 + np.hypot(x, y)) ** 2.53
+    psf[PSF_PX // 2, PSF_PX // 2] = 1 - (psf.sum() - psf[PSF_PX // 2, PSF_PX // 2])
+    image = rng.gamma(2.0, 200.0, (IMAGE_PX, IMAGE_PX))
+    image[600:620, 900:930] += 20_000
+    return image.astype(np.float32), (psf / psf.sum()).astype(np.float32)
+
+
+def reference_s() -> float:
+    import scipy.fft
+
+    field = np.random.default_rng(0).random((4096, 4096), dtype=np.float32)
+    times = []
+    for _ in range(5):
+        start = time.perf_counter()
+        scipy.fft.irfft2(scipy.fft.rfft2(field, workers=2), s=field.shape, workers=2)
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def peak_gib() -> float:
+    """Largest resident size of this process. (getrusage would count what the parent held when it forked.)"""
+    line = next(
+        line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")
+    )
+    return int(line.split()[1]) / 2**20
+
+
+def run_one(name: str, folder: Path) -> None:
+    """In a process of its own: time one contender; a first short run loads what is loaded once."""
+    image, psf = np.load(folder / "image.npy"), np.load(folder / "psf.npy")
+    if name == "heliopsf":
+        CONTENDERS[name](image[:64, :64], psf[2016:2080, 2016:2080])  # kernels from the compiler's cache
+    start = time.perf_counter()
+    result = CONTENDERS[name](image, psf)
+    seconds = time.perf_counter() - start
+    np.save(folder / f"{name.split()[0]}.npy", result.astype(np.float32))
+    print(json.dumps({"seconds": seconds, "peak_gib": peak_gib()}))
+
+
+def main(interpreters: dict[str, str]) -> None:
+    f_s = reference_s()
+    print(f"1 F = {f_s:.3f} s; {IMAGE_PX} px image, {PSF_PX} px PSF, {STEPS} steps")
+    with TemporaryDirectory(prefix="heliopsf-peers-") as name:
+        folder = Path(name)
+        for label, array in zip(("image", "psf"), data(), strict=True):
+            np.save(folder / f"{label}.npy", array)
+        took: dict[str, float] = {}
+        for contender in CONTENDERS:
+            python = interpreters.get(contender, sys.executable)
+            command = [python, str(Path(__file__).resolve()), "--one", contender, str(folder)]
+            environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+            answer = subprocess.run(command, capture_output=True, text=True, env=environment)
+            if answer.returncode:
+                last = (answer.stderr.strip().splitlines() or ["no message"])[-1]
+                print(f"{contender:<24} left out: {last}")
+                continue
+            measured = json.loads(answer.stdout.splitlines()[-1])
+            took[contender] = measured["seconds"]
+            ours = np.load(folder / "heliopsf.npy")
+            theirs = np.load(folder / f"{contender.split()[0]}.npy")
+            inner = (slice(256, -256), slice(256, -256))
+            apart = float(np.abs(theirs - ours)[inner].max() / ours.max())
+            print(
+                f"{contender:<24} {measured['seconds']:8.2f} s {measured['seconds'] / f_s:8.1f} F "
+                f"{took['heliopsf'] / measured['seconds']:6.3f} (ours / theirs)   peak {measured['peak_gib']:.2f} GiB   "
+                f"differs by {apart:.1e} of the maximum, edges apart"
+            )
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--one"]:
+        run_one(sys.argv[2], Path(sys.argv[3]))
+    else:
+        peers = sys.argv[1] if len(sys.argv) > 1 else sys.executable
+        main({"scikit-image": peers, "aiapy": peers})

@@ -1,0 +1,95 @@
+"""`python -m benchmarks.ring_sums [--quick]`: the sums of images over shells, by three ways, as ratios to 1 F.
+
+51,660 targets, 410 round each of 126 places along a transit in 2048 px images, and the published 50 shells; also
+shells cut into 12 sectors, and fine shells. 1 F is that of `benchmarks.deconvolution`. Plain look-up and one convolution a shell
+take too long for all: they are timed on a part, scaled, and compared with the running sums on that part.
+"""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.deconvolution import THREADS, reference, seconds
+from psfcore.scatter.as_published.ring_sums import segment_sums
+from psfcore.scatter.as_published.segments import Segments, fine_shells, shells_as_published
+from tests.psfcore.scatter.as_published.ring_sum_references import segment_sums_fft, segment_sums_plain
+
+IMAGES, TARGETS_AN_IMAGE, SIZE_PX = 126, 410, 2048
+KINDS = (
+    ("50 shells", shells_as_published(), 1),
+    ("50 shells in 12 sectors", shells_as_published(), 12),
+    ("fine shells", fine_shells(), 1),
+)
+
+
+def transit_targets() -> list[NDArray[np.int64]]:
+    """The 410 pixels nearest to each of 126 places on a line across the image."""
+    dy, dx = np.indices((31, 31)) - 15
+    nearest = np.argsort((dy**2 + dx**2).ravel(), kind="stable")[:TARGETS_AN_IMAGE]
+    disc = np.column_stack((dy.ravel()[nearest], dx.ravel()[nearest]))
+    along = np.linspace(0.1, 0.9, IMAGES) * SIZE_PX
+    return [disc + np.array([round(0.55 * SIZE_PX + 0.1 * x), round(x)]) for x in along]
+
+
+def report(what: str, took_s: float, f_s: float, note: str = "") -> None:
+    print(f"{what:<58} {took_s:9.2f} s {took_s / f_s:9.1f} F  {note}", flush=True)
+
+
+def of_part(sums: NDArray[np.float64], expected: NDArray[np.float64]) -> str:
+    return f"largest difference {np.abs(sums / expected - 1).max():.1e} of a shell's sum"
+
+
+def ring_sums_bench(*, quick: bool = False) -> None:
+    """Print the table; `quick`: a tenth of the images for the running sums, scaled, and one shell for the FFT."""
+    f_s = reference()
+    print(f"1 F = {f_s:.3f} s, {THREADS} threads, {IMAGES * TARGETS_AN_IMAGE} targets")
+    rng = np.random.default_rng(0)
+    images = [rng.gamma(2.0, 100.0, (SIZE_PX, SIZE_PX)).astype(np.float32) for _ in range(3)]
+    targets = transit_targets()
+    used = range(0, IMAGES, 10) if quick else range(IMAGES)
+    scale = IMAGES / len(used)
+    scaled = f"{len(used)} images, scaled" if quick else ""
+    for name, edges, sectors in KINDS:
+        segments = Segments(tuple(edges), sectors)
+        report(f"{name} ({segments.size}): to prepare", seconds(lambda s=segments: s.runs), f_s)
+
+        def one(n: int, segments: Segments = segments, threads: int = 1) -> NDArray[np.float64]:
+            return segment_sums(images[n % len(images)], targets[n], segments, threads=threads)
+
+        def side_by_side(one=one) -> None:  # type: ignore[no-untyped-def]
+            with ThreadPoolExecutor(THREADS) as pool:
+                list(pool.map(one, used))
+
+        one(0)
+        report("  running sums, one thread", scale * seconds(lambda o=one: [o(n) for n in used]), f_s, scaled)
+        took = scale * seconds(lambda o=one: [o(n, threads=THREADS) for n in used])
+        report(f"  running sums, {THREADS} threads on each image", took, f_s, scaled)
+        report(f"  running sums, {THREADS} images at a time", scale * seconds(side_by_side), f_s, scaled)
+    segments = Segments(tuple(KINDS[0][1]))
+    sums = segment_sums(images[0], targets[0], segments)
+    some = slice(0, TARGETS_AN_IMAGE, 100 if quick else 40)
+    part = targets[0][some]
+    result: list[NDArray[np.float64]] = []
+    took = seconds(lambda: result.append(segment_sums_plain(images[0], part, segments)))
+    note = f"{len(part)} targets, scaled; {of_part(sums[some], result[-1])}"
+    report("50 shells: plain look-up, one thread", took * IMAGES * TARGETS_AN_IMAGE / len(part), f_s, note)
+    # A convolution costs the same for every shell.
+    shells = (0, 49)[1 if quick else 0 :]
+    took = 0.0
+    differences = []
+    for k in shells:
+        shell = Segments(tuple(KINDS[0][1][k : k + 2]))
+        took += seconds(
+            lambda s=shell: result.append(segment_sums_fft(images[0], targets[0], s, threads=THREADS))
+        )
+        differences.append(of_part(sums[:, [k]], result[-1]))
+    note = f"{len(shells)} of 50 shells of one image, scaled; {differences[-1]}"
+    report(f"50 shells: FFT, {THREADS} threads", took / len(shells) * 50 * IMAGES, f_s, note)
+
+
+if __name__ == "__main__":
+    ring_sums_bench(quick="--quick" in sys.argv)

@@ -1,0 +1,261 @@
+"""A blind set on disk: its folders, its seals, and the making of all its cases.
+
+DIR/set.json                  how the set was made: seed, sizes, number of cases
+DIR/cases/NNNN/transit/       what a diagnosis gets
+DIR/cases/NNNN/report.json    what it said (gap/1); run.json: time, memory, and why there is no report
+DIR/truth/NNNN.json           salt and truth
+DIR/seals.jsonl               {"case", "sha256"}, a line a case
+DIR/score.json, .txt, .png    the figures, the table, the picture; made anew by each run
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.blind.cases import Case, draw_case
+from psfcore.blind.make_case import make, seal_of, sealed, write_transit
+from psfcore.comparison import array_sha256
+from psfcore.errors import DataError
+from psfcore.whole_files import write_whole
+
+Plane = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SetPlan:
+    """How a set is made. first: the number of its first case; the others: as draw_case has them."""
+
+    cases: int
+    seed: int
+    size_px: int = 256
+    images: int = 18
+    first: int = 0
+    only: tuple[str, ...] = ()
+    clean_only: bool = False
+    built_diffraction: bool = True
+    left_pct: tuple[float, ...] = ()
+
+    @property
+    def numbers(self) -> range:
+        """The cases' numbers."""
+        return range(self.first, self.first + self.cases)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A case that was made and sealed, or why it could not be."""
+
+    case: int
+    seconds: float
+    seal: str = ""
+    why_not: str = ""
+
+
+@dataclass(frozen=True)
+class BlindSet:
+    """A folder that holds a set."""
+
+    folder: Path
+
+    def case_folder(self, number: int) -> Path:
+        """Of one case: its transit, then its report."""
+        return self.folder / "cases" / f"{number:04d}"
+
+    def transit(self, number: int) -> Path:
+        """What a diagnosis gets."""
+        return self.case_folder(number) / "transit"
+
+    def report(self, number: int) -> Path:
+        """What it said."""
+        return self.case_folder(number) / "report.json"
+
+    def truth_file(self, number: int) -> Path:
+        """Salt and truth."""
+        return self.folder / "truth" / f"{number:04d}.json"
+
+    @property
+    def seals_file(self) -> Path:
+        """The seals of all cases."""
+        return self.folder / "seals.jsonl"
+
+    def seals(self) -> dict[int, str]:
+        """SHA-256 by case. Raises DataError "bad-seals"."""
+        if not self.seals_file.is_file():
+            return {}
+        found: dict[int, str] = {}
+        # What stands behind the last end of a line was cut when the power went; its case is made again.
+        for line in self.seals_file.read_text("utf-8").rpartition("\n")[0].splitlines():
+            try:
+                entry = json.loads(line)
+                number, seal = int(entry["case"]), str(entry["sha256"])
+            except (ValueError, KeyError, TypeError) as error:
+                message = f"expected a case and its sha256 a line; got {line!r:.60}"
+                raise DataError("bad-seals", message) from error
+            if found.setdefault(number, seal) != seal:
+                raise DataError("bad-seals", f"expected one seal a case; got two for case {number:04d}")
+        return found
+
+    def truth(self, number: int) -> dict[str, Any]:
+        """A case's truth, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
+        seal = self.seals().get(number)
+        try:
+            kept = json.loads(self.truth_file(number).read_text("utf-8"))
+            salt, truth = str(kept["salt"]), dict(kept["truth"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                "broken-seal", f"case {number:04d}: expected salt and truth; got {error!s:.100}"
+            ) from error
+        if seal is None or seal_of(salt, truth) != seal:
+            message = (
+                f"case {number:04d}: expected a truth that hashes to {seal}; it was changed, or never sealed"
+            )
+            raise DataError("broken-seal", message)
+        return truth
+
+    def is_made(self, number: int) -> bool:
+        """Whether a case was made and sealed; its transit may have been deleted after the report.
+
+        Raises DataError "bad-seals".
+        """
+        return self.truth_file(number).is_file() and number in self.seals()
+
+
+def make_set(
+    folder: Path,
+    plan: SetPlan,
+    *,
+    scenes: Sequence[Plane] = (),
+    processes: int = 1,
+    progress: Progress = lambda line: None,
+) -> tuple[BlindSet, dict[int, str]]:
+    """Make and seal all cases of a set that are not there yet; the set, and why by case where one cannot be made.
+
+    scenes: images [y, x] in DN/s to take scenes from. Raises DataError "other-set" where the folder holds a set made
+    otherwise or from other scenes, "bad-seals", and what drawing a case raises, before any is made.
+    """
+    made = BlindSet(folder)
+    _remember(made, plan, scenes)
+    (folder / "truth").mkdir(parents=True, exist_ok=True)
+    sealed_before = made.seals()
+    missing = [n for n in plan.numbers if not (n in sealed_before and made.truth_file(n).is_file())]
+    cases = [_drawn(plan, number) for number in missing]
+    for number in missing:
+        shutil.rmtree(made.case_folder(number), ignore_errors=True)  # half made
+    not_made: dict[int, str] = {}
+    for done, attempt in enumerate(_made(made, cases, scenes, processes), 1):
+        so_far = f"in {attempt.seconds:.1f} s ({done} of {len(missing)})"
+        if attempt.why_not:
+            not_made[attempt.case] = attempt.why_not
+            progress(f"could not make case {attempt.case:04d} {so_far}: {attempt.why_not}")
+            continue
+        _end_cut_line(made.seals_file)
+        with made.seals_file.open("a", encoding="utf-8") as seals:
+            seals.write(json.dumps({"case": attempt.case, "sha256": attempt.seal}) + "\n")
+            seals.flush()
+            os.fsync(seals.fileno())
+        progress(f"made case {attempt.case:04d} {so_far}")
+    return made, not_made
+
+
+def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
+    """Write how the set is made, or see that it is the same."""
+    about = json.loads(json.dumps(asdict(plan) | {"scenes": [array_sha256(scene) for scene in scenes]}))
+    file = made.folder / "set.json"
+    if file.is_file():
+        before = {"scenes": []} | json.loads(file.read_text("utf-8"))  # sets made earlier do not say
+        same = {key: value for key, value in before.items() if key != "cases"}
+        if same != {key: value for key, value in about.items() if key != "cases"}:
+            raise DataError(
+                "other-set", f"expected a folder for {about}; {made.folder} holds a set made with {before}"
+            )
+    made.folder.mkdir(parents=True, exist_ok=True)
+    write_whole(file, json.dumps(about, indent=1) + "\n")
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """While it lasts, no other process works on the set in this folder. Raises DataError "set-in-use"."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as held:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise DataError(
+                "set-in-use", f"expected a folder that no other run works on; {folder} is in use"
+            ) from error
+        yield
+
+
+def _end_cut_line(file: Path) -> None:
+    """Take away what a loss of power left of a last line."""
+    if file.is_file() and not (text := file.read_text("utf-8")).endswith("\n"):
+        file.write_text(text.rpartition("\n")[0] + "\n" if "\n" in text else "", "utf-8")
+
+
+def _made(
+    made: BlindSet, cases: Sequence[Case], scenes: Sequence[Plane], processes: int
+) -> Iterator[_Attempt]:
+    """Each case's making, as they come."""
+    if processes <= 1 or len(cases) <= 1:
+        yield from (_make_one(made, case, scenes) for case in cases)
+        return
+    # Fork would carry this process's threads' locks along.
+    with ProcessPoolExecutor(
+        processes, mp_context=get_context("spawn"), initializer=_end_with_parent
+    ) as pool:
+        waiting = [pool.submit(_make_one, made, case, scenes) for case in cases]
+        for future in as_completed(waiting):
+            yield future.result()
+
+
+def _end_with_parent() -> None:
+    """A process of the pool would outlive a parent that was killed, and go on making."""
+
+    def wait() -> None:
+        parent = parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _drawn(plan: SetPlan, number: int) -> Case:
+    return draw_case(
+        plan.seed,
+        number,
+        plan.size_px,
+        plan.images,
+        only=plan.only,
+        clean_only=plan.clean_only,
+        built_diffraction=plan.built_diffraction,
+        left_pct=plan.left_pct,
+    )
+
+
+def _make_one(made: BlindSet, case: Case, scenes: Sequence[Plane]) -> _Attempt:
+    started = time.perf_counter()
+    try:
+        result = make(case, scenes)
+    except DataError as error:
+        return _Attempt(case.number, time.perf_counter() - started, why_not=f"{error.code}: {error.message}")
+    write_transit(result, case.plan, made.transit(case.number))
+    seal, kept = sealed(result.truth)
+    write_whole(made.truth_file(case.number), json.dumps(kept, allow_nan=False))
+    return _Attempt(case.number, time.perf_counter() - started, seal)

@@ -1,0 +1,41 @@
+"""All effects of the blind set: those that the library is expected to have, by the same names, and others."""
+
+from __future__ import annotations
+
+from psfcore.blind.effects.detector import DETECTOR_EFFECTS
+from psfcore.blind.effects.effect import Effect
+from psfcore.blind.effects.optics import OPTICS_EFFECTS
+from psfcore.blind.effects.scene import SCENE_EFFECTS
+from psfcore.errors import DataError
+
+EFFECTS: dict[str, type[Effect]] = {
+    effect.name: effect for effect in (*SCENE_EFFECTS, *OPTICS_EFFECTS, *DETECTOR_EFFECTS)
+}
+KNOWN = (
+    "dark_offset",
+    "intensity_gradient",
+    "gain_mismatch",
+    "nonlinearity",
+    "flat_field_residual",
+    "column_smear",
+    "persistence",
+    "ghost",
+    "anisotropic_scatter",
+    "field_dependent_scatter",
+    "wide_halo",
+    "core_blur",
+    "mesh_rotation",
+    "mesh_pitch",
+    "occulter_motion",
+    "out_of_field_light",
+    "saturation_fill",
+    "scene_evolution",
+)
+UNKNOWN = tuple(sorted(set(EFFECTS) - set(KNOWN)))
+
+
+def effect_named(name: str) -> type[Effect]:
+    """The effect of a name. Raises DataError "unknown-effect"."""
+    if name not in EFFECTS:
+        raise DataError("unknown-effect", f"expected one of {', '.join(sorted(EFFECTS))}; got {name!r}")
+    return EFFECTS[name]

@@ -1,0 +1,250 @@
+"""Making a case: its transit in a folder of its own, its truth apart, and a seal on the truth.
+
+    DIR/cases/NNNN/transit/   images, diffraction.fits, transit.json: nothing else, and nothing in them names an effect
+    DIR/truth/NNNN.json       salt and truth
+    DIR/seals.jsonl           a line a case: SHA-256 of the salt and the truth, made before any diagnosis
+
+An effect's strength is set so that it leaves about what the case is meant to leave in the discs, within what is
+believed of that effect; what it then does leave is measured and is part of the truth.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.blind.cases import Case, case_scenes
+from psfcore.blind.chain import Chain, Sky
+from psfcore.blind.effects.effect import Effect
+from psfcore.blind.effects.fine_optics import boxed_glass, fine_optics
+from psfcore.blind.leftover import Left, LinearEstimator, refitted, rms_difference
+from psfcore.fits.fits_io import Cards, CardValue, write_plane
+from psfcore.simulate.plan import HIGH, Plan
+from psfcore.simulate.transit_files import instrument_values, shot_values
+from psfcore.transit.prepare import Exposure, prepare
+from psfcore.transit.transit import Frame, Place
+
+Plane = NDArray[np.float64]
+SCHEMA = "transit/1"
+TRIALS = 2
+STRENGTH_WITHIN = 1.4  # of the target: nearer than this, a strength is good
+_PLACE_STREAM = 2003
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A case as made: exposures in whole DN, reported places, the level they clip at, the known PSF, the truth."""
+
+    exposures: list[Plane]
+    reported: list[Place]
+    saturation_dn: float | None
+    diffraction: Plane
+    truth: dict[str, Any]
+
+
+def make(case: Case, images: Sequence[Plane] = ()) -> Made:
+    """Draw scenes, set strengths, observe, measure. images: to take scenes from.
+
+    Raises DataError "bad-scene", and as `psfcore.scatter.inversion.invert` does.
+    """
+    sky = Sky(case.plan, fine_optics(case.law, case.glass, case.plan.size_px), case_scenes(case, images))
+    diffraction = boxed_glass(case.glass)
+    clean = Chain(sky, ())
+    clean_rates = clean.all_expected()
+    level = _level(case, clean_rates)
+    estimator = LinearEstimator(_frames(case.plan, clean_rates, None), diffraction, case.law, case.plan.noise)
+    alone = [
+        _at_target(effect, target, case, sky, estimator)
+        for effect, target in zip(case.effects, case.target_pct, strict=True)
+    ]
+    effects = tuple(effect for effect, _ in alone)
+    chain = Chain(sky, effects)
+    expected = chain.all_expected() if effects else clean_rates
+    own_level = chain.saturation_dn(expected) or level
+    exposures = _clipped(chain.read_out(expected, case.seed), case.plan, own_level)
+    left = _left(case, chain, expected, estimator, diffraction, own_level)
+    truth = case.as_json() | {
+        "effects": [effect.as_json() | _left_alone(by_itself, left) for effect, by_itself in alone],
+        "psf": {"b": case.law.b_px, "c": case.law.c, "total": case.law.total},
+        "exact": [{"x": shot.x_px, "y": shot.y_px} for shot in case.plan.shots],
+        "plan": case.plan.as_json() | {"saturation_dn": own_level},
+        **left,
+    }
+    return Made(exposures, _reported(case), own_level, diffraction, truth)
+
+
+def _at_target(
+    effect: Effect, target_pct: float, case: Case, sky: Sky, estimator: LinearEstimator
+) -> tuple[Effect, Left]:
+    """The effect at a strength that leaves about target_pct, or as near as its largest comes; and what it leaves."""
+    tried, found = effect, _quick_left(effect, case, sky, estimator)
+    for _ in range(TRIALS):
+        short = target_pct / max(found.after_refit_pct, 1e-6)
+        if max(short, 1 / short) < STRENGTH_WITHIN:
+            break
+        wanted = tried.strength * short ** (1 / tried.power)
+        strength = float(min(wanted, tried.largest))
+        if strength == tried.strength:  # as strong as is believed, and still too little
+            break
+        tried = tried.at(strength)
+        found = _quick_left(tried, case, sky, estimator)
+    return tried, found
+
+
+def _quick_left(effect: Effect, case: Case, sky: Sky, estimator: LinearEstimator) -> Left:
+    """What an effect leaves, to first order."""
+    chain = Chain(sky, (effect,))
+    expected = chain.all_expected()
+    rates = _rates(chain, case, expected, chain.saturation_dn(expected))
+    return estimator.left(dict(enumerate(rates)))
+
+
+def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
+    """What an effect leaves after a refit without the case's others, to first order: percent, and chi2 of the discs' means,
+    the sum of its squares over their noise."""
+    noise = left["refitted"]["noise_pct"]
+    shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)
+    return {"left_alone_pct": by_itself.after_refit_pct, "left_alone_chi2": float(shown)}
+
+
+def _rates(chain: Chain, case: Case, expected: Sequence[Plane], level: float | None) -> list[Plane]:
+    """Nearly noise-free images [y, x], DN/s, as the analysis gets them: clipped pixels filled."""
+    return [
+        np.asarray(frame.pixels, dtype=np.float64)
+        for frame in _frames(case.plan, chain.mean_rate(expected, case.seed), level)
+    ]
+
+
+def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Frame, ...]:
+    """Frames with the exact places; pixels at the level are filled as a reader fills them."""
+    exposures = []
+    for n, (rate, shot) in enumerate(zip(rates, plan.shots, strict=True)):
+        gaps = None
+        if level is not None and shot.gain_mode == HIGH:
+            gaps = rate * shot.exposure_s >= level * (1 - 1e-9)
+        exposures.append(
+            Exposure(
+                file=f"{n:03d}.fits",
+                pixels=rate.astype(np.float32),
+                fov=shot.fov,
+                place=plan.place(n),
+                exposure_s=shot.exposure_s,
+                time_s=shot.time_s,
+                gain_mode=shot.gain_mode,
+                gaps=gaps if gaps is not None and gaps.any() else None,
+                saturated=0 if gaps is None else int(gaps.sum()),
+            )
+        )
+    return prepare(exposures)[0]
+
+
+def _left(
+    case: Case,
+    chain: Chain,
+    expected: Sequence[Plane],
+    estimator: LinearEstimator,
+    diffraction: Plane,
+    level: float | None,
+) -> dict[str, Any]:
+    """What the effects leave in the discs: percent, rms over images, and by image after the refit."""
+    clean_after = estimator.clean_left_pct()
+    clean_rms = float(np.sqrt(np.mean(np.square(list(clean_after.values())))))
+    if not chain.effects:
+        return {"left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0, "clean_left_pct": clean_rms}
+    rates = _rates(chain, case, expected, level)
+    quick = estimator.left(dict(enumerate(rates)))
+    frames = _frames(case.plan, chain.mean_rate(expected, case.seed), level)
+    whole = refitted(frames, diffraction, case.law, case.plan.noise)
+    return {
+        "left_before_refit_pct": quick.before_refit_pct,
+        "left_after_refit_pct": rms_difference(whole.residual_pct, clean_after),
+        "left_after_refit_first_order_pct": quick.after_refit_pct,
+        "clean_left_pct": clean_rms,
+        "clean_by_image_pct": {str(n): value for n, value in clean_after.items()},
+        "refitted": whole.as_json(),
+    }
+
+
+def _level(case: Case, rates: Sequence[Plane]) -> float | None:
+    """The level of a transit that could saturate and does not."""
+    if case.headroom is None:
+        return None
+    brightest = max(
+        float(rate.max()) * shot.exposure_s for rate, shot in zip(rates, case.plan.shots, strict=True)
+    )
+    return float(np.rint(case.headroom * brightest))
+
+
+def _clipped(exposures: Sequence[Plane], plan: Plan, level: float | None) -> list[Plane]:
+    return [
+        np.minimum(dn, level) if level is not None and shot.gain_mode == HIGH else dn
+        for dn, shot in zip(exposures, plan.shots, strict=True)
+    ]
+
+
+def _reported(case: Case) -> list[Place]:
+    """Places as the ephemeris has them, to a tenth of a pixel."""
+    rng = np.random.default_rng([case.seed, _PLACE_STREAM])
+    plan = case.plan
+    errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))
+    return [
+        Place(round(shot.x_px + float(dx), 1), round(shot.y_px + float(dy), 1), round(plan.radius_px, 3))
+        for shot, (dx, dy) in zip(plan.shots, errors, strict=True)
+    ]
+
+
+def write_transit(made: Made, plan: Plan, folder: Path) -> None:
+    """Write a made case's transit, and nothing of its truth, into a new folder."""
+    folder.mkdir(parents=True)
+    for n, dn in enumerate(made.exposures):
+        cards = _frame_cards(plan, n, made.saturation_dn)
+        write_plane(folder / f"{n:03d}.fits", dn.astype(np.int32), cards=cards)
+    write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(instrument_values()))
+    entries = [
+        {"file": f"{n:03d}.fits", "fov": shot.fov, "x": place.x_px, "y": place.y_px, "r": place.radius_px}
+        for n, (shot, place) in enumerate(zip(plan.shots, made.reported, strict=True))
+    ]
+    noise = {"photon_gain_dn": plan.noise.photon_gain_dn, "read_noise_dn": plan.noise.read_noise_dn}
+    content = {
+        "schema": SCHEMA,
+        "instrument": "hri_euv",
+        "known_psf": "diffraction.fits",
+        "noise": noise,
+        "images": entries,
+    }
+    (folder / "transit.json").write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+
+
+def _frame_cards(plan: Plan, index: int, level: float | None) -> Cards:
+    shot = plan.shots[index]
+    values = shot_values(shot, "DN")
+    if level is not None and shot.gain_mode == HIGH:
+        values["SATURATE"] = level
+    return _cards(values)
+
+
+def _cards(values: dict[str, CardValue]) -> Cards:
+    return {key: (value, "simulated") for key, value in values.items()}
+
+
+def sealed(truth: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The seal of a truth, and what is to be kept to open it: a random salt and the truth."""
+    salt = secrets.token_hex(16)
+    return seal_of(salt, truth), {"salt": salt, "truth": truth}
+
+
+def seal_of(salt: str, truth: dict[str, Any]) -> str:
+    """SHA-256 (hex) of a salt and the canonical JSON of a truth."""
+    canonical = json.dumps(truth, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256((salt + canonical).encode()).hexdigest()
+
+
+__all__ = ["Made", "make", "seal_of", "sealed", "write_transit"]

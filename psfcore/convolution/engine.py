@@ -1,0 +1,392 @@
+"""A PSF prepared for one shape of field, applied and adjoint-applied in single precision, fused and pruned.
+
+The same operators as ``psfcore.convolution.convolver.Convolver`` (its Eq. (1) and (2)), several times faster:
+
+- pruned: of the padded plane only the field's rows are transformed along x; along y, a block of sixteen columns
+  is padded, transformed, multiplied by the transfer function and transformed back while it is in cache, and only
+  the field's rows are written back;
+- fused: between two convolutions of an iteration a block of rows is transformed back, changed by what the method
+  does to pixels, and transformed again, in cache; H x is never written out;
+- the transfer function is kept real where the PSF is symmetric about its centre.
+
+Fields live in the engine as blocks of 32 rows, [block][x][half][lane]: row 32 block + 16 half + lane. The two halves
+are the real and the imaginary part of one complex transform, so that a real row costs half a transform. Spectra
+live as [block of 16 columns][row][re, im][lane]. Every block is worked on alone and in one order, so the result does
+not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import itertools
+import queue
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.compiled import compiled
+from psfcore.convolution.convolver import needed_kernel
+from psfcore.convolution.fft_kernels import LANES, Plan, forward, good_length, inverse, make_plan
+from psfcore.errors import DataError
+
+BLOCK_ROWS = 2 * LANES
+SYMMETRIC_TO = 1e-7  # of the sum: below float32's own rounding of the transfer function
+# Of small images and of large ones: handing out a chunk takes as long as a small block or two.
+_CHUNKS_A_THREAD = (2, 4)
+_BLOCKS_A_CHUNK = 8
+
+Single = NDArray[np.float32]
+# A method's own work on a block of rows between two transforms: (spectrum, first, last block, scratch).
+RowWork = Callable[[int, int, "Scratch"], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Scratch:
+    """What one thread needs while it works: a transform's buffer and a corner to turn blocks in."""
+
+    buffer: Single
+    corner: Single
+
+
+class Engine:
+    """Convolution with one PSF, cut to one field, and its adjoint, in float32.
+
+    psf_kernel: weights [y, x], centre at [n // 2, n // 2]; any shape, even or odd. field_shape: (ny, nx).
+    span: (ny, nx), pixels less than this apart are joined as the PSF says; none: all, the field's shape. Where the
+    field holds a margin, what is farther apart lies in opposite margins: there light may wrap, which keeps
+    the transforms short. threads: how many work at once; the result is the same for any number.
+    Raises DataError "field-shape" when an array has another shape.
+    """
+
+    def __init__(
+        self,
+        psf_kernel: NDArray[np.floating],
+        field_shape: tuple[int, int],
+        *,
+        span: tuple[int, int] | None = None,
+        threads: int = 1,
+    ) -> None:
+        self.field_shape = field_shape
+        self.threads = threads
+        span = span or field_shape
+        kernel, first = needed_kernel(psf_kernel, span)
+        ly, lx = (
+            good_length(max(size, joined + max(-low, low + count - 1, 0)))
+            for size, joined, low, count in zip(field_shape, span, first, kernel.shape, strict=True)
+        )
+        self.row_plan, self.column_plan = make_plan(lx), make_plan(ly)
+        ny, nx = field_shape
+        self.row_blocks = -(-ny // BLOCK_ROWS)
+        self.column_blocks = -(-(lx // 2 + 1) // LANES)
+        self.lanes_shape = (self.row_blocks, nx, 2, LANES)
+        self._spectrum = np.zeros((self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES), np.float32)
+        self._pool = ThreadPoolExecutor(max(threads - 1, 1))
+        self._scratch: queue.SimpleQueue[Scratch] = queue.SimpleQueue()
+        for _ in range(threads):
+            buffer = np.zeros(max(lx, ly) * 2 * LANES, np.float32)
+            self._scratch.put(Scratch(buffer, np.zeros((LANES, 4, LANES), np.float32)))
+        self.transfer = self._transfer_function(kernel, first)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds between two calls."""
+        scratch = self.threads * max(self.row_plan.length, self.column_plan.length) * 2 * LANES * 4
+        return self.transfer.nbytes + self._spectrum.nbytes + scratch
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the PSF is symmetric about its centre: its transfer function is real."""
+        return self.transfer.shape[2] == 1
+
+    # Whole operators -------------------------------------------------------------------------------
+
+    def apply(self, x: NDArray[np.floating]) -> Single:
+        """H x: the field as seen through the PSF; shape (ny, nx)."""
+        return self._whole(x, adjoint=False)
+
+    def adjoint(self, y: NDArray[np.floating]) -> Single:
+        """H^T y: where the light of each pixel may have come from; shape (ny, nx)."""
+        return self._whole(y, adjoint=True)
+
+    def _whole(self, field: NDArray[np.floating], *, adjoint: bool) -> Single:
+        lanes = self.to_lanes(field)
+        self.rows_forward(lanes)
+        self.columns(adjoint=adjoint)
+        self.rows_inverse(lanes)
+        return self.from_lanes(lanes)
+
+    # The parts that methods put together ------------------------------------------------------------
+
+    def to_lanes(self, field: NDArray[np.floating], *, padding: float = 0.0) -> Single:
+        """A field (ny, nx) in the engine's order; rows that fill the last block hold `padding`."""
+        if field.shape != self.field_shape:
+            raise DataError("field-shape", f"expected a field of {self.field_shape}; got {field.shape}")
+        ny, nx = self.field_shape
+        padded = np.full((self.row_blocks, 2, LANES, nx), padding, np.float32)
+        padded.reshape(-1, nx)[:ny] = field
+        return np.ascontiguousarray(padded.transpose(0, 3, 1, 2))
+
+    def from_lanes(self, lanes: Single) -> Single:
+        """The inverse of ``to_lanes``: shape (ny, nx)."""
+        ny, nx = self.field_shape
+        return np.ascontiguousarray(lanes.transpose(0, 2, 3, 1).reshape(-1, nx)[:ny])
+
+    def rows_forward(self, lanes: Single) -> None:
+        """Transform the rows of a field into the spectrum."""
+
+        def work(start: int, stop: int, scratch: Scratch) -> None:
+            _rows_forward(
+                lanes, self._spectrum, scratch.buffer, scratch.corner, start, stop, *self.row_numbers
+            )
+
+        self.run(work, self.row_blocks)
+
+    def rows_inverse(self, lanes: Single) -> None:
+        """Transform the spectrum's rows back into a field."""
+
+        def work(start: int, stop: int, scratch: Scratch) -> None:
+            _rows_inverse(
+                lanes, self._spectrum, scratch.buffer, scratch.corner, start, stop, *self.row_numbers
+            )
+
+        self.run(work, self.row_blocks)
+
+    def columns(self, *, adjoint: bool) -> None:
+        """Convolve the spectrum's columns: there, times the transfer function (conjugate: adjoint), and back."""
+        self.multiply_columns(self.transfer, conjugate=adjoint)
+
+    def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
+        """The spectrum's columns there, times a filter laid out as the transfer function, and back."""
+        kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
+        sign = np.float32(-1.0 if conjugate else 1.0)
+
+        def work(start: int, stop: int, scratch: Scratch) -> None:
+            kernel(self._spectrum, transfer, sign, scratch.buffer, start, stop, *_numbers(self.column_plan))
+
+        self.run(work, self.column_blocks)
+
+    def row_stage(self, work: Callable[..., Any], *fields: Any) -> list[Any]:
+        """Run a method's compiled row stage on all blocks; returns what it returned, a chunk at a time.
+
+        ``work`` is called with the spectrum, the fields, a buffer, a corner, the range of blocks and the plan.
+        """
+
+        def part(start: int, stop: int, scratch: Scratch) -> Any:
+            return work(
+                self._spectrum, *fields, scratch.buffer, scratch.corner, start, stop, *self.row_numbers
+            )
+
+        return self.run(part, self.row_blocks)
+
+    @property
+    def row_numbers(self) -> tuple[Any, ...]:
+        """The row plan as kernels take it."""
+        return (*_numbers(self.row_plan), self.row_plan.place)
+
+    def run(self, work: Callable[[int, int, Scratch], Any], blocks: int) -> list[Any]:
+        """Call ``work(start, stop, scratch)`` on ranges that cover all blocks, in as many threads as set."""
+        few, many = _CHUNKS_A_THREAD
+        a_thread = min(max(blocks // (_BLOCKS_A_CHUNK * self.threads), few), many)
+        chunks = min(blocks, self.threads * a_thread) if self.threads > 1 else 1
+        bounds = [blocks * n // chunks for n in range(chunks + 1)]
+
+        def one(n: int) -> Any:
+            scratch = self._scratch.get()
+            try:
+                return work(bounds[n], bounds[n + 1], scratch)
+            finally:
+                self._scratch.put(scratch)
+
+        # One chunk is not worth handing to another thread.
+        return [one(0)] if chunks == 1 else self._shared_out(one, chunks)
+
+    def _shared_out(self, one: Callable[[int], Any], chunks: int) -> list[Any]:
+        """Every chunk's result. This thread works too, and each takes the next chunk: where an image is small, waking
+        another for every chunk would take longer than the chunk."""
+        results: list[Any] = [None] * chunks
+        taken = itertools.count()
+
+        def work() -> None:
+            while (n := next(taken)) < chunks:
+                results[n] = one(n)
+
+        others = [self._pool.submit(work) for _ in range(self.threads - 1)]
+        try:
+            work()
+        finally:
+            for other in others:  # they write to the same spectrum
+                other.result()
+        return results
+
+    @property
+    def transfer_scale(self) -> int:
+        """What the transfer function is divided by, so that a transform there and back needs no scaling."""
+        return self.row_plan.length * self.column_plan.length
+
+    def _transfer_function(self, kernel: NDArray[np.floating], first: tuple[int, int]) -> Single:
+        """The PSF's transform over the transforms' lengths: [block of columns][row][re, im][lane].
+
+        Without the imaginary part where the PSF is symmetric.
+        """
+        ly, lx = self.column_plan.length, self.row_plan.length
+        blocks = -(-ly // BLOCK_ROWS)
+        transfer = np.zeros((self.column_blocks, blocks * BLOCK_ROWS, 2, LANES), np.float32)
+
+        def along_rows(start: int, stop: int, scratch: Scratch) -> None:
+            for block in range(start, stop):
+                here = slice(block * BLOCK_ROWS, (block + 1) * BLOCK_ROWS)
+                rows = _wrapped_rows(kernel, first, (ly, lx), here) * np.float32(1 / self.transfer_scale)
+                lanes = np.ascontiguousarray(rows.reshape(1, 2, LANES, lx).transpose(0, 3, 1, 2))
+                _rows_forward(
+                    lanes, transfer[:, here], scratch.buffer, scratch.corner, 0, 1, *self.row_numbers
+                )
+
+        def along_columns(start: int, stop: int, _scratch: Scratch) -> None:
+            for block in range(start, stop):
+                forward(transfer[block, :ly].reshape(-1), *_numbers(self.column_plan))
+
+        self.run(along_rows, blocks)
+        self.run(along_columns, self.column_blocks)
+        transfer = transfer[:, :ly]
+        odd_part = float(np.abs(transfer[:, :, 1]).max()) * self.transfer_scale
+        symmetric = odd_part < SYMMETRIC_TO * float(np.abs(kernel).sum())
+        return np.ascontiguousarray(transfer[:, :, :1] if symmetric else transfer)
+
+
+def _wrapped_rows(
+    kernel: NDArray[np.floating], first: tuple[int, int], shape: tuple[int, int], rows: slice
+) -> Single:
+    """Some rows of a plane of zeros that holds the kernel, its centre in the corner, wrapped round the ends."""
+    (ky, kx), (fy, fx), (ly, lx) = kernel.shape, first, shape
+    out = np.zeros((rows.stop - rows.start, lx), np.float32)
+    split = min(kx, max(0, -fx))
+    for n, row in enumerate(range(rows.start, min(rows.stop, ly))):
+        source = (row - fy) % ly
+        if source < ky:
+            out[n, (fx % lx) : (fx % lx) + split] = kernel[source, :split]
+            out[n, fx + split : fx + kx] = kernel[source, split:]
+    return out
+
+
+def _numbers(plan: Plan) -> tuple[Any, ...]:
+    return plan.length, plan.radices, plan.lengths, plan.twiddles, plan.offsets
+
+
+# Kernels: each works on the blocks [start, stop) ---------------------------------------------------------
+
+
+@compiled()
+def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
+    """A block of rows, transformed two to a complex signal, taken apart into the spectra of its 32 rows.
+
+    With Z the transform of a + i b for real a, b: A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
+    """
+    z = buffer.reshape((-1, 2, LANES))
+    half = np.float32(0.5)
+    last = length // 2
+    for group in range(spectrum.shape[0]):
+        for kk in range(LANES):
+            k = group * LANES + kk
+            if k > last:
+                corner[kk] = np.float32(0.0)
+                continue
+            p, q = place[k], place[(length - k) % length]
+            for w in range(LANES):
+                pr, pi, qr, qi = z[p, 0, w], z[p, 1, w], z[q, 0, w], z[q, 1, w]
+                corner[kk, 0, w] = half * (pr + qr)
+                corner[kk, 1, w] = half * (pi - qi)
+                corner[kk, 2, w] = half * (pi + qi)
+                corner[kk, 3, w] = half * (qr - pr)
+        for side in range(2):
+            for w in range(LANES):
+                row = block * BLOCK_ROWS + side * LANES + w
+                for kk in range(LANES):
+                    spectrum[group, row, 0, kk] = corner[kk, 2 * side, w]
+                    spectrum[group, row, 1, kk] = corner[kk, 2 * side + 1, w]
+
+
+@compiled()
+def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
+    """The inverse of ``spectrum_from_buffer``: Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k]."""
+    z = buffer.reshape((-1, 2, LANES))
+    last = length // 2
+    for group in range(spectrum.shape[0]):
+        for side in range(2):
+            for w in range(LANES):
+                row = block * BLOCK_ROWS + side * LANES + w
+                for kk in range(LANES):
+                    corner[kk, 2 * side, w] = spectrum[group, row, 0, kk]
+                    corner[kk, 2 * side + 1, w] = spectrum[group, row, 1, kk]
+        for kk in range(LANES):
+            k = group * LANES + kk
+            if k > last:
+                break
+            p, q = place[k], place[(length - k) % length]
+            for w in range(LANES):
+                ar, ai, br, bi = corner[kk, 0, w], corner[kk, 1, w], corner[kk, 2, w], corner[kk, 3, w]
+                z[q, 0, w] = ar + bi
+                z[q, 1, w] = br - ai
+                z[p, 0, w] = ar - bi
+                z[p, 1, w] = ai + br
+
+
+@compiled()
+def _rows_forward(lanes, spectrum, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]
+    filled = lanes.shape[1] * 2 * LANES
+    for block in range(start, stop):
+        buffer[:filled] = lanes[block].reshape(-1)
+        buffer[filled : length * 2 * LANES] = np.float32(0.0)
+        forward(buffer, length, radices, lengths, tw, offsets)
+        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+
+
+@compiled()
+def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]
+    filled = lanes.shape[1] * 2 * LANES
+    for block in range(start, stop):
+        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
+        inverse(buffer, length, radices, lengths, tw, offsets)
+        lanes[block].reshape(-1)[:] = buffer[:filled]
+
+
+@compiled()
+def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
+    # Rows of padding that the transform is too short for are zero and stay so.
+    filled = min(spectrum.shape[1], length) * 2 * LANES
+    z = buffer.reshape((-1, 2, LANES))
+    for group in range(start, stop):
+        column = spectrum[group].reshape(-1)
+        buffer[:filled] = column[:filled]
+        buffer[filled : length * 2 * LANES] = np.float32(0.0)
+        forward(buffer, length, radices, lengths, tw, offsets)
+        for k in range(length):
+            for w in range(LANES):
+                t = transfer[group, k, 0, w]
+                z[k, 0, w] *= t
+                z[k, 1, w] *= t
+        inverse(buffer, length, radices, lengths, tw, offsets)
+        column[:filled] = buffer[:filled]
+
+
+@compiled()
+def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
+    """As ``_columns_real`` for a PSF without symmetry; ``sign`` -1 takes the conjugate: the adjoint."""
+    # Rows of padding that the transform is too short for are zero and stay so.
+    filled = min(spectrum.shape[1], length) * 2 * LANES
+    z = buffer.reshape((-1, 2, LANES))
+    for group in range(start, stop):
+        column = spectrum[group].reshape(-1)
+        buffer[:filled] = column[:filled]
+        buffer[filled : length * 2 * LANES] = np.float32(0.0)
+        forward(buffer, length, radices, lengths, tw, offsets)
+        for k in range(length):
+            for w in range(LANES):
+                tr, ti = transfer[group, k, 0, w], sign * transfer[group, k, 1, w]
+                r, i = z[k, 0, w], z[k, 1, w]
+                z[k, 0, w] = r * tr - i * ti
+                z[k, 1, w] = r * ti + i * tr
+        inverse(buffer, length, radices, lengths, tw, offsets)
+        column[:filled] = buffer[:filled]

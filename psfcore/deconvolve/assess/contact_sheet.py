@@ -1,0 +1,275 @@
+"""What a deconvolution does to many images: figures of each, the doubtful ones first, and one sheet of thumbnails.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images": a catalogue at a daily
+cadence was deconvolved "to visually inspect for artifacts". Here the artefact check ranks the images, so that an eye
+goes first to where there may be something to see. No image is kept in memory: of each only its thumbnails are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from psfcore.deconvolve.assess.changes import Effects, effects
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.drawing.plots import CHANGE, CHANGE_LIMIT_PCT, GOLD, INK, binned, change_pct, square_root_stretch
+from psfcore.errors import DataError
+from psfcore.image import Image
+from psfcore.psf import Psf
+from psfcore.psf_sampling import psf_for_image
+
+THUMBNAIL_PX = 256
+MOST_ON_SHEET = 60
+# The rows of psfcore.deconvolve.assess.changes that stand for an image: blocks of 4 px, tails of 1 %.
+BLOCK_PX, TAIL_PCT = 4, 1.0
+LOOK_FROM = 1.0
+_MARKS = 300
+_LETTERS = 48
+_DOUBTFUL, _CLEAN = "#b3261e", "#2b8a6e"
+_CELL_IN, _TEXT_IN, _TITLE_IN = 2.0, 0.62, 0.75
+
+Plane = NDArray[np.float64]
+Deconvolve = Callable[[Image, Psf], "Treated"]
+
+
+@dataclass(frozen=True, eq=False)
+class Treated:
+    """One image: its figures, thumbnails [y, x] of before and after, and where in them artefacts are suspected, (n, [y, x])."""
+
+    name: str
+    taken: str | None
+    psf: str
+    found: Effects
+    steps_done: int
+    stopped_because: str
+    before: Plane
+    after: Plane
+    suspected: NDArray[np.intp]
+
+    @property
+    def score(self) -> float:
+        """Of the artefact check: below 1 nothing was found."""
+        return self.found.artefacts.score
+
+    def structure(self, kind: str) -> dict[str, float] | None:
+        """Change of bright or dark blocks: of their summed light, and up to; none where there are none."""
+        for row in self.found.structures:
+            if (row.kind, row.block_px, row.tail_pct) == (kind, BLOCK_PX, TAIL_PCT):
+                return {"sum_pct": row.sum_pct, "up_to_pct": row.up_to_pct}
+        return None
+
+    def as_json(self) -> dict[str, Any]:
+        """A row of the table."""
+        return {
+            "file": self.name,
+            "taken": self.taken,
+            "psf": self.psf,
+            "score": self.score,
+            "flux_change_pct": self.found.flux_change_pct,
+            "bright": self.structure("bright"),
+            "dark": self.structure("dark"),
+            "steps_done": self.steps_done,
+            "stopped_because": self.stopped_because,
+            "effects": self.found.as_json(),
+        }
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An image that could not be treated, and why."""
+
+    name: str
+    code: str
+    reason: str
+
+
+def treat(
+    name: str,
+    image: Image,
+    psf: Psf,
+    *,
+    method: str = "richardson-lucy",
+    conditions: Conditions | None = None,
+    **parameters: Any,
+) -> Treated:
+    """Deconvolve one image and take its figures. Raises DataError as the method does, "plate-scale-mismatch"."""
+    conditions = conditions or Conditions()
+    fitting = psf_for_image(psf, image.header)
+    result = method_named(method)(image, fitting, conditions, **parameters)
+    edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
+    found = effects(image, result.pixels, fitting, noise=conditions.noise, edge_px=edge_px)
+    step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
+    return Treated(
+        name=name,
+        taken=_taken(image),
+        psf=f"{fitting.name} {fitting.version}",
+        found=found,
+        steps_done=result.steps_done,
+        stopped_because=result.stopped_because,
+        before=binned(image.pixels, step),
+        after=binned(result.pixels, step),
+        suspected=np.unique(np.argwhere(found.artefacts.suspected) // step, axis=0),
+    )
+
+
+def treat_many(
+    names: Sequence[str],
+    one: Callable[[str], Treated],
+    *,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> tuple[list[Treated], list[Failure]]:
+    """Every image, worst first, and those that failed, in the order given. What an image lacks never stops the run.
+
+    one(name) reads and treats an image; where it raises DataError or OSError, the image is a failure.
+    """
+    treated: list[Treated] = []
+    failures: list[Failure] = []
+    for done, name in enumerate(names):
+        progress(done, len(names))
+        try:
+            treated.append(one(name))
+        except DataError as error:
+            failures.append(Failure(name, error.code, error.message))
+        except OSError as error:
+            failures.append(Failure(name, "unreadable-file", error.strerror or str(error)))
+    progress(len(names), len(names))
+    return sorted(treated, key=lambda row: -row.score), failures
+
+
+def table(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
+    """The run as JSON: a summary, one row an image in the order given, and the failures."""
+    return {
+        "schema": "effects/1",
+        "summary": _summary(treated, failures),
+        "blocks": {"block_px": BLOCK_PX, "tail_pct": TAIL_PCT},
+        "images": [row.as_json() for row in treated],
+        "failures": [vars(failure) for failure in failures],
+    }
+
+
+def contact_sheet_png(
+    treated: Sequence[Treated], failures: Sequence[Failure], path: str | Path, *, most: int = MOST_ON_SHEET
+) -> None:
+    """Thumbnails of before, after and change of the first `most` images, in the order given; failures at the foot."""
+    shown = list(treated[:most])
+    across = 1 if len(shown) < 4 else 2
+    down = max(1, -(-len(shown) // across))
+    width = across * (3 * _CELL_IN + 0.7) + 0.3
+    foot = 0.35 + 0.2 * min(len(failures), 12)
+    height = _TITLE_IN + down * (_CELL_IN + _TEXT_IN) + foot
+    figure = Figure(figsize=(width, height), dpi=100, facecolor="white")
+    figure.text(
+        0.3 / width,
+        1 - 0.3 / height,
+        _heading(treated, shown),
+        fontsize=12,
+        color=INK,
+        weight="bold",
+        va="center",
+    )
+    legend = f"each: before, after (one stretch), change in percent of before, blue -{CHANGE_LIMIT_PCT:g} to red +{CHANGE_LIMIT_PCT:g}, circles: suspected artefacts"
+    figure.text(0.3 / width, 1 - 0.55 / height, legend, fontsize=9, color=INK, va="center")
+    for index, row in enumerate(shown):
+        down_at, across_at = divmod(index, across)
+        left = 0.3 + across_at * (3 * _CELL_IN + 0.7)
+        top = height - _TITLE_IN - down_at * (_CELL_IN + _TEXT_IN)
+        _draw_row(figure, row, index + 1, left, top, (width, height))
+    for line, text in enumerate(_failure_lines(failures)):
+        figure.text(0.3 / width, (foot - 0.2 - 0.2 * line) / height, text, fontsize=9, color=_DOUBTFUL)
+    FigureCanvasAgg(figure).print_png(str(path), pil_kwargs={"compress_level": 6})
+
+
+def _draw_row(
+    figure: Figure, row: Treated, rank: int, left: float, top: float, size: tuple[float, float]
+) -> None:
+    width, height = size
+    colour = _DOUBTFUL if row.score >= LOOK_FROM else _CLEAN
+    heading = f"{rank}. score {row.score:.2f}   {_short(row.name)}"
+    figure.text(left / width, (top - 0.16) / height, heading, fontsize=9.5, color=colour, weight="bold")
+    figure.text(left / width, (top - 0.36) / height, _changes(row), fontsize=8.5, color=INK)
+    stretch = square_root_stretch(row.before, row.after)
+    change = change_pct(row.before, row.after)
+    panels = (
+        (row.before, GOLD, stretch),
+        (row.after, GOLD, stretch),
+        (change, CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT)),
+    )
+    for n, (plane, colours, norm) in enumerate(panels):
+        place = (
+            (left + n * (_CELL_IN + 0.06)) / width,
+            (top - 0.44 - _CELL_IN) / height,
+            _CELL_IN / width,
+            _CELL_IN / height,
+        )
+        axes = figure.add_axes(place)
+        axes.imshow(plane, origin="lower", cmap=colours, norm=norm, interpolation="nearest")
+        axes.set_axis_off()
+        if n == 2:
+            y, x = row.suspected[:_MARKS].T
+            axes.scatter(x, y, s=14, facecolors="none", edgecolors="#111111", linewidths=0.6)
+
+
+def _heading(treated: Sequence[Treated], shown: Sequence[Treated]) -> str:
+    doubtful = sum(row.score >= LOOK_FROM for row in treated)
+    images = f"{len(treated)} image{'' if len(treated) == 1 else 's'}"
+    part = "" if len(shown) == len(treated) else f", the worst {len(shown)} shown"
+    return f"{images} deconvolved{part}, by artefact score; {doubtful} to look at (score of {LOOK_FROM:g} or more)"
+
+
+def _changes(row: Treated) -> str:
+    parts = [] if row.taken is None else [row.taken]
+    for kind in ("bright", "dark"):
+        found = row.structure(kind)
+        if found is not None:
+            parts.append(f"{kind} {found['sum_pct']:+.0f} %, up to {found['up_to_pct']:+.0f} %")
+    return "   ".join([*parts, f"flux {row.found.flux_change_pct:+.2f} %"])
+
+
+def _failure_lines(failures: Sequence[Failure]) -> list[str]:
+    if not failures:
+        return []
+    lines = [f"not deconvolved: {len(failures)}"]
+    lines += [f"   {_short(failure.name)}: {failure.reason}"[:200] for failure in failures[:10]]
+    return lines + ([f"   and {len(failures) - 10} more, in the table"] if len(failures) > 10 else [])
+
+
+def _short(name: str) -> str:
+    """A file's name without its folder, its middle left out where it is long."""
+    file = Path(name).name
+    return file if len(file) <= _LETTERS else f"{file[: _LETTERS // 2 - 2]}...{file[-_LETTERS // 2 :]}"
+
+
+def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
+    """Over all images: how many are doubtful, and medians and extremes of the changes."""
+    out: dict[str, Any] = {
+        "images": len(treated),
+        "failures": len(failures),
+        "to_look_at": sum(row.score >= LOOK_FROM for row in treated),
+    }
+    for kind in ("bright", "dark"):
+        rows = [found for found in (row.structure(kind) for row in treated) if found is not None]
+        if rows:
+            ups = [found["up_to_pct"] for found in rows]
+            out[kind] = {
+                "median_sum_pct": float(np.median([found["sum_pct"] for found in rows])),
+                "median_up_to_pct": float(np.median(ups)),
+                "extreme_pct": max(ups) if kind == "bright" else min(ups),
+            }
+    return out
+
+
+def _taken(image: Image) -> str | None:
+    for key in ("DATE-BEG", "DATE-OBS", "T_OBS"):
+        value = image.header.get(key)
+        if isinstance(value, str) and value.strip():
+            return value.strip()
+    return None

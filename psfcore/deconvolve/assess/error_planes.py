@@ -1,0 +1,227 @@
+"""How uncertain each pixel of a deconvolved image is, by doing it again.
+
+Photon and read noise: the parametric bootstrap (Efron and Tibshirani 1993, chapter 6).
+
+    m = H x G(y) / G(H x)                                 Eq. (1)    what the scene found looks like
+    d_k = run(noise_k(m)) - run(m)                        Eq. (2)    k = 1 ... K
+    sigma^2 = n W(sum over k of d_k^2 / n) / K            Eq. (3)    n: variance of the smoothed m
+
+Noise is drawn about the model m and not about the observation, which already holds noise once. Without G the
+model would be too dark near the edges: light that leaves the field is not put back by a method that keeps the
+flux, so that H x is less than y by what the field holds of a pixel's light.
+
+The window W makes few draws enough. The variance follows the scene, and so does n; their quotient changes
+slowly, and is averaged with a Gaussian of 2 px, which spans about 50 pixels. Measured with Richardson-Lucy, 20
+steps, against 300 draws about the truth: 8 draws give sigma to 8 % rms at 100 photons a pixel, 11 % at 7 and
+19 % at 1 photon; a wider window smears edges, a narrower one leaves the scatter of the draws. Draws about the
+observation (y + noise) are worse at few photons, and a linearised update fails there (by a factor up to 3).
+
+The scatter of sigma itself is counted: nu degrees of freedom by Satterthwaite's rule (1946) from the scatter of
+W(d_k^2 / n) among draws, and the mean of a root of a chi-square divided out (c4).
+
+The PSF's own uncertainty: mean and variance over deconvolutions with samples of PSFs, or with the sigma points
+of a covariance (Julier and Uhlmann 1997), which need two deconvolutions a parameter and no chance.
+
+| symbol | name | unit |
+|---|---|---|
+| y | image.pixels | image unit |
+| x | estimate: run(image) | image unit |
+| H | Engine.apply | - |
+| m | expected | image unit |
+| K | draws | - |
+| n | reference_variance | image unit squared |
+| W, G | _local_mean, of WINDOW_PX and MODEL_WINDOW_PX | - |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from psfcore.convolution.engine import Engine
+from psfcore.errors import DataError
+from psfcore.image import Image
+from psfcore.noise import Noise, dn_per_unit
+from psfcore.psf import Psf
+
+WINDOW_PX = 2.0
+MODEL_WINDOW_PX = 4.0
+REFERENCE_WINDOW_PX = 1.0
+SMALLEST_DRAWS = 2
+
+Plane = NDArray[np.float64]
+Run = Callable[[Image], Plane]
+RunWithPsf = Callable[[Psf], Plane]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class ErrorPlanes:
+    """1-sigma planes [y, x] of a deconvolved image, in its unit, NaN where a pixel is not trusted.
+
+    error: from photon and read noise. psf_error: from the PSF's uncertainty, None where it is not known.
+    amplification: median of error over the noise of the observation, none where
+    the edge bands leave no pixel. degrees_of_freedom: how well a pixel's
+    variance is known (its relative error is sqrt(2 / degrees_of_freedom)).
+    """
+
+    error: Plane
+    psf_error: Plane | None
+    amplification: float | None
+    degrees_of_freedom: float
+    draws: int
+    seed: int
+
+
+def error_planes(
+    image: Image,
+    psf: Psf,
+    run: Run,
+    noise: Noise,
+    *,
+    estimate: Plane | None = None,
+    draws: int = 8,
+    seed: int = 0,
+    edge_px: int = 0,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> ErrorPlanes:
+    """Error plane of `run(image)`; run is any method and takes an image of the same shape and mask.
+
+    estimate: run(image), where it is at hand. edge_px: band left out of the amplification. The same seed
+    gives the same planes. progress(done, of) is called after each run; what it raises passes through.
+    Raises DataError "bad-draws", "no-exposure".
+    """
+    if draws < SMALLEST_DRAWS:
+        raise DataError("bad-draws", f"expected at least {SMALLEST_DRAWS} draws; got {draws}")
+    scale = dn_per_unit(image)
+    expected = expected_image(image, run(image) if estimate is None else estimate, psf, threads=threads)
+    base = run(_with_pixels(image, expected))
+    _tell(progress, 1, draws + 1)
+    reference_variance = noise.variance(_local_mean(expected, image.valid, REFERENCE_WINDOW_PX), scale)
+    total, squares = np.zeros_like(expected), np.zeros_like(expected)
+    for k in range(draws):
+        drawn = noise.observe(expected, scale, np.random.default_rng([seed, k]))
+        difference = run(_with_pixels(image, drawn)) - base  # Eq. (2)
+        local = _local_mean(difference**2 / reference_variance, image.valid, WINDOW_PX)
+        total += local
+        squares += local**2
+        _tell(progress, k + 2, draws + 1)
+    counted = _away_from_edges(image.valid, edge_px)
+    freedom = _degrees_of_freedom(total[counted], squares[counted], draws)
+    error = np.sqrt(reference_variance * total / draws) / mean_of_root(freedom)  # Eq. (3)
+    ratio = error[counted] / np.sqrt(noise.variance(expected[counted], scale))
+    return ErrorPlanes(
+        error=np.where(image.valid, error, np.nan),
+        psf_error=None,
+        amplification=float(np.median(ratio)) if ratio.size else None,
+        degrees_of_freedom=freedom,
+        draws=draws,
+        seed=seed,
+    )
+
+
+def expected_image(image: Image, estimate: Plane, psf: Psf, *, threads: int = 1) -> Plane:
+    """m of Eq. (1): what the camera would see, without noise, of the scene `estimate` [y, x]; not below zero."""
+    finite = np.isfinite(estimate)
+    scene = np.where(finite, estimate, _local_mean(estimate, finite, MODEL_WINDOW_PX))
+    seen = np.maximum(Engine(psf.kernel, scene.shape, threads=threads).apply(scene).astype(np.float64), 0.0)
+    observed = np.maximum(_local_mean(image.pixels, image.valid, MODEL_WINDOW_PX), 0.0)
+    model = _local_mean(seen, image.valid, MODEL_WINDOW_PX)
+    ratio = np.divide(observed, model, out=np.ones_like(model), where=model > 0)
+    return np.asarray(seen * ratio)  # Eq. (1)
+
+
+def with_psf_error(planes: ErrorPlanes, psf_error: Plane) -> ErrorPlanes:
+    """The same planes with one from the PSF's uncertainty beside them, NaN where `error` is."""
+    return replace(planes, psf_error=np.where(np.isnan(planes.error), np.nan, psf_error))
+
+
+def psf_error_plane(
+    psfs: Sequence[Psf], run: RunWithPsf, *, chance: bool = True, progress: Progress | None = None
+) -> Plane:
+    """1-sigma plane [y, x] of run(psf) over `psfs`, all of equal weight.
+
+    chance: True where the PSFs are drawn at random (variance over n - 1, and the mean of a root divided
+    out); False where they are the sigma points of a covariance, which have its variance as they stand.
+    Raises DataError "bad-draws" for fewer than two.
+    """
+    if len(psfs) < SMALLEST_DRAWS:
+        raise DataError("bad-draws", f"expected at least {SMALLEST_DRAWS} PSFs; got {len(psfs)}")
+    mean: Plane = np.zeros(())
+    spread: Plane = np.zeros(())
+    for count, psf in enumerate(psfs, start=1):
+        pixels = run(psf)
+        step = pixels - mean
+        mean = mean + step / count
+        spread = spread + step * (pixels - mean)
+        _tell(progress, count, len(psfs))
+    if not chance:
+        return np.asarray(np.sqrt(spread / len(psfs)))
+    freedom = len(psfs) - 1
+    return np.asarray(np.sqrt(spread / freedom) / mean_of_root(freedom))
+
+
+def sigma_points(mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """2 p parameter vectors (2 p, p) of equal weight with this mean (p,) and covariance (p, p).
+
+    Raises DataError "bad-covariance" where it is not symmetric or has a negative eigenvalue.
+    """
+    covariance = np.asarray(covariance, dtype=np.float64)
+    count = len(mean)
+    problem = f"expected a symmetric covariance of {count} x {count} without negative eigenvalues"
+    if covariance.shape != (count, count) or not np.allclose(covariance, covariance.T):
+        raise DataError("bad-covariance", f"{problem}; got shape {covariance.shape}")
+    values, vectors = np.linalg.eigh(covariance)
+    if values.min() < -1e-10 * max(values.max(), 0.0):
+        raise DataError("bad-covariance", f"{problem}; the smallest is {values.min():.3g}")
+    steps = (vectors * np.sqrt(count * np.maximum(values, 0.0))).T
+    return np.concatenate([mean + steps, mean - steps])
+
+
+def mean_of_root(freedom: float) -> float:
+    """c4: mean of sqrt(chi2 / nu) for nu degrees of freedom; below 1, so a root of a variance is too small."""
+    ratio = math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)
+    return math.sqrt(2 / freedom) * math.exp(ratio)
+
+
+def _with_pixels(image: Image, pixels: Plane) -> Image:
+    """The same image seen with other noise: pixels that are not trusted keep their value."""
+    return replace(image, pixels=np.where(image.valid, pixels, image.pixels))
+
+
+def _local_mean(plane: Plane, counted: NDArray[np.bool_], window_px: float) -> Plane:
+    """Gaussian mean of `plane` over counted pixels alone; 0 where none is near."""
+    if counted.all():
+        return np.asarray(gaussian_filter(plane, window_px, mode="reflect", truncate=3.0))
+    weight = gaussian_filter(counted.astype(np.float64), window_px, mode="reflect", truncate=3.0)
+    total = gaussian_filter(np.where(counted, plane, 0.0), window_px, mode="reflect", truncate=3.0)
+    return np.divide(total, weight, out=np.zeros_like(total), where=weight > 1e-6)
+
+
+def _degrees_of_freedom(total: Plane, squares: Plane, draws: int) -> float:
+    """2 mean^2 / variance of a pixel's local variance over the draws, times their number."""
+    mean = total / draws
+    variance = (squares - draws * mean**2) / (draws - 1)
+    positive = mean > 0
+    if not positive.any():
+        return float(draws)
+    relative = float(np.mean(variance[positive] / mean[positive] ** 2))
+    return max(1.0, 2 * draws / relative) if relative > 0 else 1e9
+
+
+def _away_from_edges(valid: NDArray[np.bool_], edge_px: int) -> NDArray[np.bool_]:
+    inner = np.zeros_like(valid)
+    ny, nx = valid.shape
+    inner[edge_px : ny - edge_px, edge_px : nx - edge_px] = True
+    return np.asarray(inner & valid)
+
+
+def _tell(progress: Progress | None, done: int, of: int) -> None:
+    if progress is not None:
+        progress(done, of)

@@ -1,0 +1,126 @@
+"""Basic iterative deconvolution: Hofmeister et al. 2024, Solar Physics 299; van Cittert 1931.
+
+    x <- x + w (y - H x),   x_0 = y      Eq. (1)
+
+The paper recommends it for a bright source near an edge: what a pixel loses beyond the field is given back,
+since Eq. (1) settles where H x = y, whatever share of the light H keeps. The light that comes in has to be
+accounted for likewise: with a scene that ends at the field, the pixels along the edge come out a third too bright
+(`python -m studies.edges`), so that the field is continued by its mirror image. A field may be much smaller
+than its PSF: then the whole PSF still counts, over the margin.
+
+Linear: negative pixels are data and stay, and so may be results. A masked pixel (w = 0) keeps its first
+estimate. On frequencies, with T the PSF's transform, the noise of the estimate after n steps is that of the
+image times sum over j = 0 .. n of (1 - T)^j; where abs(1 - T) > 1 that grows without end.
+
+| symbol | name | unit |
+|---|---|---|
+| y | observed | image unit |
+| x | estimate | image unit |
+| w | trusted, 1 or 0 | - |
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psfcore.compiled import compiled
+from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
+from psfcore.convolution.fft_kernels import LANES, forward, inverse
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.frequencies import check_converges, noise_amplification, transfer_sample
+from psfcore.deconvolve.problem import Problem, first_estimate, pose, solution
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.stopping import Iteration, Stop
+from psfcore.image import Image
+from psfcore.psf import Psf
+
+METHOD = "basic-iterative"
+EDGES: Edges = "symmetric"
+MARGIN_SHARE = 0.015
+
+
+def deconvolve(
+    image: Image, psf: Psf, conditions: Conditions, *, steps: int = 20, stop: Stop = "fixed"
+) -> Deconvolved:
+    """Estimate the scene behind `image` [y, x] seen through `psf`, starting from the observation.
+
+    The result is NaN where the image is not finite, the first estimate where it is saturated, and may be negative.
+    Raises DataError as `problem.pose`, and "method-diverges" for a PSF that blurs too much.
+    """
+    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
+    sample = transfer_sample(problem.engine)
+    check_converges(sample, steps)
+    iteration = _BasicIterative(problem)
+    ended = problem.solve(iteration, steps=steps, stop=stop)
+    return solution(
+        problem,
+        problem.engine.from_lanes(iteration.x),
+        ended,
+        method=METHOD,
+        last_change=iteration.change,
+        negatives_count=True,
+        noise_amplification=noise_amplification(sample, np.ones_like(sample.values), ended.steps_done),
+    )
+
+
+class _BasicIterative(Iteration):
+    """Eq. (1), one row stage a step: the next estimate is made while H x is in cache, and taken by ``update``."""
+
+    def __init__(self, problem: Problem) -> None:
+        domain, engine = problem.domain, problem.engine
+        self._engine, self._judgement = engine, problem.judgement
+        self.x = engine.to_lanes(first_estimate(problem))
+        self._next = np.zeros_like(self.x)
+        trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
+        self._observed = engine.to_lanes(trusted, padding=np.nan)
+        self._moved, self._total = np.zeros((2, engine.row_blocks))
+        engine.rows_forward(self.x)
+
+    def measure(self) -> None:
+        self._engine.columns(adjoint=False)
+        self._engine.row_stage(
+            _step_rows, self._observed, self.x, self._next, self._moved, self._total, *self._judgement.numbers
+        )
+
+    def update(self, *, last: bool) -> None:
+        self.x, self._next = self._next, self.x
+
+    @property
+    def change(self) -> float:
+        """Rms of the last step over the rms of x."""
+        total = float(self._total.sum())
+        return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
+
+
+@compiled(fastmath={"contract", "reassoc"})
+def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+    """new <- Eq. (1), and its rows; sums of (change)^2, x^2, and (y - H x)^2 / variance over judged pixels."""
+    nx = x.shape[1]
+    zero, least = np.float32(0.0), np.float32(1e-30)
+    z = buffer.reshape((-1, 2, LANES))
+    for block in range(start, stop):
+        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
+        inverse(buffer, length, radices, lengths, tw, offsets)
+        sum_here, moved_here, total_here = 0.0, 0.0, 0.0
+        for i in range(nx):
+            sum_row, moved_row, total_row = zero, zero, zero
+            for side in range(2):
+                for w in range(LANES):
+                    y, seen = observed[block, i, side, w], z[i, side, w]
+                    misfit = y - seen if y == y else zero
+                    variance = max(slope * max(seen, zero) + ground, least)
+                    sum_row += judged[block, side, w] * misfit * misfit / variance
+                    value = x[block, i, side, w] + misfit  # Eq. (1)
+                    new[block, i, side, w] = value
+                    z[i, side, w] = value
+                    moved_row += misfit * misfit
+                    total_row += value * value
+            if first <= i < last:
+                sum_here += sum_row
+            moved_here += moved_row
+            total_here += total_row
+        sums[block], moved[block], total[block] = sum_here, moved_here, total_here
+        buffer[nx * 2 * LANES : length * 2 * LANES] = zero
+        forward(buffer, length, radices, lengths, tw, offsets)
+        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)

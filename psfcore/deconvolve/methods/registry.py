@@ -1,0 +1,44 @@
+"""Methods by their names: the module ``richardson_lucy`` is the method "richardson-lucy"."""
+
+from __future__ import annotations
+
+import pkgutil
+import re
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import psfcore.deconvolve.methods
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.errors import DataError
+
+Method = Callable[..., Deconvolved]
+
+
+def method_named(name: str) -> Method:
+    """The function ``deconvolve(image, psf, conditions, **parameters)`` of a method.
+
+    Raises DataError "unknown-method", which lists the known ones.
+    """
+    file = name.replace("-", "_")
+    if not re.fullmatch(r"[a-z_]+", file) or file not in _files() or _name_of(file) != name:
+        raise DataError("unknown-method", f"expected one of {', '.join(method_names())}; got {name!r}")
+    method: Method = _module(file).deconvolve
+    return method
+
+
+def method_names() -> list[str]:
+    """Names of all methods: modules of this package that say which METHOD they are."""
+    return sorted(name for name in map(_name_of, _files()) if name is not None)
+
+
+def _files() -> list[str]:
+    return [module.name for module in pkgutil.iter_modules(psfcore.deconvolve.methods.__path__)]
+
+
+def _name_of(file: str) -> str | None:
+    return getattr(_module(file), "METHOD", None)
+
+
+def _module(file: str) -> Any:
+    return import_module(f"psfcore.deconvolve.methods.{file}")

@@ -1,0 +1,297 @@
+"""An evaluation in numbers and in words: pointing by pointing, with the noise that is expected, and by detector place.
+
+    slope = sum w (u - <u>) e / sum w (u - <u>)^2,   <u> = sum w u / sum w,   w = 1 / noise^2    Eq. (1)
+    its error = (sum w (u - <u>)^2)^(-1/2) max(1, chi2 / (N - 2))^(1/2)                          Eq. (2)
+
+Where errors scatter by more than noise about the line, the slope is as unsure as they show, Eq. (2). The occulter's
+x and y move together along its track: slopes against each are of the same images, and are not independent.
+
+| symbol | name | unit |
+|---|---|---|
+| u | detector x or y of the occulter | px |
+| e | residual, or absolute error | %, DN/s |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.evaluation.evaluation import Evaluation
+from psfcore.evaluation.frame import FrameEvaluation, Slice
+from psfcore.evaluation.superposed import Superposed
+from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
+
+Vector = NDArray[np.float64]
+
+SCHEMA = "evaluation/1"
+TREND_PX = 100.0  # slopes are per so many pixels
+LEAST_TREND_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Errors of some images, percent of the observed mean unless the name says otherwise; fov None: of all.
+
+    mean_noise, noise: standard error of the mean, and rms over images, as noise in the images makes them. gap: rms
+    with the noise taken out in quadrature. centre_...: of the PE at the centre.
+    """
+
+    fov: int | None
+    images: int
+    mean_pct: float
+    mean_noise_pct: float
+    rms_pct: float
+    noise_pct: float
+    gap_pct: float
+    largest_pct: float
+    mean_dn_s: float
+    rms_dn_s: float
+    centre_mean_pct: float
+    centre_rms_pct: float
+    centre_noise_pct: float
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Change over TREND_PX pixels, and its standard error."""
+
+    per_100_px: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Trend:
+    """How errors of a pointing change with the occulter's place on the detector."""
+
+    fov: int
+    against: Literal["x", "y"]
+    images: int
+    relative_pct: Slope
+    absolute_dn_s: Slope
+
+
+def summaries(evaluation: Evaluation) -> tuple[Summary, ...]:
+    """One of each pointing, in order, and last that of all images."""
+    fovs = sorted({frame.fov for frame in evaluation.frames})
+    parts = [summary_of([f for f in evaluation.frames if f.fov == fov], fov) for fov in fovs]
+    return (*parts, summary_of(evaluation.frames, None))
+
+
+def summary_of(frames: Sequence[FrameEvaluation], fov: int | None) -> Summary:
+    """The errors of some images."""
+    residual, noise = _each(frames, "residual_pct"), _each(frames, "noise_pct")
+    error = _each(frames, "error_dn_s")
+    centre, centre_noise = _each(frames, "centre_pct"), _each(frames, "centre_noise_pct")
+    there = np.isfinite(centre)
+    return Summary(
+        fov=fov,
+        images=len(frames),
+        mean_pct=float(residual.mean()),
+        mean_noise_pct=_rms(noise) / math.sqrt(len(frames)),
+        rms_pct=_rms(residual),
+        noise_pct=_rms(noise),
+        gap_pct=math.sqrt(max(_rms(residual) ** 2 - _rms(noise) ** 2, 0.0)),
+        largest_pct=float(np.abs(residual).max()),
+        mean_dn_s=float(error.mean()),
+        rms_dn_s=_rms(error),
+        centre_mean_pct=float(centre[there].mean()) if there.any() else math.nan,
+        centre_rms_pct=_rms(centre[there]),
+        centre_noise_pct=_rms(centre_noise[there]),
+    )
+
+
+def trends(evaluation: Evaluation) -> tuple[Trend, ...]:
+    """Slopes against x and y of every pointing with at least LEAST_TREND_FRAMES images whose places differ."""
+    found = []
+    for fov in sorted({frame.fov for frame in evaluation.frames}):
+        frames = [f for f in evaluation.frames if f.fov == fov]
+        for against in ("x", "y"):
+            where = np.array([getattr(f.found.place, f"{against}_px") for f in frames])
+            if len(frames) < LEAST_TREND_FRAMES or np.ptp(where) < 1.0:
+                continue
+            relative, absolute = (
+                slope_of(where, _each(frames, value), _each(frames, noise))
+                for value, noise in (("residual_pct", "noise_pct"), ("error_dn_s", "noise_dn_s"))
+            )
+            found.append(Trend(fov, against, len(frames), relative, absolute))
+    return tuple(found)
+
+
+def slope_of(where_px: Vector, error: Vector, noise: Vector) -> Slope:
+    """Eq. (1) and (2), over TREND_PX pixels."""
+    weight = noise**-2.0
+    u = where_px - np.sum(weight * where_px) / weight.sum()
+    spread = float(np.sum(weight * u**2))
+    slope = float(np.sum(weight * u * error)) / spread  # Eq. (1)
+    left = error - np.sum(weight * error) / weight.sum() - slope * u
+    excess = max(1.0, float(np.sum(weight * left**2)) / max(error.size - 2, 1))
+    return Slope(TREND_PX * slope, TREND_PX * math.sqrt(excess / spread))  # Eq. (2)
+
+
+def _each(frames: Sequence[FrameEvaluation], name: str) -> Vector:
+    return np.array([getattr(frame, name) for frame in frames], dtype=np.float64)
+
+
+def _rms(values: Vector) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
+
+
+# --- as JSON ----------------------------------------------------------------------------------------------
+
+
+def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict[str, Any]:
+    """JSON-able: summaries, trends, one image a line, maps, slices and, where given, what dark offsets do."""
+    *pointings, whole = (_plain(asdict(summary)) for summary in summaries(evaluation))
+    out: dict[str, Any] = {
+        "schema": SCHEMA,
+        "all": whole,
+        "pointings": pointings,
+        "trends": [_plain(asdict(trend)) for trend in trends(evaluation)],
+        "superposed": _superposed_json(evaluation.superposed),
+        "frames": [_frame_json(frame) for frame in evaluation.frames],
+        "left_out": evaluation.left_out,
+        "slices": [
+            {
+                "file": frame.file,
+                "fov": frame.fov,
+                "along_x": _slice_json(frame.along_x),
+                "along_y": _slice_json(frame.along_y),
+            }
+            for frame in evaluation.frames
+            if frame.along_x is not None and frame.along_y is not None
+        ],
+        "inputs_sha256": evaluation.transit.sha256,
+    }
+    if study is not None:
+        out["dark_offsets"] = _study_json(study)
+    return out
+
+
+def _frame_json(frame: FrameEvaluation) -> dict[str, Any]:
+    centre_observed, centre_simulated = frame.centre_dn_s
+    return _plain(
+        {
+            "file": frame.file,
+            "fov": frame.fov,
+            "time_s": frame.time_s,
+            "x": frame.found.place.x_px,
+            "y": frame.found.place.y_px,
+            "dark_pixels": int(frame.dark[0].size),
+            "observed_dn_s": frame.observed_dn_s,
+            "simulated_dn_s": frame.simulated_dn_s,
+            "error_dn_s": frame.error_dn_s,
+            "noise_dn_s": frame.noise_dn_s,
+            "residual_pct": frame.residual_pct,
+            "noise_pct": frame.noise_pct,
+            "centre_observed_dn_s": centre_observed,
+            "centre_simulated_dn_s": centre_simulated,
+            "centre_residual_pct": frame.centre_pct,
+            "centre_noise_pct": frame.centre_noise_pct,
+        }
+    )
+
+
+def _superposed_json(maps: Superposed) -> dict[str, Any]:
+    return {
+        "images": maps.images,
+        "registered": "to the nearest pixel",
+        "centre_index": maps.half_px,
+        "mpe_rms_pct": maps.mpe_rms_pct,
+        "mpe_noise_rms_pct": maps.mpe_noise_rms_pct,
+        "mpe_largest_pct": maps.mpe_largest_pct,
+        "mape_mean_pct": maps.mape_mean_pct,
+        "mape_noise_mean_pct": maps.mape_noise_mean_pct,
+        "mape_largest_pct": maps.mape_largest_pct,
+        "count": maps.count.tolist(),
+        "mpe_pct": _rows(maps.mpe_pct),
+        "mape_pct": _rows(maps.mape_pct),
+        "noise_mpe_pct": _rows(maps.noise_mpe_pct),
+        "noise_mape_pct": _rows(maps.noise_mape_pct),
+    }
+
+
+def _slice_json(along: Slice) -> dict[str, Any]:
+    return {
+        "offset_px": along.offset_px.tolist(),
+        "observed_dn_s": along.observed.tolist(),
+        "simulated_dn_s": along.simulated.tolist(),
+        "dark": along.dark.tolist(),
+    }
+
+
+def _study_json(study: DarkOffsetStudy) -> dict[str, Any]:
+    return {
+        "radii_px": study.radii_px.tolist(),
+        "curve_radii_px": study.curve_radii_px.tolist(),
+        "nominal": study.nominal,
+        "largest_weight_change_pct": study.largest_weight_change_pct,
+        "largest_curve_change_points": study.largest_curve_change_points,
+        "largest_total_curve_change_points": study.largest_total_curve_change_points,
+        "offsets": [
+            {
+                "offset_dn": o.offset_dn,
+                "parameters": o.values,
+                "images": o.images,
+                "converged": o.converged,
+                "weight_change_pct": o.weight_change_pct.tolist(),
+                "curve_change_points": o.curve_change_points.tolist(),
+                "total_curve_change_points": o.total_curve_change_points.tolist(),
+            }
+            for o in study.offsets
+        ],
+    }
+
+
+def _rows(values: Vector) -> list[list[float | None]]:
+    return [[None if math.isnan(v) else v for v in row] for row in values.tolist()]
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """Without what is no number in JSON."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+
+
+# --- in words ---------------------------------------------------------------------------------------------
+
+
+def lines(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> list[str]:
+    """A short table for people."""
+    maps = evaluation.superposed
+    out = ["simulated minus observed light in the occulter, percent of what was observed:"]
+    out += [_line(summary) for summary in summaries(evaluation)]
+    out.append(
+        f"by pixel of the disc: MPE {maps.mpe_rms_pct:.2f} % rms, {maps.mpe_largest_pct:.2f} % at most "
+        f"(noise alone {maps.mpe_noise_rms_pct:.2f} % rms); MAPE {maps.mape_mean_pct:.2f} % "
+        f"(noise alone {maps.mape_noise_mean_pct:.2f} %)"
+    )
+    out += [
+        f"pointing {t.fov} along {t.against}: {t.relative_pct.per_100_px:+.2f} +- {t.relative_pct.sigma:.2f} %, "
+        f"{t.absolute_dn_s.per_100_px:+.3g} +- {t.absolute_dn_s.sigma:.2g} DN/s in {TREND_PX:g} px"
+        for t in trends(evaluation)
+    ]
+    if study is not None:
+        tried = ", ".join(f"{o.offset_dn:+g}" for o in study.offsets)
+        out.append(
+            f"dark offsets of {tried} DN: diffuse weights change by at most "
+            f"{study.largest_weight_change_pct:.1f} %, the light beyond any distance by at most "
+            f"{study.largest_curve_change_points:.2f} points"
+        )
+    if evaluation.left_out:
+        out.append(f"left out: {len(evaluation.left_out)} images")
+        out += [f"  {file}: {reason}" for file, reason in evaluation.left_out.items()]
+    return out
+
+
+def _line(of: Summary) -> str:
+    name = "all pointings" if of.fov is None else f"pointing {of.fov}"
+    centre = "" if math.isnan(of.centre_mean_pct) else f"; centre {of.centre_mean_pct:+.2f} %"
+    return (
+        f"{name}: {of.images} images, mean {of.mean_pct:+.2f} % (noise {of.mean_noise_pct:.2f}), "
+        f"rms {of.rms_pct:.2f} % (noise {of.noise_pct:.2f}), at most {of.largest_pct:.2f} %{centre}"
+    )

@@ -1,0 +1,252 @@
+"""Shapes of scatter compared by the errors that each leaves in images which it was not fitted to.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness": the isotropic fit, one
+stretched along x and one stretched along any direction, by the MPE and MAPE of all occulters laid on one another;
+here also free shells. Each shape is fitted to all images, each fold's PSF is one step from there (Eq. (1) of
+`psfcore.scatter.validation.cross_validation`), and every image is simulated with the PSF of the fold that holds it out.
+
+Errors are those of drawing the images again with repetition. All shapes see the same images, so that their
+differences are known far better than the figures themselves. Images that follow one another share a fold: where an
+error lasts over several images, the errors here are too small.
+
+    MPE rms = rms over the disc of the mean over images of PE,   MAPE mean = mean over the disc of the mean of |PE|
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.evaluation.evaluation import evaluate
+from psfcore.evaluation.frame import FrameEvaluation
+from psfcore.evaluation.superposed import LEAST_SHARE
+from psfcore.scatter.inversion import Progress, Solution, invert
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.scatter.validation.cross_validation import Draw, shared_step
+from psfcore.scatter.validation.free_shells import free_kernel, free_shares, law_light
+from psfcore.transit.blocks import folds
+from psfcore.transit.transit import Kernel
+
+Floats = NDArray[np.float64]
+
+FREE_SHELLS = "free-shells"
+STRETCHED = ("stretched-along-x", "stretched")
+RESAMPLES = 1000
+FIGURES = ("residual_mean_pct", "residual_rms_pct", "mpe_rms_pct", "mape_mean_pct")
+KernelOf = Callable[[int], Kernel]
+
+
+@dataclass(frozen=True)
+class ShapeErrors:
+    """What one shape leaves: FIGURES by name, each a value and its error, percent of the observed mean.
+
+    minus_first: the same for this shape's figures less those of the softened power law. parameters: of the fit to all
+    images, value and error; none for free shells.
+    """
+
+    name: str
+    parameters: dict[str, tuple[float, float]]
+    figures: dict[str, tuple[float, float]]
+    minus_first: dict[str, tuple[float, float]]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "name": self.name,
+            "parameters": _named(self.parameters),
+            **_named(self.figures),
+            "minus_softened_power_law": _named(self.minus_first),
+        }
+
+
+@dataclass(frozen=True)
+class ShapesByErrors:
+    """All shapes on the same images, the softened power law first."""
+
+    images: int
+    folds: int
+    shapes: tuple[ShapeErrors, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "images": self.images,
+            "folds": self.folds,
+            "resamples": RESAMPLES,
+            "shapes": [shape.to_json() for shape in self.shapes],
+        }
+
+    def lines(self) -> list[str]:
+        """A short table for people."""
+        head = f"{'held-out errors of shapes (%)':<30}{'residual rms':>16}{'MPE rms':>16}{'MAPE mean':>16}"
+        out = [head]
+        for shape in self.shapes:
+            out.append(f"  {shape.name:<28}" + "".join(_cell(shape.figures[k]) for k in FIGURES[1:]))
+        out.append(f"less those of {self.shapes[0].name}")
+        for shape in self.shapes[1:]:
+            out.append(f"  {shape.name:<28}" + "".join(_cell(shape.minus_first[k], "+") for k in FIGURES[1:]))
+        return out
+
+
+def _cell(figure: tuple[float, float], sign: str = "") -> str:
+    return f"{f'{figure[0]:{sign}.2f} +- {figure[1]:.2f}':>16}"
+
+
+def _named(figures: dict[str, tuple[float, float]]) -> dict[str, dict[str, float]]:
+    return {name: {"value": value, "sigma": sigma} for name, (value, sigma) in figures.items()}
+
+
+def compare_shapes_by_errors(
+    solution: Solution, *, seed: int = 1, progress: Progress = lambda stage, step, steps: None
+) -> ShapesByErrors:
+    """The softened power law that `solution` fitted to all images, both stretched ones, and free shells.
+
+    seed: of the images drawn again. Raises DataError "unknown-shape" where `solution` is of another shape,
+    "too-few-frames" where there are too few images for two folds, and as `inversion.invert` and `evaluate`.
+    """
+    if solution.inversion.shape.name != SOFTENED_POWER_LAW.name:
+        raise DataError(
+            "unknown-shape",
+            f"expected a fit of {SOFTENED_POWER_LAW.name}; got {solution.inversion.shape.name}",
+        )
+    draws = _fold_draws(len(solution.transit.frames))
+    named: dict[str, tuple[Solution | None, KernelOf]] = {
+        SOFTENED_POWER_LAW.name: (solution, _fold_kernels(solution, draws))
+    }
+    for name in STRETCHED:
+        stretched = _fit_of(solution, name, progress)
+        named[name] = stretched, _fold_kernels(stretched, draws)
+    named[FREE_SHELLS] = None, _free_fold_kernels(solution, draws, progress)
+    looks = {name: _looked(solution, kernel_of, name, progress) for name, (_, kernel_of) in named.items()}
+    images = sorted(set.intersection(*(set(look) for look in looks.values())))
+    drawn = _drawn_again(len(images), seed)
+    found = {name: _figures([look[n] for n in images], drawn) for name, look in looks.items()}
+    first = found[SOFTENED_POWER_LAW.name]
+    return ShapesByErrors(
+        images=len(images),
+        folds=len(draws),
+        shapes=tuple(
+            ShapeErrors(
+                name=name,
+                parameters={} if fitted is None else _parameters(fitted),
+                figures=_with_errors(found[name]),
+                minus_first=_with_errors(found[name] - first),
+            )
+            for name, (fitted, _) in named.items()
+        ),
+    )
+
+
+def _fit_of(solution: Solution, name: str, progress: Progress) -> Solution:
+    """Another shape fitted to all images, from where the power law's fit ended."""
+    shape = SHAPES[name]
+
+    def said(stage: str, step: int, steps: int) -> None:
+        progress(f"{name}: {stage}", step, steps)
+
+    start = shape.coordinates(solution.inversion.values)
+    return invert(solution.transit, shape, start=start, threads=solution.threads, progress=said)
+
+
+def _parameters(solution: Solution) -> dict[str, tuple[float, float]]:
+    values, sigma = solution.inversion.values, solution.inversion.value_sigma
+    return {name: (values[name], sigma[name]) for name in values}
+
+
+def _fold_draws(images: int) -> tuple[Draw, ...]:
+    """One draw a fold, of each of its images once."""
+    parts = folds(images)
+    if not parts:
+        raise DataError("too-few-frames", f"expected at least 6 images, to hold some out; got {images}")
+    return tuple(
+        Draw(0, k, tuple(int(n in fold.fitted) for n in range(images)), fold.held_out)
+        for k, fold in enumerate(parts)
+    )
+
+
+def _fold_kernels(solution: Solution, draws: tuple[Draw, ...]) -> KernelOf:
+    """The total PSF [y, x] of the fold that holds an image out."""
+    at = solution.inversion.coordinates
+    kernels = [solution.total.kernel(at + shared_step(solution, draw)) for draw in draws]
+    return _by_image(draws, kernels)
+
+
+def _free_fold_kernels(solution: Solution, draws: tuple[Draw, ...], progress: Progress) -> KernelOf:
+    """The same of free shells."""
+    shape, diffraction = solution.inversion.shape, solution.transit.diffraction
+    shares = free_shares(solution, solution.inversion.coordinates, progress=progress)
+    kernels = []
+    for draw in draws:
+        at = solution.inversion.coordinates + shared_step(solution, draw)
+        free = shares.fit(draw.counts, law_light(shape, at))
+        kernels.append(
+            free_kernel(free, shape, at, diffraction, solution.total.size, threads=solution.threads)
+        )
+    return _by_image(draws, kernels)
+
+
+def _by_image(draws: tuple[Draw, ...], kernels: list[Kernel]) -> KernelOf:
+    fold_of = {n: draw.fold for draw in draws for n in draw.held_out}
+    return lambda n: kernels[fold_of[n]]
+
+
+def _looked(
+    solution: Solution, kernel_of: KernelOf, name: str, progress: Progress
+) -> dict[int, FrameEvaluation]:
+    """Every image that can be looked at with its fold's PSF, by index."""
+
+    def said(stage: str, step: int, steps: int) -> None:
+        progress(f"{name}: {stage}", step, steps)
+
+    looked = evaluate(solution.transit, kernel_of, draws=0, threads=solution.threads, progress=said)
+    return {frame.index: frame for frame in looked.frames}
+
+
+def _drawn_again(images: int, seed: int) -> Floats:
+    """How often each image counts, (1 + RESAMPLES, images): first all of them once."""
+    rng = np.random.default_rng(seed)
+    drawn = rng.multinomial(images, np.full(images, 1 / images), RESAMPLES)
+    return np.concatenate((np.ones((1, images)), drawn))
+
+
+def _figures(frames: list[FrameEvaluation], drawn: Floats) -> Floats:
+    """FIGURES of all images and of each resample: (FIGURES, 1 + RESAMPLES)."""
+    maps = _maps(frames)
+    dark = np.isfinite(maps)
+    shown = dark.sum(axis=0) >= LEAST_SHARE * len(frames)
+    pe, dark = np.nan_to_num(maps[:, shown]), dark[:, shown]
+    # A place that no image of a resample shows counts as one without error, in one resample of very many.
+    count = np.maximum(drawn @ dark, 1)
+    mpe, mape = drawn @ pe / count, drawn @ np.abs(pe) / count
+    residual = np.array([frame.residual_pct for frame in frames])
+    share = drawn / len(frames)
+    return np.array(
+        [
+            share @ residual,
+            np.sqrt(share @ residual**2),
+            np.sqrt((mpe**2).mean(axis=1)),
+            mape.mean(axis=1),
+        ]
+    )
+
+
+def _maps(frames: list[FrameEvaluation]) -> Floats:
+    """PE of each image by the offset from the occulter's centre, to the nearest pixel, nan where it is not dark."""
+    half = int(np.ceil(max(frame.found.place.radius_px for frame in frames))) + 1
+    maps = np.full((len(frames), 2 * half + 1, 2 * half + 1), np.nan)
+    for of, frame in zip(maps, frames, strict=True):
+        place = frame.found.place
+        of[frame.dark[0] - round(place.y_px) + half, frame.dark[1] - round(place.x_px) + half] = frame.pe_pct
+    return maps.reshape(len(frames), -1)
+
+
+def _with_errors(figures: Floats) -> dict[str, tuple[float, float]]:
+    return {
+        name: (float(values[0]), float(values[1:].std(ddof=1)))
+        for name, values in zip(FIGURES, figures, strict=True)
+    }

@@ -1,0 +1,283 @@
+"""Effects of the optics: changes of the PSF, and copies of the image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import affine_transform, gaussian_filter, rotate
+
+from psfcore.convolution.convolver import Convolver
+from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+from psfcore.gap.evidence.search import KERNEL_REACH_PX, displaced, place_search
+from psfcore.psf import crop_or_pad
+from psfcore.scatter.optics import Blur
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.scatter.total_psf import TotalPsf
+
+Kernel = NDArray[np.float64]
+Steps = tuple[tuple[int, int], ...]
+Halo = Callable[[int], Kernel]  # of a size: weights [y, x], sum 1 on the plane, the centre at size // 2
+HALO_SCALES_PX = (20.0, 40.0, 80.0, 160.0, 320.0)
+MOFFAT = 1.5  # exponent of a halo that falls off as r^-3
+GHOST_TRIALS = 300  # a field of 512 px holds about that many copies that differ
+ANGLES_DEG = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
+PITCHES_PCT = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 38.0)
+DIRECTIONS: tuple[Steps, ...] = (((1, 0), (0, 1)), ((1, 0),), ((0, 1),), ((1, 1),), ((1, -1),))
+# Between those, steps are longer: for blurs alone that are wider.
+BETWEEN_THEM: tuple[Steps, ...] = (((1, 2),), ((2, 1),), ((1, -2),), ((2, -1),))
+BLURS = (
+    *((width, steps) for width in (0.4, 0.8, 1.5, 2.5) for steps in DIRECTIONS),
+    *((width, steps) for width in (1.5, 2.5) for steps in BETWEEN_THEM),
+)
+BETWEEN = 6  # parts that the steps on both sides of the best are divided into
+SPLINE = 3  # a linear interpolation would blur what it turns
+AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate that says how much is scattered
+
+
+def by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
+    """A change of the PSF, times a weight of where the light is from."""
+    return Change(lambda n, images: view.blurred(n, blur, weight), lit=False)
+
+
+def by_psf_in_time(view: View, blur: Blur, factor: Callable[[int], float]) -> Change:
+    """A change of the PSF that differs from image to image."""
+    return Change(lambda n, images: view.blurred(n, blur) * np.float32(factor(n)), lit=False)
+
+
+def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Blur]:
+    """Slopes of the total PSF along coordinates of a shape, about the solution."""
+    transit, solution = view.solution.transit, view.solution
+    total = TotalPsf(transit.diffraction, SHAPES[shape], transit.shape, threads=solution.threads)
+    at = SHAPES[shape].coordinates(solution.inversion.values)
+    return [Blur(total.slope(at, k), transit.shape, threads=solution.threads) for k in parameters]
+
+
+def not_a_power_law(view: View) -> str | None:
+    """Why a change of the power law cannot be tried."""
+    name = view.solution.inversion.shape.name
+    return None if name == SOFTENED_POWER_LAW.name else f"the fitted shape is {name}, of which it is a part"
+
+
+def core_slope(view: View) -> Blur:
+    """A Gaussian blur of variance 1 px^2 along each axis: half the Laplacian of the PSF."""
+    kernel = view.kernel
+    neighbours = sum(np.roll(kernel, step, axis) for axis in (0, 1) for step in (-1, 1))
+    return _blur(view, (neighbours - 4 * kernel) / 2)
+
+
+def _blur(view: View, kernel: Kernel) -> Blur:
+    return Blur(kernel, view.solution.transit.shape, threads=view.solution.threads)
+
+
+def _ghost(view: View) -> Sequence[Change]:
+    """A blurred copy, displaced to where the discs ask for it most, by a search over the field."""
+    return _copy(*place_search(view).copy)
+
+
+def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
+    def change(n: int, images: Sequence[Field]) -> Field:
+        return np.asarray(displaced(gaussian_filter(images[n], blur_px), dx, dy), dtype=np.float32)
+
+    return [Change(change, lit=False)]
+
+
+def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
+    """The effect of that name with a form that is sought no more."""
+    sought = next(effect for effect in EFFECTS if effect.name == name)
+    return replace(sought, changes=changes, held=None)
+
+
+def _held_ghost(view: View) -> Effect:
+    blur_px, dx, dy = place_search(view).copy
+    ghost = _held("ghost", lambda view: _copy(blur_px, dx, dy))
+    return replace(
+        ghost, cause=f"{ghost.cause[:-1]}: displaced by ({dx}, {dy}) px, blurred by {blur_px:g} px."
+    )
+
+
+def _anisotropic(view: View) -> Sequence[Change]:
+    return [by_psf(view, blur) for blur in shape_slopes(view, "stretched", (3, 4))]
+
+
+def _halo(view: View) -> Sequence[Change]:
+    return _as_halo(view, _sought_halo(view))
+
+
+def _exponential(scale_px: float) -> Halo:
+    return lambda size: np.exp(-_radius(size) / scale_px) / (2 * np.pi * scale_px**2)
+
+
+def _moffat(scale_px: float) -> Halo:
+    area = np.pi * scale_px**2 / (MOFFAT - 1)
+    return lambda size: (1 + (_radius(size) / scale_px) ** 2) ** -MOFFAT / area
+
+
+def _radius(size: int) -> Kernel:
+    d = np.arange(size) - size // 2
+    return np.asarray(np.hypot(d[:, None], d[None, :]))
+
+
+HALOS: tuple[Halo, ...] = tuple(form(scale) for scale in HALO_SCALES_PX for form in (_exponential, _moffat))
+
+
+def _as_halo(view: View, halo: Halo) -> Sequence[Change]:
+    """A share of the scattered light in a halo instead."""
+    total, inversion = view.solution.total, view.solution.inversion
+    scatter = inversion.shape.kernel(inversion.coordinates, total.size)
+    return [by_psf(view, _blur(view, total.diffracted(halo(total.size) - scatter)))]
+
+
+def _sought_halo(view: View) -> Halo:
+    """The halo that explains most."""
+    size = view.solution.total.size
+    return HALOS[place_search(view).wide_kernel([halo(size) for halo in HALOS])]
+
+
+def _held_halo(view: View) -> Effect:
+    halo = _sought_halo(view)
+    return _held("wide_halo", lambda view: _as_halo(view, halo))
+
+
+def _field_dependent(view: View) -> Sequence[Change]:
+    slope = view.slopes[AMOUNT]
+    # The coordinate is a logit: a share of the amount of scatter is what people ask for.
+    share = np.float32(1 - view.solution.inversion.values["total"])
+    x, y = view.places
+    return [by_psf(view, slope, (where / share).astype(np.float32)) for where in (x, y, x * x + y * y)]
+
+
+def _core_blur(view: View) -> Sequence[Change]:
+    return blur_as(view, *_sought_blur(view))
+
+
+def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
+    """A blur of that width, for a variance of 1 px^2."""
+    change = (_blurred(view.kernel, width_px, steps) - view.kernel) / width_px**2
+    return [by_psf(view, _blur(view, change))]
+
+
+def _sought_blur(view: View) -> tuple[float, Steps]:
+    """Width (px) and directions of the blur that explains most."""
+    near = crop_or_pad(view.kernel, 2 * KERNEL_REACH_PX + 1)
+    return BLURS[place_search(view).kernel([_blurred(near, *blur) - near for blur in BLURS])]
+
+
+def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
+    """A kernel [y, x] blurred to that width along each of some directions: a random walk of these steps (y, x).
+
+    On pixels a Gaussian of less than one would ring; this one is nowhere negative and has its variance exactly.
+    """
+    fy, fx = np.fft.fftfreq(kernel.shape[0])[:, None], np.fft.rfftfreq(kernel.shape[1])[None, :]
+    walk = sum((np.cos(2 * np.pi * (y * fy + x * fx)) - 1) / (y * y + x * x) for y, x in steps)
+    transfer = np.exp(width_px**2 * walk)
+    return np.asarray(np.fft.irfft2(np.fft.rfft2(kernel) * transfer, s=kernel.shape))
+
+
+def _held_blur(view: View) -> Effect:
+    blur = _sought_blur(view)
+    return _held("core_blur", lambda view: blur_as(view, *blur))
+
+
+def _mesh(view: View, changed: Kernel) -> list[Change]:
+    """A change of the diffraction pattern, seen through the scatter."""
+    solution = view.solution
+    size = solution.total.size
+    scatter = solution.inversion.shape.kernel(solution.inversion.coordinates, size)
+    through = Convolver(changed, (size, size), dtype=np.float64, threads=solution.threads)
+    return [by_psf(view, _blur(view, np.asarray(through.apply(scatter), dtype=np.float64)))]
+
+
+def _odd(view: View) -> Kernel:
+    """The diffraction pattern with its centre in the middle."""
+    pattern = view.solution.transit.diffraction
+    return np.asarray(pattern[1 - pattern.shape[0] % 2 :, 1 - pattern.shape[1] % 2 :])
+
+
+def _turned(pattern: Kernel, angle_deg: float) -> Kernel:
+    return np.asarray(rotate(pattern, angle_deg, reshape=False, order=SPLINE))
+
+
+def _stretched(pattern: Kernel, percent: float) -> Kernel:
+    by = 1 + percent / 100
+    centre = np.array(pattern.shape) // 2
+    return np.asarray(
+        affine_transform(pattern, np.eye(2) / by, offset=centre - centre / by, order=SPLINE) / by**2
+    )
+
+
+def _sought(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> float:
+    """By how much the diffraction pattern has to change for the discs: looked for, the orders move by more than they are wide.
+
+    form(pattern, amount): the pattern changed. steps: sizes of amounts that are tried, both signs; then between them.
+    """
+    search, pattern = place_search(view), _near(_odd(view))
+    tried = sorted(sign * step for step in steps for sign in (-1, 1))
+    best = search.kernel([form(pattern, amount) - pattern for amount in tried])
+    low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
+    between = [low + (high - low) * k / BETWEEN for k in range(1, BETWEEN)]
+    between = [amount for amount in between if abs(amount) >= min(steps)]
+    return between[search.kernel([form(pattern, amount) - pattern for amount in between])]
+
+
+def _near(pattern: Kernel) -> Kernel:
+    """What of a pattern a search looks at."""
+    return crop_or_pad(pattern, min(2 * KERNEL_REACH_PX + 1, pattern.shape[0]))
+
+
+def _changed_mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: float) -> list[Change]:
+    """The mesh changed by an amount, for one unit of it."""
+    pattern = _odd(view)
+    change = (form(pattern, amount) - pattern) / amount
+    return _mesh(view, crop_or_pad(change, view.solution.transit.diffraction.shape[0]))
+
+
+def _mesh_effect(name: str, form: Callable[[Kernel, float], Kernel], steps: Sequence[float],
+                 parameter: EffectParameter, cause: str, axes: tuple[str, ...]) -> Effect:  # fmt: skip
+    def held(view: View) -> Effect:
+        amount = _sought(view, form, steps)
+        return replace(effect, changes=lambda view: _changed_mesh(view, form, amount), held=None)
+
+    effect = Effect(
+        name,
+        "optics",
+        (parameter,),
+        cause,
+        "the arms of a flare",
+        axes,
+        lambda view: _changed_mesh(view, form, _sought(view, form, steps)),
+        trials=2 * len(steps),
+        held=held,
+    )
+    return effect
+
+
+def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
+    return EffectParameter(name, unit, likely, positive)
+
+
+EFFECTS: tuple[Effect, ...] = (
+    Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection lays a displaced, defocused copy over the image.",
+           "a bright source moved across the field", ("detector_x", "detector_y", "intensity"), _ghost,
+           trials=GHOST_TRIALS, held=_held_ghost),
+    Effect("anisotropic_scatter", "optics", (_p("p", "", 0.1), _p("q", "", 0.1)),
+           "Scatter reaches farther along one direction: ln(1 + stretch) times cos and sin of twice its angle.",
+           "a transit of a second track across the first", ("azimuth_in_disc", "detector_x", "detector_y"),
+           _anisotropic, not_a_power_law),
+    Effect("field_dependent_scatter", "optics",
+           (_p("x", "/field", 0.1), _p("y", "/field", 0.1), _p("outwards", "/field2", 0.2)),
+           "The amount of scatter changes across the detector, along it or from its middle outwards.", "a transit of another part of the detector",
+           ("detector_x", "detector_y"), _field_dependent, not_a_power_law),
+    Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "A second, wide component of scatter.",
+           "an eclipse or a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,
+           trials=len(HALOS), held=_held_halo),
+    Effect("core_blur", "optics", (_p("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
+           "a sharp limb, or a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur, trials=len(BLURS),
+           held=_held_blur),
+    _mesh_effect("mesh_rotation", _turned, ANGLES_DEG, _p("angle", "deg", 3.0),
+                 "The meshes are turned against the detector.", ("azimuth_in_disc", "detector_x", "detector_y")),
+    _mesh_effect("mesh_pitch", _stretched, PITCHES_PCT, _p("stretch", "%", 3.0),
+                 "The meshes' pitch is not the drawing's.", ("radius_in_disc", "azimuth_in_disc")),
+)  # fmt: skip

@@ -1,0 +1,218 @@
+"""Effects of the scene: what lies beyond the field, the occulter's motion, a Sun that changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from psfcore.convolution.convolver import Convolver
+from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+from psfcore.gap.evidence.lit_blocks import blocks, not_compared
+from psfcore.gap.evidence.search import coarse_kernel
+from psfcore.transit.occulter import coverage
+from psfcore.transit.transit import Place
+
+Planes = NDArray[np.float64]
+
+# In the longest exposure. What a long track changes is not so many times what a short one does.
+MOTIONS_PX = (1.0, 5.0)
+MOTION_PARTS = 5  # that an exposure is divided into
+STRUCTURE_PX = 6.0
+LEAST_TO_EVOLVE = 5
+MOST_TERMS = 4
+RIDGE = 1e-3  # of an image's weight, where few images show a place
+COARSE_PX = 4
+SIDES = ("left", "right", "bottom", "top")
+MOST_POINTINGS = 8  # whose surroundings are told apart
+
+
+def _beyond_field(view: View) -> Sequence[Change]:
+    """The field's mirror image beyond each of its edges, seen through the PSF.
+
+    What gets in from there is smooth but for the outermost pixels: worked out on coarse pixels.
+    """
+    solution = view.solution
+    ny, nx = (-(-n // COARSE_PX) for n in solution.transit.shape)
+    pad_y, pad_x = ny // 2, nx // 2
+    kernel = coarse_kernel(view.kernel, COARSE_PX)
+    through = Convolver(kernel, (ny + 2 * pad_y, nx + 2 * pad_x), dtype=np.float32, threads=solution.threads)
+    y, x = np.indices((ny + 2 * pad_y, nx + 2 * pad_x))
+    low_y, high_y, low_x, high_x = y < pad_y, y >= pad_y + ny, x < pad_x, x >= pad_x + nx
+    # A corner belongs to the side: the sides share all that is beyond the field.
+    sides = (low_x, high_x, low_y & ~low_x & ~high_x, high_y & ~low_x & ~high_x)
+
+    def change(n: int, side: NDArray[np.bool_]) -> Field:
+        scene = _coarse(view.scenes[n])
+        wide = np.pad(scene, ((pad_y, pad_y), (pad_x, pad_x)), mode="symmetric") * side
+        seen = through.apply(wide.astype(np.float32))[pad_y : pad_y + ny, pad_x : pad_x + nx]
+        return on_pixels(seen, solution.transit.shape)
+
+    frames = solution.transit.frames
+    nothing = np.zeros(solution.transit.shape, np.float32)
+
+    def one(fov: int, side: NDArray[np.bool_]) -> Change:
+        return Change(lambda n, _: change(n, side) if frames[n].fov == fov else nothing, lit=False)
+
+    # Each pointing has its own surroundings.
+    return [one(fov, side) for fov in sorted({f.fov for f in frames})[:MOST_POINTINGS] for side in sides]
+
+
+def _coarse(plane: Field) -> Field:
+    """Means of squares of COARSE_PX; the last ones are made whole with their own edge."""
+    ny, nx = plane.shape
+    whole = np.pad(plane, ((0, -ny % COARSE_PX), (0, -nx % COARSE_PX)), mode="edge")
+    rows, columns = (n // COARSE_PX for n in whole.shape)
+    return np.asarray(whole.reshape(rows, COARSE_PX, columns, COARSE_PX).mean(axis=(1, 3)))
+
+
+def _motion(view: View) -> Sequence[Change]:
+    """The disc drawn out along its track: light where it was dark for a part of the exposure, and the other way."""
+    solution = view.solution
+    frames = solution.transit.frames
+    places = [found.place for found in solution.sky.found]
+    longest = max(frame.exposure_s for frame in frames)
+    shape = solution.transit.shape
+
+    def change(n: int, longest_px: float) -> Field:
+        near = [k for k, f in enumerate(frames) if f.fov == frames[n].fov and k != n]
+        hidden = view.behind(n)
+        if not near or hidden is None:
+            return np.zeros(shape, np.float32)
+        other = min(near, key=lambda k: abs(frames[k].time_s - frames[n].time_s))
+        dx, dy = places[other].x_px - places[n].x_px, places[other].y_px - places[n].y_px
+        reach = longest_px * frames[n].exposure_s / longest / max(float(np.hypot(dx, dy)), 1e-9)
+        here = places[n]
+        parts = (np.arange(MOTION_PARTS) + 0.5) / MOTION_PARTS - 0.5
+        along = (
+            coverage(shape, Place(here.x_px + s * reach * dx, here.y_px + s * reach * dy, here.radius_px))
+            for s in parts
+        )
+        lost = (sum(along) / MOTION_PARTS - coverage(shape, here)) * hidden
+        optics = solution.optics
+        return optics.field(optics.see(optics.lanes((-lost).astype(np.float32))))
+
+    return [Change(lambda n, _, px=px: change(n, px), lit=False) for px in MOTIONS_PX]  # type: ignore[misc]
+
+
+def _evolution(view: View) -> Sequence[Change]:
+    """What the lit parts of a pointing's images show to have changed evenly in time, and beyond that smoothly, for a
+    change of one rms.
+
+    The discs do not show it: each image's scene is its own.
+    """
+    frames = view.solution.transit.frames
+    evolving = [
+        _smooth_in_time(view, images)
+        for fov in sorted({f.fov for f in frames})
+        if len(images := [n for n, f in enumerate(frames) if f.fov == fov]) >= LEAST_TO_EVOLVE
+    ]
+    nothing = np.zeros(view.solution.transit.shape, np.float32)
+
+    def one(terms: slice) -> Change:
+        planes = {n: plane for part in evolving for n, plane in part.planes(terms).items()}
+        rms = np.sqrt(
+            np.mean([np.mean(planes[n] ** 2) / part.level**2 for part in evolving for n in part.images])
+        )
+        unit = {n: np.asarray(plane / max(float(rms), 1e-9), np.float32) for n, plane in planes.items()}
+        return Change(
+            lambda n, _: on_pixels(unit[n], nothing.shape) if n in unit else nothing,
+            disc=False,
+            numbers=sum(part.numbers(terms) for part in evolving),
+        )
+
+    return [one(slice(1, 2)), one(slice(2, None))]
+
+
+@dataclass(frozen=True, eq=False)
+class _Evolving:
+    """One pointing on coarse pixels. basis: polynomials in time (images, terms); terms: the maps that they multiply,
+    DN/s (terms, y, x); level: of its mean. free: how many images show each of its blocks."""
+
+    images: tuple[int, ...]
+    basis: NDArray[np.float64]
+    terms: Planes
+    level: float
+    free: NDArray[np.int64]
+
+    def planes(self, terms: slice) -> dict[int, Planes]:
+        """How each image differs from the mean over time, by some of the terms."""
+        # The mean over time is the scene's: no part of how it changes.
+        basis = self.basis[:, terms] - self.basis[:, terms].mean(axis=0)
+        return dict(zip(self.images, np.tensordot(basis, self.terms[terms], axes=1), strict=True))
+
+    def numbers(self, terms: slice) -> int:
+        """How many numbers were taken from the blocks for some of the terms: of a block no more than it has images."""
+        last = np.minimum(self.basis.shape[1] if terms.stop is None else terms.stop, self.free)
+        return int(np.maximum(last - terms.start, 0).sum())
+
+
+def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
+    solution = view.solution
+    time_s = np.array([solution.transit.frames[n].time_s for n in images])
+    at = 2 * (time_s - time_s[0]) / max(float(time_s[-1] - time_s[0]), 1e-9) - 1
+    degree = min(MOST_TERMS, len(images) // 2)
+    basis = np.polynomial.legendre.legvander(at, degree)
+    seen, weight, free = lit_on_coarse(view, images)
+    level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
+    normal = np.einsum("nk,nyx,nl->yxkl", basis, weight, basis) + RIDGE * np.eye(degree + 1)
+    score = np.einsum("nk,nyx->yxk", basis, weight * (seen - level))
+    terms = np.moveaxis(np.linalg.solve(normal, score[..., None])[..., 0], -1, 0)
+    return _Evolving(
+        images=tuple(images),
+        basis=basis,
+        terms=np.array([gaussian_filter(plane, STRUCTURE_PX / COARSE_PX) for plane in terms]),
+        level=max(float(level.mean()), 1e-9),
+        free=free,
+    )
+
+
+def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
+    """Images of one pointing on coarse pixels, the hidden light put back and each as bright as their mean, DN/s
+    (images, y, x); one where they can be compared; and how many of them show each of the blocks."""
+    planes, weights, free = [], [], []
+    for n in images:
+        out = not_compared(view.solution, n)
+        planes.append(_coarse(view.unocculted[n]))
+        weights.append(_coarse((~out).astype(np.float32)) == 1)
+        free.append(blocks(out.astype(np.float64)) == 0)
+    seen, weight = np.array(planes, dtype=np.float64), np.array(weights, dtype=np.float64)
+    level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
+    # How bright an image is as a whole is not the Sun's structure.
+    for one, use in zip(seen, weight > 0, strict=True):
+        if use.any():
+            one /= one[use].sum() / max(float(level[use].sum()), 1e-9)
+    return seen, weight, np.sum(free, axis=0)
+
+
+def on_pixels(plane: Field, shape: tuple[int, ...]) -> Field:
+    """A coarse plane on the images' pixels."""
+    fine = np.repeat(np.repeat(plane, COARSE_PX, axis=0), COARSE_PX, axis=1)
+    return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
+
+
+def _too_few_to_evolve(view: View) -> str | None:
+    frames = view.solution.transit.frames
+    most = max(sum(f.fov == fov for f in frames) for fov in {f.fov for f in frames})
+    if most >= LEAST_TO_EVOLVE:
+        return None
+    return f"no pointing has the {LEAST_TO_EVOLVE} images that it takes; the most is {most}"
+
+
+def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
+    return EffectParameter(name, unit, likely, positive)
+
+
+EFFECTS: tuple[Effect, ...] = (
+    Effect("occulter_motion", "scene",
+           (_p("short_tracks", "", 4.0, True), _p("long_tracks", "", 1.0, True)), "The occulter moves during an exposure.",
+           "shorter exposures", ("radius_in_disc", "azimuth_in_disc"), _motion),
+    Effect("out_of_field_light", "scene", tuple(_p(f"{side}_{k}", "", 0.5, True) for k in range(1, MOST_POINTINGS + 1) for side in SIDES),
+           "The Sun goes on beyond the field and scatters in.",
+           "full-Sun images of the same time", ("scattering_distance", "pointing", "intensity"), _beyond_field),
+    Effect("scene_evolution", "scene", (_p("rms", "", 0.3, True), _p("rms_uneven", "", 0.3, True)), "The Sun changes while the occulter crosses a pointing.",
+           "images closer in time", ("time", "pointing"), _evolution, _too_few_to_evolve),
+)  # fmt: skip

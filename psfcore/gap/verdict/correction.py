@@ -1,0 +1,267 @@
+"""The model with an effect added: the images as they would be without it, and the PSF fitted anew.
+
+Images minus the effect's change, worked out from the scene and the PSF as they are; a new fit; the change worked out
+again from that, and what is left of the effect fitted beside the PSF. Two or three rounds settle it, as a Gauss-Newton
+step does, and what was a first-order change is one no more. A round that leaves clearly more than one before is not
+taken.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.gap.effect import Effect, View
+from psfcore.gap.evidence.evidence import Evidence, gather
+from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.verdict.judge import Tried, fitted, label_of, left_chi2
+from psfcore.scatter.inversion import Progress, Solution, invert
+from psfcore.transit.transit import Transit
+
+Vector = NDArray[np.float64]
+
+ROUNDS = 3
+SETTLED = 0.3  # of a parameter's error
+WORSE = 9.0  # of chi2: what a round may leave more than the best did
+WORSE_SHARE = 0.05  # and of the effect's gain
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A fit with an effect added. values: its parameters, all rounds together, with errors. model: about that fit."""
+
+    effects: tuple[Effect, ...]
+    solution: Solution
+    evidence: Evidence
+    model: LinearModel
+    values: dict[str, tuple[float, float, str]]
+    rounds: int
+
+    @property
+    def label(self) -> str:
+        """The effects' names as a report has them."""
+        return label_of([effect.name for effect in self.effects])
+
+    @property
+    def covariance(self) -> Vector:
+        """Of the PSF's coordinates, the effects' parameters free beside them: (coordinates, coordinates)."""
+        columns = tuple(c for effect in self.effects for c in self.evidence.columns[effect.name])
+        base = len(self.evidence.base)
+        return self.model.fit(columns).covariance[:base, :base]
+
+
+def corrected(transit: Transit, view: View, effects: Sequence[Effect], theta: Vector) -> Transit:
+    """The images of a transit less what the effects with these parameters did to them."""
+    changes = [change for effect in effects for change in effect.changes(view)]
+    frames = []
+    for n, frame in enumerate(transit.frames):
+        error = np.zeros(transit.shape)
+        for value, change in zip(theta, changes, strict=True):
+            if change.disc:  # what the discs do not answer to is part of each image's own scene
+                error += value * change.change(n, view.expected)
+        frames.append(replace(frame, pixels=(frame.pixels - error).astype(np.float32)))
+    return replace(transit, frames=tuple(frames))
+
+
+def add_to_model(
+    solution: Solution,
+    effects: Sequence[Effect],
+    found: Tried,
+    model: LinearModel,
+    *,
+    view: View | None = None,
+    progress: Progress = lambda stage, step, steps: None,
+) -> Corrected:
+    """Fit PSF and effects together, starting from the linear fit `found`.
+
+    view: of the solution, where there is one. Raises what `invert` raises before a round was good, and DataError
+    "effect-unseen" where none of an effect is left, "bad-effects" of what somebody added.
+    """
+    transit = solution.transit
+    # A form with a place of its own keeps the place that was found: it is looked for once.
+    view = view or View(solution)
+    held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
+    names, theta = list(found.values), np.array([value for value, _, _ in found.values.values()])
+    units = [unit for _, _, unit in found.values.values()]
+    in_images = _in_images(held, view)
+    base = len(model.evidence.base)
+    here, start = view, _stepped(solution, found.step.values[:base])
+    least = np.inf
+    taken: Corrected | None = None
+    for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
+        try:
+            if in_images.any():
+                images = corrected(transit, here, held, theta)
+                shape, threads = solution.inversion.shape, solution.threads
+                near = start is not None
+                fit = invert(images, shape, start=start, near=near, threads=threads, progress=progress)
+                here = View(fit)
+            seen = _look(here, held, theta, in_images, model, progress)
+        except DataError:
+            if taken is None:
+                raise
+            break  # no fit, or nothing of the effect left, after a step that was too long
+        steps, theta, start = seen.theta - theta, seen.theta, seen.start
+        # Where light can be added alone, what would take it away does not act.
+        acts = ~(_positive(held) & (theta <= 0))
+        if not acts.all() and rounds < ROUNDS:
+            held = _those_that_act(held, acts)
+            names, units = (list(itertools.compress(some, acts)) for some in (names, units))
+            theta, in_images = theta[acts], in_images[acts]
+            taken, least = None, np.inf
+            continue
+        left_over = float(left_chi2(seen.model, seen.left.step).sum())
+        if left_over > least + max(WORSE, WORSE_SHARE * found.gain):  # too strong for first-order steps
+            break
+        least = min(least, left_over)
+        taken = Corrected(
+            effects=tuple(held),
+            solution=here.solution,
+            evidence=seen.model.evidence,
+            model=seen.model,
+            values={
+                name: (float(value), float(sigma), unit)
+                for name, value, sigma, unit in zip(names, theta, seen.sigma, units, strict=True)
+            },
+            rounds=rounds,
+        )
+        if float(np.abs(steps / np.maximum(seen.sigma, 1e-300)).max()) < SETTLED:
+            break
+    assert taken is not None
+    return taken
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a fit shows of effects that were partly taken out of its images: the model about it, what is left of them
+    there, their parameters with what was taken out, and where the PSF's coordinates go beside them: as `_stepped`."""
+
+    model: LinearModel
+    left: Tried
+    theta: Vector
+    start: Vector | None
+
+    @property
+    def sigma(self) -> Vector:
+        """Of theta."""
+        return np.array([sigma for _, sigma, _ in self.left.values.values()])
+
+
+def _look(
+    view: View,
+    held: Sequence[Effect],
+    out: Vector,
+    in_images: NDArray[np.bool_],
+    model: LinearModel,
+    progress: Progress,
+) -> _Seen:
+    """out: the parameters, of which those in_images were taken out of the images."""
+    evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
+    again = replace(model, evidence=evidence)
+    left = fitted(again, evidence.effects, any_sign=True)
+    found = np.array([value for value, _, _ in left.values.values()])
+    if found.size != out.size:
+        raise DataError(
+            "effect-unseen",
+            f"expected the images to show {label_of([e.name for e in held])} once it is taken out; they show "
+            f"{found.size} of {out.size} parameters",
+        )
+    base = len(evidence.base)
+    out_already = np.concatenate([np.zeros(base), np.where(in_images, out, 0.0)])
+    found -= again.pull_of_prior(left.step, out_already)[base:]
+    # What was taken out of the images shows what is left of it, the rest shows all of it.
+    theta = np.where(in_images, out + found, found)
+    return _Seen(again, left, theta, _stepped(view.solution, left.step.values[:base]))
+
+
+def _stepped(current: Solution, step: Vector) -> Vector | None:
+    """The coordinates of a fit after a step; none where one so long is not to be believed, and the next fit starts anew."""
+    step, whole = current.inversion.shape.shortened(step)
+    return current.inversion.coordinates + step if whole else None
+
+
+def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:
+    """Which of some effects' changes the discs answer to."""
+    return np.array([change.disc for effect in effects for change in effect.changes(view)], dtype=np.bool_)
+
+
+def _positive(effects: Sequence[Effect]) -> NDArray[np.bool_]:
+    return np.array(
+        [parameter.positive for effect in effects for parameter in effect.parameters], dtype=np.bool_
+    )
+
+
+def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[Effect]:
+    """Effects with those of their parameters alone that act, in a row. Raises DataError "effect-unseen" where none does."""
+    out, first = [], 0
+    for effect in effects:
+        count = len(effect.parameters)
+        part = [k for k in range(count) if acts[first + k]]
+        first += count
+        if not part:
+            raise DataError(
+                "effect-unseen",
+                f"expected {effect.name} to add light beside the fitted PSF; it would take it away",
+            )
+        out.append(_with_part(effect, part))
+    return out
+
+
+def beyond(
+    added: Corrected,
+    library: Sequence[Effect],
+    model: LinearModel,
+    *,
+    progress: Progress = lambda stage, step, steps: None,
+) -> LinearModel:
+    """The model about a fit with effects in it, which are always fitted, and how it answers to others of a library.
+
+    Raises DataError "bad-effects" of what somebody added.
+    """
+    names = {effect.name for effect in added.effects}
+    others = [effect for effect in library if effect.name not in names]
+    evidence = gather(added.solution, (*added.effects, *others), progress=progress)
+    evidence = _with_noise_of(model.evidence, evidence)
+    base = len(evidence.base) + sum(len(evidence.columns.get(name, ())) for name in names)
+    effects = tuple(effect for effect in evidence.effects if effect.name not in names)
+    return replace(model, evidence=replace(evidence, base=tuple(range(base)), effects=effects))
+
+
+def hold(effect: Effect, view: View) -> Effect:
+    """The effect with whatever it searches for, as a place, held as these images give it."""
+    return effect if effect.held is None else effect.held(view)
+
+
+def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
+    """The evidence after an effect was taken out, with the noise, and the blocks' floor, of before: the light that is
+    gone left its noise. So are the means that percents are of."""
+    were = {disc.index: disc for disc in before.discs}
+    discs = []
+    for disc in after.discs:
+        was = were.get(disc.index)
+        if was is not None:
+            same = was.covariance.shape == disc.covariance.shape
+            disc = replace(disc, covariance=was.covariance if same else disc.covariance, untouched=was.level)
+        discs.append(disc)
+    return replace(after, discs=tuple(discs), lit=replace(after.lit, variance=before.lit.variance))
+
+
+def _acting(effect: Effect, found: Tried, effects: int) -> Effect:
+    """The effect with those of its parameters alone that take part in a fit."""
+    labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
+    return _with_part(effect, [k for k, label in enumerate(labels) if label in found.values])
+
+
+def _with_part(effect: Effect, part: Sequence[int]) -> Effect:
+    if len(part) == len(effect.parameters):
+        return effect
+    return replace(
+        effect,
+        parameters=tuple(effect.parameters[k] for k in part),
+        changes=lambda view: [effect.changes(view)[k] for k in part],
+    )

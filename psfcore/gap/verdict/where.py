@@ -1,0 +1,275 @@
+"""Where a gap lies: what share of it goes with each axis.
+
+Axes are confounded: a transit has three pointings and one track, so that place, time and brightness go together. The
+share of an axis is what it adds to the others, averaged over all orders in which they could be taken (Shapley's
+value), of what all axes explain together; its p-value counts how often images with their signs drawn anew fall as far
+with this axis alone, times the number of axes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from psfcore.gap.evidence.cells import DiscCells
+from psfcore.gap.evidence.evidence import Evidence, Taken
+from psfcore.gap.evidence.linear_model import LinearModel, Step
+from psfcore.gap.evidence.patterns import in_disc
+
+Matrix = NDArray[np.float64]
+Vector = NDArray[np.float64]
+
+DRAWS = 999
+AS_GOOD = 0.3  # of the best axis' own fall: an axis of the effect that was found may be the strongest if it explains so much
+SIGNIFICANT = 0.05  # an axis that chance explains does not come before one that it does not
+SUSPECT = 2  # pointings that are named
+
+
+@dataclass(frozen=True)
+class Axis:
+    """How much of a gap follows one axis, and where along it."""
+
+    name: str
+    share: float
+    p_value: float
+    alone: float
+    at: dict[str, Any]
+
+    def to_json(self) -> dict[str, Any]:
+        """As a gap report has it."""
+        return {"axis": self.name, "share": self.share, "p_value": self.p_value, "at": self.at}
+
+
+def where(
+    model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = (), explained: Step | None = None
+) -> tuple[Axis, ...]:
+    """All axes, the strongest first: of those that chance does not explain, the one with the largest share.
+
+    favoured: axes of the effect that was found; of axes that explain about as much, they come first, for the effect was
+    found by more than its place on the track. explained: the fit of an effect that explains the gap; shares are then of
+    what it explains, which has no noise.
+    """
+    designs = _designs(model.evidence)
+    cells, lit = _of_cells(model, designs), _of_lit(model, designs)
+    disc = cells.equations([one.residual for one in model.discs])
+    seen = disc if explained is None else cells.equations(_explained(model, explained))
+    names = list(designs)
+    spans = _spans(designs)
+    subset = {
+        chosen: _fall(seen, lit, [c for name in chosen for c in spans[name]])
+        for size in range(len(names) + 1)
+        for chosen in itertools.combinations(names, size)
+    }
+    shares = _shapley(names, subset)
+    total = max(sum(max(share, 0.0) for share in shares.values()), 1e-300)
+    draws = _drawn_scores(model, cells, rng)
+    out = []
+    for name in names:
+        alone = subset[(name,)]
+        beaten = int((_falls(disc.normal, draws, spans[name]) >= _fall_of(disc, spans[name])).sum())
+        p_value = min(1.0, (1 + beaten) / (1 + DRAWS) * len(names))
+        if _fall_of(lit, spans[name]) > 0:
+            p_value = min(p_value, _p_of_lit(lit, spans[name], len(names)))
+        out.append(Axis(name, max(shares[name], 0.0) / total, p_value, alone, _at(model, name)))
+    best = max((axis.alone for axis in out), default=0.0)
+    return tuple(
+        sorted(
+            out,
+            key=lambda a: (
+                not (a.name in favoured and a.alone >= AS_GOOD * best),
+                a.p_value > SIGNIFICANT,
+                -a.share,
+            ),
+        )
+    )
+
+
+def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
+    """For each axis along which these images differ, a pattern (columns, cells) in DN/s for each disc."""
+    taken = [evidence.taken[disc.index] for disc in evidence.discs]
+    level = [np.full(disc.expected.size, disc.mean_expected) for disc in evidence.discs]
+    out: dict[str, list[Matrix]] = {}
+    for name, values in _along(evidence.discs, taken).items():
+        columns = _curve(values) if name not in ("pointing", "gain_mode") else _kinds(values)
+        if columns is not None:
+            out[name] = [column[:, None] * one for column, one in zip(columns.T, level, strict=True)]
+    inside = [in_disc(disc) for disc in evidence.discs]
+    out["radius_in_disc"] = [p[:1] * one for p, one in zip(inside, level, strict=True)]
+    out["azimuth_in_disc"] = [p[1:] * one for p, one in zip(inside, level, strict=True)]
+    return out
+
+
+def _along(discs: Sequence[DiscCells], taken: Sequence[Taken]) -> dict[str, Vector]:
+    """Each image's value on each axis."""
+    return {
+        "detector_x": np.array([t.x_px for t in taken]),
+        "detector_y": np.array([t.y_px for t in taken]),
+        "time": np.array([t.time_s for t in taken]),
+        "pointing": np.array([float(t.fov) for t in taken]),
+        "intensity": np.log(np.array([max(d.mean_expected, 1e-6) for d in discs])),
+        "exposure": np.log(np.array([t.exposure_s for t in taken])),
+        "gain_mode": np.array([float((t.gain_mode or "").lower() == "combined") for t in taken]),
+        "scattering_distance": np.array([t.scattering_distance_px for t in taken]),
+    }
+
+
+def _curve(values: Vector) -> Matrix | None:
+    """A slope and a bend along an axis, (2 or 1, images); none where all images lie at one place of it."""
+    spread = float(values.std())
+    if spread <= 1e-9 * max(1.0, float(np.abs(values).max())):
+        return None
+    x = (values - values.mean()) / spread
+    if np.unique(values).size < 3:
+        return x[None, :]
+    bend = x**2 - np.polyval(np.polyfit(x, x**2, 1), x)
+    return np.array([x, bend]) if float(bend.std()) > 1e-6 else x[None, :]
+
+
+def _kinds(values: Vector) -> Matrix | None:
+    """Which kind an image is of, less the mean: (kinds - 1, images)."""
+    kinds = np.unique(values)
+    if kinds.size < 2:
+        return None
+    return np.array([(values == kind) - np.mean(values == kind) for kind in kinds[1:]])
+
+
+def _spans(designs: dict[str, list[Matrix]]) -> dict[str, list[int]]:
+    first, out = 0, {}
+    for name, patterns in designs.items():
+        out[name] = list(range(first, first + patterns[0].shape[0]))
+        first += patterns[0].shape[0]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    normal: Matrix
+    score: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """All discs' cells, whitened: the axes' columns without what the PSF's coordinates take up, and a basis of that."""
+
+    design: Matrix
+    absorbed: Matrix
+
+    def left(self, of_discs: Sequence[Vector]) -> Vector:
+        """What the PSF's coordinates leave of residuals, disc by disc, in a row."""
+        residual = np.concatenate(of_discs)
+        return np.asarray(residual - self.absorbed @ (self.absorbed.T @ residual))
+
+    def equations(self, of_discs: Sequence[Vector]) -> _Normal:
+        """Normal equations of the axes' columns for residuals, disc by disc."""
+        return _Normal(self.design @ self.design.T, self.design @ self.left(of_discs))
+
+
+def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Cells:
+    base = list(model.evidence.base)
+    rows = [
+        np.vstack([patterns[k] for patterns in designs.values()]) @ disc.white
+        for k, disc in enumerate(model.discs)
+    ]
+    design = np.hstack(rows)
+    absorbed = np.linalg.qr(np.hstack([disc.answers[base] for disc in model.discs]).T)[0]
+    return _Cells(design - (design @ absorbed) @ absorbed.T, absorbed)
+
+
+def _explained(model: LinearModel, step: Step) -> list[Vector]:
+    """What a fit's effects explain in each disc's cells."""
+    base = len(model.evidence.base)
+    here, values = list(step.columns[base:]), step.values[base:]
+    return [disc.answers[here].T @ values for disc in model.discs]
+
+
+def _of_lit(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal:
+    """Normal equations of the axes' columns for how bright the images are among those of their pointing: their gains over
+    the width of these."""
+    lit = model.evidence.lit
+    gains = model.evidence.whole_lit.gains[list(model.evidence.images)] / lit.gain_width
+    columns = np.vstack(
+        [
+            np.array(
+                [patterns[k].mean(axis=1) / disc.mean_expected for k, disc in enumerate(model.evidence.discs)]
+            ).T
+            for patterns in designs.values()
+        ]
+    )
+    fov = lit.fov[list(model.evidence.images)]
+    for one in np.unique(fov):  # brightness is known among images of one pointing alone
+        here = fov == one
+        columns[:, here] -= columns[:, here].mean(axis=1, keepdims=True)
+        gains = np.where(here, gains - gains[here].mean(), gains)
+    return _Normal(columns @ columns.T, columns @ gains)
+
+
+def _fall(disc: _Normal, lit: _Normal, columns: list[int]) -> float:
+    return _fall_of(disc, columns) + _fall_of(lit, columns)
+
+
+def _fall_of(of: _Normal, columns: list[int]) -> float:
+    return float(_falls(of.normal, of.score[None, :], columns)[0])
+
+
+def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
+    """How far chi2 falls by these columns beyond their number, for every row of scores (draws, columns)."""
+    if not columns:
+        return np.zeros(scores.shape[0])
+    normal, scores = normal[np.ix_(columns, columns)], scores[:, columns]
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-12))
+    inverse = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-6, hermitian=True)
+    scores = scores / size
+    return np.maximum(np.einsum("ni,ij,nj->n", scores, inverse, scores) - len(columns), 0.0)
+
+
+def _p_of_lit(lit: _Normal, columns: list[int], axes: int) -> float:
+    return min(1.0, axes * float(chdtrc(len(columns), _fall_of(lit, columns) + len(columns))))
+
+
+def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
+    """What each name adds, averaged over all orders."""
+    count = len(names)
+    out = dict.fromkeys(names, 0.0)
+    for chosen, value in worth.items():
+        for name in names:
+            if name in chosen:
+                continue
+            with_it = tuple(n for n in names if n in chosen or n == name)
+            weight = 1 / (count * math.comb(count - 1, len(chosen)))
+            out[name] += weight * (worth[with_it] - value)
+    return out
+
+
+def _drawn_scores(model: LinearModel, cells: _Cells, rng: np.random.Generator) -> Matrix:
+    """Scores of all columns with every image's residuals turned over or not: (DRAWS, columns)."""
+    residual = cells.left([disc.residual for disc in model.discs])
+    which = np.repeat(np.arange(len(model.discs)), [d.residual.size for d in model.discs])
+    signs = np.array([rng.choice((-1.0, 1.0), len(model.discs)) for _ in range(DRAWS)])
+    return np.asarray((signs[:, which] * residual) @ cells.design.T)
+
+
+def _at(model: LinearModel, name: str) -> dict[str, Any]:
+    """The pointings where the residuals are largest, and the axis' range in them."""
+    evidence = model.evidence
+    left = model.left(model.base)
+    excess = np.array([float(r @ r) - r.size for r in left])
+    fov = np.array([evidence.taken[d.index].fov for d in evidence.discs])
+    by_fov = {int(one): float(excess[fov == one].sum()) for one in np.unique(fov)}
+    strongest = sorted(by_fov, key=lambda one: -by_fov[one])[:SUSPECT]
+    out: dict[str, Any] = {"pointings": sorted(strongest)}
+    taken = [evidence.taken[d.index] for d in evidence.discs]
+    values = _along(evidence.discs, taken).get(name)
+    if values is not None and name not in ("pointing", "gain_mode"):
+        here = values[np.isin(fov, strongest)]
+        low, high = float(here.min()), float(here.max())
+        if name in ("intensity", "exposure"):
+            low, high = math.exp(low), math.exp(high)
+        out["range"] = [low, high]
+    return out

@@ -1,0 +1,356 @@
+"""What a paper shows of a PSF and of the transit that it comes from, found with one inversion.
+
+Hofmeister et al., The point-spread function of HRI_EUV, sections "Inversion results", "Accuracy and robustness" and
+"Evaluation". The inversion of all images is made once. About it the folds differ by a small step, which the images'
+shares of its normal equations give (`psfcore.scatter.validation.cross_validation`, the shared scheme): the folds of the
+cross-validation, their images drawn again, and those that every image is held out with for its evaluation, all of
+their images taken once. Only the dark offsets are fitted anew, from where the inversion ended.
+
+A PSF that is given instead is evaluated as it is; what only a fit can say is missing then, and the report says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from psfcore.errors import DataError
+from psfcore.evaluation.evaluation import Evaluation, evaluate
+from psfcore.evaluation.plot import sentence as evaluation_sentence
+from psfcore.evaluation.report import report as evaluation_json
+from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
+from psfcore.scatter.fit import TransitFit, fit_transit, psf_of
+from psfcore.scatter.fit import report as fit_json
+from psfcore.scatter.inversion import Progress, Solution
+from psfcore.scatter.validation.cross_validation import (
+    Bands,
+    Draw,
+    FoldFit,
+    bands,
+    draws,
+    shared_fits,
+    shared_step,
+)
+from psfcore.scatter.validation.dark_offsets import OFFSETS_DN, DarkOffsetStudy, dark_offset_study
+from psfcore.tables.make import tables_of
+from psfcore.transit.blocks import folds
+from psfcore.transit.prepare import Prepared
+from psfcore.transit.transit import Kernel, Transit
+
+SCHEMA = "psf-report/1"
+STAGES = {
+    "fit": 24.0,
+    "folds": 14.0,
+    "evaluating": 9.0,
+    "dark offsets": 63.0,
+    "tables": 6.0,
+}  # relative costs
+OFFSET_VISITS = 8.5  # of a frame in a fit with a dark offset, as a rule
+
+
+@dataclass(frozen=True, eq=False)
+class CrossValidated:
+    """Fits with images held out and drawn again: all of them, and what holds over all."""
+
+    fits: tuple[FoldFit, ...]
+    bands: Bands
+
+
+@dataclass(frozen=True)
+class Missing:
+    """What a report does not show, and why."""
+
+    what: str
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class PsfReport:
+    """A transit, a PSF and all that was found about them.
+
+    tables: of the PSF (`psfcore.tables.make`). held_out: whether every image was judged with a PSF fitted without it.
+    given: the PSF came from elsewhere, and nothing was fitted; fitted_to_these: its history names these images.
+    """
+
+    transit: Transit
+    prepared: Prepared
+    psf: Psf
+    tables: dict[str, Any]
+    fit: TransitFit | None
+    cross: CrossValidated | None
+    evaluation: Evaluation
+    held_out: bool
+    study: DarkOffsetStudy | None
+    fitted_to_these: bool
+    missing: tuple[Missing, ...]
+    seed: int
+
+    @property
+    def given(self) -> bool:
+        """Whether the PSF came from elsewhere."""
+        return self.fit is None
+
+    @property
+    def sentence(self) -> str:
+        """What a person reads first."""
+        judged = evaluation_sentence(self.evaluation)
+        if self.fit is not None:
+            return fit_json(self.fit)["sentence"] + f" {self.how_judged}. {judged}"
+        return f"PSF {self.psf.name} {self.psf.version}. {self.how_judged}. {judged}"
+
+    @property
+    def how_judged(self) -> str:
+        """Whether the evaluation is a test."""
+        if self.held_out:
+            return "Each image judged with a PSF fitted without it and its neighbours"
+        if self.given:
+            test = ", to which it was fitted: no test of it" if self.fitted_to_these else ""
+            return f"Each image judged with the PSF as it was given{test}"
+        return "Each image judged with the PSF that was fitted to it too, which is no test"
+
+
+def make_report(
+    transit: Transit,
+    prepared: Prepared,
+    *,
+    psf: Psf | None = None,
+    dark_offsets: bool = True,
+    seed: int = 1,
+    threads: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> PsfReport:
+    """Fit a transit and show how good the fit is; or, where a PSF is given, show how good that one is.
+
+    dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: of all draws.
+    Raises DataError "plate-scale-mismatch", and as `fit_transit` and `evaluate` do.
+    """
+    wanted = [s for s in STAGES if psf is None or s in ("evaluating", "tables")]
+    if not dark_offsets and psf is None:
+        wanted.remove("dark offsets")
+    stages = _Stages(progress, {name: STAGES[name] for name in wanted})
+    if psf is not None:
+        _check_scale(transit, psf)
+        return _on_a_given(transit, prepared, psf, seed, threads, stages)
+    missing: list[Missing] = []
+    fit = fit_transit(transit, seed=seed, threads=threads, progress=stages.of("fit"))
+    made = psf_of(fit, name=f"{transit.instrument or 'transit'}-fitted", version="this report", provenance={})
+    cross = _cross_validated(fit, seed, missing, stages.of("folds"))
+    kernels = _held_out_kernels(fit.solution, missing)
+    evaluation = evaluate(
+        transit,
+        kernels or (lambda _index: fit.kernel),
+        seed=seed,
+        threads=threads,
+        progress=stages.of("evaluating"),
+    )
+    study = None
+    if dark_offsets:
+        study = _offsets(fit, threads, missing, stages)
+    else:
+        missing.append(Missing("what wrong dark levels do", "it was not asked for"))
+    return PsfReport(
+        transit=transit,
+        prepared=prepared,
+        psf=made,
+        tables=_tables(made, threads, stages),
+        fit=fit,
+        cross=cross,
+        evaluation=evaluation,
+        held_out=kernels is not None,
+        study=study,
+        fitted_to_these=kernels is None,
+        missing=tuple(missing),
+        seed=seed,
+    )
+
+
+def _on_a_given(
+    transit: Transit, prepared: Prepared, psf: Psf, seed: int, threads: int, stages: _Stages
+) -> PsfReport:
+    """The report on a PSF that nobody fits here."""
+    evaluation = evaluate(
+        transit, lambda _index: psf.kernel, seed=seed, threads=threads, progress=stages.of("evaluating")
+    )
+    why = "a PSF was given, and nothing was fitted"
+    lacking = (
+        "parameters and their cross-validation",
+        "scatter without a formula (free shells)",
+        "other shapes of scatter",
+        "what wrong dark levels do to a fit",
+    )
+    missing = [Missing(what, why) for what in lacking]
+    if psf.fitted is None:
+        missing.append(Missing("errors of the PSF's curve and profile", "the PSF's file holds none"))
+    return PsfReport(
+        transit=transit,
+        prepared=prepared,
+        psf=psf,
+        tables=_tables(psf, threads, stages),
+        fit=None,
+        cross=None,
+        evaluation=evaluation,
+        held_out=False,
+        study=None,
+        fitted_to_these=_names_images(psf, transit),
+        missing=tuple(missing),
+        seed=seed,
+    )
+
+
+def _check_scale(transit: Transit, psf: Psf) -> None:
+    """Raise DataError "plate-scale-mismatch" where both scales are known and differ by over 1 %."""
+    seen, wanted = transit.plate_scale_arcsec, psf.plate_scale_arcsec
+    if seen is not None and wanted is not None and abs(seen / wanted - 1) > PLATE_SCALE_TOLERANCE:
+        raise DataError(
+            "plate-scale-mismatch",
+            f"expected images of {wanted:g} arcsec/px as PSF {psf.name} has it; got {seen:g} arcsec/px",
+        )
+
+
+def _names_images(psf: Psf, transit: Transit) -> bool:
+    """Whether a PSF's history holds the SHA-256 of one of a transit's images. Its lines were broken anywhere."""
+    history = "".join(str(line) for line in psf.provenance.get("history", ()))
+    return any(transit.sha256.get(frame.file, "-") in history for frame in transit.frames)
+
+
+def _tables(psf: Psf, threads: int, stages: _Stages) -> dict[str, Any]:
+    stages.of("tables")("tables of the PSF", 0, 1)
+    return tables_of(psf, threads=threads)
+
+
+def _cross_validated(
+    fit: TransitFit, seed: int, missing: list[Missing], progress: Progress
+) -> CrossValidated | None:
+    """All draws of all runs, by the shared scheme; none, and the reason, where the images do not suffice."""
+    try:
+        fits = shared_fits(fit.solution, draws(len(fit.transit.frames), seed=seed), progress=progress)
+    except DataError as error:
+        what = "the cross-validation, and scatter without a formula beside it"
+        missing.append(Missing(what, error.message))
+        return None
+    return CrossValidated(fits, bands(fits, fit.solution.total.radii_px))
+
+
+def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[int], Kernel] | None:
+    """For an image's index the total PSF of the fold that holds it out, its neighbours kept out by the guard."""
+    images = len(solution.transit.frames)
+    parts = folds(images)
+    kernels = []
+    try:
+        if not parts:
+            raise DataError("too-few-images", f"expected at least 6 images to hold some out; got {images}")
+        for k, fold in enumerate(parts):
+            once = tuple(int(n in set(fold.fitted)) for n in range(images))
+            step = shared_step(solution, Draw(0, k, once, fold.held_out))
+            kernels.append(solution.total.kernel(solution.inversion.coordinates + step))
+    except DataError as error:
+        missing.append(Missing("a test on images held out", error.message))
+        return None
+    which = {n: k for k, fold in enumerate(parts) for n in fold.held_out}
+    return lambda index: kernels[which[index]]
+
+
+def _offsets(
+    fit: TransitFit, threads: int, missing: list[Missing], stages: _Stages
+) -> DarkOffsetStudy | None:
+    visits = len(fit.transit.frames) * len(OFFSETS_DN) * OFFSET_VISITS
+    try:
+        return dark_offset_study(
+            fit.transit,
+            nominal=fit.inversion,
+            threads=threads,
+            progress=stages.counted("dark offsets", visits),
+        )
+    except DataError as error:
+        missing.append(Missing("what wrong dark levels do", error.message))
+        return None
+
+
+class _Stages:
+    """Progress of the whole out of that of its stages; it never goes back."""
+
+    SCALE = 1000
+
+    def __init__(self, progress: Progress, costs: dict[str, float]) -> None:
+        self._progress, self._costs = progress, costs
+        self._furthest = 0
+
+    def of(self, name: str) -> Progress:
+        """Progress of a stage that says how far it is."""
+
+        def report(stage: str, step: int, steps: int) -> None:
+            self._say(name, stage, step / max(steps, 1))
+
+        return report
+
+    def counted(self, name: str, visits: float) -> Progress:
+        """Progress of a stage that starts anew many times: its calls are counted."""
+        calls = 0
+
+        def report(stage: str, _step: int, _steps: int) -> None:
+            nonlocal calls
+            calls += 1
+            self._say(name, stage, calls / visits)
+
+        return report
+
+    def _say(self, name: str, stage: str, share: float) -> None:
+        before = 0.0
+        for other, cost in self._costs.items():
+            if other == name:
+                break
+            before += cost
+        done = (before + min(share, 1.0) * self._costs[name]) / sum(self._costs.values())
+        self._furthest = max(self._furthest, round(self.SCALE * done))
+        self._progress(stage, self._furthest, self.SCALE)
+
+
+# --- as JSON ----------------------------------------------------------------------------------------------
+
+
+def report_json(report: PsfReport, provenance: dict[str, Any]) -> dict[str, Any]:
+    """All numbers of a report. provenance: what made it, which this package does not know."""
+    out: dict[str, Any] = {
+        "schema": SCHEMA,
+        "sentence": report.sentence,
+        "psf": {
+            "name": report.psf.name,
+            "version": report.psf.version,
+            "given": report.given,
+            "sum": report.psf.total,
+            "fitted_to_these_images": report.fitted_to_these,
+        },
+        "tables": report.tables,
+        "evaluation": evaluation_json(report.evaluation, report.study) | {"held_out": report.held_out},
+        "not_shown": [vars(missing) for missing in report.missing],
+        "inputs": inputs_of(report),
+        "seed": report.seed,
+        "provenance": provenance,
+    }
+    if report.fit is not None:
+        out["fit"] = fit_json(report.fit)
+    if report.cross is not None:
+        out["cross_validation"] = {
+            "scheme": "shared",
+            "fits": len(report.cross.fits),
+            **report.cross.bands.to_json(),
+        }
+    return out
+
+
+def inputs_of(report: PsfReport) -> dict[str, Any]:
+    """What the report was made of: files with their SHA-256, noise, and what was done to pixels without a value."""
+    transit = report.transit
+    return {
+        "instrument": transit.instrument,
+        "images": len(transit.frames),
+        "shape": list(transit.shape),
+        "plate_scale_arcsec": transit.plate_scale_arcsec,
+        "exposures_s": sorted({frame.exposure_s for frame in transit.frames}),
+        "noise": vars(transit.noise),
+        "diffraction_shape": list(transit.diffraction.shape),
+        "reach_px": REACH_GRID_PX,
+        "prepared": report.prepared.to_json(),
+        "sha256": transit.sha256,
+    }

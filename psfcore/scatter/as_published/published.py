@@ -1,0 +1,322 @@
+"""The inversion as published, to the letter, and with each of its four biases mended alone.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j): six
+rounds of Richardson-Lucy, an occulter found and blanked, lines drawn and fitted; three rounds with free shells, three
+with a softened power law. Where the text leaves a choice, what was taken stands beside the constant.
+
+What the choices are, and what mending one does, is `Choices`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+
+from psfcore.convolution.convolver import Convolver
+from psfcore.convolution.engine import Engine
+from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.methods.richardson_lucy import deconvolve
+from psfcore.errors import DataError
+from psfcore.image import Image
+from psfcore.psf import CENTRE_TOLERANCE, REACH_GRID_PX, Psf, crop_or_pad, cumulative_curve, squared_radii
+from psfcore.scatter.as_published.equations import LIT, Drawn, Lines, PowerLawDrawn, free_fit, power_law_fit
+from psfcore.scatter.as_published.ring_sums import segment_sums
+from psfcore.scatter.as_published.segments import Segments, shells_as_published
+from psfcore.scatter.total_psf import CURVE_RADII_PX
+from psfcore.transit.occulter import FoundPlace, disc_distance, find_occulter, fully_dark
+from psfcore.transit.transit import Frame, Transit
+
+Kernel = NDArray[np.float64]
+Vector = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+LUCY_STEPS = 20
+FREE_ROUNDS = 3
+POWER_LAW_ROUNDS = 3
+SHRUNK_PX = 1.0
+LIT_WITHIN_PX = 5.0
+LIT_A_FRAME = 10
+LEAST_LEVEL_DN_S = 1e-3
+# Lines are divided by their observed value. Where a pixel holds a few photons some are zero or less, and would weigh
+# without bound: no line is divided by less than this share of its disc's mean.
+LEAST_OF_MEAN = 0.5
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Where the published fit is biased, each True as published, False mended.
+
+    weighed_by_observed: each line divided by its own noisy intensity, which pulls faint discs low; mended, by the
+    noise expected of the disc's mean. added: scatter is added to the diffraction, Eq. (1) of `equations`; mended, the
+    two convolve: the ring sums are those of the diffracted scene. counted_on_array: the light that is not scattered
+    is one less what falls on the array of the known PSF; mended, on the full reach. whole_disc_blanked: all
+    pixels within the radius; mended, only those that are fully dark.
+    """
+
+    weighed_by_observed: bool = True
+    added: bool = True
+    counted_on_array: bool = True
+    whole_disc_blanked: bool = True
+
+
+AS_PUBLISHED = Choices()
+MENDED_ALONE = {
+    "weights from the expected intensity": replace(AS_PUBLISHED, weighed_by_observed=False),
+    "scatter and diffraction convolved": replace(AS_PUBLISHED, added=False),
+    "light counted on the full reach": replace(AS_PUBLISHED, counted_on_array=False),
+    "only fully dark pixels blanked": replace(AS_PUBLISHED, whole_disc_blanked=False),
+}
+ALL_MENDED = Choices(False, False, False, False)
+
+
+@dataclass(frozen=True)
+class PublishedRound:
+    """One round: free shells or power law, and the total PSF's cumulative curve after it (percent)."""
+
+    fit: str
+    curve_pct: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Published:
+    """What the published recipe finds.
+
+    a, b_px, c: the power law of the last round, with the spread of its draws, none where fewer than two draws were
+    kept. total: scattered light on the array
+    it was counted on, a grid of grid_px. free: draws of the last free fit, on `segments`. curve_pct at radii_px: of
+    the final total PSF, scatter convolved with diffraction.
+    """
+
+    a: float
+    b_px: float
+    c: float
+    spread: dict[str, float] | None
+    total: float
+    grid_px: int
+    free: Drawn
+    segments: Segments
+    radii_px: Vector
+    curve_pct: Vector
+    rounds: tuple[PublishedRound, ...]
+    lines: int
+
+    @property
+    def scatter(self) -> Kernel:
+        """The scatter kernel [y, x] on grid_px."""
+        return _power_law_kernel(np.array([self.a, self.b_px, self.c]), self.grid_px)
+
+
+def invert_as_published(
+    transit: Transit,
+    choices: Choices = AS_PUBLISHED,
+    *,
+    seed: int = 1,
+    draws: int = 100,
+    threads: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> Published:
+    """Steps (a) to (j). Raises DataError "no-lines" where no pixel is occulted, "no-scatter" where what is found is
+    no scatter: more than all light, or a PSF that is not brightest at its centre."""
+    recipe = _Recipe(transit, choices, seed, draws, threads, progress)
+    return recipe.run()
+
+
+class _Recipe:
+    def __init__(
+        self, transit: Transit, choices: Choices, seed: int, draws: int, threads: int, progress: Progress
+    ) -> None:
+        self.transit, self.choices, self.seed, self.draws = transit, choices, seed, draws
+        self.threads, self.progress = threads, progress
+        field = max(transit.shape)
+        # "Out to the edge of the PSF": the array of the known part, which in the paper is as large as the images.
+        self.grid = (
+            min(transit.diffraction.shape[0], REACH_GRID_PX) if choices.counted_on_array else REACH_GRID_PX
+        )
+        reach = float(np.hypot(self.grid // 2, self.grid // 2)) + 1.0
+        self.segments = Segments(tuple(shells_as_published(reach)), reach_grid_px=self.grid)
+        self.psf_size = min(2 * field, REACH_GRID_PX)
+        self.to_total = Convolver(
+            transit.diffraction, (self.psf_size, self.psf_size), dtype=np.float64, threads=threads
+        )
+        self.diffract = Engine(transit.diffraction, transit.shape, threads=threads)
+        self.radii = np.array([r for r in CURVE_RADII_PX if r < self.psf_size // 2])
+        self.radius_of_segment = _radii_of(self.segments)
+
+    def run(self) -> Published:
+        kernel = crop_or_pad(self.transit.diffraction, self.psf_size)
+        rounds = []
+        law = np.array([0.15, 6.0, 2.5])
+        free: Drawn | None = None
+        count = 0
+        for n in range(FREE_ROUNDS + POWER_LAW_ROUNDS):
+            lines = self._lines(kernel, n)
+            count = len(lines)
+            counts = self.segments.counts.astype(np.float64)
+            if n < FREE_ROUNDS:
+                free = free_fit(lines, counts, seed=self.seed * 100 + n, draws=self.draws)
+                scatter, name = self._free_kernel(free.mean), "free shells"
+            else:
+                fitted = power_law_fit(
+                    lines, counts, self.radius_of_segment, law, seed=self.seed * 100 + n, draws=self.draws
+                )
+                law, name = fitted.law, "softened power law"
+                scatter = _power_law_kernel(law, self.grid)
+            centre = float(scatter[self.grid // 2, self.grid // 2])
+            if not centre > 0:
+                raise DataError(
+                    "no-scatter",
+                    f"round {n + 1}: expected {name} that scatter less than all light; got {100 * (1 - centre):.3g} %",
+                )
+            kernel = np.maximum(self.to_total.apply(crop_or_pad(scatter, self.psf_size)), 0.0)
+            _check_brightest_at_centre(kernel, f"round {n + 1}: {name}")
+            curve = cumulative_curve(kernel, self.radii)
+            rounds.append(PublishedRound(name, tuple(float(c) for c in curve)))
+        assert free is not None
+        return Published(
+            a=float(law[0]),
+            b_px=float(law[1]),
+            c=float(law[2]),
+            spread=_spread(fitted),
+            total=1 - centre,
+            grid_px=self.grid,
+            free=free,
+            segments=self.segments,
+            radii_px=self.radii,
+            curve_pct=np.array(rounds[-1].curve_pct),
+            rounds=tuple(rounds),
+            lines=count,
+        )
+
+    def _lines(self, kernel: Kernel, n: int) -> Lines:
+        """Steps (d) to (h) for all frames."""
+        frames = self.transit.frames
+        scenes = self._deconvolved(kernel, n)
+        rng = np.random.default_rng([self.seed, n])
+        parts = []
+        for k, frame in enumerate(frames):
+            self.progress(f"round {n + 1}: equations", k, len(frames))
+            found = find_occulter(
+                k, frames, scenes, [f.place for f in frames], kernel, self.transit.noise
+            )  # step (e)
+            part = self._frame_lines(frame, scenes[k], found, rng)
+            if part is not None:
+                parts.append(part)
+        if not parts:
+            raise DataError("no-lines", "expected occulted pixels in the images; got none")
+        return Lines.joined(parts)
+
+    def _deconvolved(self, kernel: Kernel, n: int) -> list[NDArray[np.float32]]:
+        """Step (d)."""
+        psf = Psf(kernel, name="round", version=str(n), instrument=None, status="draft")
+        conditions = Conditions(edges="zero", margin_px=0, threads=self.threads, engine_for=EngineCache())
+        scenes = []
+        for k, frame in enumerate(self.transit.frames):
+            self.progress(f"round {n + 1}: deconvolving", k, len(self.transit.frames))
+            image = Image(
+                pixels=frame.pixels.astype(np.float64),
+                mask=np.zeros(frame.pixels.shape, np.uint8),
+                header=Header(),
+                unit="DN/s",
+                exposure_s=frame.exposure_s,
+            )
+            scenes.append(deconvolve(image, psf, conditions, steps=LUCY_STEPS).pixels.astype(np.float32))
+        return scenes
+
+    def _frame_lines(
+        self, frame: Frame, scene: NDArray[np.float32], found: FoundPlace, rng: np.random.Generator
+    ) -> Lines | None:
+        """Steps (f) to (h) for one frame; None where no pixel of it is occulted."""
+        shape, place = self.transit.shape, found.place
+        distance = disc_distance(shape, place)
+        within = distance <= place.radius_px
+        blanked = within if self.choices.whole_disc_blanked else fully_dark(shape, place)
+        true = np.where(blanked, np.float32(0), scene)  # step (f)
+        occulted = distance <= place.radius_px - SHRUNK_PX
+        if frame.filled is not None:
+            occulted &= ~frame.filled
+        rows, columns = np.nonzero(occulted)
+        if rows.size == 0:
+            return None
+        lit = np.flatnonzero((~within & (distance <= place.radius_px + LIT_WITHIN_PX)).ravel())
+        lit = rng.choice(lit, min(LIT_A_FRAME, lit.size), replace=False)
+        targets = np.concatenate(
+            (np.stack((rows, columns), axis=1), np.stack(np.unravel_index(lit, shape), axis=1))
+        )
+        stratum = np.floor(place.radius_px - SHRUNK_PX - distance[rows, columns]).astype(np.int64)  # step (g)
+        stratum = np.concatenate((np.maximum(stratum, 0), np.full(lit.size, LIT)))
+        observed = frame.pixels[targets[:, 0], targets[:, 1]].astype(np.float64)
+        diffracted = self.diffract.apply(true)
+        summed = true if self.choices.added else diffracted
+        return Lines(
+            observed=observed,
+            ring_sums=segment_sums(summed, targets, self.segments, threads=self.threads),
+            unscattered=diffracted[targets[:, 0], targets[:, 1]].astype(np.float64),
+            scale=self._scale(frame, observed, stratum),
+            stratum=stratum,
+        )  # step (h)
+
+    def _scale(self, frame: Frame, observed: Vector, stratum: NDArray[np.int64]) -> Vector:
+        """What each line is divided by."""
+        level = np.empty_like(observed)
+        for here in (stratum == LIT, stratum != LIT):
+            level[here] = max(float(observed[here].mean()), LEAST_LEVEL_DN_S) if here.any() else 1.0
+        if self.choices.weighed_by_observed:
+            return np.maximum(observed, LEAST_OF_MEAN * level)
+        return np.sqrt(self.transit.noise.variance(level, frame.exposure_s))
+
+    def _free_kernel(self, coefficients: Vector) -> Kernel:
+        label = self.segments.label_map(self.grid)
+        kernel = np.where(label >= 0, coefficients[np.maximum(label, 0)], 0.0)
+        kernel[self.grid // 2, self.grid // 2] = 1 - kernel.sum()
+        return np.asarray(kernel)
+
+
+def _check_brightest_at_centre(kernel: Kernel, found: str) -> None:
+    """A PSF that is fainter at its centre than beside it is no smear of a point: no image can be freed of it."""
+    middle = (kernel.shape[0] // 2, kernel.shape[1] // 2)
+    if kernel[middle] < kernel.max() * (1 - CENTRE_TOLERANCE):
+        y, x = np.unravel_index(int(kernel.argmax()), kernel.shape)
+        distance = np.hypot(y - middle[0], x - middle[1])
+        raise DataError(
+            "no-scatter",
+            f"{found}: expected a PSF that is brightest at its centre; got {kernel[middle]:.3g} of the light there "
+            f"and {kernel.max():.3g} in a pixel {distance:.3g} px from it",
+        )
+
+
+def _spread(fitted: PowerLawDrawn) -> dict[str, float] | None:
+    """Standard deviations of a, b and c over the draws; none of fewer than two."""
+    if len(fitted.fits) < 2:
+        return None
+    return dict(zip(("a", "b_px", "c"), fitted.fits.std(axis=0, ddof=1).tolist(), strict=True))
+
+
+def _power_law_kernel(law: Vector, size: int) -> Kernel:
+    a, b, c = law
+    kernel = a * (b + np.sqrt(squared_radii((size, size)))) ** -c
+    kernel[size // 2, size // 2] = 0.0
+    kernel[size // 2, size // 2] = 1 - kernel.sum()
+    return np.asarray(kernel)
+
+
+def _radii_of(segments: Segments) -> list[tuple[Vector, Vector]]:
+    """For each segment the distances of its pixels and how many have each; far ones thinned to rings 0.1 px wide."""
+    squares, count = np.unique(
+        squared_radii((segments.reach_grid_px, segments.reach_grid_px)), return_counts=True
+    )
+    radius = np.sqrt(squares)
+    shell = np.searchsorted(segments.edges_px, radius, side="right") - 1
+    out = []
+    for k in range(segments.shells):
+        here = shell == k
+        r, n = radius[here], count[here].astype(np.float64)
+        if r.size > 40:
+            ring = np.linspace(0, 40, r.size, endpoint=False).astype(int)
+            total = np.bincount(ring, weights=n)
+            r, n = np.bincount(ring, weights=n * r) / total, total
+        out.append((r, n) if r.size else (np.array([segments.edges_px[k]]), np.zeros(1)))
+    return out

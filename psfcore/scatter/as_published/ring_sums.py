@@ -1,0 +1,191 @@
+"""Sums of an image over the segments of the PSF round many targets.
+
+Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", step (h):
+
+    A_S[r] = sum over dr in S of I[r - dr]                                                   Eq. (1)
+
+for targets r, with I = 0 beyond the image. A segment is a few runs of neighbouring pixels in each row, so with running
+sums along the image's rows each run costs one difference, whatever its length:
+
+    P[y, i] = sum over x < i of I[y, x]                                                      Eq. (2)
+    sum over dx_start <= dx < dx_stop of I[y, x - dx] = P[y, x - dx_start + 1] - P[y, x - dx_stop + 1]    Eq. (3)
+
+Targets come in strips of up to 24 neighbours of a row, which read neighbours of P and are summed as vectors. Rows of
+the image are taken four at a time, whose running sums stay in cache while all strips use them.
+
+| symbol | name |
+|---|---|
+| I | image[y, x] |
+| r | targets, (y, x) |
+| dr = (dx, dy) | offset, target minus source, px |
+| P | running |
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from psfcore.compiled import compiled
+from psfcore.errors import DataError
+from psfcore.scatter.as_published.segments import Runs, Segments
+
+LANES = 24
+_ROWS = 4
+_VECTOR = 4  # a strip is as many lanes as whole vectors hold
+_LARGEST_SUMS = 2**20  # numbers held by one thread while it works: 8 MiB
+
+Sums = NDArray[np.float64]
+
+
+def segment_sums(
+    image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments, *, threads: int = 1
+) -> Sums:
+    """A_S, Eq. (1), (n, segments.size) in the image's unit times px^2, exact but for float64's rounding.
+
+    image: [y, x], float32 or float64. targets: (n, 2), (y, x) on the image, in any order. Light beyond the image
+    counts as dark. threads: each takes a part of the targets; the result is the same for any number.
+    Raises DataError "image-nonfinite" when a pixel is NaN or infinite, ValueError when the image has not two axes or a
+    target lies off it.
+    """
+    _check(image, targets)
+    out = np.zeros((len(targets), segments.size))
+    if len(targets) == 0:
+        return out
+    image = np.ascontiguousarray(image, dtype=np.float32 if image.dtype == np.float32 else np.float64)
+    order = np.lexsort((targets[:, 1], targets[:, 0]))
+    ordered = np.ascontiguousarray(targets[order], dtype=np.int64)
+    strip, strip_yx = _strips(ordered)
+    runs = segments.runs
+    if runs.segment.size == 0:
+        return out
+    places = _places(strip_yx, runs)
+
+    def work(part: slice) -> None:
+        mine = slice(*np.searchsorted(strip, (part.start, part.stop)))
+        lane = ordered[mine, 1] - strip_yx[strip[mine], 1]
+        lanes = -(-(int(lane.max()) + 1) // _VECTOR) * _VECTOR
+        sums = np.zeros((part.stop - part.start, segments.size, lanes))
+        _sum_strips(image, strip_yx[part], runs, places, sums)
+        out[order[mine]] = sums[strip[mine] - part.start, :, lane]
+
+    largest = max(1, _LARGEST_SUMS // (segments.size * LANES))
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(work, _parts(len(strip_yx), threads, largest)))
+    return out
+
+
+def ring_sums(
+    image: NDArray[np.floating], targets: NDArray[np.integer], edges_px: ArrayLike, *, threads: int = 1
+) -> Sums:
+    """A_S of plain rings, (n, shells): `segment_sums` for `Segments(edges_px)`, which is kept for the next image."""
+    return segment_sums(image, targets, _rings(tuple(np.asarray(edges_px, float).tolist())), threads=threads)
+
+
+@lru_cache(maxsize=4)
+def _rings(edges_px: tuple[float, ...]) -> Segments:
+    return Segments(edges_px)
+
+
+def _check(image: NDArray[np.floating], targets: NDArray[np.integer]) -> None:
+    if image.ndim != 2:
+        raise ValueError(f"expected an image on two axes, got shape {image.shape}")
+    if targets.ndim != 2 or targets.shape[1] != 2 or not np.issubdtype(targets.dtype, np.integer):
+        raise ValueError(f"expected whole-numbered targets (n, 2), got {targets.shape} of {targets.dtype}")
+    if not ((targets >= 0) & (targets < image.shape)).all():
+        raise ValueError(f"expected targets (y, x) on the image of {image.shape}, got one off it")
+    if not np.isfinite(image).all():
+        bad = int(np.count_nonzero(~np.isfinite(image)))
+        raise DataError("image-nonfinite", f"expected finite pixels; got {bad} that are NaN or infinite")
+
+
+def _parts(strips: int, threads: int, largest: int) -> list[slice]:
+    """Strips shared out evenly: a part for each thread, or more where its sums would outgrow the cache."""
+    count = min(strips, threads * -(-strips // (threads * largest)))
+    bounds = [strips * k // count for k in range(count + 1)]
+    return [slice(start, stop) for start, stop in pairwise(bounds)]
+
+
+@compiled()
+def _strips(targets):  # type: ignore[no-untyped-def]
+    """Strip of each target, and (y, x) of each strip's first pixel; targets are sorted by y, then x."""
+    strip = np.empty(len(targets), np.int64)
+    first = np.empty((len(targets), 2), np.int64)
+    count = 0
+    for i in range(len(targets)):
+        y, x = targets[i, 0], targets[i, 1]
+        if count == 0 or y != first[count - 1, 0] or x >= first[count - 1, 1] + LANES:
+            first[count, 0], first[count, 1] = y, x
+            count += 1
+        strip[i] = count - 1
+    return strip, first[:count].copy()
+
+
+def _places(strip_yx: NDArray[np.int64], runs: Runs) -> range:
+    """Places of P that any strip reads. The same for all parts: where P begins decides how it is rounded."""
+    first = strip_yx[:, 1].min() - runs.dx_stop.max() + 1
+    last = strip_yx[:, 1].max() + LANES - runs.dx_start.min()
+    return range(int(first), int(last) + 1)
+
+
+def _sum_strips(
+    image: NDArray[np.floating], strip_yx: NDArray[np.int64], runs: Runs, places: range, sums: Sums
+) -> None:
+    """Eq. (1) for strips, added to `sums`, (strips, segments, lanes)."""
+    running = np.zeros((_ROWS, len(places)))
+    of_row = (runs.first_dy, runs.row, runs.dx_start, runs.dx_stop, runs.segment)
+    _accumulate(image, strip_yx, *of_row, places.start, running, sums)
+
+
+@compiled()
+def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
+    """Eq. (2) for four rows from `top` on, at places from `first` on; constant beyond the image's columns.
+
+    A row beyond the last is the last again. The four sums wait for each other's additions, not for their own.
+    """
+    ny, nx = image.shape
+    places = running.shape[1]
+    begin, end = max(0, first), min(nx, first + places - 1)
+    y0, y1, y2, y3 = top, min(top + 1, ny - 1), min(top + 2, ny - 1), min(top + 3, ny - 1)
+    t0 = t1 = t2 = t3 = 0.0
+    running[:, : max(0, min(places, begin - first + 1))] = 0.0
+    for x in range(begin, end):
+        t0 += image[y0, x]
+        t1 += image[y1, x]
+        t2 += image[y2, x]
+        t3 += image[y3, x]
+        i = x + 1 - first
+        running[0, i], running[1, i], running[2, i], running[3, i] = t0, t1, t2, t3
+    beyond = max(0, end + 1 - first)
+    running[0, beyond:], running[1, beyond:], running[2, beyond:], running[3, beyond:] = t0, t1, t2, t3
+
+
+@compiled()
+def _accumulate(image, strip_yx, first_dy, row, dx_start, dx_stop, segment, first, running, sums):  # type: ignore[no-untyped-def]
+    ny, lanes = image.shape[0], sums.shape[2]
+    rows_of_runs = len(row) - 1
+    lowest_y, highest_y = strip_yx[0, 0], strip_yx[-1, 0]
+    # dy = y - source y
+    top = max(0, lowest_y - (first_dy + rows_of_runs - 1))
+    bottom = min(ny, highest_y - first_dy + 1)
+    for y0 in range(top, bottom, _ROWS):
+        _running_sums(image, y0, first, running)
+        for s in range(len(strip_yx)):
+            base = strip_yx[s, 1] - first + 1
+            mine = sums[s].ravel()
+            for k in range(min(_ROWS, bottom - y0)):
+                j = strip_yx[s, 0] - (y0 + k) - first_dy
+                if j < 0 or j >= rows_of_runs:
+                    continue
+                p = running[k]
+                for i in range(row[j], row[j + 1]):
+                    # Eq. (3) for neighbouring targets: unsigned indices and a number of lanes that the compiler
+                    # does not know let it make vectors of them.
+                    high, low = np.uint64(base - dx_start[i]), np.uint64(base - dx_stop[i])
+                    a = np.uint64(segment[i]) * np.uint64(lanes)
+                    for w in range(lanes):
+                        mine[a + np.uint64(w)] += p[high + np.uint64(w)] - p[low + np.uint64(w)]

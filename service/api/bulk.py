@@ -1,0 +1,276 @@
+"""Bulk, many images deconvolved alike: ``/v1/bulk``."""
+
+from __future__ import annotations
+
+import logging
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import BaseModel, Field
+
+from psfcore.errors import DataError
+from service.http.callers import Bulk, Caller, Reading
+from service.http.paging import Cursor, Limit, Page, following, page, place, position
+from service.http.problems import RESPONSES, Problem
+from service.http.psf_problems import problem
+from service.http.quotas import check_room
+from service.http.state import Shared
+from workers.bulk import turns as bulk_turns
+from workers.bulk.intake import begin
+from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
+from workers.contract.bulk import AT_WORK, BulkPhase, BulkRequest, ItemState
+from workers.contract.contract import JobError
+
+log = logging.getLogger(__name__)
+router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)
+BulkId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
+LOOK_FROM = 1.0  # an artefact score from which on an image is to be looked at
+
+
+class Counts(BaseModel):
+    """How many images are how far."""
+
+    total: int = Field(description="as far as they are listed")
+    waiting: int
+    at_work: int
+    done: int
+    reused: int = Field(description="of those done: the product was there already")
+    failed: int
+    to_look_at: int = Field(description=f"of those done: with an artefact score of {LOOK_FROM:g} or more")
+
+
+class BulkView(BaseModel):
+    """A bulk."""
+
+    id: str
+    name: str
+    phase: BulkPhase
+    created_at: float
+    ended_at: float | None
+    psf_id: str | None = Field(
+        description="the PSF of all images; null: that which the context pins for each"
+    )
+    context_id: str | None
+    request: dict[str, Any] = Field(description="what was asked for, but for the ids of uploaded images")
+    images: Counts
+    images_an_hour: float | None = Field(description="by the last ones; null where nothing is known")
+    time_left_s: float | None
+    error: JobError | None = Field(description="why it could not go on")
+    results: str = Field(description="address of the manifest of what is done")
+    failures: str = Field(description="address of what failed, with reasons")
+    events: str = Field(description="address of its progress as server-sent events")
+
+    @classmethod
+    def of(cls, row: BulkRow, state: Shared) -> BulkView:
+        """The view of a row."""
+        pace = state.catalogue.bulks.pace(row)
+        here = f"/v1/bulk/{row.id}"
+        left = row.total - row.done - row.failed
+        rate = None if row.phase in (BulkPhase.PAUSED, BulkPhase.ERROR) else pace.images_an_hour
+        return cls(
+            id=row.id,
+            name=row.name,
+            phase=BulkPhase(row.phase),
+            created_at=row.created_at,
+            ended_at=row.ended_at,
+            psf_id=row.psf_id,
+            context_id=row.context_id,
+            request=row.request,
+            images=Counts(
+                total=row.total,
+                waiting=max(0, left - pace.taken),
+                at_work=pace.taken,
+                done=row.done,
+                reused=row.reused,
+                failed=row.failed,
+                to_look_at=state.catalogue.bulks.to_look_at(row.id, LOOK_FROM),
+            ),
+            images_an_hour=rate,
+            time_left_s=left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
+            error=JobError.model_validate(row.error) if row.error else None,
+            results=f"{here}/results",
+            failures=f"{here}/failures",
+            events=f"{here}/events",
+        )
+
+
+class BulkLine(BaseModel):
+    """A bulk, as a list shows it."""
+
+    id: str
+    name: str
+    phase: BulkPhase
+    created_at: float
+    ended_at: float | None
+    total: int
+    done: int
+    failed: int
+
+    @classmethod
+    def of(cls, row: BulkRow) -> BulkLine:
+        """The line of a row."""
+        return cls(
+            id=row.id,
+            name=row.name,
+            phase=BulkPhase(row.phase),
+            created_at=row.created_at,
+            ended_at=row.ended_at,
+            total=row.total,
+            done=row.done,
+            failed=row.failed,
+        )
+
+
+class Failed(BaseModel):
+    """An image that could not be deconvolved."""
+
+    position: int
+    source: str = Field(description="the upload's id, or the file's path")
+    attempts: int
+    ended_at: float | None
+    error: JobError
+
+    @classmethod
+    def of(cls, row: BulkItemRow) -> Failed:
+        """The view of a row."""
+        return cls(
+            position=row.position,
+            source=row.source,
+            attempts=row.attempts,
+            ended_at=row.ended_at,
+            error=JobError.model_validate(row.error),
+        )
+
+
+@router.post(
+    "",
+    status_code=202,
+    summary="Have many images deconvolved alike",
+    responses={200: {"model": BulkView, "description": "An equal request is open; this is its bulk."}},
+)
+def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shared) -> BulkView:
+    """Write the bulk down; workers list its files and do its images. People's jobs go before.
+
+    The PSF, or the context that pins one for each image, is fixed here. A product that is there is not made again.
+    """
+    if body.keeps_products:
+        check_room(state, caller.owner)
+    try:
+        row, new = begin(body, state.catalogue, caller.owner, state.settings)
+    except DataError as error:
+        raise problem(error) from error
+    if new:
+        log.info("bulk %s: asked for, %d uploads", row.id, row.total, extra={"fields": {"bulk": row.id}})
+        state.reconciler.wake()
+    response.status_code = 202 if new else 200
+    response.headers["Location"] = f"/v1/bulk/{row.id}"
+    return BulkView.of(row, state)
+
+
+@router.get("", summary="List bulks")
+def list_bulks(
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    phase: BulkPhase | None = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[BulkLine]:
+    """Bulks, newest first."""
+    rows = state.catalogue.page(
+        BulkRow, owner=caller.owner, limit=limit + 1, after=position(cursor), phase=phase
+    )
+    return page(request, rows, limit, BulkLine.of)
+
+
+@router.get("/{bulk_id}", summary="One bulk: how far it is, how fast, and until when")
+def get_bulk(bulk_id: BulkId, caller: Reading, state: Shared) -> BulkView:
+    """The bulk as it is now."""
+    return BulkView.of(find(state, caller, bulk_id), state)
+
+
+@router.get("/{bulk_id}/failures", summary="Images that failed, with reasons")
+def list_failures(
+    bulk_id: BulkId,
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    limit: Annotated[int, Query(ge=1, le=200, description="rows a page")] = 50,
+    cursor: Cursor = None,
+) -> Page[Failed]:
+    """What failed, in the bulk's order."""
+    row = find(state, caller, bulk_id)
+    after = _after(cursor)
+    items = state.catalogue.bulks.items(row.id, ItemState.FAILED, after=after, limit=limit + 1)
+    next_page = following(request, str(items[limit - 1].position)) if len(items) > limit else None
+    return Page(items=[Failed.of(item) for item in items[:limit]], next=next_page)
+
+
+@router.post("/{bulk_id}/pause", summary="Pause a bulk")
+def pause_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
+    """Begin no more images; those at work are let end."""
+    row = find(state, caller, bulk_id)
+    _done(state.catalogue.bulks.pause(row.id), row, "LISTING or RUNNING")
+    return BulkView.of(find(state, caller, bulk_id), state)
+
+
+@router.post("/{bulk_id}/resume", summary="Let a bulk go on")
+def resume_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
+    """Go on where it was."""
+    row = find(state, caller, bulk_id)
+    _done(state.catalogue.bulks.resume(row.id), row, "PAUSED or ERROR")
+    state.reconciler.wake()
+    return BulkView.of(find(state, caller, bulk_id), state)
+
+
+@router.post("/{bulk_id}/cancel", summary="Cancel a bulk")
+def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
+    """End it: images at work stop within a step. What is done stays."""
+    row = find(state, caller, bulk_id)
+    _done(state.catalogue.bulks.cancel(row.id), row, "any but COMPLETED and CANCELLED")
+    bulk_turns.cancel_turns(state.catalogue, row.id)
+    return BulkView.of(find(state, caller, bulk_id), state)
+
+
+@router.post("/{bulk_id}/retry", summary="Try again what failed")
+def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
+    """Let the images that failed wait again; what is done stays done.
+
+    An equal request that was sent since the bulk ended is open as a bulk of its own: 409 names it until it has ended.
+    """
+    row = find(state, caller, bulk_id)
+    try:
+        changed = state.catalogue.bulks.retry(row.id)
+    except DataError as error:
+        raise Problem(409, error.code, error.message) from error
+    _done(changed is not None, row, "any but CANCELLED")
+    state.reconciler.wake()
+    return BulkView.of(find(state, caller, bulk_id), state)
+
+
+def find(state: Shared, caller: Caller, bulk_id: str) -> BulkRow:
+    """The bulk's row; ``Problem`` 404 where there is none of the caller's."""
+    row = state.catalogue.bulks.get(bulk_id)
+    if row is None or row.owner != caller.owner:
+        raise Problem(404, "no-such-bulk", f"there is no bulk with id {bulk_id}")
+    return row
+
+
+def goes_on(row: BulkRow) -> bool:
+    """Whether something may still happen to a bulk without anybody asking."""
+    return row.phase in AT_WORK
+
+
+def _done(changed: bool, row: BulkRow, expected: str) -> None:
+    if not changed:
+        raise Problem(409, "wrong-phase", f"expected a bulk whose phase is {expected}; it is {row.phase}")
+
+
+def _after(cursor: str | None) -> int:
+    """The position in a cursor; ``Problem`` 422 where it is none of ours."""
+    parts = place(cursor, 1)
+    if parts is None:
+        return -1
+    if not parts[0].isdecimal() or len(parts[0]) > 9:
+        raise Problem(422, "bad-cursor", "expected the cursor of an earlier page's `next`")
+    return int(parts[0])

@@ -1,0 +1,167 @@
+"""Progress as server-sent events: ``/v1/jobs/{id}/events`` and ``/v1/bulk/{id}/events``.
+
+Read off the rows, which any server sees, once in ``LOOK_EVERY_S`` a stream. An event's id says what the row said, so
+that a client which comes back with it (``Last-Event-ID``) is told of what changed meanwhile, and of nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import logging
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.types import Receive, Scope, Send
+
+from service.api.bulk import BulkId, BulkView
+from service.api.bulk import find as find_bulk
+from service.api.jobs import JobId, JobView
+from service.api.jobs import find as find_job
+from service.http.callers import Reading
+from service.http.problems import RESPONSES
+from service.http.state import Shared
+from workers.contract.bulk import BULK_ENDED, BulkPhase
+from workers.contract.contract import Phase
+
+log = logging.getLogger(__name__)
+LOOK_EVERY_S = 0.5
+ALIVE_EVERY_S = 15.0
+COME_BACK_MS = 2000
+TYPE = "text/event-stream"
+
+router = APIRouter(tags=["events"], responses=RESPONSES)
+LastId = Annotated[str | None, Header(alias="Last-Event-ID", max_length=64)]
+DESCRIBED: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Events `progress`, each with the whole view as its data, and `end` as the last one.",
+        "content": {TYPE: {}},
+    },
+    204: {"description": "The last event that the client names was the end: there is nothing more to come."},
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a row says now: an id for it, the view of it, whether it is the last."""
+
+    id: str
+    view: Callable[[], BaseModel]
+    ended: bool
+
+
+Look = Callable[[], Seen | None]  # none: the row is gone
+
+
+@router.get(
+    "/v1/jobs/{job_id}/events",
+    summary="A job's progress as events",
+    response_class=Response,
+    responses=DESCRIBED,
+)
+async def follow_job(
+    job_id: JobId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
+) -> Response:
+    """The job now and whenever it changes, until it ends."""
+    await run_in_threadpool(find_job, state, caller, job_id)
+
+    def look() -> Seen | None:
+        row = state.catalogue.jobs.get(job_id)
+        if row is None:
+            return None
+        said = (row.phase, row.attempt, row.stage, row.step, row.steps, row.cancel_requested, row.queue)
+        return Seen(_id(*said), lambda: JobView.of(row), Phase(row.phase).ended)
+
+    return await _stream(request, state, caller.name, look, last_id)
+
+
+@router.get(
+    "/v1/bulk/{bulk_id}/events",
+    summary="A bulk's progress as events",
+    response_class=Response,
+    responses=DESCRIBED,
+)
+async def follow_bulk(
+    bulk_id: BulkId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
+) -> Response:
+    """The bulk now and whenever it changes, until it ends. One that is paused goes on being followed."""
+    await run_in_threadpool(find_bulk, state, caller, bulk_id)
+
+    def look() -> Seen | None:
+        row = state.catalogue.bulks.get(bulk_id)
+        if row is None:
+            return None
+        said = (row.phase, row.total, row.done, row.failed)
+        return Seen(_id(*said), lambda: BulkView.of(row, state), BulkPhase(row.phase) in BULK_ENDED)
+
+    return await _stream(request, state, caller.name, look, last_id)
+
+
+class _Stream(StreamingResponse):
+    """Gives its place back, however it ends."""
+
+    def __init__(self, events: AsyncIterator[str], close: Callable[[], None]) -> None:
+        # Proxies that gather what they pass on would hold events back.
+        super().__init__(events, media_type=TYPE, headers={"X-Accel-Buffering": "no"})
+        self._close = close
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._close()
+
+
+async def _stream(request: Request, state: Shared, who: str, look: Look, last_id: str | None) -> Response:
+    now = await run_in_threadpool(look)
+    if now is not None and now.ended and now.id == last_id:
+        return Response(status_code=204)  # what tells a browser not to come back
+    state.streams.open(who)
+    ends_at = time.monotonic() + state.settings.stream_s
+
+    def over() -> bool:
+        return time.monotonic() > ends_at or getattr(request.app.state, "stopping", False)
+
+    events = _events(look, over, last_id)
+    return _Stream(events, lambda: state.streams.close(who))
+
+
+async def _events(look: Look, over: Callable[[], bool], last_id: str | None) -> AsyncIterator[str]:
+    yield f"retry: {COME_BACK_MS}\n\n"
+    said_at = time.monotonic()
+    while not over():
+        try:
+            now = await run_in_threadpool(look)
+            text = await run_in_threadpool(_event, now, last_id)
+        except SQLAlchemyError as error:
+            log.warning("a stream of events waits for the database: %s", str(error).splitlines()[0])
+            now, text = Seen(last_id or "", BaseModel, False), ""
+        if text or time.monotonic() - said_at > ALIVE_EVERY_S:
+            said_at = time.monotonic()
+            yield text or ": still here\n\n"
+        if now is None or now.ended:
+            return
+        last_id = now.id
+        await asyncio.sleep(LOOK_EVERY_S)
+
+
+def _event(now: Seen | None, last_id: str | None) -> str:
+    """The event for what is seen; nothing where the client knows it."""
+    if now is None:
+        return "event: gone\ndata: {}\n\n"
+    if now.id == last_id and not now.ended:
+        return ""
+    name = "end" if now.ended else "progress"
+    return f"id: {now.id}\nevent: {name}\ndata: {now.view().model_dump_json()}\n\n"
+
+
+def _id(*said: object) -> str:
+    return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:16]

@@ -1,0 +1,76 @@
+"""Uploaded images: ``/v1/images``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, Field
+
+from service.http import uploads
+from service.http.callers import Reading, Submitting
+from service.http.paging import Cursor, Limit, Page, page, position
+from service.http.problems import RESPONSES, Problem
+from service.http.quotas import Allowed
+from service.http.state import Shared
+from workers.catalogue.tables import ImageRow
+from workers.contract.contract import Identity
+from workers.intake.requests import image_row
+
+router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)
+
+
+class ImageView(BaseModel):
+    """An uploaded image."""
+
+    id: str = Field(description="SHA-256 of the file")
+    created_at: float
+    bytes: int
+    filename: str | None
+    header: dict[str, Any] = Field(description="what the FITS header says")
+
+    @classmethod
+    def of(cls, row: ImageRow) -> ImageView:
+        """The view of a row."""
+        return cls(
+            id=row.id, created_at=row.created_at, bytes=row.bytes, filename=row.filename, header=row.summary
+        )
+
+
+@router.post(
+    "",
+    status_code=201,
+    summary="Upload a FITS image",
+    openapi_extra=uploads.OPENAPI_BODY,
+    responses={200: {"model": ImageView, "description": "The same file was uploaded before."}},
+)
+async def upload_image(request: Request, response: Response, caller: Submitting, state: Shared) -> ImageView:
+    """Stream one FITS file in. Its header is inspected; its pixels are not touched here."""
+    take = Allowed(state, caller)
+    limit = state.settings.max_upload_bytes
+    async with uploads.receive(request, state.store, state.limits, limit, take) as upload:
+        await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
+    row = image_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
+    row, new = await run_in_threadpool(take.add, row)
+    response.status_code = 201 if new else 200
+    response.headers["Location"] = f"/v1/images/{row.id}"
+    return ImageView.of(row)
+
+
+@router.get("", summary="List uploaded images")
+def list_images(
+    request: Request, caller: Reading, state: Shared, limit: Limit = 50, cursor: Cursor = None
+) -> Page[ImageView]:
+    """Uploaded images, newest first."""
+    rows = state.catalogue.page(ImageRow, owner=caller.owner, limit=limit + 1, after=position(cursor))
+    return page(request, rows, limit, ImageView.of)
+
+
+@router.get("/{image_id}", summary="One uploaded image")
+def get_image(image_id: Identity, caller: Reading, state: Shared) -> ImageView:
+    """What is known of an uploaded image."""
+    row = state.catalogue.get(ImageRow, image_id, caller.owner)
+    if row is None:
+        raise Problem(404, "no-such-image", f"no image was uploaded with id {image_id}")
+    return ImageView.of(row)

@@ -1,0 +1,60 @@
+"""Where a PSF or a product came from, and whether it comes out the same again: ``.../lineage``, ``.../rerun``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from fastapi import APIRouter, Response
+
+from psfcore.errors import DataError
+from service.api.jobs import JobView, submit_job
+from service.http.callers import Reading, Submitting
+from service.http.problems import RESPONSES
+from service.http.psf_problems import problem
+from service.http.state import Shared
+from workers.catalogue.tables import ProductRow, PsfRow
+from workers.contract.contract import Identity, Rerun, RerunRequest
+from workers.lineage import Ancestor, lineage
+
+router = APIRouter(tags=["lineage"], responses=RESPONSES)
+
+
+@router.get("/v1/psfs/{psf_id}/lineage", summary="Where a PSF came from")
+def get_psf_lineage(psf_id: Identity, caller: Reading, state: Shared) -> Ancestor:
+    """Inputs by hash, parameters, versions of code and libraries, jobs; and the same of every PSF that it came from."""
+    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
+    if row is None:
+        raise _missing("psf", psf_id)
+    return lineage(state.catalogue, row)
+
+
+@router.get("/v1/products/{product_id}/lineage", summary="Where a product came from")
+def get_product_lineage(product_id: Identity, caller: Reading, state: Shared) -> Ancestor:
+    """Its image, its parameters, versions of code and libraries, its job; and the same of its PSF and that one's."""
+    row = state.catalogue.get(ProductRow, product_id, caller.owner)
+    if row is None:
+        raise _missing("product", product_id)
+    return lineage(state.catalogue, row)
+
+
+@router.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again, and compare")
+def rerun_psf(psf_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
+    """A job with the parameters that the PSF was made with; its result is a report on what differs from the first."""
+    return _rerun("psf", psf_id, response, caller, state)
+
+
+@router.post("/v1/products/{product_id}/rerun", status_code=202, summary="Make a product again, and compare")
+def rerun_product(product_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
+    """A job with the parameters that the product was made with; its result is a report on what differs from the first."""
+    return _rerun("product", product_id, response, caller, state)
+
+
+def _rerun(
+    of: Literal["product", "psf"], identity: str, response: Response, caller: Submitting, state: Shared
+) -> JobView:
+    asked = RerunRequest(kind="rerun", parameters=Rerun(of=of, id=identity))
+    return submit_job(asked, response, caller, state)
+
+
+def _missing(of: str, identity: str) -> Exception:
+    return problem(DataError(f"no-such-{of}", f"the catalogue holds no {of} with id {identity}"))

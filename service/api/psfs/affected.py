@@ -1,0 +1,92 @@
+"""Products made with PSFs that are no longer to be used: ``/v1/affected``, ``/v1/psfs/{id}/affected``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, Field
+
+from psfcore.errors import DataError
+from service.http import paging
+from service.http.callers import Reading
+from service.http.paging import Cursor, Limit, Page
+from service.http.problems import RESPONSES
+from service.http.psf_problems import problem
+from service.http.state import Shared
+from workers.catalogue.affected import Affected, Place
+from workers.catalogue.tables import PsfRow
+from workers.contract.contract import Identity
+
+router = APIRouter(tags=["PSFs"], responses=RESPONSES)
+
+
+class AffectedView(BaseModel):
+    """A product, the PSF that it was made with, and what to make it again with."""
+
+    product_id: str
+    image_id: str
+    created_at: float
+    psf_id: str
+    psf_version: str = Field(description="as it was called when the product was made")
+    psf_status: str
+    successor: str | None
+    redo_with: str | None = Field(
+        description="the certified PSF at the end of the successors; null: there is none"
+    )
+
+    @classmethod
+    def of(cls, one: Affected) -> AffectedView:
+        """The view of a product and its PSF."""
+        return cls(
+            product_id=one.product.id,
+            image_id=one.product.image_id,
+            created_at=one.product.created_at,
+            psf_id=one.psf.id,
+            psf_version=one.product.psf_version,
+            psf_status=one.psf.status,
+            successor=one.psf.successor_id,
+            redo_with=None if one.redo_with is None else one.redo_with.id,
+        )
+
+
+@router.get("/v1/affected", summary="Products made with deprecated PSFs")
+def list_affected(
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    superseded: Annotated[bool, Query(description="those alone whose PSF has a successor")] = False,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[AffectedView]:
+    """Products whose PSF is deprecated: by PSF, and of each the newest first."""
+    at = paging.place(cursor, 3)
+    after = None if at is None else Place(at[0], paging.number(at[1]), at[2])
+    found = state.catalogue.affected.page(caller.owner, superseded=superseded, limit=limit + 1, after=after)
+    return _page(request, found, limit, whole=True)
+
+
+@router.get("/v1/psfs/{psf_id}/affected", summary="Products made with a PSF")
+def list_affected_by_psf(
+    psf_id: Identity,
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[AffectedView]:
+    """Products that were made with this PSF, whatever its status, newest first."""
+    psf = state.catalogue.get(PsfRow, psf_id, caller.owner)
+    if psf is None:
+        raise problem(DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}"))
+    found = state.catalogue.affected.of_psf(psf, limit=limit + 1, after=paging.position(cursor))
+    return _page(request, found, limit, whole=False)
+
+
+def _page(request: Request, found: list[Affected], limit: int, *, whole: bool) -> Page[AffectedView]:
+    following = None
+    if len(found) > limit:
+        last = found[limit - 1]
+        place = (repr(last.product.created_at), last.product.id)
+        following = paging.following(request, *((last.psf.id, *place) if whole else place))
+    return Page(items=[AffectedView.of(one) for one in found[:limit]], next=following)

@@ -1,0 +1,90 @@
+"""One PSF: the one that fits filters, ``/v1/psfs/best``, or an image, ``/v1/images/{id}/psf``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+from pydantic import BaseModel, Field
+
+from psfcore.errors import DataError
+from service.api.psfs.filters import Filters, InContext
+from service.api.psfs.versions import PsfView
+from service.http.callers import Reading
+from service.http.problems import RESPONSES, Problem
+from service.http.psf_problems import problem
+from service.http.state import Shared
+from workers.catalogue.tables import ImageRow
+from workers.contract.contract import Identity
+from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image
+from workers.versions.series import TOTAL, WORD
+from workers.versions.validity import iso
+
+router = APIRouter(tags=["PSFs"], responses=RESPONSES)
+
+
+class Choice(BaseModel):
+    """The one PSF that fits, and what it was looked for by."""
+
+    psf: PsfView
+    context: str | None = Field(description="id of the context that it was found in; null: among all PSFs")
+    instrument: str | None
+    channel: str | None
+    kind: str | None
+    valid_at: str | None = Field(description="the time that it is valid at; null: none was given")
+
+
+@router.get("/v1/psfs/best", summary="The one PSF that fits")
+def get_best_psf(caller: Reading, state: Shared, filters: Filters, context: InContext = None) -> Choice:
+    """The PSF with these properties; without a status and a context, of the certified ones.
+
+    404 says which filter left none; 409 names all that are left where there are several.
+    """
+    return _choice(lambda: look(state.catalogue, filters, caller.owner, context))
+
+
+@router.get("/v1/images/{image_id}/psf", summary="The PSF for an image")
+def get_psf_for_image(
+    image_id: Identity,
+    caller: Reading,
+    state: Shared,
+    context: InContext = None,
+    kind: Annotated[str, Query(pattern=WORD)] = TOTAL,
+) -> Choice:
+    """The PSF of the image's instrument, channel and time of observation, by what its header says."""
+    row = state.catalogue.get(ImageRow, image_id, caller.owner)
+    if row is None:
+        raise Problem(404, "no-such-image", f"no image was uploaded with id {image_id}")
+    return _choice(lambda: look_for_image(state.catalogue, row.summary, caller.owner, context, kind))
+
+
+def _choice(search: Callable[[], Found]) -> Choice:
+    candidates: list[dict[str, str | None]] = []
+    try:
+        found = search()
+        candidates = [
+            {
+                "id": psf.id,
+                "name": psf.name,
+                "version": psf.version,
+                "status": psf.status,
+                "line": psf.line,
+                "valid_from": None if psf.valid_from is None else iso(psf.valid_from),
+                "valid_to": None if psf.valid_to is None else iso(psf.valid_to),
+            }
+            for psf in found.psfs[:MOST_NAMED]
+        ]
+        psf = found.one()
+    except DataError as error:
+        more = {"candidates": candidates} if error.code == "several-psfs-fit" else {}
+        raise problem(error, **more) from error
+    wanted = found.wanted
+    return Choice(
+        psf=PsfView.of(psf),
+        context=None if found.context is None else found.context.id,
+        instrument=wanted.instrument,
+        channel=wanted.channel,
+        kind=wanted.kind,
+        valid_at=None if wanted.valid_at is None else iso(wanted.valid_at),
+    )

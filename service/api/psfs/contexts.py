@@ -1,0 +1,200 @@
+"""Contexts, sets of PSFs that stay as they are: ``/v1/contexts``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from psfcore.errors import DataError
+from service.api.psfs.filters import TEXT
+from service.http.callers import Certifying, Reading
+from service.http.paging import Cursor, Limit, Page, page, position
+from service.http.problems import RESPONSES
+from service.http.psf_problems import problem
+from service.http.state import Shared
+from workers.catalogue.contexts import NAME, Pin
+from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow
+from workers.contract.contract import ContextName, Identity
+from workers.versions.validity import TIME, Validity, iso
+
+router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES)
+
+Time = Annotated[str, Field(pattern=TIME, description="as 2024-03-01T12:00:00Z; UTC without a zone")]
+Reason = Annotated[str, Field(max_length=400, pattern=TEXT, description="why, for those who ask later")]
+IdOrName = Annotated[
+    str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="its id or its name")
+]
+
+
+class PinAsked(BaseModel):
+    """A PSF to pin; without a range, for the one that it has."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    psf_id: Identity
+    valid_from: Time | None = None
+    valid_to: Time | None = None
+
+
+class ContextAsked(BaseModel):
+    """A context to make: of these PSFs, or of all that are certified now."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str = Field(pattern=NAME, description="not now, and not default")
+    reason: Reason = ""
+    pins: list[PinAsked] | None = Field(
+        None, max_length=10_000, description="null: all that is certified now"
+    )
+
+
+class PinView(BaseModel):
+    """The PSF of a line for a range of times of observation."""
+
+    line: str = Field(description="instrument/channel/kind")
+    valid_from: str | None = Field(description="null: from ever")
+    valid_to: str | None = Field(description="null: open")
+    psf_id: str
+    version: str = Field(description="the PSF's when it was pinned")
+
+    @classmethod
+    def of(cls, row: PsfPinRow) -> PinView:
+        """The view of a row."""
+        return cls(
+            line=row.line,
+            valid_from=iso(row.valid_from),
+            valid_to=iso(row.valid_to),
+            psf_id=row.psf_id,
+            version=row.version,
+        )
+
+
+class ContextView(BaseModel):
+    """A context. It never changes; a change is another context."""
+
+    id: str = Field(description="SHA-256 of its name and its pins")
+    name: str
+    created_at: float
+    created_by: str
+    reason: str
+    size: int = Field(description="how many pins it has")
+
+    @classmethod
+    def of(cls, row: PsfContextRow) -> ContextView:
+        """The view of a row."""
+        return cls(
+            id=row.id,
+            name=row.name,
+            created_at=row.created_at,
+            created_by=row.created_by,
+            reason=row.reason,
+            size=row.pins,
+        )
+
+
+class WholeContext(ContextView):
+    """A context with all that it pins."""
+
+    pins: list[PinView] = Field(description="by line and time")
+
+
+class DefaultAsked(BaseModel):
+    """The context that images are to be looked up in from now on."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    context: ContextName | None = Field(
+        description="its id or its name; null: what is certified at the moment"
+    )
+    reason: Reason = ""
+
+
+class Move(BaseModel):
+    """A move of the default."""
+
+    context: str | None
+    at: float
+    by: str
+    reason: str
+
+    @classmethod
+    def of(cls, row: DefaultContextRow) -> Move:
+        """The view of a row."""
+        return cls(context=row.context_id, at=row.at, by=row.by, reason=row.reason)
+
+
+class DefaultView(BaseModel):
+    """The default context, and where it was before."""
+
+    context: ContextView | None = Field(description="null: what is certified at the moment")
+    history: list[Move] = Field(description="the last 200 moves, the last first; all are kept")
+
+
+@router.post(
+    "",
+    status_code=201,
+    summary="Make a context",
+    responses={200: {"model": WholeContext, "description": "It was made before."}},
+)
+def create_context(body: ContextAsked, response: Response, caller: Certifying, state: Shared) -> WholeContext:
+    """Pin PSFs under a name: those given, or all that are certified now."""
+    contexts = state.catalogue.contexts
+    try:
+        pins = None if body.pins is None else [_pin(asked) for asked in body.pins]
+        row, new = contexts.create(body.name, caller.owner, caller.name, reason=body.reason, pins=pins)
+    except DataError as error:
+        raise problem(error) from error
+    response.status_code = 201 if new else 200
+    response.headers["Location"] = f"/v1/contexts/{row.id}"
+    return _whole(state, row)
+
+
+@router.get("", summary="List contexts")
+def list_contexts(
+    request: Request, caller: Reading, state: Shared, limit: Limit = 50, cursor: Cursor = None
+) -> Page[ContextView]:
+    """Contexts, newest first."""
+    rows = state.catalogue.page(PsfContextRow, owner=caller.owner, limit=limit + 1, after=position(cursor))
+    return page(request, rows, limit, ContextView.of)
+
+
+@router.get("/default", summary="The default context")
+def get_default_context(caller: Reading, state: Shared) -> DefaultView:
+    """The context that images are looked up in where a request names none."""
+    contexts = state.catalogue.contexts
+    row = contexts.default(caller.owner)
+    return DefaultView(
+        context=None if row is None else ContextView.of(row),
+        history=[Move.of(move) for move in contexts.default_changes(caller.owner)],
+    )
+
+
+@router.put("/default", summary="Move the default")
+def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
+    """Name another context, or none, as the default. Where it was before stays written down."""
+    try:
+        state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)
+    except DataError as error:
+        raise problem(error) from error
+    return get_default_context(caller, state)
+
+
+@router.get("/{context}", summary="One context, with its pins")
+def get_context(context: IdOrName, caller: Reading, state: Shared) -> WholeContext:
+    """What a context pins."""
+    try:
+        return _whole(state, state.catalogue.contexts.named(context, caller.owner))
+    except DataError as error:
+        raise problem(error) from error
+
+
+def _pin(asked: PinAsked) -> Pin:
+    told = {"valid_from", "valid_to"} & asked.model_fields_set
+    return Pin(asked.psf_id, Validity.of(asked.valid_from, asked.valid_to) if told else None)
+
+
+def _whole(state: Shared, row: PsfContextRow) -> WholeContext:
+    pins = state.catalogue.contexts.pins(row.id, row.owner)
+    return WholeContext(**ContextView.of(row).model_dump(), pins=[PinView.of(pin) for pin in pins])

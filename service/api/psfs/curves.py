@@ -1,0 +1,229 @@
+"""What a PSF says: questions about a version under ``/v1/psfs/{id}``, answered from its stored tables.
+
+The tables are made when a PSF is built or fitted. One that was uploaded, or made before there were tables, has none
+until a job ``psf-tables`` makes them: the web process holds no numerics, and an upload is not kept waiting.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+
+from psfcore.errors import DataError
+from psfcore.fits.cutout import cutout
+from psfcore.tables import lookup as psf_lookup
+from service.http import downloads as files
+from service.http.callers import Caller, Reading
+from service.http.problems import RESPONSES, Problem
+from service.http.state import Shared
+from workers.catalogue.tables import PsfRow
+from workers.contract.contract import Identity
+
+# Enters every ETag: raised by hand when an answer changes that the same tables give.
+ANSWERS_VERSION = 1
+STATUS_OF = {"cutout-not-plain": 409, "plate-scale-mismatch": 409}
+router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
+
+Radius = Annotated[float, Query(description="px, from the PSF's centre")]
+ByComponent = dict[str, list[float]]
+
+
+class PsfSaid(BaseModel):
+    """What stands in every answer: which PSF, and on what array its weights are."""
+
+    name: str
+    version: str
+    shape: list[int]
+    sum_on_array: float
+    central_weight: float
+    reach_px: float
+    plate_scale_arcsec: float | None
+
+
+class CurveAnswer(PsfSaid):
+    """Light beyond radii, in percent; TOTAL and each component by name."""
+
+    radii_px: list[float]
+    light_beyond_pct: ByComponent
+    sigma_points: ByComponent = Field(description="1-sigma errors; of a fitted PSF alone")
+    resolution: str = Field(description="what the table resolves, and by how much interpolation may be off")
+
+
+class ProfileAnswer(PsfSaid):
+    """Mean weight of a pixel by ring."""
+
+    radius_px: list[float]
+    pixels: list[int]
+    mean_weight: ByComponent
+    sigma: ByComponent = Field(description="1-sigma errors; of a fitted PSF alone")
+    azimuthal_rms_over_mean: list[float] = Field(description="how uneven TOTAL is round a ring")
+    resolution: str
+
+
+class EncircledAnswer(PsfSaid):
+    """Light within a radius, as a fraction of all light."""
+
+    radius_px: float
+    light_within: dict[str, float]
+    sigma: dict[str, float]
+    resolution: str
+
+
+class AnnulusAnswer(PsfSaid):
+    """Light between two radii, as a fraction of all light."""
+
+    inner_px: float
+    outer_px: float
+    light: dict[str, float]
+    sigma: dict[str, float]
+    resolution: str
+
+
+class ComparisonAnswer(BaseModel):
+    """Two PSFs, `other` minus `one`."""
+
+    one: PsfSaid
+    other: PsfSaid
+    radii_px: list[float]
+    difference_points: ByComponent = Field(description="of the light beyond each radius, percentage points")
+    sigma_points: ByComponent
+    largest_points: dict[str, float]
+    difference_of_sums: float
+    difference_of_central_weights: float
+    only_in_one: list[str]
+    only_in_other: list[str]
+    resolution: str
+
+
+@router.get("/{psf_id}/curve", summary="Light beyond radii", response_model=CurveAnswer)
+def get_curve(
+    psf_id: Identity,
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    radii: Annotated[
+        str | None, Query(max_length=12_000, description="px, as 1,10,100; none: those of the table")
+    ] = None,
+) -> Response:
+    """The cumulative curve, with errors where the PSF was fitted."""
+    wanted = None if radii is None else _numbers(radii)
+    return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.curve(tables, wanted))
+
+
+@router.get("/{psf_id}/profile", summary="Mean weight by radius", response_model=ProfileAnswer)
+def get_profile(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """The radial profile, and how uneven the PSF is round each ring."""
+    return _answer(request, caller, state, [psf_id], psf_lookup.profile)
+
+
+@router.get("/{psf_id}/encircled", summary="Light within a radius", response_model=EncircledAnswer)
+def get_encircled(
+    psf_id: Identity, radius: Radius, request: Request, caller: Reading, state: Shared
+) -> Response:
+    """Encircled energy."""
+    return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.encircled(tables, radius))
+
+
+@router.get("/{psf_id}/annulus", summary="Light between two radii", response_model=AnnulusAnswer)
+def get_annulus(
+    psf_id: Identity, inner: Radius, outer: Radius, request: Request, caller: Reading, state: Shared
+) -> Response:
+    """Light farther than `inner`, and not farther than `outer`."""
+    return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.annulus(tables, inner, outer))
+
+
+@router.get("/{psf_id}/compare/{other_id}", summary="Two PSFs side by side", response_model=ComparisonAnswer)
+def get_comparison(
+    psf_id: Identity, other_id: Identity, request: Request, caller: Reading, state: Shared
+) -> Response:
+    """Differences of curves in points and of totals, the second less the first."""
+    return _answer(request, caller, state, [psf_id, other_id], psf_lookup.compare)
+
+
+@router.get("/{psf_id}/cutout", summary="The middle of a PSF as FITS", response_class=Response)
+def get_cutout(
+    psf_id: Identity,
+    size: Annotated[int, Query(ge=1, description="edge in px, at most the PSF's own")],
+    request: Request,
+    caller: Reading,
+    state: Shared,
+) -> Response:
+    """The central weights, not renormalised, centre at [size // 2, size // 2]."""
+    row = _find(state, caller, psf_id)
+    headers = _headers(f"{row.file_sha256} cutout {size}")
+    if files.known(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    try:
+        content = cutout(state.store.path(row.file_sha256), size, state.limits)
+    except DataError as error:
+        raise _problem(error) from error
+    headers["Content-Disposition"] = f'attachment; filename="psf-{psf_id[:12]}-{size}px.fits"'
+    return Response(content, media_type=files.FITS_TYPE, headers=headers)
+
+
+def _answer(
+    request: Request, caller: Caller, state: Shared, psf_ids: list[str], ask: Callable[..., dict[str, Any]]
+) -> Response:
+    """The answer of the tables of these PSFs, or 304 where the client has it already."""
+    rows = [_find(state, caller, psf_id) for psf_id in psf_ids]
+    digests = [_tables_of(row) for row in rows]
+    headers = _headers(f"{' '.join(digests)} {request.url.path} {request.url.query}")
+    if files.known(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    tables = [_read(state, row, digest) for row, digest in zip(rows, digests, strict=True)]
+    try:
+        return JSONResponse(ask(*tables), headers=headers)
+    except DataError as error:
+        raise _problem(error) from error
+
+
+def _headers(what: str) -> dict[str, str]:
+    digest = hashlib.sha256(f"{ANSWERS_VERSION} {what}".encode()).hexdigest()
+    return {"ETag": f'"{digest}"', "Cache-Control": files.KEPT}
+
+
+def _read(state: Shared, row: PsfRow, digest: str) -> Mapping[str, Any]:
+    tables: dict[str, Any] = json.loads(state.store.path(digest).read_bytes())
+    if tables["schema"] != psf_lookup.SCHEMA:
+        raise _no_tables(row)
+    return tables
+
+
+def _tables_of(row: PsfRow) -> str:
+    digest = row.details.get("tables_sha256")
+    if digest is None:
+        raise _no_tables(row)
+    return str(digest)
+
+
+def _no_tables(row: PsfRow) -> Problem:
+    return Problem(
+        409,
+        "no-tables",
+        f"expected a PSF with tables; {row.name} {row.version} ({row.origin}) has none yet: the job "
+        f'{{"kind": "psf-tables", "parameters": {{"psf_id": "{row.id}"}}}} sent to /v1/jobs makes them',
+    )
+
+
+def _problem(error: DataError) -> Problem:
+    return Problem(STATUS_OF.get(error.code, 422), error.code, error.message)
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise Problem(422, "bad-radius", f"radii: expected numbers and commas; got {text!r:.60}") from error
+
+
+def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
+    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
+    if row is None:
+        raise Problem(404, "no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+    return row

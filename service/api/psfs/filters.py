@@ -1,0 +1,64 @@
+"""What PSFs are looked for by, as the query of an address."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Depends, Query
+
+from psfcore.errors import DataError
+from service.http.problems import Problem
+from service.http.psf_problems import problem
+from workers.catalogue.contexts import NOW
+from workers.catalogue.psfs import PsfFilter
+from workers.versions.status import PsfStatus
+from workers.versions.validity import TIME, seconds
+
+PRINTABLE = r"^[^\x00-\x1f\x7f]+$"
+TEXT = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"  # of people's words: PostgreSQL keeps no NUL
+Text = Annotated[str | None, Query(max_length=80, pattern=PRINTABLE)]
+Time = Annotated[
+    str | None,
+    Query(pattern=TIME, description="a time of observation, as 2024-03-01T12:00:00Z; UTC without a zone"),
+]
+InContext = Annotated[
+    str | None,
+    Query(
+        max_length=64, pattern=PRINTABLE, description=f"id or name of a context; {NOW}: what is certified now"
+    ),
+]
+
+
+def _filter(
+    instrument: Text = None,
+    channel: Annotated[
+        str | None,
+        Query(max_length=40, pattern=PRINTABLE, description="wavelength in whole angstrom, as 174"),
+    ] = None,
+    kind: Annotated[
+        str | None,
+        Query(
+            max_length=40,
+            pattern=PRINTABLE,
+            description="total, uploaded, or a component's name, as diffraction",
+        ),
+    ] = None,
+    name: Text = None,
+    version: Text = None,
+    status: PsfStatus | None = None,
+    valid_at: Time = None,
+) -> PsfFilter:
+    if valid_at is not None and status not in (None, PsfStatus.CERTIFIED):
+        raise Problem(
+            422,
+            "not-valid-at-any-time",
+            f"valid_at: expected it for certified PSFs; got it with status {status}",
+        )
+    try:
+        at = None if valid_at is None else seconds(valid_at, "valid_at")
+    except DataError as error:
+        raise problem(error) from error
+    return PsfFilter(instrument, channel, kind, name, version, None, status, at)
+
+
+Filters = Annotated[PsfFilter, Depends(_filter)]

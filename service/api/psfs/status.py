@@ -1,0 +1,151 @@
+"""How far a PSF may be trusted, and what it is valid for: ``/v1/psfs/{id}/status``."""
+
+from __future__ import annotations
+
+import logging
+from typing import Annotated
+
+from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
+
+from psfcore.errors import DataError
+from service.api.psfs.filters import TEXT
+from service.http.callers import Caller, Certifying, Reading
+from service.http.problems import RESPONSES
+from service.http.psf_problems import problem
+from service.http.state import Shared, State
+from workers.catalogue.psfs import StatusAsked
+from workers.catalogue.tables import PsfChangeRow, PsfRow
+from workers.contract.contract import Identity
+from workers.versions.series import WORD
+from workers.versions.status import MAY_BECOME, PsfStatus, next_version
+from workers.versions.validity import TIME, Validity, iso
+
+log = logging.getLogger(__name__)
+router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
+
+Time = Annotated[str, Field(pattern=TIME, description="as 2024-03-01T12:00:00Z; UTC without a zone")]
+Word = Annotated[str, Field(pattern=WORD)]
+
+
+class StatusChange(BaseModel):
+    """What a PSF is to become. A draft is certified; a certified PSF gets another range, or is deprecated."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    status: PsfStatus
+    reason: str = Field("", max_length=400, pattern=TEXT, description="why, for those who ask later")
+    version: str | None = Field(
+        None, max_length=40, description="of a draft: three numbers, as 1.2.0, that its line has not had"
+    )
+    valid_from: Time | None = Field(None, description="the first time of observation; null: from ever")
+    valid_to: Time | None = Field(None, description="the time before which it ends; null: open")
+    supersedes: list[Identity] = Field(
+        [], max_length=100, description="certified PSFs of the line that are deprecated in the same step"
+    )
+    successor: Identity | None = Field(
+        None, description="of a deprecated PSF: the certified one to use instead"
+    )
+    instrument: Word | None = Field(None, description="of a draft whose file names none")
+    channel: Word | None = Field(None, description="of a draft whose file names no wavelength")
+    kind: Word | None = Field(None, description="of a draft that was uploaded, as total")
+
+
+class Change(BaseModel):
+    """A change that was made."""
+
+    at: float
+    by: str
+    status_before: PsfStatus
+    status: PsfStatus
+    version_before: str
+    version: str
+    valid_from: str | None
+    valid_to: str | None
+    successor: str | None
+    reason: str
+
+    @classmethod
+    def of(cls, row: PsfChangeRow) -> Change:
+        """The view of a row."""
+        return cls(
+            at=row.at,
+            by=row.by,
+            status_before=PsfStatus(row.status_before),
+            status=PsfStatus(row.status),
+            version_before=row.version_before,
+            version=row.version,
+            valid_from=None if row.valid_from is None else iso(row.valid_from),
+            valid_to=None if row.valid_to is None else iso(row.valid_to),
+            successor=row.successor_id,
+            reason=row.reason,
+        )
+
+
+class StatusView(BaseModel):
+    """A PSF's status, what it may become, and how it came to this."""
+
+    id: str
+    status: PsfStatus
+    version: str
+    line: str | None = Field(description="instrument/channel/kind; null where the instrument is not known")
+    valid_from: str | None = Field(description="null: from ever, or never certified")
+    valid_to: str | None = Field(description="null: open, or never certified")
+    successor: str | None
+    may_become: list[PsfStatus]
+    next_version: str | None = Field(description="one that its line has not had; null where it has no line")
+    history: list[Change] = Field(description="the first change first; kept for ever")
+
+
+@router.get("/{psf_id}/status", summary="A PSF's status and its history")
+def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusView:
+    """What a PSF is, what it may become, and who made it so, when and why."""
+    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
+    if row is None:
+        raise problem(DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}"))
+    return _view(state, caller, row)
+
+
+@router.post("/{psf_id}/status", summary="Certify or deprecate a PSF")
+def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, state: Shared) -> StatusView:
+    """Certify a draft, change a certified PSF's range, deprecate it, or name a deprecated one's successor.
+
+    Ranges of certified PSFs of a line may not overlap: 409 names the one in the way.
+    """
+    try:
+        row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)
+    except DataError as error:
+        raise problem(error) from error
+    log.info("PSF %s: %s, version %s, by %s", row.id, row.status, row.version, caller.name)
+    return _view(state, caller, row)
+
+
+def _asked(body: StatusChange) -> StatusAsked:
+    told = {"valid_from", "valid_to"} & body.model_fields_set
+    return StatusAsked(
+        status=body.status,
+        reason=body.reason,
+        version=body.version,
+        validity=Validity.of(body.valid_from, body.valid_to) if told else None,
+        successor_id=body.successor,
+        supersedes=tuple(body.supersedes),
+        instrument=body.instrument,
+        channel=body.channel,
+        kind=body.kind,
+    )
+
+
+def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
+    psfs = state.catalogue.psfs
+    return StatusView(
+        id=row.id,
+        status=PsfStatus(row.status),
+        version=row.version,
+        line=row.line,
+        valid_from=None if row.valid_from is None else iso(row.valid_from),
+        valid_to=None if row.valid_to is None else iso(row.valid_to),
+        successor=row.successor_id,
+        may_become=sorted(MAY_BECOME[PsfStatus(row.status)]),
+        next_version=None if row.line is None else next_version(psfs.released(row.line, caller.owner)),
+        history=[Change.of(change) for change in psfs.changes(row.id, caller.owner)],
+    )

@@ -1,0 +1,207 @@
+"""PSF versions: ``/v1/psfs``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, Field
+
+from psfcore.errors import DataError
+from service.api.psfs.filters import PRINTABLE, Filters, InContext
+from service.http import downloads as files
+from service.http import uploads
+from service.http.callers import Caller, Reading, Submitting
+from service.http.paging import Cursor, Limit, Page, page, position
+from service.http.problems import RESPONSES, Problem
+from service.http.psf_problems import problem
+from service.http.quotas import Allowed
+from service.http.state import Shared
+from workers.catalogue.contexts import NOW
+from workers.catalogue.psfs import PsfFilter
+from workers.catalogue.tables import PsfRow
+from workers.contract.contract import Identity
+from workers.intake.requests import uploaded_psf_row
+from workers.versions.series import WORD
+from workers.versions.status import PsfStatus
+from workers.versions.validity import iso
+
+router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
+
+
+class PsfView(BaseModel):
+    """A PSF. Its content never changes: another content has another id. What changes is how far it is trusted."""
+
+    id: str
+    created_at: float
+    name: str
+    version: str
+    instrument: str | None
+    channel: str | None = Field(description="wavelength in whole angstrom; null where it is not known")
+    kind: str = Field(
+        description="total, a component's name as diffraction, or uploaded where nobody said which"
+    )
+    status: PsfStatus
+    valid_from: str | None = Field(description="time of observation; null: from ever, or never certified")
+    valid_to: str | None = Field(description="null: open, or never certified")
+    successor: str | None = Field(description="id of the PSF to use instead, of a deprecated one")
+    origin: str = Field(description="built here, fitted to a transit, or uploaded")
+    bytes: int
+    details: dict[str, Any] = Field(description="shape, curve, parameters, where it came from")
+    file: str = Field(description="address of the FITS file")
+    preview: str | None = Field(description="address of a picture; null for an uploaded PSF without tables")
+    report: str | None = Field(description="address of the fit's report; null where nothing was fitted")
+
+    @classmethod
+    def of(cls, row: PsfRow) -> PsfView:
+        """The view of a row."""
+        here = f"/v1/psfs/{row.id}"
+        return cls(
+            id=row.id,
+            created_at=row.created_at,
+            name=row.name,
+            version=row.version,
+            instrument=row.instrument,
+            channel=row.channel,
+            kind=row.kind,
+            status=PsfStatus(row.status),
+            valid_from=None if row.valid_from is None else iso(row.valid_from),
+            valid_to=None if row.valid_to is None else iso(row.valid_to),
+            successor=row.successor_id,
+            origin=row.origin,
+            bytes=row.bytes,
+            details=row.details,
+            file=f"{here}/file",
+            preview=f"{here}/preview" if row.preview_sha256 else None,
+            report=f"{here}/report" if "report_sha256" in row.details else None,
+        )
+
+
+@router.post(
+    "",
+    status_code=201,
+    summary="Upload a PSF of your own",
+    openapi_extra=uploads.OPENAPI_BODY,
+    responses={200: {"model": PsfView, "description": "The same file was uploaded before."}},
+)
+async def upload_psf(
+    request: Request,
+    response: Response,
+    caller: Submitting,
+    state: Shared,
+    name: Annotated[
+        str | None,
+        Query(max_length=80, pattern=PRINTABLE, description="default: PSFNAME, or the file's name"),
+    ] = None,
+    version: Annotated[
+        str | None, Query(max_length=40, pattern=PRINTABLE, description="default: PSFVERS, or 0.0.0+hash")
+    ] = None,
+    instrument: Annotated[
+        str | None, Query(pattern=WORD, description="default: DETECTOR or INSTRUME")
+    ] = None,
+    channel: Annotated[
+        str | None, Query(pattern=WORD, description="default: WAVELNTH in whole angstrom")
+    ] = None,
+    kind: Annotated[
+        str | None,
+        Query(
+            pattern=WORD,
+            description="total, for a whole PSF; default: uploaded, which images are not given unasked",
+        ),
+    ] = None,
+) -> PsfView:
+    """Stream a PSF in: one 2-D image, its centre at [n//2, n//2], its sum at most 1.
+
+    The header is inspected here; a job that uses the PSF says what its pixels lack.
+    """
+    take = Allowed(state, caller)
+    limit = state.settings.max_upload_bytes
+    async with uploads.receive(request, state.store, state.limits, limit, take) as upload:
+        await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
+    row = uploaded_psf_row(
+        caller.owner,
+        upload.sha256,
+        upload.bytes,
+        upload.filename,
+        upload.summary,
+        name=name,
+        version=version,
+        instrument=instrument,
+        channel=channel,
+        kind=kind,
+    )
+    row, new = await run_in_threadpool(take.add, row)
+    response.status_code = 201 if new else 200
+    response.headers["Location"] = f"/v1/psfs/{row.id}"
+    return PsfView.of(row)
+
+
+@router.get("", summary="List PSFs")
+def list_psfs(
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    filters: Filters,
+    context: InContext = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[PsfView]:
+    """PSFs, newest first; with a time, those that are certified for it, or that the context pins for it."""
+    try:
+        wanted = _in_context(state, caller, filters, context)
+    except DataError as error:
+        raise problem(error) from error
+    rows = state.catalogue.psfs.page(wanted, caller.owner, limit=limit + 1, after=position(cursor))
+    return page(request, rows, limit, PsfView.of)
+
+
+@router.get("/{psf_id}", summary="One PSF version")
+def get_psf(psf_id: Identity, caller: Reading, state: Shared) -> PsfView:
+    """What is known of a PSF version."""
+    return PsfView.of(_find(state, caller, psf_id))
+
+
+@router.get("/{psf_id}/file", summary="The PSF as FITS", response_class=Response)
+def get_psf_file(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """Download the PSF; its hash is the ETag."""
+    row = _find(state, caller, psf_id)
+    return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, f"psf-{psf_id[:12]}.fits")
+
+
+@router.get("/{psf_id}/preview", summary="A picture of the PSF", response_class=Response)
+def get_psf_preview(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """The PSF, its radial profile and its cumulative curve as PNG."""
+    row = _find(state, caller, psf_id)
+    if row.preview_sha256 is None:
+        raise Problem(404, "no-preview", "an uploaded PSF has no picture until a job psf-tables draws it")
+    return files.send(request, state.store, row.preview_sha256, "image/png", None)
+
+
+@router.get("/{psf_id}/report", summary="What a fit found, as JSON", response_class=Response)
+def get_psf_report(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """Parameters with errors, curves and bands, every image's residual, and what these data cannot say."""
+    digest = _find(state, caller, psf_id).details.get("report_sha256")
+    if digest is None:
+        raise Problem(
+            404, "no-report", "this PSF was not fitted to a transit; its details say where it is from"
+        )
+    return files.send(request, state.store, digest, "application/json", f"psf-{psf_id[:12]}.json")
+
+
+def _in_context(state: Shared, caller: Caller, filters: PsfFilter, context: str | None) -> PsfFilter:
+    """The filters with the context that a list is asked for in. Raises ``DataError`` "no-such-context"."""
+    if context is None:
+        return filters
+    if context == NOW:
+        return replace(filters, status=PsfStatus.CERTIFIED)
+    return replace(filters, context_id=state.catalogue.contexts.named(context, caller.owner).id)
+
+
+def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
+    """The PSF's row; ``Problem`` 404 where there is none."""
+    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
+    if row is None:
+        raise Problem(404, "no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+    return row

@@ -1,0 +1,129 @@
+"""Reports on transits: ``/v1/reports``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from pydantic import BaseModel, Field
+
+from service.http import downloads as files
+from service.http.callers import Caller, Reading
+from service.http.paging import Cursor, Limit, Page, page, position
+from service.http.problems import RESPONSES, Problem
+from service.http.state import Shared
+from workers.catalogue.tables import ReportRow
+from workers.contract.contract import Identity
+
+PAGE_POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'"
+)
+
+router = APIRouter(prefix="/v1/reports", tags=["reports"], responses=RESPONSES)
+
+
+class ReportView(BaseModel):
+    """What a study of a transit found."""
+
+    id: str
+    created_at: float
+    kind: str
+    transit_id: str | None = Field(description="null for a report on a rerun")
+    about_id: str | None = Field(description="the PSF or the product that was made again")
+    bytes: int
+    details: dict[str, Any] = Field(description="the sentence to read first, and the figures that matter")
+    file: str = Field(description="address of the whole report, JSON")
+    preview: str | None = Field(description="address of a picture")
+    html: str | None = Field(description="address of the report as a page to read, which needs nothing else")
+    output: str | None = Field(description="address of what a rerun made, which is in no list")
+
+    @classmethod
+    def of(cls, row: ReportRow) -> ReportView:
+        """The view of a row."""
+        here = f"/v1/reports/{row.id}"
+        return cls(
+            id=row.id,
+            created_at=row.created_at,
+            kind=row.kind,
+            transit_id=row.transit_id,
+            about_id=row.about_id,
+            bytes=row.bytes,
+            details=row.details,
+            file=f"{here}/file",
+            preview=f"{here}/preview" if row.preview_sha256 else None,
+            html=f"{here}/page" if row.details.get("page_sha256") else None,
+            output=f"{here}/output" if row.details.get("output_sha256") else None,
+        )
+
+
+@router.get("", summary="List reports")
+def list_reports(
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    transit_id: Identity | None = None,
+    about_id: Identity | None = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[ReportView]:
+    """Reports, newest first."""
+    rows = state.catalogue.page(
+        ReportRow,
+        owner=caller.owner,
+        limit=limit + 1,
+        after=position(cursor),
+        transit_id=transit_id,
+        about_id=about_id,
+    )
+    return page(request, rows, limit, ReportView.of)
+
+
+@router.get("/{report_id}", summary="One report")
+def get_report(report_id: Identity, caller: Reading, state: Shared) -> ReportView:
+    """What is known of a report."""
+    return ReportView.of(_find(state, caller, report_id))
+
+
+@router.get("/{report_id}/file", summary="The report as JSON", response_class=Response)
+def get_report_file(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """Download the report; its hash is the ETag."""
+    row = _find(state, caller, report_id)
+    return files.send(
+        request, state.store, row.file_sha256, "application/json", f"report-{report_id[:12]}.json"
+    )
+
+
+@router.get("/{report_id}/preview", summary="A picture of the report", response_class=Response)
+def get_report_preview(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """The report's figures as PNG."""
+    row = _find(state, caller, report_id)
+    if row.preview_sha256 is None:
+        raise Problem(404, "no-preview", "this report has no picture")
+    return files.send(request, state.store, row.preview_sha256, "image/png", None)
+
+
+@router.get("/{report_id}/page", summary="The report as a page to read", response_class=Response)
+def get_report_page(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """The report as HTML with its figures inside; the browser is told to load nothing else and to run no script."""
+    digest = _find(state, caller, report_id).details.get("page_sha256")
+    if digest is None:
+        raise Problem(404, "no-page", "this report has no page; its file and its picture are all there is")
+    answer = files.send(request, state.store, digest, "text/html; charset=utf-8", None)
+    answer.headers["Content-Security-Policy"] = PAGE_POLICY
+    return answer
+
+
+@router.get("/{report_id}/output", summary="What a rerun made, as FITS", response_class=Response)
+def get_report_output(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """The product or the PSF as it came out again."""
+    digest = _find(state, caller, report_id).details.get("output_sha256")
+    if digest is None:
+        raise Problem(404, "no-output", "this report is on no rerun: its file is all that its job made")
+    return files.send(request, state.store, digest, files.FITS_TYPE, f"again-{report_id[:12]}.fits")
+
+
+def _find(state: Shared, caller: Caller, report_id: str) -> ReportRow:
+    row = state.catalogue.get(ReportRow, report_id, caller.owner)
+    if row is None:
+        raise Problem(404, "no-such-report", f"there is no report with id {report_id}")
+    return row

@@ -1,0 +1,378 @@
+"""``heliopsf doctor``: what an operator would look at first, looked at in one command.
+
+Nothing is made and nothing is changed by it, and it needs nothing that runs: what is not there is what it finds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Literal
+from urllib.parse import urlsplit
+
+import click
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+
+from service.cli.operator.database import sentence
+from service.cli.options import OUTPUT_FOLDER, read_settings
+from workers import checks
+from workers.catalogue.catalogue import Catalogue
+from workers.files.opened import open_store
+from workers.settings import Settings, cores, software_version
+
+State = Literal["ok", "warning", "broken"]
+SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
+PINS = Path(__file__).parents[3] / "constraints.txt"
+CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+LITTLE_ROOM_BYTES = 5 * 2**30
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was looked at, how it is, what was found, and what to do where something is to be done."""
+
+    what: str
+    state: State
+    found: str
+    advice: str = ""
+
+
+@click.command()
+@click.option("--data", type=OUTPUT_FOLDER, help="Folder for everything kept")
+@click.option("--json", "as_json", is_flag=True, help="Say it as JSON")
+def doctor(data: Path | None, as_json: bool) -> None:
+    """Say what of the service's surroundings is well and what is not, and what to do. Status 1: something is broken."""
+    findings = examine(read_settings(data))
+    broken = any(finding.state == "broken" for finding in findings)
+    if as_json:
+        click.echo(json.dumps({"ok": not broken, "findings": [asdict(one) for one in findings]}, indent=1))
+    else:
+        for line in table(findings, shutil.get_terminal_size((110, 24)).columns):
+            click.echo(line)
+    sys.exit(1 if broken else 0)
+
+
+def examine(settings: Settings) -> list[Finding]:
+    """Everything, in the order in which one would mend it."""
+    findings = [versions(), threads(settings), storage(settings)]
+    findings += [object_store(settings)] if settings.store_url else []
+    findings.append(broker(settings))
+    with _catalogue(settings) as (catalogue, finding):
+        findings.append(finding)
+        if catalogue is not None:
+            looks: list[Callable[[Settings, Catalogue], Finding]] = [schema, clock, workers, stuck_jobs]
+            for look in looks:
+                try:
+                    findings.append(look(settings, catalogue))
+                except SQLAlchemyError as error:
+                    name = look.__name__.replace("_", " ")
+                    findings.append(
+                        Finding(name, "broken", f"the database does not say: {checks.database_said(error)}")
+                    )
+    return findings
+
+
+def table(findings: list[Finding], width: int) -> Iterator[str]:
+    """The findings as lines: what, state, what was found, and below it what to do."""
+    names = max(len(finding.what) for finding in findings)
+    indent = " " * (names + 11)
+    for finding in findings:
+        start = f"{finding.what:<{names}}  {finding.state:<7}  "
+        texts = [finding.found, *([f"-> {finding.advice}"] if finding.advice else [])]
+        lines = [line for text in texts for line in textwrap.wrap(text, max(40, width - len(indent)))]
+        first = start.replace(finding.state, click.style(finding.state, fg=SIGNS[finding.state]), 1)
+        yield first + lines[0]
+        yield from (indent + line for line in lines[1:])
+    count = {state: sum(finding.state == state for finding in findings) for state in SIGNS}
+    yield ", ".join(f"{number} {state}" for state, number in count.items() if number)
+
+
+# What is looked at ----------------------------------------------------------------------------------
+
+
+def versions(pins: Path = PINS) -> Finding:
+    """The libraries that are installed: as declared, and where the sources are at hand, as tested."""
+    wrong, other, count = [], [], 0
+    tested = _pinned(pins)
+    for requirement in map(Requirement, requires("heliopsf") or []):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        count += 1
+        try:
+            found = version(requirement.name)
+        except PackageNotFoundError:
+            wrong.append(f"{requirement.name} is missing")
+            continue
+        pin = tested.get(canonicalize_name(requirement.name), found)
+        if not requirement.specifier.contains(found, prereleases=True):
+            wrong.append(f"{requirement.name} {found}, needed {requirement.specifier}")
+        elif pin != found:
+            other.append(f"{requirement.name} {found}, tested with {pin}")
+    about = f"heliopsf {software_version()}, Python {sys.version.split()[0]}"
+    if wrong:
+        return Finding("versions", "broken", f"{about}; {'; '.join(wrong)}", "install heliopsf again")
+    if other:
+        advice = "install with `-c constraints.txt` for the versions that it was tested with"
+        return Finding("versions", "warning", f"{about}; {'; '.join(other)}", advice)
+    as_what = "as tested" if tested else "as declared (no constraints.txt here to compare with)"
+    return Finding("versions", "ok", f"{about}; {count} libraries {as_what}")
+
+
+def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
+    """Do workers and libraries together start more threads than there are cores?"""
+    here = cores()
+    may_use = min(here, _quota(cpu_quota) or here)
+    wanted = settings.worker_processes * settings.threads
+    plural = "es" if settings.worker_processes > 1 else ""
+    found = f"{here} cores, {settings.worker_processes} worker process{plural} of {settings.threads} threads"
+    if may_use < here:
+        found += f"; the container may use {may_use:g} of the cores"
+    more = []
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        value = os.environ.get(name)
+        if value is None:
+            continue
+        found += f"; {name}={value}"
+        if name == "NUMBA_NUM_THREADS":  # a worker sets its own
+            continue
+        first = value.split(",")[0].strip()
+        if not first.isdecimal() or int(first) < 1:
+            more.append(f"{name} is no number of threads")
+        elif int(first) * settings.worker_processes > may_use:
+            more.append(f"set {name} to {max(1, int(may_use // settings.worker_processes))} or less")
+    if wanted > may_use:
+        fit = max(1, int(may_use // settings.worker_processes))
+        more.append(f"threads wait for one another: set HELIOPSF_WORKER_THREADS={fit}, or fewer processes")
+    return Finding("threads", "warning" if more else "ok", found, "; ".join(more))
+
+
+def storage(settings: Settings) -> Finding:
+    """Can files be kept, and is there room?"""
+    folder = settings.data_dir.resolve()
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or (there != folder and not os.access(there, os.W_OK | os.X_OK)):
+        found = f"{folder} is not there and cannot be made"
+        return Finding("storage", "broken", found, "set HELIOPSF_DATA_DIR to a folder that can be written to")
+    if there == folder:
+        try:
+            checks.storage(folder)
+        except checks.Unusable as fault:
+            found = f"{folder}: {fault}"
+            return Finding("storage", "broken", found, "let this user write there, or free the disk")
+    free = checks.free_bytes(there)
+    found = f"{folder}{'' if there == folder else ' (not made yet)'}, {_gib(free)} free"
+    largest = max(settings.max_upload_bytes, settings.max_transit_bytes)
+    if free < settings.max_upload_bytes:
+        return Finding("storage", "broken", f"{found}: no room for one upload", "free the disk")
+    if free < max(LITTLE_ROOM_BYTES, largest):
+        advice = f"free the disk: one transit may take {_gib(settings.max_transit_bytes)}"
+        return Finding("storage", "warning", found, advice)
+    return Finding("storage", "ok", found)
+
+
+def object_store(settings: Settings) -> Finding:
+    """Does what keeps the files elsewhere take them?"""
+    try:
+        checks.object_store(open_store(settings))
+    except checks.Unusable as fault:
+        advice = "look at HELIOPSF_STORE_URL and at the AWS_* variables: endpoint, region, credentials"
+        return Finding("object store", "broken", f"{settings.store_url}: {fault}", advice)
+    except ImportError:
+        advice = "install heliopsf with its extra: pip install 'heliopsf[s3]'"
+        return Finding("object store", "broken", "the library for S3 is not installed", advice)
+    return Finding("object store", "ok", str(settings.store_url))
+
+
+def broker(settings: Settings) -> Finding:
+    """Does the broker answer?"""
+    if settings.embedded:
+        return Finding("broker", "ok", "embedded: a folder in the data folder")
+    where = address(settings.broker_url)
+    try:
+        checks.broker(settings)
+    except checks.Unusable as fault:
+        advice = "start it, or mend HELIOPSF_BROKER_URL; jobs wait in the database until it is back"
+        return Finding("broker", "broken", f"{where}: {fault}", advice)
+    return Finding("broker", "ok", f"{where} answers")
+
+
+def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
+    """Is the database at the revision that this version works with, and is everything there?"""
+    status = catalogue.schema.status()
+    said = sentence(status)
+    match status.state:
+        case "empty":
+            return Finding("schema", "warning", said, "the first `heliopsf serve` makes them")
+        case "newer":
+            return Finding("schema", "broken", said, "run the version of heliopsf that upgraded it")
+        case "unversioned" | "older":
+            advice = (
+                "keep a copy of it, then `heliopsf database upgrade`; the next `heliopsf serve` does it too"
+            )
+            return Finding("schema", "warning", said, advice)
+        case "current":
+            faults = catalogue.schema.faults()
+    if faults.columns:
+        found = f"{said}, but columns are missing: {', '.join(faults.columns)}"
+        return Finding("schema", "broken", found, "somebody changed the tables: take a copy from before")
+    if faults.tables or faults.indexes:
+        found = f"{said}, but these are missing: {', '.join((*faults.tables, *faults.indexes))}"
+        return Finding("schema", "warning", found, "`heliopsf database upgrade` makes them again")
+    return Finding("schema", "ok", f"{said}: tables, columns and indexes are there")
+
+
+def clock(_settings: Settings, catalogue: Catalogue) -> Finding:
+    """Do this machine and the database's agree about the time? Leases go by the database's alone."""
+    before = time.time()
+    theirs = catalogue.census.clock()
+    after = time.time()
+    apart = theirs - (before + after) / 2
+    found = f"the database's clock is {abs(apart):.2f} s {'ahead' if apart > 0 else 'behind'}"
+    if abs(apart) > 1.0 + (after - before):
+        advice = "set both clocks by NTP: when things were made, and when keys expire, goes by this machine's"
+        return Finding("clock", "warning", found, advice)
+    return Finding("clock", "ok", f"within {max(0.01, abs(apart)):.2f} s of the database's")
+
+
+def workers(settings: Settings, catalogue: Catalogue) -> Finding:
+    """Is anybody there to do the work, and of this version?"""
+    if "workers" in catalogue.schema.faults().tables:
+        return Finding("workers", "warning", "none has ever been here", _start(settings))
+    there = catalogue.census.workers(settings.lease_s)
+    waiting = catalogue.census.oldest_queued_at()
+    if not there:
+        found = f"none was heard of for {settings.lease_s:g} s"
+        if waiting is not None:
+            found += f"; a job has waited for {_span(time.time() - waiting)}"
+        state: State = "broken" if waiting is not None and not settings.embedded else "warning"
+        return Finding("workers", state, found, _start(settings))
+    others = sorted({row.version for row in there} - {software_version()})
+    found = (
+        f"{len(there)} process{'es' if len(there) > 1 else ''}: {', '.join(row.name for row in there[:5])}"
+    )
+    found += ", ..." if len(there) > 5 else ""
+    if others:
+        advice = f"start them again with {software_version()}"
+        return Finding("workers", "warning", f"{found}; some run version {', '.join(others)}", advice)
+    return Finding("workers", "ok", found)
+
+
+def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
+    """Jobs that a running service would have taken care of by now."""
+    if "jobs" in catalogue.schema.faults().tables:
+        return Finding("stuck jobs", "ok", "no jobs yet")
+    silent = catalogue.census.count_silent(settings.lease_s + 5 * settings.reconcile_s)
+    left = catalogue.census.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))
+    if not silent and not left:
+        return Finding("stuck jobs", "ok", "none")
+    found = f"{silent} at work without a sign of life, {left} queued that no server gave to the broker"
+    return Finding(
+        "stuck jobs",
+        "warning" if settings.embedded else "broken",
+        found,
+        "start `heliopsf serve`: it queues them again; if it runs, its log says what hinders it",
+    )
+
+
+# How it is said -------------------------------------------------------------------------------------
+
+
+def address(url: str) -> str:
+    """A URL's scheme, host, port and path: what an operator knows it by, without user, password and options."""
+    try:
+        parts = urlsplit(url)
+        where = f"{parts.hostname}:{parts.port}" if parts.port else parts.hostname or ""
+    except ValueError:
+        return "the URL that is set"
+    # What does not read as a URL may be a password in any of its parts; one with / in it ends the host early.
+    beyond = parts.path + parts.query + parts.fragment
+    if "@" in beyond or not (parts.hostname or parts.scheme.startswith("sqlite")):
+        return "the URL that is set"
+    return f"{parts.scheme}://{where}{parts.path}"
+
+
+@contextmanager
+def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]:
+    """The catalogue, where there is one that answers; and what is to be said of the database."""
+    where, own = _database(settings)
+    if own and not Path(where).exists():  # looking at it would make it
+        yield None, Finding("database", "warning", f"{where} is not there yet", "`heliopsf serve` makes it")
+        return
+    advice = "mend the file's permissions" if own else "start it, or mend HELIOPSF_DATABASE_URL"
+    try:
+        catalogue = Catalogue(settings.catalogue_url)
+    except (ArgumentError, ImportError, ValueError) as error:
+        found = f"{where} cannot be used ({type(error).__name__})"
+        yield (
+            None,
+            Finding("database", "broken", found, "mend HELIOPSF_DATABASE_URL: postgresql://... or none"),
+        )
+        return
+    try:
+        started = time.perf_counter()
+        catalogue.ping()
+        took_ms = 1e3 * (time.perf_counter() - started)
+    except SQLAlchemyError as error:
+        yield None, Finding("database", "broken", f"{where}: {checks.database_said(error)}", advice)
+    else:
+        yield catalogue, Finding("database", "ok", f"{where} answers in {took_ms:.0f} ms")
+    finally:
+        catalogue.close()
+
+
+def _database(settings: Settings) -> tuple[str, bool]:
+    """Where the database is, and whether that is a file of SQLite's."""
+    try:
+        url = make_url(settings.catalogue_url)
+    except (ArgumentError, ValueError):
+        url = None
+    if url is not None and url.get_backend_name() == "sqlite" and url.database:
+        return url.database, True
+    return address(settings.catalogue_url), False
+
+
+def _start(settings: Settings) -> str:
+    return "`heliopsf serve` starts one" if settings.embedded else "start `heliopsf worker`"
+
+
+def _pinned(file: Path) -> dict[str, str]:
+    """Name -> version of a file of pins; nothing where it is not there."""
+    if not file.is_file():
+        return {}
+    pairs = (line.split("==", 1) for line in file.read_text().splitlines() if "==" in line and line[0] != "#")
+    return {canonicalize_name(name.strip()): pin.split(";")[0].strip() for name, pin in pairs}
+
+
+def _quota(file: Path) -> float | None:
+    """Cores that a container may use, as Linux says; None without a limit."""
+    try:
+        quota, period = file.read_text().split()
+        return int(quota) / int(period)
+    except (OSError, ValueError):
+        return None
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:.1f} GiB"
+
+
+def _span(seconds: float) -> str:
+    for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+COMMANDS = (doctor,)

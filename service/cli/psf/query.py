@@ -1,0 +1,242 @@
+"""Commands about what a PSF says: ``psf query``, ``psf cutout``, ``psf rebin``; of a file, or of a service's PSF.
+
+A file is read here and asked the same questions as the service's tables are.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from psfcore.tables import lookup as psf_lookup
+from service.cli.connection import remote, server_option
+from service.cli.options import OUTPUT, check_writable, limits, user_errors, write_json
+
+if TYPE_CHECKING:
+    from psfcore.psf import Psf
+
+SERVER = server_option("Service to ask for an ID")
+SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+
+
+@click.command("query")
+@click.argument("psf", metavar="PSF_ID|FILE")
+@click.option("--radius", "radii", multiple=True, type=float, help="px; may be given many times")
+@click.option("--annulus", nargs=2, type=float, metavar="INNER OUTER", help="Light between two radii, px")
+@click.option("--profile", is_flag=True, help="Mean weight by radius too")
+@click.option("--compare", metavar="PSF_ID|FILE", help="Differences of this one, less PSF")
+@click.option("--json", "json_file", type=OUTPUT, help="Write the answers")
+@SERVER
+def query(
+    psf: str,
+    radii: tuple[float, ...],
+    annulus: tuple[float, float] | None,
+    profile: bool,
+    compare: str | None,
+    json_file: Path | None,
+    server: str | None,
+) -> None:
+    """Say how far the light of a PSF goes: by radius, in an annulus, beside another PSF."""
+    check_writable(json_file)
+    answers: dict[str, Any] = {}
+    with user_errors(), _asking(server, psf, compare) as ask:
+        if radii or not (annulus or profile or compare):
+            reach = ask(psf, "encircled", radius=0.0)["reach_px"]
+            wanted = list(radii) or [r for r in SHOWN_RADII_PX if r <= reach]
+            answers["curve"] = ask(psf, "curve", radii=wanted)
+        if annulus is not None:
+            answers["annulus"] = ask(psf, "annulus", inner=annulus[0], outer=annulus[1])
+        if profile:
+            answers["profile"] = ask(psf, "profile")
+        if compare is not None:
+            answers["compare"] = ask(psf, f"compare/{compare}")
+    for name, lines in _LINES.items():
+        if name in answers:
+            click.echo("\n".join(lines(answers[name])))
+    write_json(json_file, answers)
+
+
+@click.command("cutout")
+@click.argument("psf", metavar="PSF_ID|FILE")
+@click.option("--size", required=True, type=click.IntRange(1), help="Edge of the middle to cut out, px")
+@click.option("-o", "--output", required=True, type=OUTPUT)
+@SERVER
+def cutout(psf: str, size: int, output: Path, server: str | None) -> None:
+    """Write the middle of a PSF, not renormalised. Of a file, its components too."""
+    check_writable(output)
+    with user_errors():
+        if _is_id(psf):
+            with remote(server) as service:
+                service.psf_cutout(psf, size, output)
+        else:
+            _write(output, _cut(_read(psf), size))
+    click.echo(f"{output}: central {size} x {size} px")
+
+
+@click.command("rebin")
+@click.argument("psf", metavar="PSF_ID|FILE")
+@click.option("--factor", required=True, type=click.IntRange(2), help="Pixels a binned pixel, on each axis")
+@click.option("-o", "--output", required=True, type=OUTPUT)
+@SERVER
+def rebin(psf: str, factor: int, output: Path, server: str | None) -> None:
+    """Write the PSF that an image of FACTOR x FACTOR binned pixels is seen through."""
+    from psfcore.psf_sampling import rebinned
+
+    check_writable(output)
+    with user_errors(), TemporaryDirectory(prefix="heliopsf-") as folder:
+        file = psf
+        if _is_id(psf):
+            file = str(Path(folder) / "psf.fits")
+            with remote(server) as service:
+                service.download(f"/v1/psfs/{psf}/file", file)
+        binned = rebinned(_read(file), factor)
+        _write(output, binned)
+    ny, nx = binned.kernel.shape
+    click.echo(f"{output}: {binned.name} {binned.version}, {nx} x {ny} px of {factor} x {factor}")
+
+
+COMMANDS = (query, cutout, rebin)  # of the group `psf`
+
+
+@contextmanager
+def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
+    """What answers a question about a PSF that the user named: of ids the service, of files their own tables."""
+    ids = [psf for psf in psfs if psf is not None and _is_id(psf)]
+    files = [psf for psf in psfs if psf is not None and not _is_id(psf)]
+    if ids and files:
+        raise click.UsageError(
+            "expected two ids of a service or two files to compare; got one of each: upload the file"
+        )
+    if not ids:
+        tables = {file: _tables(file) for file in files}
+
+        def ask_files(psf: str, question: str, **wanted: Any) -> dict[str, Any]:
+            name, _, other = question.partition("/")
+            if other:
+                return psf_lookup.compare(tables[psf], tables[other])
+            return psf_lookup.QUESTIONS[name](tables[psf], **wanted)
+
+        yield ask_files
+        return
+    with remote(server) as service:
+        yield lambda psf, question, **wanted: service.answer(
+            ids if "/" in question else [psf], question, wanted
+        )
+
+
+def _is_id(psf: str) -> bool:
+    if re.fullmatch(r"[0-9a-f]{64}", psf):
+        return True
+    if not Path(psf).is_file():
+        raise click.UsageError(f"expected a PSF id (64 hexadecimal digits) or a file; got {psf!r}")
+    return False
+
+
+def _tables(file: str) -> dict[str, Any]:
+    from psfcore.tables.make import tables_of
+
+    return tables_of(_read(file))
+
+
+def _read(file: str) -> Psf:
+    from psfcore.fits.fits_io import read_psf
+
+    return read_psf(file, limits())
+
+
+def _cut(psf: Psf, size: int) -> Psf:
+    from dataclasses import replace
+
+    from psfcore.errors import DataError
+    from psfcore.psf import crop_centred
+
+    smallest = min(psf.kernel.shape)
+    if size > smallest:
+        raise DataError("cutout-too-large", f"expected a size of 1 to {smallest} px; got {size}")
+    shape = (size, size)
+    return replace(
+        psf,
+        kernel=crop_centred(psf.kernel, shape),
+        components={name: crop_centred(part, shape) for name, part in psf.components.items()},
+    )
+
+
+def _write(output: Path, psf: Psf) -> None:
+    from psfcore.fits.fits_io import write_psf
+
+    text = psf.provenance.get("instrument_toml")
+    write_psf(output, psf, instrument_file=None if text is None else text.encode())
+
+
+def _curve_lines(answer: dict[str, Any]) -> list[str]:
+    curves, sigma = answer["light_beyond_pct"], answer["sigma_points"]
+    lines = [
+        f"{answer['name']} {answer['version']}, sum {answer['sum_on_array']:.6f} on {answer['shape'][1]} x "
+        f"{answer['shape'][0]} px, central pixel {answer['central_weight']:.4f}",
+        "light farther than R, or off the array, in percent:",
+        f"{'R (px)':>10}" + "".join(f"{name:>{_width(name, sigma)}}" for name in curves),
+    ]
+    for n, radius in enumerate(answer["radii_px"]):
+        values = (_with_sigma(curves[name][n], sigma.get(name, [None] * (n + 1))[n]) for name in curves)
+        lines.append(
+            f"{radius:>10g}"
+            + "".join(f"{v:>{_width(k, sigma)}}" for k, v in zip(curves, values, strict=True))
+        )
+    return [*lines, f"({answer['resolution']})"]
+
+
+def _width(name: str, sigma: dict[str, Any]) -> int:
+    return 22 if name in sigma else 15
+
+
+def _with_sigma(value: float, sigma: float | None) -> str:
+    return f"{value:.3f}" if sigma is None else f"{value:.3f} +- {sigma:.3f}"
+
+
+def _annulus_lines(answer: dict[str, Any]) -> list[str]:
+    lines = [f"light between {answer['inner_px']:g} and {answer['outer_px']:g} px, percent of all:"]
+    for name, light in answer["light"].items():
+        sigma = answer["sigma"].get(name)
+        lines.append(f"  {name:<14} {_with_sigma(100 * light, None if sigma is None else 100 * sigma)}")
+    return [*lines, f"({answer['resolution']})"]
+
+
+def _profile_lines(answer: dict[str, Any]) -> list[str]:
+    weights = answer["mean_weight"]
+    lines = ["mean weight of a pixel:", f"{'R (px)':>10}" + "".join(f"{name:>15}" for name in weights)]
+    for n, radius in enumerate(answer["radius_px"]):
+        if radius <= 20 or radius % 10 == 0:
+            lines.append(f"{radius:>10g}" + "".join(f"{row[n]:>15.4e}" for row in weights.values()))
+    return lines
+
+
+def _compare_lines(answer: dict[str, Any]) -> list[str]:
+    one, other = answer["one"], answer["other"]
+    lines = [
+        f"{other['name']} {other['version']} less {one['name']} {one['version']}: sum {answer['difference_of_sums']:+.6f}, "
+        f"central pixel {answer['difference_of_central_weights']:+.5f}; light beyond R, points:"
+    ]
+    points = answer["difference_points"]
+    lines.append(f"{'R (px)':>10}" + "".join(f"{name:>15}" for name in points))
+    shown = [n for n, r in enumerate(answer["radii_px"]) if r in (0.0, *SHOWN_RADII_PX)]
+    for n in shown:
+        radius = answer["radii_px"][n]
+        lines.append(f"{radius:>10g}" + "".join(f"{row[n]:>+15.3f}" for row in points.values()))
+    lines.append(
+        f"{'largest':>10}" + "".join(f"{most:>+15.3f}" for most in answer["largest_points"].values())
+    )
+    return lines
+
+
+_LINES = {
+    "curve": _curve_lines,
+    "annulus": _annulus_lines,
+    "profile": _profile_lines,
+    "compare": _compare_lines,
+}

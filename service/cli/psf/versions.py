@@ -1,0 +1,201 @@
+"""Commands about PSFs in versions: ``psf list``, ``upload``, ``certify``, ``deprecate``, ``best``, ``lineage``, ``rerun``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from service.cli.connection import SERVER, remote
+from service.cli.options import FILE, OUTPUT, check_writable, progress_bar, user_errors, write_json
+from workers.versions.status import PsfStatus
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+REASON = click.option("--reason", default="", help="Why, for those who ask later")
+FROM = click.option(
+    "--from", "valid_from", metavar="TIME", help="First time of observation [default: from ever]"
+)
+TO = click.option("--to", "valid_to", metavar="TIME", help="The time before which it ends [default: open]")
+CONTEXT = click.option("--context", help="Id or name of a context; now: what is certified now")
+JSON = click.option("--json", "json_file", type=OUTPUT, help="Write the answer")
+
+
+def _line_options(command: Command) -> Command:
+    for name, what in (
+        ("kind", "total, uploaded, or a component's name, as diffraction"),
+        ("channel", "Wavelength in whole angstrom, as 174"),
+        ("instrument", "As hri_euv"),
+    ):
+        command = click.option(f"--{name}", help=what)(command)
+    return command
+
+
+def _filter_options(command: Command) -> Command:
+    at = click.option("--valid-at", metavar="TIME", help="Time of observation, as 2024-03-01T12:00:00")
+    status = click.option("--status", type=click.Choice([str(status) for status in PsfStatus]))
+    version = click.option("--version")
+    return _line_options(version(status(at(CONTEXT(command)))))
+
+
+@click.command("list")
+@_filter_options
+@SERVER
+def list_psfs(server: str | None, **filters: str | None) -> None:
+    """List the PSFs of a service."""
+    with user_errors(), remote(server) as service:
+        rows = list(service.psfs(**_given(filters)))
+    if not rows and not _given(filters):
+        click.echo("no PSF yet: `heliopsf psf build` makes one, and so does the first deconvolution")
+    elif not rows:
+        click.echo("no PSF with " + ", ".join(f"{name} {value}" for name, value in _given(filters).items()))
+    for row in rows:
+        size = "x".join(map(str, row["details"]["shape"]))
+        line = f"{row['id']}  {row['name']}  {row['version']}  {row['status']}  {size}"
+        click.echo(line + _validity(row))
+
+
+@click.command("upload")
+@click.argument("file", type=FILE)
+@click.option("--name", help="[default: PSFNAME, or the file's name]")
+@click.option("--version", help="[default: PSFVERS]")
+@_line_options
+@SERVER
+def upload_psf(file: Path, server: str | None, **said: str | None) -> None:
+    """Upload a PSF of your own. KIND total lets images be deconvolved with it once it is certified."""
+    with user_errors(), remote(server) as service:
+        row = service.upload_psf(file, **said)
+    line = f"{row['instrument'] or 'unknown instrument'} {row['channel'] or '-'} {row['kind']}"
+    click.echo(f"{row['id']}  {row['name']}  {row['version']}  {row['status']}  {line}")
+
+
+@click.command("certify")
+@click.argument("psf_id", metavar="PSF_ID")
+@click.option("--version", help="Three numbers that its line has not had; a certified PSF keeps its own")
+@FROM
+@TO
+@click.option(
+    "--supersedes", multiple=True, metavar="PSF_ID", help="A certified one to deprecate in the same step"
+)
+@REASON
+@_line_options
+@SERVER
+def certify(
+    psf_id: str,
+    version: str | None,
+    valid_from: str | None,
+    valid_to: str | None,
+    supersedes: tuple[str, ...],
+    reason: str,
+    server: str | None,
+    **line: str | None,
+) -> None:
+    """Certify a PSF for a range of times of observation, or give a certified one another range."""
+    with user_errors(), remote(server) as service:
+        said = service.certify_psf(
+            psf_id,
+            version,
+            valid_from=valid_from,
+            valid_to=valid_to,
+            supersedes=supersedes,
+            reason=reason,
+            **line,
+        )
+    click.echo(f"{said['line']} {said['version']}: {said['status']}{_validity(said)}")
+
+
+@click.command("deprecate")
+@click.argument("psf_id", metavar="PSF_ID")
+@click.option("--successor", metavar="PSF_ID", help="The certified one to use instead")
+@REASON
+@SERVER
+def deprecate(psf_id: str, successor: str | None, reason: str, server: str | None) -> None:
+    """Say that a certified PSF is no longer to be used; or name a deprecated one's successor."""
+    with user_errors(), remote(server) as service:
+        said = service.deprecate_psf(psf_id, successor, reason=reason)
+        count = sum(1 for _ in service.affected(psf_id))
+    instead = f", use {said['successor']}" if said["successor"] else ""
+    click.echo(f"{said['line']} {said['version']}: {said['status']}{instead}")
+    click.echo(f"products made with it: {count}")
+
+
+@click.command("best")
+@click.option("--image", type=FILE, help="An image, by whose header it is found")
+@_filter_options
+@JSON
+@SERVER
+def best(image: Path | None, json_file: Path | None, server: str | None, **filters: str | None) -> None:
+    """Say which PSF fits an image, or these properties."""
+    check_writable(json_file)
+    given = _given(filters)
+    if image is not None and set(given) - {"context", "kind"}:
+        raise click.UsageError("--image: expected --context and --kind alone beside it")
+    with user_errors(), remote(server) as service:
+        if image is None:
+            found = service.best_psf(**given)
+        else:
+            found = service.psf_for_image(service.upload_image(image)["id"], **given)
+    psf = found["psf"]
+    click.echo(f"{psf['id']}  {psf['name']}  {psf['version']}  {psf['status']}{_validity(psf)}")
+    write_json(json_file, found)
+
+
+@click.command("lineage")
+@click.argument("identity", metavar="PSF_ID")
+@click.option("--product", is_flag=True, help="PSF_ID is a product's id")
+@JSON
+@SERVER
+def lineage(identity: str, product: bool, json_file: Path | None, server: str | None) -> None:
+    """Say where a PSF, or a product, came from."""
+    check_writable(json_file)
+    with user_errors(), remote(server) as service:
+        told = service.lineage("product" if product else "psf", identity)
+    for line in _tree(told, 0):
+        click.echo(line)
+    write_json(json_file, told)
+
+
+@click.command("rerun")
+@click.argument("identity", metavar="PSF_ID")
+@click.option("--product", is_flag=True, help="PSF_ID is a product's id")
+@JSON
+@SERVER
+def rerun(identity: str, product: bool, json_file: Path | None, server: str | None) -> None:
+    """Make a PSF, or a product, again and compare. Status 1: it came out otherwise."""
+    check_writable(json_file)
+    with user_errors(), remote(server) as service, progress_bar() as report:
+        found = service.rerun("product" if product else "psf", identity, progress=report)
+        if json_file is not None:
+            service.download(found["file"], json_file)
+    click.echo(found["details"]["sentence"])
+    sys.exit(0 if found["details"]["same"] else 1)
+
+
+COMMANDS = (list_psfs, upload_psf, certify, deprecate, best, lineage, rerun)  # of the group `psf`
+
+
+def _given(filters: dict[str, str | None]) -> dict[str, str]:
+    return {name: value for name, value in filters.items() if value is not None}
+
+
+def _validity(row: dict[str, Any]) -> str:
+    """The range of a PSF that has one; a draft has none."""
+    if row["status"] == PsfStatus.DRAFT:
+        return ""
+    return f"  [{row['valid_from'] or 'from ever'}, {row['valid_to'] or 'open'})"
+
+
+def _tree(told: dict[str, Any], depth: int) -> Iterator[str]:
+    """A lineage as lines, each thing below what was made from it."""
+    made = told["made"] or {}
+    named = " ".join(str(made[key]) for key in ("name", "version", "status") if made.get(key))
+    by = [f"heliopsf {made['software_version']}"] if made.get("software_version") else []
+    by += [f"job {made['job_id']}"] if made.get("job_id") else []
+    gone = "" if told["there"] or told["type"] == "instrument-file" else "no longer here"
+    cut = "told above" if told["cut"] else ""
+    said = "; ".join(part for part in (named, ", ".join(by), gone, cut) if part)
+    yield "  " * depth + f"{told['type']} {told['id']}" + (f"  ({said})" if said else "")
+    for parent in told["parents"]:
+        yield from _tree(parent, depth + 1)

@@ -1,0 +1,264 @@
+"""A client for scripts: ``with Heliopsf("http://127.0.0.1:8765") as sun: sun.deconvolve("in.fits", "out.fits")``."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any
+
+import httpx
+
+from psfcore.errors import DataError
+from psfcore.transit.archive import pack
+from service.client.bulk import BulkClient
+from service.client.errors import ServiceError
+from service.client.operations import Operations
+from service.client.versions import Progress, VersionedPsfs
+
+DEFAULT_SERVER = "http://127.0.0.1:8765"
+PATIENCE_S = 30.0
+
+
+class Heliopsf(VersionedPsfs, BulkClient, Operations):
+    """A heliopsf service, over HTTP."""
+
+    def __init__(
+        self,
+        server: str | None = None,
+        *,
+        key: str | None = None,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        """``server``, ``key``: by default what HELIOPSF_SERVER and HELIOPSF_KEY say."""
+        self.server = server or os.environ.get("HELIOPSF_SERVER", DEFAULT_SERVER)
+        key = (key or os.environ.get("HELIOPSF_KEY", "")).strip()
+        if not (key.isascii() and key.isprintable()) or " " in key:
+            # Said here, since what a library says of a header that it cannot send shows the header.
+            raise ServiceError(
+                "expected a key of the form hpsf_ID_SECRET; got something else", code="bad-key"
+            )
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._http = httpx.Client(base_url=self.server, timeout=60, transport=transport, headers=headers)
+
+    def __enter__(self) -> Heliopsf:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._http.close()
+
+    def health(self) -> dict[str, Any]:
+        """What ``/healthz`` says."""
+        return self._json("GET", "/healthz")
+
+    def wait_until_up(self, timeout_s: float = 60.0) -> None:
+        """Wait until a service that was just started answers; ``ServiceError`` where it does not in time."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                self.health()
+                return
+            except ServiceError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.1)
+
+    def upload_image(self, path: str | Path) -> dict[str, Any]:
+        """Upload a FITS image; returns its description, with its ``id``."""
+        return self._upload("/v1/images", Path(path), {})
+
+    def upload_transit(self, path: str | Path) -> dict[str, Any]:
+        """Upload a transit, a folder or an archive of one; returns its description, with its ``id``."""
+        with as_archive(Path(path)) as archive:
+            return self._upload("/v1/transits", archive, {}, media_type="application/octet-stream")
+
+    def upload_psf(
+        self,
+        path: str | Path,
+        *,
+        name: str | None = None,
+        version: str | None = None,
+        instrument: str | None = None,
+        channel: str | None = None,
+        kind: str | None = None,
+    ) -> dict[str, Any]:
+        """Upload a PSF of your own; returns its description, with its ``id``."""
+        line = {"instrument": instrument, "channel": channel, "kind": kind}
+        return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **line})
+
+    def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
+        """Ask for a job; returns it as it is then, which is ended where an equal one was done before.
+
+        ``queue``: "bulk" lets all that people wait for go before.
+        """
+        body = {"kind": kind, "queue": queue, "parameters": parameters}
+        return self._json("POST", "/v1/jobs", json=body)
+
+    def job(self, job_id: str) -> dict[str, Any]:
+        """A job as it is now."""
+        return self._json("GET", f"/v1/jobs/{job_id}")
+
+    def cancel(self, job_id: str) -> dict[str, Any]:
+        """Cancel a job."""
+        return self._json("DELETE", f"/v1/jobs/{job_id}")
+
+    def wait(
+        self, job: dict[str, Any], *, progress: Progress | None = None, timeout_s: float | None = None
+    ) -> dict[str, Any]:
+        """Wait for a job's end; returns it completed.
+
+        Raises ``ServiceError`` where it failed or was cancelled, ``TimeoutError`` after ``timeout_s``.
+        """
+        started = time.monotonic()
+        while job["phase"] in ("QUEUED", "EXECUTING"):
+            if timeout_s is not None and time.monotonic() - started > timeout_s:
+                raise TimeoutError(f"job {job['id']} is {job['phase']} after {timeout_s:g} s")
+            time.sleep(0.1)
+            job = self._job_patiently(job["id"])
+            if progress is not None and job["progress"]["steps"]:
+                progress(job["progress"]["stage"], job["progress"]["step"], job["progress"]["steps"])
+        return self._ended(job)
+
+    def _job_patiently(self, job_id: str) -> dict[str, Any]:
+        """The job; a service that is away for a moment (a restart) does not end the wait for it."""
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                return self.job(job_id)
+            except ServiceError as error:
+                if error.status not in (None, 429, 502, 503) or time.monotonic() > deadline:
+                    raise
+                time.sleep(min(error.retry_after_s or 0.5, PATIENCE_S))
+
+    def get(self, address: str) -> dict[str, Any]:
+        """The description at an address of the service."""
+        return self._json("GET", address)
+
+    def product(self, product_id: str) -> dict[str, Any]:
+        """The description of a product."""
+        return self._json("GET", f"/v1/products/{product_id}")
+
+    def psf(self, psf_id: str) -> dict[str, Any]:
+        """The description of a PSF version."""
+        return self._json("GET", f"/v1/psfs/{psf_id}")
+
+    def psfs(self, **filters: str) -> Iterator[dict[str, Any]]:
+        """All PSF versions, newest first."""
+        return self._all("/v1/psfs", filters)
+
+    def products(self, **filters: str) -> Iterator[dict[str, Any]]:
+        """All products, newest first."""
+        return self._all("/v1/products", filters)
+
+    def download(self, address: str, path: str | Path) -> None:
+        """Download a file of the service; ``path`` is written only once it is whole."""
+        target = Path(path)
+        partial = target.with_name(target.name + ".part")
+        try:
+            with self._streamed(address) as response, partial.open("wb") as file:
+                for chunk in response.iter_bytes():
+                    file.write(chunk)
+            partial.replace(target)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
+        """The service's answer to a question about a PSF."""
+        told = {
+            name: ",".join(f"{number!r}" for number in value) if isinstance(value, list) else value
+            for name, value in query.items()
+        }
+        return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=told)
+
+    def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
+        """Download the central (size, size) px of a PSF."""
+        self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output)
+
+    def _upload(
+        self, address: str, path: Path, query: dict[str, str | None], *, media_type: str = "application/fits"
+    ) -> dict[str, Any]:
+        known = {key: value for key, value in query.items() if value is not None}
+        with path.open("rb") as file:
+            return self._json(
+                "POST",
+                address,
+                params={"filename": path.name, **known},
+                content=iter(lambda: file.read(2**20), b""),
+                headers={"Content-Type": media_type, "Content-Length": str(path.stat().st_size)},
+            )
+
+    def _all(self, address: str, filters: dict[str, str]) -> Iterator[dict[str, Any]]:
+        page = self._json("GET", address, params={"limit": "200", **filters})
+        while True:
+            yield from page["items"]
+            if page["next"] is None:
+                return
+            page = self._json("GET", page["next"])
+
+    @contextmanager
+    def _streamed(self, address: str, **options: Any) -> Iterator[httpx.Response]:
+        try:
+            with self._http.stream("GET", address, **options) as response:
+                if response.is_error:
+                    response.read()
+                    raise _refused(response)
+                yield response
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from error
+
+    def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
+        try:
+            response = self._http.request(method, address, **options)
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from error
+        if response.is_error:
+            raise _refused(response)
+        body: dict[str, Any] = response.json()
+        return body
+
+    def _unreachable(self, error: httpx.TransportError) -> ServiceError:
+        return ServiceError(f"no answer from {self.server} ({error}); `heliopsf serve` starts a service")
+
+
+@contextmanager
+def as_archive(path: Path) -> Iterator[Path]:
+    """The archive at ``path``, or one made of the folder there, which is gone afterwards."""
+    if not path.is_dir():
+        yield path
+        return
+    with TemporaryDirectory(prefix="heliopsf-") as folder:
+        archive = Path(folder) / f"{path.resolve().name}.tar"
+        try:
+            pack(path, archive)
+        except DataError as error:
+            raise ServiceError(error.message, code=error.code) from error
+        yield archive
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A change as people read it; None is a change of nothing."""
+    return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
+
+
+def _refused(response: httpx.Response) -> ServiceError:
+    if response.headers.get("content-type", "").startswith("application/problem+json"):
+        problem = response.json()
+        code = str(problem["type"]).removeprefix("urn:heliopsf:")
+        after = response.headers.get("retry-after", "")
+        return ServiceError(
+            problem["detail"],
+            status=response.status_code,
+            code=code,
+            retry_after_s=float(after) if after.isdecimal() else None,
+        )
+    return ServiceError(f"the service answered {response.status_code}", status=response.status_code)

@@ -1,0 +1,127 @@
+"""What a client asks of PSFs in versions: statuses, the one that fits, contexts, lineage, reruns."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
+
+Progress = Callable[[str, int, int], None]
+
+
+class VersionedPsfs(ABC):
+    """The part of a service's client that is about versions. Times are ISO 8601, UTC without a zone.
+
+    Every method raises ``service.client.http.ServiceError``, whose ``code`` says why ("ranges-overlap", "no-psf-fits", ...).
+    """
+
+    @abstractmethod
+    def get(self, address: str) -> dict[str, Any]:
+        """The description at an address of the service."""
+
+    @abstractmethod
+    def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
+        """Ask for a job."""
+
+    @abstractmethod
+    def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
+        """Wait for a job's end."""
+
+    @abstractmethod
+    def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
+        """The answer to a request."""
+
+    @abstractmethod
+    def _all(self, address: str, filters: dict[str, str]) -> Iterator[dict[str, Any]]:
+        """All items of a list."""
+
+    def psf_status(self, psf_id: str) -> dict[str, Any]:
+        """A PSF's status, what it may become, the next version of its line, and its history."""
+        return self.get(f"/v1/psfs/{psf_id}/status")
+
+    def certify_psf(
+        self,
+        psf_id: str,
+        version: str | None = None,
+        *,
+        valid_from: str | None = None,
+        valid_to: str | None = None,
+        supersedes: Sequence[str] = (),
+        reason: str = "",
+        **line: str | None,
+    ) -> dict[str, Any]:
+        """Certify a draft under a version, or give a certified PSF another range; its status then.
+
+        ``supersedes``: certified PSFs that are deprecated in the same step. ``line``: ``instrument``, ``channel``,
+        ``kind`` of an uploaded PSF whose file does not say them.
+        """
+        body = {
+            "status": "certified",
+            "version": version,
+            "valid_from": valid_from,
+            "valid_to": valid_to,
+            "supersedes": list(supersedes),
+            "reason": reason,
+            **line,
+        }
+        return self._json("POST", f"/v1/psfs/{psf_id}/status", json=body)
+
+    def deprecate_psf(self, psf_id: str, successor: str | None = None, *, reason: str = "") -> dict[str, Any]:
+        """Deprecate a certified PSF, or name a deprecated one's successor; its status then."""
+        body = {"status": "deprecated", "successor": successor, "reason": reason}
+        return self._json("POST", f"/v1/psfs/{psf_id}/status", json=body)
+
+    def best_psf(self, **filters: str | None) -> dict[str, Any]:
+        """The one PSF that fits ``instrument``, ``channel``, ``kind``, ``version``, ``valid_at``, ``context``, ...
+
+        The answer's ``psf`` is its description. ``ServiceError`` "no-psf-fits" or "several-psfs-fit" says why not.
+        """
+        return self._json("GET", "/v1/psfs/best", params=_given(filters))
+
+    def psf_for_image(self, image_id: str, **where: str | None) -> dict[str, Any]:
+        """The PSF for an uploaded image, by its header; ``context`` and ``kind`` as for ``best_psf``."""
+        return self._json("GET", f"/v1/images/{image_id}/psf", params=_given(where))
+
+    def affected(self, psf_id: str | None = None, *, superseded: bool = False) -> Iterator[dict[str, Any]]:
+        """Products made with a PSF; without one, those made with any that is deprecated (and has a successor)."""
+        if psf_id is not None:
+            return self._all(f"/v1/psfs/{psf_id}/affected", {})
+        return self._all("/v1/affected", {"superseded": "true" if superseded else "false"})
+
+    def contexts(self) -> Iterator[dict[str, Any]]:
+        """All contexts, newest first, without their pins."""
+        return self._all("/v1/contexts", {})
+
+    def context(self, id_or_name: str) -> dict[str, Any]:
+        """A context with its pins."""
+        return self.get(f"/v1/contexts/{id_or_name}")
+
+    def create_context(
+        self, name: str, pins: Sequence[dict[str, Any]] | None = None, *, reason: str = ""
+    ) -> dict[str, Any]:
+        """Pin PSFs under a name: all that are certified now, or ``{"psf_id", "valid_from", "valid_to"}`` each."""
+        body = {"name": name, "reason": reason, "pins": None if pins is None else list(pins)}
+        return self._json("POST", "/v1/contexts", json=body)
+
+    def default_context(self) -> dict[str, Any]:
+        """The context that images are looked up in where a request names none, and where it was before."""
+        return self.get("/v1/contexts/default")
+
+    def use_context(self, id_or_name: str | None, *, reason: str = "") -> dict[str, Any]:
+        """Make a context the default; none: what is certified at the moment."""
+        return self._json("PUT", "/v1/contexts/default", json={"context": id_or_name, "reason": reason})
+
+    def lineage(self, of: Literal["psf", "product"], identity: str) -> dict[str, Any]:
+        """Where a PSF or a product came from, back to what was uploaded."""
+        return self.get(f"/v1/{of}s/{identity}/lineage")
+
+    def rerun(
+        self, of: Literal["psf", "product"], identity: str, *, progress: Progress | None = None
+    ) -> dict[str, Any]:
+        """Have a PSF or a product made again; the report on what differs from the first."""
+        job = self.submit("rerun", of=of, id=identity)
+        return self.get(self.wait(job, progress=progress)["result"])
+
+
+def _given(filters: dict[str, str | None]) -> dict[str, str]:
+    return {name: value for name, value in filters.items() if value is not None}

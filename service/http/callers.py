@@ -1,0 +1,114 @@
+"""Who asks, and may they? Each route names the scope that it needs, and works for the owner that it gets from here.
+
+With keys, a request has one in ``Authorization``: as a bearer token, or as the password of HTTP Basic (any user
+name), which browsers and clients of the Virtual Observatory know. Open, for a service that only its own machine
+reaches, nobody is asked and all is one owner's.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request, Security
+from fastapi.openapi.models import HTTPBase, HTTPBearer
+from fastapi.security import SecurityScopes
+from fastapi.security.base import SecurityBase
+
+from service.http.problems import Problem
+from service.http.rates import Bucket
+from service.http.state import Shared, State
+from workers.catalogue.keys import OWNER, KeyRefused, Scope
+from workers.catalogue.tables import DEFAULT_OWNER
+
+ACT_FOR = "X-Owner"  # whose an administrator's request is to be
+CHALLENGE = {"WWW-Authenticate": 'Bearer realm="heliopsf", Basic realm="heliopsf", charset="UTF-8"'}
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who asks: the owner of all that is made and seen, and what the key allows."""
+
+    owner: str
+    scopes: frozenset[Scope]
+    name: str  # what rates are counted by, and what logs say: the key's id, or an address
+
+
+class _Scheme(SecurityBase):
+    """A way to send a key, for the description of the interface."""
+
+    def __init__(self, name: str, model: HTTPBase) -> None:
+        self.scheme_name, self.model = name, model
+
+    async def __call__(self) -> None:
+        """Nothing: the key is looked at in one place, whichever way it came."""
+
+
+_AS_BEARER = _Scheme("bearer", HTTPBearer(description="a key, hpsf_ID_SECRET"))
+_AS_PASSWORD = _Scheme("basic", HTTPBase(scheme="basic", description="any user name, a key as the password"))
+
+
+def _caller(
+    request: Request,
+    needed: SecurityScopes,
+    state: Shared,
+    _bearer: Annotated[None, Depends(_AS_BEARER)],
+    _basic: Annotated[None, Depends(_AS_PASSWORD)],
+) -> Caller:
+    """Who asks, where the key allows what the route needs and its allowance is not used up; else ``Problem``."""
+    caller = _let_in(request, state)
+    request.state.caller = caller
+    for scope in map(Scope, needed.scopes):
+        if scope not in caller.scopes:
+            raise Problem(
+                403,
+                "scope-missing",
+                f"expected a key with the scope '{scope}'; this one has {', '.join(sorted(caller.scopes))}",
+            )
+        reading = scope in (Scope.READ, Scope.ADMIN)
+        bucket = Bucket.READS if reading else Bucket.SUBMISSIONS
+        request.state.allowance = state.rates.take(bucket, caller.name)
+    return caller
+
+
+def _let_in(request: Request, state: State) -> Caller:
+    address = request.client.host if request.client is not None else "unknown"
+    if not state.access.keys:
+        return Caller(DEFAULT_OWNER, frozenset(Scope), address)
+    try:
+        row = state.catalogue.keys.check(_sent_key(request))
+    except KeyRefused as refused:
+        state.rates.take(Bucket.READS, address)  # who tries keys is not let try without end
+        raise Problem(401, refused.code, refused.message, headers=CHALLENGE) from refused
+    caller = Caller(row.owner, frozenset(map(Scope, row.scopes)), row.id)
+    owner = request.headers.get(ACT_FOR)
+    if owner is None or owner == caller.owner:
+        return caller
+    if Scope.ADMIN not in caller.scopes or not OWNER.fullmatch(owner):
+        raise Problem(403, "scope-missing", f"{ACT_FOR}: expected a key with the scope '{Scope.ADMIN}'")
+    return Caller(owner, caller.scopes, caller.name)
+
+
+def _sent_key(request: Request) -> str:
+    """The key in a request; ``KeyRefused`` where there is none."""
+    way, _, sent = request.headers.get("Authorization", "").partition(" ")
+    sent = sent.strip()
+    if way.lower() == "bearer" and sent:
+        return sent
+    if way.lower() == "basic" and sent:
+        try:
+            return base64.b64decode(sent, validate=True).decode().partition(":")[2]
+        except (binascii.Error, UnicodeDecodeError) as error:
+            raise KeyRefused("bad-key", "expected HTTP Basic as base64 of user:key") from error
+    raise KeyRefused(
+        "no-key", "expected a key: 'Authorization: Bearer hpsf_...', or as the password of Basic"
+    )
+
+
+Reading = Annotated[Caller, Security(_caller, scopes=[Scope.READ])]
+Submitting = Annotated[Caller, Security(_caller, scopes=[Scope.SUBMIT])]
+Certifying = Annotated[Caller, Security(_caller, scopes=[Scope.CERTIFY])]
+Bulk = Annotated[Caller, Security(_caller, scopes=[Scope.BULK])]
+Administering = Annotated[Caller, Security(_caller, scopes=[Scope.ADMIN])]

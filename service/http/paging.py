@@ -1,0 +1,81 @@
+"""Lists a page at a time, newest first, by a cursor that is a place in the order and no offset."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Generic, Protocol, TypeVar
+
+from fastapi import Query, Request
+from pydantic import BaseModel, Field
+
+from service.http.problems import Problem
+
+Item = TypeVar("Item", bound=BaseModel)
+
+
+class Page(BaseModel, Generic[Item]):
+    """Part of a list."""
+
+    items: list[Item]
+    next: str | None = Field(description="address of the next page; null on the last")
+
+
+class _Ordered(Protocol):
+    created_at: Any
+    id: Any
+
+
+Row = TypeVar("Row", bound=_Ordered)
+Limit = Annotated[int, Query(ge=1, le=200, description="rows a page")]
+Cursor = Annotated[str | None, Query(description="from the `next` of the page before")]
+
+
+def position(cursor: str | None) -> tuple[float, str] | None:
+    """The (created_at, id) in a cursor; ``Problem`` 422 where it is none of ours."""
+    parts = place(cursor, 2)
+    return None if parts is None else (number(parts[0]), parts[1])
+
+
+def place(cursor: str | None, count: int) -> list[str] | None:
+    """The parts of the place in a cursor, the last of them an id; ``Problem`` 422 where it is none of ours."""
+    if cursor is None:
+        return None
+    try:
+        parts = base64.urlsafe_b64decode(cursor.encode()).decode("ascii").split(" ")
+    except (binascii.Error, ValueError) as error:
+        raise _no_cursor() from error
+    if len(parts) != count or not parts[-1].isalnum() or not all(map(str.isprintable, parts)):
+        raise _no_cursor()
+    return parts
+
+
+def number(part: str) -> float:
+    """A time in a cursor; ``Problem`` 422 where it is none."""
+    try:
+        at = float(part)
+    except ValueError as error:
+        raise _no_cursor() from error
+    if not math.isfinite(at):
+        raise _no_cursor()
+    return at
+
+
+def following(request: Request, *parts: str) -> str:
+    """The address of the page that begins behind a place."""
+    cursor = base64.urlsafe_b64encode(" ".join(parts).encode()).decode()
+    query = request.url.include_query_params(cursor=cursor)
+    return f"{query.path}?{query.query}"
+
+
+def _no_cursor() -> Problem:
+    return Problem(422, "bad-cursor", "expected the cursor of an earlier page's `next`")
+
+
+def page(request: Request, rows: Sequence[Row], limit: int, view: Callable[[Row], Item]) -> Page[Item]:
+    """The page for ``limit + 1`` rows that were asked for: one more than is shown tells of a next page."""
+    after = rows[limit - 1] if len(rows) > limit else None
+    next_page = None if after is None else following(request, repr(after.created_at), after.id)
+    return Page(items=[view(row) for row in rows[:limit]], next=next_page)

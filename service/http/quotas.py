@@ -1,0 +1,57 @@
+"""How much an owner may have kept: refused before it is sent, or before it is worked on."""
+
+from __future__ import annotations
+
+from service.http.callers import Caller
+from service.http.problems import Problem
+from service.http.state import State
+from workers.catalogue.catalogue import Row
+from workers.catalogue.owners import NOT_KEPT, OverQuota, Usage
+
+
+class Allowed:
+    """Counts the bytes of one upload against the caller's rate and against the owner's quota."""
+
+    def __init__(self, state: State, caller: Caller) -> None:
+        self._state, self._caller = state, caller
+        self._asked = 0
+
+    def __call__(self, count: int) -> None:
+        """So many bytes more; ``Problem`` 429 or 413."""
+        self._asked += count
+        usage = _usage(self._state, self._caller.owner)
+        if not usage.allows(self._asked):
+            raise _file_too_large(usage, self._asked)
+        self._state.rates.take_bytes(self._caller.name, count)
+
+    def add(self, row: Row) -> tuple[Row, bool]:
+        """``Catalogue.add`` of the upload's row; ``Problem`` 413 where others took the room meanwhile."""
+        try:
+            return self._state.catalogue.add(row, self._state.settings.quota_mib)
+        except OverQuota as over:
+            raise _file_too_large(over.usage, row.bytes) from over
+
+
+def check_room(state: State, owner: str) -> None:
+    """Before work whose results are kept: ``Problem`` 507 where the owner may keep nothing more."""
+    usage = _usage(state, owner)
+    if usage.full:
+        raise _exceeded(507, usage, NOT_KEPT)
+
+
+def _usage(state: State, owner: str) -> Usage:
+    return state.catalogue.owners.usage(owner, state.settings.quota_mib)
+
+
+def _file_too_large(usage: Usage, count: int) -> Problem:
+    return _exceeded(413, usage, f"this file needs at least {count} more")
+
+
+def _exceeded(status: int, usage: Usage, why: str) -> Problem:
+    return Problem(
+        status,
+        "quota-exceeded",
+        usage.no_room(why),
+        used_bytes=usage.used_bytes,
+        limit_bytes=usage.limit_bytes,
+    )

@@ -1,0 +1,44 @@
+"""What the endpoints share: settings, catalogue, store and reconciler, made once for each application."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from psfcore.fits.header import FitsLimits
+from service.http.access import Access
+from service.http.rates import Rates
+from service.http.streams import Streams
+from workers.broker.reconciler import Reconciler
+from workers.catalogue.catalogue import Catalogue
+from workers.files.store import Store
+from workers.settings import Settings
+
+
+@dataclass(frozen=True)
+class State:
+    """Handles that live as long as the application."""
+
+    settings: Settings
+    catalogue: Catalogue
+    store: Store
+    reconciler: Reconciler
+    access: Access
+    rates: Rates
+    streams: Streams
+
+    @property
+    def limits(self) -> FitsLimits:
+        """Limits of the files that are taken."""
+        return FitsLimits(max_pixels=self.settings.max_pixels)
+
+
+def _state(request: Request) -> State:
+    state = request.app.state.heliopsf
+    assert isinstance(state, State)
+    return state
+
+
+Shared = Annotated[State, Depends(_state)]

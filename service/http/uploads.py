@@ -1,0 +1,297 @@
+"""One upload, streamed to the store: hashed, counted and recognised as it comes, never held in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+
+from fastapi import Request
+from fastapi.concurrency import run_in_threadpool
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.requests import ClientDisconnect
+
+from psfcore.errors import DataError, HeaderError
+from psfcore.fits.header import FitsLimits, HeaderSummary, read_summary
+from psfcore.transit.archive import (
+    START_BYTES,
+    ArchiveContents,
+    ArchiveLimits,
+    archive_kind,
+    could_be_archive,
+    list_archive,
+)
+from service.http.problems import Problem
+from workers.files.store import Store
+
+if TYPE_CHECKING:
+    from python_multipart.multipart import MultipartCallbacks
+
+FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
+FORM_BYTES = 2**16  # what a form may add to the file
+LARGE = frozenset({"/v1/images", "/v1/psfs", "/v1/transits"})  # where files come in, with limits of their own
+UNDECLARED_BYTES = 2**20  # taken at a time from the allowance where a request does not say how long it is
+Take = Callable[[int], object]
+_ARCHIVE_STATUS = {"archive-too-large": 413, "not-an-archive": 415}
+
+
+def _body(what: str, media_type: str) -> dict[str, Any]:
+    """How an upload stands in the description of the interface."""
+    return {
+        "parameters": [
+            {
+                "name": "filename",
+                "in": "query",
+                "required": False,
+                "description": "a label for people, where the file is the body itself",
+                "schema": {"type": "string"},
+            }
+        ],
+        "requestBody": {
+            "required": True,
+            "description": f"The {what}, as the body itself or as the part `file` of a form.",
+            "content": {
+                media_type: {"schema": {"type": "string", "format": "binary"}},
+                "multipart/form-data": {
+                    "schema": {
+                        "type": "object",
+                        "properties": {"file": {"type": "string", "format": "binary"}},
+                        "required": ["file"],
+                    }
+                },
+            },
+        },
+    }
+
+
+OPENAPI_BODY = _body("FITS file", "application/fits")
+OPENAPI_TRANSIT_BODY = _body("transit's .zip, .tar or .tar.gz", "application/octet-stream")
+
+Found = TypeVar("Found")
+FoundOut = TypeVar("FoundOut", covariant=True)
+
+
+@dataclass(frozen=True)
+class Upload(Generic[Found]):
+    """A file that came whole, and what a look into it found; not yet kept."""
+
+    path: Path
+    sha256: str
+    bytes: int
+    filename: str | None
+    summary: Found
+
+
+class _Format(Protocol[FoundOut]):
+    """What kind of file is taken."""
+
+    what: str
+    start_bytes: int
+
+    def recognise(self, start: bytes, *, whole: bool) -> None:
+        """Raise ``Problem`` where the first bytes, all there are if ``whole``, rule it out."""
+
+    def inspect(self, path: Path) -> FoundOut:
+        """Look into the file; ``Problem`` where it cannot be used."""
+
+
+@asynccontextmanager
+async def receive(
+    request: Request, store: Store, limits: FitsLimits, max_bytes: int, take: Take
+) -> AsyncIterator[Upload[HeaderSummary]]:
+    """Stream the request's FITS file to a temporary path and inspect its header.
+
+    take: counts bytes against the caller's allowance. Raises ``Problem`` 413 over the size limit, 415 for what is no FITS, 400 for a broken form or an upload
+    that ended early, and 422 for a header that shows a file that cannot be used.
+    """
+    async with _receive(request, store, _Fits(limits), max_bytes, take) as upload:
+        yield upload
+
+
+@asynccontextmanager
+async def receive_transit(
+    request: Request, store: Store, limits: ArchiveLimits, max_bytes: int, take: Take
+) -> AsyncIterator[Upload[ArchiveContents]]:
+    """Stream a transit's archive to a temporary path and check its table of contents and its transit.json.
+
+    Raises ``Problem`` as ``receive`` does: 413 also where more would come out than the limits allow, 415 for what
+    is no archive, and 422 for one that cannot be used.
+    """
+    async with _receive(request, store, _Archive(limits), max_bytes, take) as upload:
+        yield upload
+
+
+@asynccontextmanager
+async def _receive(
+    request: Request, store: Store, expected: _Format[Found], max_bytes: int, take: Take
+) -> AsyncIterator[Upload[Found]]:
+    declared = _refuse_by_length(request, max_bytes)
+    taken = declared
+    if declared:  # refused before it is sent, where it is known how much that will be
+        await run_in_threadpool(take, declared)
+    with store.temporary() as path:
+        body = _Body(request, max_bytes)
+        digest, size, start = hashlib.sha256(), 0, b""
+        with path.open("wb") as file:
+            async for chunk in body.chunks():
+                if len(start) < expected.start_bytes:
+                    start += chunk[: expected.start_bytes - len(start)]
+                    expected.recognise(start, whole=False)
+                size += len(chunk)
+                if size > max_bytes:
+                    raise _too_large(max_bytes)
+                if size > taken:
+                    await run_in_threadpool(take, UNDECLARED_BYTES)
+                    taken += UNDECLARED_BYTES
+                digest.update(chunk)
+                file.write(chunk)
+        if size == 0:
+            raise Problem(400, "empty-upload", f"expected {expected.what}, got 0 bytes")
+        expected.recognise(start, whole=True)
+        found = await run_in_threadpool(expected.inspect, path)
+        yield Upload(path, digest.hexdigest(), size, body.filename, found)
+
+
+class _Fits:
+    what = "a FITS file"
+    start_bytes = max(map(len, FITS_STARTS))
+
+    def __init__(self, limits: FitsLimits) -> None:
+        self._limits = limits
+
+    def recognise(self, start: bytes, *, whole: bool) -> None:
+        """Refuse at the first bytes what cannot become FITS, before the rest is taken."""
+        if not any(start.startswith(known[: len(start)]) for known in FITS_STARTS):
+            raise Problem(
+                415, "not-fits", f"expected a FITS file (it starts with 'SIMPLE  ='), got {start[:9]!r}"
+            )
+
+    def inspect(self, path: Path) -> HeaderSummary:
+        try:
+            return read_summary(path, self._limits)
+        except HeaderError as error:
+            raise Problem(422, error.code, error.message) from error
+
+
+class _Archive:
+    what = "a .zip, .tar or .tar.gz"
+    start_bytes = START_BYTES
+
+    def __init__(self, limits: ArchiveLimits) -> None:
+        self._limits = limits
+
+    def recognise(self, start: bytes, *, whole: bool) -> None:
+        """Refuse at the first bytes what cannot become an archive, before the rest is taken."""
+        if not (could_be_archive(start) and (not whole or archive_kind(start))):
+            raise Problem(415, "not-an-archive", f"expected {self.what}, got bytes {start[:9]!r}")
+
+    def inspect(self, path: Path) -> ArchiveContents:
+        try:
+            return list_archive(path, self._limits)
+        except DataError as error:
+            raise Problem(_ARCHIVE_STATUS.get(error.code, 422), error.code, error.message) from error
+
+
+def _refuse_by_length(request: Request, max_bytes: int) -> int:
+    """The length that the request declares; 0 where it declares none."""
+    text = request.headers.get("content-length", "")
+    declared = int(text) if text.isdecimal() else 0
+    if declared > max_bytes + FORM_BYTES:
+        raise _too_large(max_bytes)
+    return declared
+
+
+def _too_large(max_bytes: int) -> Problem:
+    return Problem(413, "too-large", f"expected a file of at most {max_bytes} bytes, got more")
+
+
+class _Body:
+    """The file in a request: the raw body, or the part named ``file`` of a form."""
+
+    def __init__(self, request: Request, max_bytes: int) -> None:
+        self._request, self._max_bytes = request, max_bytes
+        self.filename: str | None = None
+        self._ready: list[bytes] = []
+        self._name, self._value = b"", b""
+        self._in_file = self._seen_file = self._whole = False
+
+    async def chunks(self) -> AsyncIterator[bytes]:
+        kind, options = parse_options_header(self._request.headers.get("content-type", ""))
+        try:
+            if kind == b"multipart/form-data":
+                async for chunk in self._form(options):
+                    yield chunk
+            else:
+                self.filename = _label(self._request.query_params.get("filename"))
+                async for chunk in self._request.stream():
+                    if chunk:
+                        yield chunk
+        except ClientDisconnect as error:
+            raise Problem(
+                400, "upload-ended-early", "the connection closed before the file was whole"
+            ) from error
+
+    async def _form(self, options: dict[bytes, bytes]) -> AsyncIterator[bytes]:
+        if not options.get(b"boundary"):
+            raise Problem(400, "bad-form", "expected a boundary in the multipart Content-Type, got none")
+        callbacks: MultipartCallbacks = {
+            "on_part_begin": self._part_begin,
+            "on_header_field": self._header_field,
+            "on_header_value": self._header_value,
+            "on_header_end": self._header_end,
+            "on_part_data": self._part_data,
+            "on_end": self._end,
+        }
+        try:
+            parser = MultipartParser(options[b"boundary"], callbacks)
+            sent = 0
+            async for chunk in self._request.stream():
+                sent += len(chunk)
+                if sent > self._max_bytes + FORM_BYTES:  # parts that are not the file count too
+                    raise _too_large(self._max_bytes)
+                parser.write(chunk)
+                while self._ready:
+                    yield self._ready.pop(0)
+        except FormParserError as error:
+            raise Problem(400, "bad-form", f"expected multipart/form-data: {error}") from error
+        if not self._seen_file:
+            raise Problem(400, "bad-form", "expected a form with a part named 'file', got none")
+        if not self._whole:
+            raise Problem(400, "upload-ended-early", "the form ended before its last boundary")
+
+    def _part_begin(self) -> None:
+        self._in_file = False
+
+    def _header_field(self, data: bytes, start: int, end: int) -> None:
+        self._name += data[start:end]
+
+    def _header_value(self, data: bytes, start: int, end: int) -> None:
+        self._value += data[start:end]
+
+    def _header_end(self) -> None:
+        if self._name.lower() == b"content-disposition":
+            _, options = parse_options_header(self._value)
+            if options.get(b"name") == b"file" and not self._seen_file:
+                self._in_file = self._seen_file = True
+                self.filename = _label(options.get(b"filename", b"").decode("utf-8", "replace"))
+        self._name, self._value = b"", b""
+
+    def _part_data(self, data: bytes, start: int, end: int) -> None:
+        if self._in_file:
+            self._ready.append(data[start:end])
+
+    def _end(self) -> None:
+        self._whole = True
+
+
+def _label(filename: str | None) -> str | None:
+    """A client's file name as a label for people: its last part, printable, short. It is never a path."""
+    if not filename:
+        return None
+    last = re.split(r"[/\\]", filename)[-1]
+    return "".join(c for c in last if c.isprintable())[:200] or None

@@ -1,0 +1,134 @@
+"""Metrics for Prometheus: ``/metrics``.
+
+What concerns all processes (jobs, files, workers) is asked of the database at each scrape, by queries that read
+indexes alone; what concerns this process (its requests) is counted in it. Jobs and files are gauges: a job that is
+destroyed takes its numbers along. What jobs spent in their stages stays, and is counted.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from fastapi import APIRouter, Request, Response
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Metric, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.registry import Collector
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.api.jobs import RESULTS
+from service.http.callers import Administering
+from service.http.state import Shared, State
+from workers import checks
+from workers.catalogue.census import JobTally
+from workers.contract.contract import Phase
+from workers.contract.queues import Queue
+from workers.settings import software_version
+
+router = APIRouter(tags=["operation"])
+
+
+@router.get(
+    "/metrics",
+    summary="Numbers for Prometheus",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+def metrics(request: Request, _caller: Administering, state: Shared) -> Response:
+    """Jobs, files and workers of the whole service; requests of this process."""
+    shared = CollectorRegistry()
+    shared.register(_Catalogued(state))
+    text = generate_latest(shared) + generate_latest(request.app.state.requests.registry)
+    return Response(text, headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+
+class _Catalogued(Collector):
+    def __init__(self, state: State) -> None:
+        self._state = state
+
+    def describe(self) -> list[Metric]:
+        """Nothing: what would be asked for here is asked for at the scrape itself."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """All that the database and the storage say; where the database is away, that alone."""
+        yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
+        room = GaugeMetricFamily("heliopsf_storage_free_bytes", "Room left where the files are")
+        room.add_metric([], checks.free_bytes(self._state.settings.data_dir))
+        yield room
+        up = GaugeMetricFamily("heliopsf_database_up", "1 where the database answers")
+        try:
+            found = [*self._jobs(), *self._stages(), *self._waiting(), *self._files()]
+        except SQLAlchemyError:
+            up.add_metric([], 0)
+            yield up
+            return
+        up.add_metric([], 1)
+        yield up
+        yield from found
+
+    def _jobs(self) -> Iterator[Metric]:
+        tallies = {(tally.kind, tally.phase): tally for tally in self._state.catalogue.census.tally()}
+        kinds = sorted({*RESULTS, *(kind for kind, _ in tallies)})
+        jobs = GaugeMetricFamily("heliopsf_jobs", "Jobs", labels=["kind", "phase"])
+        attempts = GaugeMetricFamily("heliopsf_job_attempts", "Starts of jobs", labels=["kind"])
+        retries = GaugeMetricFamily("heliopsf_job_retries", "Starts of jobs after the first", labels=["kind"])
+        seconds = GaugeMetricFamily(
+            "heliopsf_job_run_seconds",
+            "Time that all jobs counted as COMPLETED took, from the last start",
+            labels=["kind"],
+        )
+        for kind in kinds:
+            of_kind = {
+                phase: tallies.get((kind, phase), JobTally(kind, phase, 0, 0, 0, 0.0)) for phase in Phase
+            }
+            for phase, tally in of_kind.items():
+                jobs.add_metric([kind, phase], tally.jobs)
+            attempts.add_metric([kind], sum(tally.attempts for tally in of_kind.values()))
+            retries.add_metric([kind], sum(tally.retries for tally in of_kind.values()))
+            seconds.add_metric([kind], of_kind[Phase.COMPLETED].run_s)
+        yield from (jobs, attempts, retries, seconds)
+
+    def _stages(self) -> Iterator[Metric]:
+        seconds = CounterMetricFamily(
+            "heliopsf_job_stage_seconds",
+            "Time of attempts that ended, by what they were at; without reporting it",
+            labels=["kind", "stage"],
+        )
+        steps = CounterMetricFamily(
+            "heliopsf_job_stage_steps", "Steps that these attempts reported", labels=["kind", "stage"]
+        )
+        for (kind, stage), spent in self._state.catalogue.stage_times.all().items():
+            seconds.add_metric([kind, stage], spent.seconds)
+            steps.add_metric([kind, stage], spent.steps)
+        yield from (seconds, steps)
+
+    def _waiting(self) -> Iterator[Metric]:
+        catalogue, lease_s = self._state.catalogue, self._state.settings.lease_s
+        age = GaugeMetricFamily(
+            "heliopsf_oldest_queued_seconds", "Age of the job that has waited longest", labels=["queue"]
+        )
+        for queue in Queue:
+            oldest = catalogue.census.oldest_queued_at(queue)
+            age.add_metric([queue], 0.0 if oldest is None else max(0.0, time.time() - oldest))
+        yield age
+        silent = GaugeMetricFamily("heliopsf_jobs_silent", "Jobs whose worker has been silent for its lease")
+        silent.add_metric([], catalogue.census.count_silent(lease_s))
+        yield silent
+        images = GaugeMetricFamily(
+            "heliopsf_bulk_images", "Images of bulks that have not ended", labels=["state"]
+        )
+        for state, count in catalogue.bulks.open_images().items():
+            images.add_metric([state], count)
+        yield images
+        workers = GaugeMetricFamily("heliopsf_workers", "Worker processes that are there")
+        workers.add_metric([], len(catalogue.census.workers(lease_s)))
+        yield workers
+
+    def _files(self) -> Iterator[Metric]:
+        files = GaugeMetricFamily("heliopsf_files", "Files kept", labels=["kind", "origin"])
+        size = GaugeMetricFamily("heliopsf_file_bytes", "Bytes of files kept", labels=["kind", "origin"])
+        for tally in self._state.catalogue.census.tally_files():
+            files.add_metric([tally.kind, tally.origin], tally.files)
+            size.add_metric([tally.kind, tally.origin], tally.bytes)
+        yield from (files, size)

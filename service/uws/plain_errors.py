@@ -1,0 +1,59 @@
+"""How UWS addresses answer and describe themselves: refusals as plain text, fields whose names are read in any case."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from fastapi import Request, Response
+from fastapi.responses import PlainTextResponse, RedirectResponse
+from fastapi.routing import APIRoute
+
+from service.http.problems import Problem
+from service.uws.documents import MEDIA_TYPE
+
+
+class PlainErrors(APIRoute):
+    """Refusals as plain text, as clients of the Virtual Observatory show them."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handle = super().get_route_handler()
+
+        async def answer(request: Request) -> Response:
+            try:
+                return await handle(request)
+            except Problem as problem:
+                return PlainTextResponse(f"{problem.detail}\n", problem.status, headers=problem.headers)
+
+        return answer
+
+
+def query(**described: str) -> dict[str, Any]:
+    """Parameters of an address for the description of the interface; their names are read in any case."""
+    return {
+        "parameters": [
+            {
+                "name": name,
+                "in": "query",
+                "required": False,
+                "schema": {"type": "string"},
+                "description": text,
+            }
+            for name, text in described.items()
+        ]
+    }
+
+
+def form(**described: str) -> dict[str, Any]:
+    """A form's fields for the description of the interface."""
+    fields = {name: {"type": "string", "description": text} for name, text in described.items()}
+    schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
+    return {"requestBody": {"content": {"application/x-www-form-urlencoded": {"schema": schema}}}}
+
+
+TEXT: dict[str, Any] = {"response_class": PlainTextResponse}
+XML: dict[str, Any] = {
+    "response_class": Response,
+    "responses": {200: {"content": {MEDIA_TYPE: {}}, "description": "A document of UWS 1.1"}},
+}
+TO_JOB: dict[str, Any] = {"status_code": 303, "response_class": RedirectResponse}

@@ -1,0 +1,180 @@
+"""The blind set's effects: nothing at strength 0, something at their nominal one, and what physics asks of some."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from psfcore.blind.chain import Chain, Sky
+from psfcore.blind.effects.effect import Earlier, Moment
+from psfcore.blind.effects.fine_optics import (
+    FINE,
+    SYNTHETIC,
+    FineOptics,
+    Glass,
+    boxed_glass,
+    boxed_kernel,
+    fine_optics,
+)
+from psfcore.blind.effects.registry import EFFECTS, KNOWN, UNKNOWN, effect_named
+from psfcore.blind.effects.scene import SaturationFill
+from psfcore.errors import DataError
+from psfcore.simulate.disc import binned
+from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan
+from psfcore.simulate.pointings import drawn_scene
+from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel
+
+LAW = ScatterTruth(5.0, 2.5, 0.4)
+GLASS = Glass(SYNTHETIC, 64)
+SIZE_PX = 96
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return default_plan(6, SIZE_PX, oversampling=FINE)
+
+
+@pytest.fixture(scope="module")
+def optics() -> FineOptics:
+    return fine_optics(LAW, GLASS, SIZE_PX)
+
+
+@pytest.fixture(scope="module")
+def sky(plan: Plan, optics: FineOptics) -> Sky:
+    return Sky(plan, optics, {fov: drawn_scene(plan, fov, 3) for fov in plan.fovs})
+
+
+@pytest.fixture(scope="module")
+def clean(sky: Sky) -> list[np.ndarray]:
+    return Chain(sky, ()).all_expected()
+
+
+def test_eighteen_effects_are_known_and_eight_or_more_are_not() -> None:
+    assert len(KNOWN) == 18
+    assert set(KNOWN) <= set(EFFECTS)
+    assert len(UNKNOWN) >= 8
+    assert all(effect.cause and effect.unit for effect in EFFECTS.values())
+    with pytest.raises(DataError, match="unknown-effect"):
+        effect_named("gremlins")
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_an_effect_changes_images_and_at_strength_0_none(
+    name: str, plan: Plan, sky: Sky, clean: list[np.ndarray]
+) -> None:
+    effect = EFFECTS[name].drawn(EFFECTS[name].nominal, plan, np.random.default_rng(8))
+    still, changed = Chain(sky, (effect.at(0.0),)), Chain(sky, (effect,))
+    for before, after in zip(clean, still.all_expected(), strict=True):
+        np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
+    for before, after in zip(Chain(sky, ()).read_out(clean, 5), still.read_out(clean, 5), strict=True):
+        np.testing.assert_array_equal(after, before)
+    moved = changed.mean_rate(changed.all_expected(), 5)
+    assert max(np.abs(after / before - 1).max() for before, after in zip(clean, moved, strict=True)) > 1e-3
+    assert all(np.isfinite(image).all() for image in moved)
+
+
+def test_a_seed_draws_the_same_effect_and_another_another(plan: Plan) -> None:
+    for effect in EFFECTS.values():
+        first, second, third = (effect.drawn(1.0, plan, np.random.default_rng(seed)) for seed in (1, 1, 2))
+        assert first == second
+        free = [field.name for field in dataclasses.fields(effect) if field.name != "strength"]
+        assert not free or any(
+            effect.drawn(1.0, plan, np.random.default_rng(seed)) != third for seed in range(3, 9)
+        )
+
+
+def test_a_boxed_scatter_kernel_is_the_law_on_detector_pixels(optics: FineOptics) -> None:
+    boxed, law = boxed_kernel(optics.scatter), anisotropic_kernel(LAW, 2 * SIZE_PX)
+    middle = SIZE_PX
+    assert boxed[middle, middle] == pytest.approx(1 - LAW.total, abs=1e-9)
+    near = (slice(middle - 20, middle + 21), slice(middle + 1, middle + 21))
+    np.testing.assert_allclose(boxed[near], law[near], rtol=0.02)
+
+
+def test_an_even_scene_is_seen_the_same_by_fine_and_boxed_kernels() -> None:
+    """A scene without structure within a pixel: boxed after = boxed before the convolution."""
+    from psfcore.convolution.convolver import Convolver
+
+    rng = np.random.default_rng(4)
+    coarse = rng.random((32, 32))
+    fine = np.kron(coarse, np.ones((FINE, FINE)))
+    kernel = Glass(SYNTHETIC, 32).fine()
+    seen = binned(Convolver(kernel, fine.shape, dtype=np.float64).apply(fine), FINE)
+    boxed = Convolver(boxed_kernel(kernel), coarse.shape, dtype=np.float64).apply(coarse)
+    np.testing.assert_allclose(seen, boxed, atol=2e-4)  # the outermost fine row has no partner
+
+
+def test_the_known_psf_sums_to_1_and_its_orders_turn() -> None:
+    kernel = boxed_glass(GLASS)
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-12)
+    assert np.unravel_index(kernel.argmax(), kernel.shape) == (32, 32)
+    straight, turned = GLASS.fine(), GLASS.fine(turn_deg=90.0)
+    np.testing.assert_allclose(turned, straight, atol=1e-12)  # a square mesh, a quarter turn
+    assert np.abs(GLASS.fine(turn_deg=5.0) - straight).sum() > 0.01
+
+
+@pytest.mark.parametrize("name", ["anisotropic_scatter", "one_sided_scatter", "core_blur", "focus_drift"])
+def test_light_is_moved_not_made(name: str, plan: Plan, optics: FineOptics) -> None:
+    effect = EFFECTS[name].drawn(EFFECTS[name].nominal, plan, np.random.default_rng(2))
+    changed = effect.optics(optics, Moment(plan, len(plan.shots) - 1))
+    assert changed.scatter.sum() == pytest.approx(optics.scatter.sum(), abs=2e-3)
+    assert changed.diffraction.sum() == pytest.approx(1.0, abs=3e-3)
+
+
+def test_scatter_that_depends_on_the_field_moves_light_between_pixels(plan: Plan, optics: FineOptics) -> None:
+    effect = EFFECTS["field_dependent_scatter"](0.5)
+    lit = np.zeros(optics.field)
+    lit[SIZE_PX, 2 * SIZE_PX - 40] = 1.0  # a point away from the centre along +x: more scatter
+    added = effect.spread(np.zeros_like(lit), lit, optics, Moment(plan, 0))
+    assert added[SIZE_PX, 2 * SIZE_PX - 40] < 0
+    assert added[SIZE_PX + 21, SIZE_PX] > 0  # off the mesh's orders, which follow the core
+
+
+def test_a_moving_disc_lets_light_in_at_its_ends_alone(plan: Plan, sky: Sky, clean: list[np.ndarray]) -> None:
+    effect = EFFECTS["occulter_motion"](1.0)  # along x
+    shot = plan.shots[0]
+    moved = Chain(sky, (effect,)).expected(0) - clean[0]
+    row, column, radius = round(shot.y_px), round(shot.x_px), int(plan.radius_px)
+    ends = moved[row, [column - radius + 1, column + radius - 1]]
+    sides = moved[[row - radius + 2, row + radius - 2], column]
+    assert ends.min() > 5 * np.abs(sides).max()
+
+
+def test_persistence_is_what_earlier_images_showed(plan: Plan) -> None:
+    effect = EFFECTS["persistence"](0.1)
+    dn, before = np.zeros((4, 4)), Earlier(np.full((4, 4), 100.0), plan.shots[0].time_s)
+    assert np.all(effect.read_out(dn, Moment(plan, 0), []) == 0)
+    left = effect.read_out(dn, Moment(plan, 1), [before])
+    wait = plan.shots[1].time_s - plan.shots[0].time_s
+    np.testing.assert_allclose(left, 10.0 * np.exp(-wait / 300.0))
+
+
+def test_a_gain_mismatch_is_in_combined_images_alone(plan: Plan) -> None:
+    effect, dn = EFFECTS["gain_mismatch"](0.1), np.full((4, 4), 50.0)
+    for index, shot in enumerate(plan.shots):
+        factor = {COMBINED: 1.1, HIGH: 1.0}[shot.gain_mode]
+        np.testing.assert_allclose(effect.read_out(dn, Moment(plan, index), []), factor * dn)
+
+
+def test_saturation_loses_the_share_of_light_that_it_is_told(plan: Plan, clean: list[np.ndarray]) -> None:
+    exposures = [rate * shot.exposure_s for rate, shot in zip(clean, plan.shots, strict=True)]
+    level = SaturationFill(0.03).saturation_dn(exposures, plan)
+    assert level is not None
+    high = np.concatenate(
+        [dn.ravel() for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
+    )
+    assert np.maximum(high - level, 0).sum() / high.sum() == pytest.approx(0.03, abs=0.002)
+
+
+def test_faint_signals_lose_what_a_nonlinearity_says(plan: Plan) -> None:
+    effect = dataclasses.replace(EFFECTS["nonlinearity"](0.2), knee_dn=100.0)
+    dn = np.array([[5.0, 100.0, 1000.0]])
+    np.testing.assert_allclose(effect.read_out(dn, Moment(plan, 0), []), [[4.0, 100.0, 1000.0]])
+
+
+def test_charge_that_repels_is_kept(plan: Plan, clean: list[np.ndarray]) -> None:
+    out = EFFECTS["brighter_fatter"](0.05).expected(clean[2], Moment(plan, 2))
+    assert out.sum() == pytest.approx(clean[2].sum(), rel=1e-12)
+    assert out.std() < clean[2].std()

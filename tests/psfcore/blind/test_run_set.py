@@ -1,0 +1,107 @@
+"""Diagnosing a blind set: alone with a transit, resumable, failures apart."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from psfcore.blind.case_set import BlindSet
+from psfcore.blind.make_case import sealed
+from psfcore.blind.run_set import has_report, judged_cases, report_of, run_of, run_set
+from psfcore.errors import DataError
+
+TRUTH = {"kind": "clean", "effects": [], "left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0}
+# A diagnosis that notes in a file that it ran, and reports what it could see.
+DIAGNOSIS = """
+import json, os, pathlib, sys
+transit, report, log = sys.argv[1:4]
+with open(log, "a") as lines:
+    lines.write(pathlib.Path(transit, "transit.json").read_text() + "\\n")
+seen = sorted(str(path.relative_to(os.getcwd())) for path in pathlib.Path(os.getcwd()).rglob("*"))
+pathlib.Path(report).write_text(json.dumps({"schema": "gap/1", "verdict": "none", "seen": seen, "at": os.getcwd()}))
+"""
+
+
+@pytest.fixture
+def blind(tmp_path: Path) -> BlindSet:
+    """Three sealed cases whose transit is one file."""
+    made = BlindSet(tmp_path / "set")
+    (made.folder / "truth").mkdir(parents=True)
+    for number in range(3):
+        made.transit(number).mkdir(parents=True)
+        (made.transit(number) / "transit.json").write_text(f"case {number}")
+        seal, kept = sealed(TRUTH)
+        made.truth_file(number).write_text(json.dumps(kept))
+        with made.seals_file.open("a") as seals:
+            seals.write(json.dumps({"case": number, "sha256": seal}) + "\n")
+    return made
+
+
+def command(log: Path, code: str = DIAGNOSIS) -> list[str]:
+    return [sys.executable, "-c", code, "{transit}", "{report}", str(log)]
+
+
+def test_a_diagnosis_sees_a_copy_of_the_transit_and_nothing_else(blind: BlindSet, tmp_path: Path) -> None:
+    (run,) = run_set(blind, [1], command(tmp_path / "log"), keep=True)
+    assert not run.failed
+    assert run.wall_s > 0
+    assert run.peak_mib > 1
+    report = report_of(blind, 1)
+    assert report["seen"] == ["transit", "transit/transit.json", "words.txt"]
+    assert not Path(report["at"]).is_relative_to(blind.folder)
+    assert not Path(report["at"]).exists()
+    assert blind.transit(1).is_dir()
+    assert run_of(blind, 1) == run
+
+
+def test_no_case_is_diagnosed_twice_and_a_half_report_is_done_again(blind: BlindSet, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    blind.report(2).write_text('{"schema": "gap/1", "verd')
+    run_set(blind, [0, 1], command(log), processes=2)
+    assert not blind.transit(0).exists(), "a transit goes once there is a report"
+    run_set(blind, [0, 1, 2], command(log), processes=2)
+    assert sorted(log.read_text().splitlines()) == ["case 0", "case 1", "case 2"]
+    assert all(has_report(blind, number) for number in range(3))
+    assert run_set(blind, [0, 1, 2], command(log)) == []
+
+
+def test_failures_are_kept_apart_and_tried_again(blind: BlindSet, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    (broken,) = run_set(blind, [0], command(log, "import sys; sys.exit('no light')"))
+    assert broken.failed
+    assert "no light" in broken.error
+    assert blind.transit(0).is_dir()
+    (silent,) = run_set(blind, [1], command(log, "pass"))
+    assert "gap/1" in silent.error
+    judged, failures = judged_cases(blind, range(2))
+    assert judged == []
+    assert "no light" in failures[0]
+    run_set(blind, [0], command(log))
+    judged, failures = judged_cases(blind, range(2))
+    assert ([case.number for case in judged], list(failures)) == ([0], [1])
+
+
+def test_what_takes_too_long_is_killed(blind: BlindSet, tmp_path: Path) -> None:
+    (late,) = run_set(blind, [0], command(tmp_path / "log", "import time; time.sleep(60)"), longest_s=0.5)
+    assert late.failed
+    assert "killed after" in late.error
+    assert late.wall_s < 20
+
+
+def test_bad_commands_and_unsealed_cases_are_refused(blind: BlindSet, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="bad-command"):
+        run_set(blind, [0], ["heliopsf", "gap", "{transit}"])
+    with pytest.raises(DataError, match="not-sealed"):
+        run_set(blind, [7], command(tmp_path / "log"))
+
+
+def test_a_truth_changed_after_its_diagnosis_is_not_scored(blind: BlindSet, tmp_path: Path) -> None:
+    run_set(blind, [0], command(tmp_path / "log"))
+    kept = json.loads(blind.truth_file(0).read_text())
+    kept["truth"]["kind"] = "single"
+    blind.truth_file(0).write_text(json.dumps(kept))
+    with pytest.raises(DataError, match="broken-seal"):
+        judged_cases(blind, [0])

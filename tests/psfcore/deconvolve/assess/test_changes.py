@@ -1,0 +1,218 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psfcore.convolution.convolver import linear_convolve
+from psfcore.deconvolve.assess.artefacts import classes_of, find_artefacts, noise_from_pixels, ringing_pct
+from psfcore.deconvolve.assess.changes import BLOCKS_PX, TAILS_PCT, Effects, block_means, effects
+from psfcore.deconvolve.assess.plots import effects_png
+from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
+from psfcore.errors import DataError
+from psfcore.fits.fits_io import read_image
+from psfcore.image import Image
+from psfcore.noise import Noise
+from psfcore.psf import Psf, crop_centred
+from psfcore.scatter.power_law import scatter_kernel
+from psfcore.simulate.observe import observe
+from psfcore.simulate.scene import solar_scene
+from tests.psfcore.conftest import LIMITS, delta, gaussian, make_image, make_psf
+
+Plane = NDArray[np.float64]
+SIZE_PX, EDGE_PX = 384, 24
+HRI = "eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
+
+
+def blurred(core_px: float, total: float = 0.411) -> Psf:
+    size = (512, 512)
+    scatter = crop_centred(scatter_kernel(6.15, 2.53, total, 2048), size)
+    return make_psf(np.maximum(linear_convolve(scatter, gaussian(41, core_px), size), 0))
+
+
+@pytest.fixture(scope="module")
+def psf() -> Psf:
+    return blurred(0.8)
+
+
+@pytest.fixture(scope="module")
+def seen(psf: Psf) -> Image:
+    scene = solar_scene((SIZE_PX, SIZE_PX), 1)
+    pixels = observe(scene, psf, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
+    image = make_image(pixels)
+    return Image(pixels, image.mask, image.header, "DN/s", 1.4)
+
+
+def found(image: Image, psf: Psf, steps: int) -> Effects:
+    result = richardson_lucy(image, psf, steps=steps, threads=2).pixels
+    return effects(image, result, psf, edge_px=EDGE_PX)
+
+
+# --- figures ---
+
+
+def test_a_result_that_is_the_input_has_no_effect(seen: Image) -> None:
+    report = effects(seen, seen.pixels, make_psf(delta(32)))
+    assert report.flux_change_pct == 0
+    assert set(report.change_pct.values()) == {0.0}
+    assert all(row.sum_pct == row.median_pct == row.up_to_pct == 0 for row in report.structures)
+    assert all(row.dynamic_before == row.dynamic_after for row in report.ranges)
+    assert report.artefacts.score == 0 and not report.artefacts.suspected.any()
+
+
+def test_known_changes_of_known_structures_are_found() -> None:
+    """A quarter of the pixels bright and raised by 40 %, a quarter dark and lowered by 85 %, in blocks of 32."""
+    before = np.full((256, 256), 100.0)
+    before[:64], before[-64:] = 1000.0, 10.0
+    after = before * np.where(before == 1000, 1.4, np.where(before == 10, 0.15, 1.0))
+    report = effects(make_image(before), after, make_psf(delta(32)))
+    assert {row.block_px for row in report.structures} == set(BLOCKS_PX)
+    for row in report.structures:
+        wanted = 40.0 if row.kind == "bright" else -85.0
+        assert (row.sum_pct, row.median_pct, row.up_to_pct) == pytest.approx((wanted,) * 3)
+        assert row.before == (1000.0 if row.kind == "bright" else 10.0)
+    for row in report.ranges:
+        assert (row.dynamic_before, row.dynamic_after) == pytest.approx((100.0, 1400 / 1.5))
+        assert row.contrast_after > row.contrast_before
+
+
+def test_block_means_by_brute_force_leave_out_blocks_with_a_bad_pixel() -> None:
+    plane = np.arange(7 * 9, dtype=float).reshape(7, 9)
+    counted = np.ones(plane.shape, bool)
+    counted[4, 5] = False
+    wanted = [plane[y : y + 3, x : x + 3].mean() for y in (0, 3) for x in (0, 3, 6) if (y, x) != (3, 3)]
+    np.testing.assert_allclose(block_means(plane, counted, 3), wanted)
+
+
+def test_deconvolution_raises_the_bright_and_lowers_the_dark(seen: Image, psf: Psf) -> None:
+    report = found(seen, psf, 20)
+    for row in report.structures:
+        if row.tail_pct == 5.0 and row.block_px <= 8:
+            assert (row.sum_pct > 0) == (row.kind == "bright"), row
+    by_block = {row.block_px: row for row in report.ranges if row.tail_pct == 5.0}
+    assert all((row.dynamic_after or 0) > (row.dynamic_before or 0) for row in by_block.values())
+
+
+def test_a_dark_sky_at_zero_has_no_dynamic_range(seen: Image, psf: Psf) -> None:
+    pixels = seen.pixels - np.percentile(seen.pixels, 10)
+    report = effects(make_image(pixels), pixels, psf)
+    assert report.ranges[0].dynamic_before is None
+    assert report.not_positive_before == report.not_positive_after > 0
+    json.dumps(report.as_json(), allow_nan=False)
+
+
+def test_masked_pixels_are_left_out(seen: Image, psf: Psf) -> None:
+    pixels = seen.pixels.copy()
+    pixels[100:110, 100:110] = np.nan
+    image = make_image(pixels)
+    report = effects(image, richardson_lucy(image, psf, steps=3).pixels, psf, edge_px=EDGE_PX)
+    assert report.pixels == (SIZE_PX - 2 * EDGE_PX) ** 2 - 100
+    assert not report.artefacts.suspected[100:110, 100:110].any()
+    json.dumps(report.as_json(), allow_nan=False)
+
+
+def test_what_cannot_be_compared_is_refused(seen: Image, psf: Psf) -> None:
+    with pytest.raises(DataError) as caught:
+        effects(seen, seen.pixels[:-1], psf)
+    assert caught.value.code == "field-shape"
+    with pytest.raises(DataError) as caught:
+        effects(seen, seen.pixels, psf, edge_px=SIZE_PX)
+    assert caught.value.code == "no-signal"
+
+
+# --- artefacts ---
+
+
+@pytest.mark.parametrize("noise", [None, Noise(6.0, 2.0)])
+def test_twenty_steps_with_the_true_psf_are_clean(seen: Image, psf: Psf, noise: Noise | None) -> None:
+    result = richardson_lucy(seen, psf, steps=20, threads=2).pixels
+    assert effects(seen, result, psf, noise=noise, edge_px=EDGE_PX).artefacts.score < 0.2
+
+
+def test_worse_deconvolutions_rank_above_better_ones(seen: Image, psf: Psf) -> None:
+    """Noise fitted by 200 steps; a core twice too wide, driven to its rings; light divided out where none is."""
+    clean = found(seen, psf, 20).artefacts.score
+    assert clean < 1 < found(seen, psf, 200).artefacts.score
+    rings = found(seen, blurred(1.6), 100).artefacts
+    assert rings.score > 1 and (rings.signs["ringing_pct"] or 0) > 0.5
+    transfer = np.fft.rfft2(np.fft.ifftshift(crop_centred(psf.kernel, (SIZE_PX, SIZE_PX))))
+    bound = np.where(np.abs(transfer) > 0.02, transfer, 0.02)
+    inverse = np.fft.irfft2(np.fft.rfft2(seen.pixels) / bound, s=seen.pixels.shape)
+    assert effects(seen, inverse, psf, edge_px=EDGE_PX).artefacts.score > 100
+
+
+def test_each_sign_is_seen_where_it_is(seen: Image, psf: Psf) -> None:
+    result = richardson_lucy(seen, psf, steps=20, threads=2).pixels
+    quiet = seen.pixels > 300
+    (y1, x1), (y2, x2), (y3, x3) = np.argwhere(quiet)[[20_000, 30_000, 40_000]]
+    result[y1, x1] = 0.0
+    result[y2, x2] = 20 * seen.pixels[y2, x2]
+    found_here = find_artefacts(seen.pixels, result, seen.valid, float(psf.kernel[256, 256]))
+    assert found_here.suspected[y1, x1] and found_here.suspected[y2, x2]
+    assert not found_here.suspected[y3, x3]
+    assert (found_here.signs["holes_ppm"] or 0) > 0 and (found_here.signs["overshoots_ppm"] or 0) > 0
+
+
+def test_rings_are_measured_in_percent_of_the_peak() -> None:
+    before, after = np.full((200, 200), 10.0), np.full((200, 200), 10.0)
+    y, x = np.mgrid[:200, :200]
+    for centre in (40, 100, 160):
+        r = np.hypot(y - centre, x - centre)
+        before += 1000 * np.exp(-(r**2) / 8)
+        after += 1500 * np.exp(-(r**2) / 2) + 150 * np.exp(-((r - 6) ** 2))
+    level, sources = ringing_pct(before, after, np.ones(before.shape, bool))
+    assert sources == 3
+    assert level == pytest.approx(10.0, abs=1.5)
+    assert ringing_pct(before, before, np.ones(before.shape, bool)) == (0.0, 3)
+    assert ringing_pct(np.ones((64, 64)), np.ones((64, 64)), np.ones((64, 64), bool))[0] is None
+
+
+def test_noise_is_found_from_the_pixels() -> None:
+    expected = np.full((256, 256), 300.0) + np.linspace(0, 600, 256)
+    noise = Noise(6.0, 2.0)
+    pixels = noise.observe(expected, 1.4, np.random.default_rng(1))
+    found_sigma = noise_from_pixels(
+        pixels, expected, np.ones(pixels.shape, bool), classes_of(expected.ravel())
+    )
+    ratio = found_sigma / np.sqrt(noise.variance(expected, 1.4))
+    assert np.abs(ratio - 1).max() < 0.1
+
+
+# --- pictures and the real image ---
+
+
+def test_the_page_is_drawn(seen: Image, psf: Psf, tmp_path: Path) -> None:
+    result = richardson_lucy(seen, psf, steps=5, threads=2).pixels
+    result[5, 5] = np.nan
+    report = effects(seen, result, psf, edge_px=EDGE_PX)
+    for name in ("a.png", "b.png"):
+        effects_png(seen.pixels, result, report, tmp_path / name, title="Simulated")
+    content = (tmp_path / "a.png").read_bytes()
+    assert content.startswith(b"\x89PNG") and len(content) > 100_000
+    assert content == (tmp_path / "b.png").read_bytes()
+
+
+def test_a_page_of_an_image_without_light_is_drawn(tmp_path: Path) -> None:
+    pixels = np.full((64, 64), -1.0)
+    pixels[3, 3] = 200.0
+    report = effects(make_image(pixels + 1), pixels + 1, make_psf(delta(16)))
+    effects_png(pixels, pixels, report, tmp_path / "p.png", title="Dark")
+
+
+@pytest.mark.slow
+def test_the_real_image(real: Callable[[str], Path]) -> None:
+    """The paper: bright features rise by up to 40 %, dark regions fall by up to 85 %, no artefacts."""
+    image = read_image(real(HRI), LIMITS)
+    scatter = make_psf(scatter_kernel(6.15, 2.53, 0.411, 2048))
+    result = richardson_lucy(image, scatter, steps=20, threads=2).pixels
+    report = effects(image, result, scatter, edge_px=EDGE_PX)
+    assert report.artefacts.score < 1
+    assert len(report.structures) == 2 * len(BLOCKS_PX) * len(TAILS_PCT)
+    bright = [row.up_to_pct for row in report.structures if row.kind == "bright" and row.block_px > 1]
+    dark = [row.up_to_pct for row in report.structures if row.kind == "dark" and row.block_px > 1]
+    assert min(bright) > 5 and max(bright) < 90
+    assert min(dark) > -90 and max(dark) < -5

@@ -1,0 +1,168 @@
+"""Many images in one run: the doubtful first, the failed apart, and a sheet to look at."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from psfcore.deconvolve.assess.contact_sheet import (
+    BLOCK_PX,
+    TAIL_PCT,
+    THUMBNAIL_PX,
+    Failure,
+    Treated,
+    contact_sheet_png,
+    table,
+    treat,
+    treat_many,
+)
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.errors import DataError
+from psfcore.image import Image
+from psfcore.psf import Psf
+from psfcore.scatter.power_law import scatter_kernel
+from psfcore.simulate.observe import observe
+from psfcore.simulate.scene import solar_scene
+from tests.psfcore.conftest import make_image, make_psf
+
+SIZE = 288
+DEAD = (slice(40, 80, 4), slice(40, 280, 8))  # [y, x] of pits that the Sun does not have
+
+
+@pytest.fixture(scope="module")
+def psf() -> Psf:
+    return make_psf(scatter_kernel(3.0, 2.5, 0.4, 128), plate_scale_arcsec=0.5)
+
+
+@pytest.fixture(scope="module")
+def images(psf: Psf) -> dict[str, Image]:
+    out = {}
+    for seed, name in enumerate(("clean", "dead", "other")):
+        scene = solar_scene((SIZE, SIZE), seed + 1)
+        pixels = observe(scene, psf, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=seed)
+        if name == "dead":
+            pixels[DEAD] = -300.0
+        out[name] = make_image(pixels)
+    return out
+
+
+def reader(images: dict[str, Image], psf: Psf) -> Callable[[str], Treated]:
+    def one(name: str) -> Treated:
+        if name == "gone":
+            raise FileNotFoundError(2, "No such file or directory", name)
+        if name == "empty":
+            raise DataError("no-signal", "expected pixels above zero; the largest is 0")
+        return treat(name, images[name], psf, steps=8)
+
+    return one
+
+
+@pytest.fixture(scope="module")
+def run(images: dict[str, Image], psf: Psf) -> tuple[list[Treated], list[Failure]]:
+    return treat_many(["gone", "clean", "dead", "empty", "other"], reader(images, psf))
+
+
+def test_the_doubtful_come_first_and_failures_stop_nothing(
+    run: tuple[list[Treated], list[Failure]],
+) -> None:
+    treated, failures = run
+    assert treated[0].name == "dead" and {row.name for row in treated} == {"clean", "dead", "other"}
+    scores = [row.score for row in treated]
+    assert scores == sorted(scores, reverse=True) and scores[0] > 1 > scores[1]
+    assert failures == [
+        Failure("gone", "unreadable-file", "No such file or directory"),
+        Failure("empty", "no-signal", "expected pixels above zero; the largest is 0"),
+    ]
+
+
+def test_what_is_ours_is_not_taken_for_a_failure_of_the_image() -> None:
+    def broken(name: str) -> Treated:
+        raise RuntimeError(name)
+
+    with pytest.raises(RuntimeError):
+        treat_many(["a"], broken)
+
+
+def test_figures_are_those_of_the_deconvolution(
+    run: tuple[list[Treated], list[Failure]], images: dict[str, Image], psf: Psf
+) -> None:
+    row = next(row for row in run[0] if row.name == "clean")
+    result = method_named("richardson-lucy")(images["clean"], psf, Conditions(), steps=8)
+    assert row.steps_done == 8
+    step = -(-SIZE // THUMBNAIL_PX)
+    assert row.after.shape == (SIZE // step, SIZE // step)
+    means = result.pixels.reshape(SIZE // step, step, SIZE // step, step).mean(axis=(1, 3))
+    assert row.after == pytest.approx(means, rel=1e-4)
+    bright = row.structure("bright")
+    wanted = [
+        s for s in row.found.structures if (s.kind, s.block_px, s.tail_pct) == ("bright", BLOCK_PX, TAIL_PCT)
+    ]
+    assert bright == {"sum_pct": wanted[0].sum_pct, "up_to_pct": wanted[0].up_to_pct}
+    assert bright["sum_pct"] > 5
+
+
+def test_suspected_pixels_are_marked_where_they_are(run: tuple[list[Treated], list[Failure]]) -> None:
+    dead = run[0][0]
+    step = -(-SIZE // THUMBNAIL_PX)
+    rows, columns = dead.suspected.T * step
+    within = (rows >= 36) & (rows <= 84) & (columns >= 36)
+    assert dead.suspected.size > 100 and within.mean() > 0.9
+
+
+def test_the_table_is_json_with_a_summary(run: tuple[list[Treated], list[Failure]]) -> None:
+    content = json.loads(json.dumps(table(*run), allow_nan=False))
+    assert [row["file"] for row in content["images"]] == [row.name for row in run[0]]
+    assert content["summary"] | {"bright": 0, "dark": 0} == {
+        "images": 3,
+        "failures": 2,
+        "to_look_at": 1,
+        "bright": 0,
+        "dark": 0,
+    }
+    ups = [row["bright"]["up_to_pct"] for row in content["images"]]
+    assert content["summary"]["bright"]["extreme_pct"] == max(ups)
+    assert content["summary"]["dark"]["extreme_pct"] == min(r["dark"]["up_to_pct"] for r in content["images"])
+    assert content["images"][0]["effects"]["artefacts"]["score"] == content["images"][0]["score"]
+    assert content["failures"][0]["reason"] == "No such file or directory"
+
+
+def drawn(path: Path) -> NDArray[np.float64]:
+    return np.asarray(matplotlib.image.imread(path), dtype=np.float64)[..., :3]
+
+
+def test_the_sheet_shows_every_image_and_every_failure(
+    run: tuple[list[Treated], list[Failure]], tmp_path: Path
+) -> None:
+    contact_sheet_png(*run, tmp_path / "all.png")
+    contact_sheet_png(run[0], run[1], tmp_path / "one.png", most=1)
+    contact_sheet_png(run[0], [], tmp_path / "well.png")
+    whole, one, well = (drawn(tmp_path / f"{name}.png") for name in ("all", "one", "well"))
+    assert whole.shape[0] > one.shape[0] + 400  # two more rows of thumbnails
+    # The failures' lines stand in red at the foot; without failures there are none.
+    red = [np.mean((image[-70:] * [1, -1, -1]).sum(axis=-1) > 0.3) for image in (whole, well)]
+    assert red[0] > 0.002 > red[1]
+    dark = (whole < 0.3).all(axis=-1).mean()
+    assert 0.05 < dark < 0.9  # thumbnails are dark, the page is not
+
+
+def test_a_run_in_which_all_failed_has_a_sheet_too(tmp_path: Path) -> None:
+    failures = [Failure(f"{n}.fits", "all-nan", "expected finite pixels") for n in range(30)]
+    contact_sheet_png([], failures, tmp_path / "none.png")
+    assert drawn(tmp_path / "none.png").std() > 0.02
+    assert table([], failures)["summary"] == {"images": 0, "failures": 30, "to_look_at": 0}
+
+
+def test_an_image_of_other_pixels_is_refused(psf: Psf, images: dict[str, Image]) -> None:
+    clean = images["clean"]
+    scaled = Image(clean.pixels, clean.mask, fits.Header({"CDELT1": 0.7, "CDELT2": 0.7}), "DN/s", 1.0)
+    with pytest.raises(DataError) as caught:
+        treat("scaled", scaled, psf)
+    assert caught.value.code == "plate-scale-mismatch"

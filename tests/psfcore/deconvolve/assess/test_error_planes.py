@@ -1,0 +1,218 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psfcore.convolution.convolver import linear_convolve
+from psfcore.deconvolve.assess.error_planes import (
+    error_planes,
+    expected_image,
+    mean_of_root,
+    psf_error_plane,
+    sigma_points,
+    with_psf_error,
+)
+from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
+from psfcore.errors import DataError
+from psfcore.image import Image, MaskBit
+from psfcore.noise import Noise
+from psfcore.psf import Psf, crop_centred
+from psfcore.scatter.power_law import scatter_kernel
+from psfcore.simulate.observe import observe
+from psfcore.simulate.scene import solar_scene
+from tests.psfcore.conftest import delta, gaussian, make_image, make_psf
+
+SIZE_PX, EDGE_PX = 112, 12
+EXPOSURE_S = 1.4
+NOISE = Noise(photon_gain_dn=6.0, read_noise_dn=2.0)
+Plane = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def psf() -> Psf:
+    """Diffuse scatter of HRI_EUV (41 %) with a core of 0.8 px."""
+    size = (256, 256)
+    scatter = crop_centred(scatter_kernel(6.15, 2.53, 0.411, 2048), size)
+    return make_psf(np.maximum(linear_convolve(scatter, gaussian(31, 0.8), size), 0))
+
+
+def cut(light: float) -> Plane:
+    """A corner of a simulated scene: disc, a hole and the corona, at `light` times the usual brightness."""
+    return light * solar_scene((1024, 1024), 3)[200 : 200 + SIZE_PX, 560 : 560 + SIZE_PX]
+
+
+def see(scene: Plane, psf: Psf, seed: int | None) -> Image:
+    gain, read = (0.0, 0.0) if seed is None else (NOISE.photon_gain_dn, NOISE.read_noise_dn)
+    pixels = observe(
+        scene, psf, exposure_s=EXPOSURE_S, photon_gain_dn=gain, read_noise_dn=read, seed=seed or 0
+    )
+    return Image(pixels, np.zeros(pixels.shape, np.uint8), make_image(pixels).header, "DN/s", EXPOSURE_S)
+
+
+def twenty_steps(psf: Psf) -> Callable[[Image], Plane]:
+    return lambda image: richardson_lucy(image, psf, steps=20).pixels
+
+
+def pulls(scene: Plane, psf: Psf, images: int, draws: int) -> tuple[Plane, Plane]:
+    """(found - noise-free deconvolved the same way) / error, [image, y, x] away from edges; and the latter."""
+    run = twenty_steps(psf)
+    truth = run(see(scene, psf, None))
+    inner = np.s_[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX]
+    found = []
+    for seed in range(1, images + 1):
+        image = see(scene, psf, seed)
+        pixels = run(image)
+        planes = error_planes(image, psf, run, NOISE, estimate=pixels, draws=draws, seed=seed)
+        found.append(((pixels - truth) / planes.error)[inner])
+    return np.array(found), truth[inner]
+
+
+def check_widths(scene: Plane, psf: Psf, images: int) -> None:
+    z, truth = pulls(scene, psf, images, draws=8)
+    faint, bright = np.percentile(truth, [10, 90])
+    widths = {
+        "all": z.std(),
+        "faintest tenth": z[:, truth <= faint].std(),
+        "brightest tenth": z[:, truth >= bright].std(),
+        "robust": np.diff(np.percentile(z, [15.87, 84.13]))[0] / 2,
+    }
+    assert all(0.9 <= width <= 1.1 for width in widths.values()), widths
+    assert abs(z.mean()) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [0.5, 0.05])
+def test_pulls_of_forty_images_have_width_one(psf: Psf, light: float) -> None:
+    """At 50 to 650 photons a pixel, and at a dozen or so."""
+    check_widths(cut(light), psf, 40)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [0.5, 0.05])
+def test_pulls_of_two_hundred_images_have_width_one(psf: Psf, light: float) -> None:
+    check_widths(cut(light), psf, 200)
+
+
+def test_a_delta_gives_back_the_noise_of_the_camera() -> None:
+    psf = make_psf(delta(32))
+    image = see(np.full((128, 128), 300.0), psf, 4)
+    planes = error_planes(image, psf, lambda seen: seen.pixels, NOISE, draws=12)
+    expected = np.sqrt(6.0 * 300 * EXPOSURE_S + 4.0) / EXPOSURE_S
+    assert planes.amplification == pytest.approx(1.0, abs=0.03)
+    assert np.median(planes.error) == pytest.approx(expected, rel=0.03)
+    # A Gaussian of 2 px averages 4 pi 2^2 = 50 pixels of white noise, each with K degrees of freedom.
+    assert planes.degrees_of_freedom == pytest.approx(12 * 50, rel=0.2)
+
+
+def test_the_plane_is_the_same_for_the_same_seed_and_empty_where_nothing_is_known(psf: Psf) -> None:
+    image = see(cut(0.5), psf, 1)
+    pixels, mask = image.pixels.copy(), image.mask.copy()
+    pixels[40, 50], mask[40, 50] = np.nan, MaskBit.NONFINITE
+    mask[60, 60] = MaskBit.SATURATED
+    damaged = Image(pixels, mask, image.header, image.unit, image.exposure_s)
+    run = twenty_steps(psf)
+    first, second = (error_planes(damaged, psf, run, NOISE, draws=3, seed=7, threads=t) for t in (1, 2))
+    np.testing.assert_array_equal(first.error, second.error)
+    np.testing.assert_array_equal(np.isnan(first.error), mask != 0)
+    whole = error_planes(image, psf, run, NOISE, draws=3, seed=7)
+    far = np.hypot(*(np.indices(mask.shape) - np.array([50, 55])[:, None, None])) > 25
+    assert np.median(first.error[far] / whole.error[far]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_model_is_as_bright_as_the_observation_though_light_leaves_the_field(psf: Psf) -> None:
+    image = see(cut(0.5), psf, None)
+    model = expected_image(image, twenty_steps(psf)(image), psf)
+    off = np.abs(model / image.pixels - 1)
+    assert off[8:-8, 8:-8].max() < 0.05
+    assert off[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX].max() < 0.02
+
+
+def test_progress_is_told_and_may_end_the_work(psf: Psf) -> None:
+    image = see(cut(0.5), psf, 1)
+    told: list[tuple[int, int]] = []
+    error_planes(image, psf, lambda seen: seen.pixels, NOISE, draws=2, progress=lambda *at: told.append(at))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+    def stop(done: int, of: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        error_planes(image, psf, lambda seen: seen.pixels, NOISE, progress=stop)
+
+
+def test_one_draw_says_nothing(psf: Psf) -> None:
+    with pytest.raises(DataError) as caught:
+        error_planes(see(cut(0.5), psf, 1), psf, lambda seen: seen.pixels, NOISE, draws=1)
+    assert caught.value.code == "bad-draws"
+
+
+def test_noise_in_dn_per_second_needs_the_exposure() -> None:
+    image = Image(
+        np.ones((32, 32)), np.zeros((32, 32), np.uint8), make_image(np.ones((32, 32))).header, "DN/s", None
+    )
+    with pytest.raises(DataError) as caught:
+        error_planes(image, make_psf(delta(16)), lambda seen: seen.pixels, NOISE)
+    assert caught.value.code == "no-exposure"
+
+
+@pytest.mark.parametrize("pair", [(0.0, 0.0), (-1.0, 2.0), (np.nan, 1.0), (1.0, np.inf)])
+def test_noise_that_is_none_is_refused(pair: tuple[float, float]) -> None:
+    with pytest.raises(DataError) as caught:
+        Noise(*pair)
+    assert caught.value.code == "bad-noise"
+
+
+def test_drawn_noise_has_the_variance_that_the_formula_says() -> None:
+    expected = np.full((300, 300), 12 * 6 / 1.4)  # a dozen photons
+    drawn = NOISE.observe(expected, 1.4, np.random.default_rng(2))
+    assert drawn.mean() == pytest.approx(expected[0, 0], rel=0.01)
+    assert drawn.var() == pytest.approx(NOISE.variance(expected, 1.4)[0, 0], rel=0.02)
+    assert drawn.var() == pytest.approx((6 * 72 + 4) / 1.4**2, rel=0.02)
+
+
+# --- the PSF's own uncertainty ---
+
+
+def test_sigma_points_have_the_mean_and_covariance_asked_for() -> None:
+    root = np.array([[1.0, 0, 0], [0.4, 0.3, 0], [-2.0, 0.1, 0.7]])
+    mean, covariance = np.array([6.15, 2.53, 0.41]), root @ root.T
+    points = sigma_points(mean, covariance)
+    assert points.shape == (6, 3)
+    np.testing.assert_allclose(points.mean(0), mean, rtol=1e-12)
+    np.testing.assert_allclose(np.cov(points.T, bias=True), covariance, rtol=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [np.array([[1.0, 0.5], [0.2, 1.0]]), np.diag([1.0, -1.0]), np.eye(3)])
+def test_what_is_no_covariance_is_refused(wrong: Plane) -> None:
+    with pytest.raises(DataError) as caught:
+        sigma_points(np.zeros(2), wrong)
+    assert caught.value.code == "bad-covariance"
+
+
+@pytest.mark.slow
+def test_sigma_points_agree_with_many_random_samples(psf: Psf) -> None:
+    """The scattered total known to 0.01: what that does to the image, by two points and by 60 draws."""
+    image = see(cut(0.5), psf, None)
+
+    def build(total: float) -> Psf:
+        return make_psf(crop_centred(scatter_kernel(6.15, 2.53, total, 2048), (128, 128)))
+
+    def run(sample: Psf) -> Plane:
+        return richardson_lucy(image, sample, steps=20).pixels
+
+    points = sigma_points(np.array([0.411]), np.array([[1e-4]]))
+    by_points = psf_error_plane([build(float(t)) for (t,) in points], run, chance=False)
+    totals = np.random.default_rng(1).normal(0.411, 0.01, 60)
+    by_chance = psf_error_plane([build(float(t)) for t in totals], run)
+    assert np.median(by_points / by_chance) == pytest.approx(1.0, abs=0.15)  # 60 samples: 9 % by themselves
+    planes = error_planes(image, psf, run=lambda seen: seen.pixels, noise=NOISE, draws=2)
+    assert with_psf_error(planes, by_points).psf_error is not None
+
+
+def test_the_root_of_an_average_is_put_right() -> None:
+    drawn = np.random.default_rng(3).chisquare(3, 400_000)
+    assert mean_of_root(3) == pytest.approx(np.sqrt(drawn / 3).mean(), rel=2e-3)
+    assert mean_of_root(1e6) == pytest.approx(1.0, abs=1e-6)

@@ -1,0 +1,414 @@
+"""Waves against closed forms: Gaussian beams, slits, parabolas, a whole telescope of parabolas."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.special import fresnel as fresnel_integrals
+
+from psfcore.convolution.convolver import ChirpTransform
+from psfcore.diffraction import fresnel as waves
+from psfcore.diffraction.best_focus import BestFocus, best_focus, paraxial_separation_mm
+from psfcore.diffraction.fresnel import (
+    Grid,
+    aperture_openings_mm,
+    binned_light,
+    common_openings_mm,
+    conic_sag_mm,
+    fraunhofer_field,
+    grid_for,
+    light_beyond,
+    mesh_openings_mm,
+    mirror_transmission,
+    open_share,
+    propagate,
+)
+from psfcore.diffraction.fresnel_study import FresnelStudy, fresnel_study
+from psfcore.diffraction.light_path import LightPath, focal_mm, light_path, mesh_windows_mm
+from psfcore.diffraction.plots import fresnel_png
+from psfcore.errors import DataError
+from psfcore.instruments.model import Aperture, Instrument, Mirror, load_instrument
+
+HRI = load_instrument("hri_euv")
+LAMBDA_MM = 1.74e-5
+Complex = NDArray[np.complex128]
+
+
+@pytest.fixture(scope="module")
+def path() -> LightPath:
+    return light_path(HRI)
+
+
+@pytest.fixture(scope="module")
+def focus(path: LightPath) -> BestFocus:
+    return best_focus(path, nominal_focal_length_mm=HRI.focal_length_mm)
+
+
+@pytest.fixture(scope="module")
+def study() -> FresnelStudy:
+    return fresnel_study(HRI, distances_mm=(273.0,), phases=4)
+
+
+def gaussian_beam(x_mm: NDArray[np.float64], z_mm: float, waist_mm: float) -> Complex:
+    q = 1 + 1j * z_mm * LAMBDA_MM / (np.pi * waist_mm**2)
+    return np.exp(-(x_mm**2) / waist_mm**2 / q) / np.sqrt(q)
+
+
+def slit_field(x_mm: NDArray[np.float64], begin_mm: float, end_mm: float, z_mm: float) -> Complex:
+    """A plane wave behind a slit, by the Fresnel integrals."""
+    scale = np.sqrt(2 / (LAMBDA_MM * z_mm))
+    s_end, c_end = fresnel_integrals(scale * (end_mm - x_mm))
+    s_begin, c_begin = fresnel_integrals(scale * (begin_mm - x_mm))
+    return (c_end - c_begin + 1j * (s_end - s_begin)) / np.sqrt(2j)
+
+
+# --- the transform and the propagator ---
+
+
+@pytest.mark.parametrize(("samples", "out_samples"), [(7, 7), (12, 5), (5, 12), (1, 4), (64, 33)])
+def test_the_chirp_transform_is_the_sum_it_stands_for(samples: int, out_samples: int) -> None:
+    f = np.random.default_rng(1).normal(size=samples) + 1j * np.arange(samples)
+    n, k = np.arange(samples) - (samples - 1) / 2, np.arange(out_samples) - (out_samples - 1) / 2
+    plain = np.exp(-2j * np.pi * 0.037 * np.outer(k, n)) @ f
+    np.testing.assert_allclose(
+        ChirpTransform(0.037, samples, out_samples).apply(f), plain, atol=1e-12 * samples
+    )
+
+
+def test_the_chirp_transform_refuses_another_length() -> None:
+    with pytest.raises(DataError, match="field-shape"):
+        ChirpTransform(0.1, 8, 8).apply(np.zeros(9, dtype=np.complex128))
+
+
+@pytest.mark.parametrize("out_samples", [2000, 3001])
+def test_propagation_keeps_the_light_of_any_field(out_samples: int) -> None:
+    source = Grid("a", 2000, 0.001)
+    target = Grid("b", out_samples, LAMBDA_MM * 300.0 / 0.001 / out_samples)  # one period of the sum
+    rng = np.random.default_rng(0)
+    field = rng.normal(size=2000) + 1j * rng.normal(size=2000)
+    after = propagate(field, source, target, wavelength_mm=LAMBDA_MM, distance_mm=300.0)
+    assert target.light(after) == pytest.approx(source.light(field), rel=1e-10)
+
+
+@pytest.mark.parametrize("z_mm", [50.0, 655.9])
+def test_a_gaussian_beam_spreads_by_its_formula(z_mm: float) -> None:
+    # The sum repeats itself after lambda z / step, 1.7 mm at the least.
+    source, target = Grid("a", 8000, 0.0005), Grid("b", 1601, 0.0008)
+    after = propagate(
+        gaussian_beam(source.x_mm, 0.0, 0.2).astype(complex),
+        source,
+        target,
+        wavelength_mm=LAMBDA_MM,
+        distance_mm=z_mm,
+    )
+    np.testing.assert_allclose(after, gaussian_beam(target.x_mm, z_mm, 0.2), atol=1e-10)
+
+
+def test_two_half_ways_are_the_whole_way() -> None:
+    source, between, target = Grid("a", 6000, 0.0006), Grid("b", 8000, 0.0005), Grid("c", 3000, 0.001)
+    field = np.exp(-((source.x_mm / 0.5) ** 8)) * np.exp(40j * source.x_mm)
+    once = propagate(field, source, target, wavelength_mm=LAMBDA_MM, distance_mm=400.0)
+    half = propagate(field, source, between, wavelength_mm=LAMBDA_MM, distance_mm=200.0)
+    twice = propagate(half, between, target, wavelength_mm=LAMBDA_MM, distance_mm=200.0)
+    np.testing.assert_allclose(twice, once, atol=1e-9)
+
+
+def test_a_slit_gives_the_fresnel_integrals() -> None:
+    source = grid_for("slit", width_mm=1.3, next_width_mm=6.0, wavelength_mm=LAMBDA_MM, distance_mm=273.0)
+    target = Grid("screen", 2001, 0.001)
+    field = open_share(source, np.array([[-0.61, 0.62]])).astype(complex)
+    after = propagate(field, source, target, wavelength_mm=LAMBDA_MM, distance_mm=273.0)
+    np.testing.assert_allclose(after, slit_field(target.x_mm, -0.61, 0.62, 273.0), atol=0.004)
+
+
+# --- mirrors and masks ---
+
+
+@pytest.mark.parametrize("conic", [0.0, -1.0, -2.04, 0.5])
+def test_the_sag_lies_on_its_conic(conic: float) -> None:
+    x_mm = np.linspace(-60, 60, 25)
+    sag = conic_sag_mm(x_mm, radius_mm=257.0, conic=conic)
+    np.testing.assert_allclose(x_mm**2 - 2 * 257.0 * sag + (1 + conic) * sag**2, 0, atol=1e-9)
+    assert sag[12] == 0 and np.all(sag >= 0)
+
+
+def test_a_sphere_ends() -> None:
+    sag = conic_sag_mm([0.0, 3.0, 5.0, 6.0], radius_mm=5.0, conic=0.0)
+    np.testing.assert_allclose(sag, [0, 1, 5, np.nan])
+
+
+def test_a_parabola_focuses_at_half_its_radius() -> None:
+    mirror = Mirror(name="m", radius_mm=1518.0, conic=-1.0, diameter_mm=10.0, figure="concave")
+    grid = Grid("mirror", 60_000, 0.0002)
+    field = mirror_transmission(mirror, grid, LAMBDA_MM)
+    axis = Grid("axis", 1, 1.0)
+    distances = np.arange(758.0, 760.01, 0.05)
+    on_axis = [
+        abs(propagate(field, grid, axis, wavelength_mm=LAMBDA_MM, distance_mm=z)[0]) for z in distances
+    ]
+    assert distances[np.argmax(on_axis)] == pytest.approx(759.0, abs=0.06)
+    screen = Grid("focus", 1601, 0.0002)
+    image = propagate(field, grid, screen, wavelength_mm=LAMBDA_MM, distance_mm=759.0)
+    u = screen.x_mm / (LAMBDA_MM * 759.0)
+    expected = 10.0**2 * np.sinc(10.0 * u) ** 2 / (LAMBDA_MM * 759.0)
+    np.testing.assert_allclose(np.abs(image) ** 2, expected, atol=1e-4 * expected.max())
+
+
+def test_a_convex_mirror_spreads_what_a_concave_one_gathers() -> None:
+    grid = Grid("mirror", 4001, 0.001)
+    concave = Mirror(name="m", radius_mm=257.0, conic=-2.04, diameter_mm=3.001, figure="concave")
+    convex = concave.model_copy(update={"figure": "convex"})
+    product = mirror_transmission(concave, grid, LAMBDA_MM) * mirror_transmission(convex, grid, LAMBDA_MM)
+    np.testing.assert_allclose(product, np.abs(grid.x_mm) < 1.5005, atol=1e-9)
+
+
+def test_a_mesh_is_open_by_its_windows() -> None:
+    windows = mesh_openings_mm(pitch_mm=1.27, wire_mm=0.04, phase=0.0, width_mm=20.0)
+    grid = Grid("g", 1270, 0.01)  # ten pitches
+    assert open_share(grid, windows).mean() == pytest.approx(1.23 / 1.27, rel=1e-12)
+    assert open_share(grid, windows)[635] == pytest.approx(1, abs=1e-9), "at phase 0 a window is on the axis"
+    moved = mesh_openings_mm(pitch_mm=1.27, wire_mm=0.04, phase=0.5, width_mm=20.0)
+    assert open_share(grid, moved)[635] == pytest.approx(0, abs=1e-9), "at phase 0.5 a wire is"
+
+
+def test_openings_have_their_length_wherever_samples_lie() -> None:
+    aperture = Aperture(diameter_mm=47.4, obscuration_diameter_mm=9.1)
+    windows = mesh_openings_mm(pitch_mm=1.27, wire_mm=0.04, phase=0.21, width_mm=47.4)
+    both = common_openings_mm(aperture_openings_mm(aperture), windows)
+    length = float(np.diff(both).sum())
+    for samples in (999, 50_000):
+        grid = Grid("g", samples, 48.0 / samples)
+        assert open_share(grid, both).sum() * grid.step_mm == pytest.approx(length, rel=1e-12)
+    assert open_share(Grid("g", 9, 1.0), both).max() == 0, "the middle is obscured"
+
+
+def test_fraunhofer_is_the_integral_over_the_openings() -> None:
+    openings = np.array([[-3.0, -1.0], [0.5, 2.0]])
+    grid = Grid("d", 41, 0.001)
+    x = (np.arange(50_000) + 0.5) * 1e-4 - 3.0
+    lit = ((x > -3) & (x < -1)) | ((x > 0.5) & (x < 2))
+    reach = LAMBDA_MM * 4187.0
+    plain = np.exp(-2j * np.pi * np.outer(grid.x_mm, x[lit]) / reach).sum(axis=1) * 1e-4 / np.sqrt(1j * reach)
+    found = fraunhofer_field(openings, grid, wavelength_mm=LAMBDA_MM, focal_length_mm=4187.0)
+    np.testing.assert_allclose(found, plain, atol=1e-5)
+
+
+def test_light_beyond_counts_whole_pixels_on_both_sides() -> None:
+    line = np.array([1.0, 2.0, 10.0, 3.0, 4.0])
+    np.testing.assert_allclose(light_beyond(line, [0, 1, 2]), [0.5, 0.25, 0.0])
+
+
+# --- the telescope ---
+
+
+def collins(path: LightPath, separation_mm: float, behind_mm: float, x_mm: NDArray[np.float64]) -> Complex:
+    """Entrance to a plane behind a parabolic secondary: one integral, each window in closed form."""
+    free: Callable[[float], NDArray[np.float64]] = lambda z: np.array([[1.0, z], [0.0, 1.0]])  # noqa: E731
+    lens: Callable[[float], NDArray[np.float64]] = lambda f: np.array([[1.0, 0.0], [-1 / f, 1.0]])  # noqa: E731
+    system = free(behind_mm) @ lens(focal_mm(path.secondary)) @ free(separation_mm)
+    system = system @ lens(focal_mm(path.primary)) @ free(path.aperture_to_primary_mm)
+    (a, b), (_, d) = system
+    curve = a / (path.wavelength_mm * b)
+    total = np.zeros(x_mm.size, dtype=complex)
+    for begin, end in path.entrance_mm:
+        s1, c1 = fresnel_integrals(np.sqrt(2 * abs(curve)) * (begin - x_mm / a))
+        s2, c2 = fresnel_integrals(np.sqrt(2 * abs(curve)) * (end - x_mm / a))
+        total += c2 - c1 + 1j * np.sign(curve) * (s2 - s1)
+    total /= np.sqrt(2 * abs(curve) * abs(path.wavelength_mm * b))
+    phase = np.pi / (path.wavelength_mm * b) * (d - 1 / a) * x_mm**2
+    return total * np.exp(1j * phase) / np.sqrt(np.diff(path.entrance_mm).sum())
+
+
+def test_a_telescope_of_parabolas_matches_the_closed_form(path: LightPath) -> None:
+    """Every plane, both meshes: chain of transforms against Fresnel integrals and a plain sum."""
+    secondary = path.secondary.model_copy(update={"conic": -1.0})
+    path = dataclasses.replace(path, secondary=secondary)
+    separation = paraxial_separation_mm(path)
+    behind, distance = path.secondary_to_detector_mm - 273.0, 273.0
+    wheel, detector = path.wheel_grid(distance), path.detector_grid
+    aperture, primary = path.entrance_grids()
+    at_mirror = path.secondary_grid(next_width_mm=wheel.width_mm, distance_mm=behind)
+    field = path.field_at_primary(path.entrance_mm, aperture, primary)
+    field = path.field_at_secondary(field, primary, at_mirror, separation)
+    field = propagate(field, at_mirror, wheel, wavelength_mm=path.wavelength_mm, distance_mm=behind)
+    sample = np.flatnonzero(np.abs(wheel.x_mm) < 2.5)[::211]
+    exact = collins(path, separation, behind, wheel.x_mm[sample])
+    np.testing.assert_allclose(np.abs(field[sample]), np.abs(exact), atol=0.006 * float(np.abs(exact).max()))
+
+    windows = mesh_windows_mm(path.wheel_mesh, 0.3, wheel.width_mm)
+    after = propagate(
+        field * open_share(wheel, windows),
+        wheel,
+        detector,
+        wavelength_mm=path.wavelength_mm,
+        distance_mm=distance,
+    )
+    # An independent grid, finer over the beam and narrower than the chain's.
+    fine = Grid("fine", 60_001, 8.0 / 60_001)
+    lit = collins(path, separation, behind, fine.x_mm) * open_share(fine, windows)
+    points = detector.samples // 2 + np.array([0, 2, 9, 40, 92, 183])
+    reach = path.wavelength_mm * distance
+    kernel = np.exp(1j * np.pi / reach * (detector.x_mm[points][:, None] - fine.x_mm) ** 2)
+    plain = np.abs(kernel @ lit * fine.step_mm) / np.sqrt(reach)
+    np.testing.assert_allclose(np.abs(after[points]), plain, atol=0.003 * plain.max())
+
+
+def test_best_focus_is_where_rays_meet(focus: BestFocus) -> None:
+    assert focus.separation_mm == pytest.approx(653.81, abs=0.01)
+    assert focus.separation_mm == pytest.approx(focus.paraxial_separation_mm, abs=0.01)
+    assert focus.shift_mm == pytest.approx(-1.89, abs=0.01)
+    assert "655.700 mm by -1.887 mm" in focus.message
+    assert focus.printed_blur_px > 30
+    assert focus.beyond_central_pixel_printed > 0.9 > 0.05 > focus.beyond_central_pixel_focused
+
+
+def test_the_focal_length_of_rays_is_that_of_the_orders(focus: BestFocus) -> None:
+    assert focus.focal_length_mm == pytest.approx(4187.0, rel=1e-3)
+    assert focus.focal_length_from_orders_mm == pytest.approx(focus.focal_length_mm, rel=3e-4)
+    assert focus.order_spacing_px == pytest.approx(5.73, abs=0.005)
+
+
+def test_the_ideal_slit_in_focus_matches_fraunhofer(path: LightPath, focus: BestFocus) -> None:
+    """The open aperture's light outside the central pixel, and 1 - integral of sinc^2."""
+    grid = path.detector_grid
+    field = fraunhofer_field(
+        path.aperture_mm, grid, wavelength_mm=path.wavelength_mm, focal_length_mm=focus.focal_length_mm
+    )
+    line = binned_light(field, grid, 16)
+    ideal = 1 - line[line.size // 2] / line.sum()
+    assert focus.beyond_central_pixel_focused == pytest.approx(ideal, abs=0.002)
+
+
+# --- the study ---
+
+
+def test_the_methods_agree_within_a_point(study: FresnelStudy) -> None:
+    (result,) = study.distances
+    assert result.largest_points < 0.6
+    assert result.largest_single_points < 1.5
+    assert result.fresnel_line.sum() == pytest.approx(1, abs=1e-12)
+    assert result.beam_mm == pytest.approx(3.09, abs=0.01)
+
+
+def test_a_mesh_moved_left_is_one_moved_right(study: FresnelStudy) -> None:
+    lowest = study.distances[0].phase_largest_points
+    assert lowest[1] == pytest.approx(lowest[3], abs=1e-6)
+    line = study.distances[0].fresnel_line
+    np.testing.assert_allclose(line, line[::-1], atol=1e-9)
+
+
+def test_the_sampling_is_told_and_loses_no_light(study: FresnelStudy) -> None:
+    planes = {plane.plane: plane for plane in study.distances[0].sampling}
+    assert list(planes) == ["aperture", "primary", "secondary", "filter wheel", "detector"]
+    assert planes["aperture"].least_samples == pytest.approx(47.4 * 66 / (LAMBDA_MM * 655.9), rel=1e-5)
+    assert planes["aperture"].samples >= 1.49 * (planes["aperture"].least_samples or 0)
+    assert planes["secondary"].light == pytest.approx(1, abs=2e-4)
+    assert planes["filter wheel"].light == pytest.approx(1.23 / 1.27, abs=0.003)
+    assert planes["detector"].light == pytest.approx(planes["filter wheel"].light, abs=5e-4)
+
+
+def test_finer_sampling_changes_nothing(study: FresnelStudy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(waves, "SAMPLING_MARGIN", 2.5)
+    finer = fresnel_study(HRI, distances_mm=(273.0,), phases=1)
+    coarse = study.distances[0].phase_largest_points[0]
+    assert finer.distances[0].phase_largest_points[0] == pytest.approx(coarse, abs=0.01)
+
+
+def test_more_windows_bring_the_series_closer() -> None:
+    """A series of few windows adds the beam's edges, which the entrance's image holds already."""
+    few, many = (
+        fresnel_study(HRI, distances_mm=(400.0,), phases=2, windows=n).distances[0].largest_points
+        for n in (4, 100)
+    )
+    assert many < 0.3 < 1.0 < few
+
+
+def test_a_study_is_plain_json_and_its_progress_is_told() -> None:
+    seen: list[tuple[int, int]] = []
+    study = fresnel_study(
+        HRI, distances_mm=(300.0, 250.0), phases=2, windows=16, progress=lambda *done: seen.append(done)
+    )
+    assert seen == [(done, 5) for done in range(6)]
+    told = json.loads(json.dumps(study.as_json(), allow_nan=False))
+    assert told["focus"]["shift_mm"] == pytest.approx(-1.89, abs=0.01)
+    assert [result["distance_mm"] for result in told["distances"]] == [300.0, 250.0]
+    for result in told["distances"]:
+        assert len(result["difference_points"]) == len(told["radii_px"])
+        assert len(result["fresnel_line"]) == len(told["offsets_px"])
+        assert len(result["phase_largest_points"]) == 2
+
+
+def without(**changes: object) -> Instrument:
+    return HRI.model_copy(update=changes)
+
+
+@pytest.mark.parametrize(
+    ("instrument", "key"),
+    [
+        (without(mirrors=()), "mirrors: expected a primary and a secondary"),
+        (without(mirrors=HRI.mirrors[:1]), "mirrors"),
+        (without(distances=None), "distances"),
+        (without(meshes=HRI.meshes[:1]), "meshes: expected one mesh at place 'filter_wheel'; got 0"),
+        (without(meshes=(HRI.meshes[0].model_copy(update={"angle_deg": 45.0}), HRI.meshes[1])), "angle_deg"),
+    ],
+)
+def test_an_instrument_that_lacks_something_is_told_what(instrument: Instrument, key: str) -> None:
+    with pytest.raises(DataError, match=f"hri_euv: .*{key}") as caught:
+        fresnel_study(instrument)
+    assert caught.value.code == "bad-instrument-file"
+
+
+@pytest.mark.parametrize(
+    ("code", "arguments"),
+    [
+        ("bad-distance", {"distances_mm": (273.0, 580.0)}),
+        ("bad-distance", {"distances_mm": (float("nan"),)}),
+        ("bad-distance", {"distances_mm": ()}),
+        ("bad-phases", {"phases": 0}),
+        ("bad-windows", {"windows": 0}),
+    ],
+)
+def test_bad_requests_are_refused(code: str, arguments: dict[str, object]) -> None:
+    with pytest.raises(DataError) as caught:
+        fresnel_study(HRI, **arguments)  # type: ignore[arg-type]
+    assert caught.value.code == code
+
+
+@pytest.mark.parametrize("distance_mm", [1.0, 579.0])
+def test_a_wheel_too_near_a_neighbour_is_refused_before_the_work(distance_mm: float) -> None:
+    seen: list[int] = []
+    with pytest.raises(DataError, match="too-many-samples"):
+        fresnel_study(HRI, distances_mm=(273.0, distance_mm), progress=lambda done, of: seen.append(done))
+    assert seen == []
+
+
+def test_mirrors_without_a_focus_are_refused(path: LightPath) -> None:
+    concave = path.secondary.model_copy(update={"figure": "concave"})
+    blind = dataclasses.replace(path, secondary=concave, secondary_to_detector_mm=128.5)
+    with pytest.raises(DataError, match="no-focus"):
+        paraxial_separation_mm(blind)
+
+
+def test_the_study_is_drawn(study: FresnelStudy, tmp_path: Path) -> None:
+    fresnel_png(study, tmp_path / "f.png")
+    assert matplotlib.image.imread(tmp_path / "f.png").std() > 0.05
+
+
+@pytest.mark.slow
+def test_every_distance_of_the_published_study() -> None:
+    """Mean over phases within a point everywhere; single phases reach 3.7 points near the detector."""
+    study = fresnel_study(HRI)
+    largest = {result.distance_mm: result.largest_points for result in study.distances}
+    assert list(largest) == [50, 100, 200, 273, 400, 500, 550]
+    assert max(largest.values()) < 1.0
+    assert largest[273.0] < 0.73
+    near = study.distances[0].largest_single_points
+    assert 3.0 < near < 4.0
+    assert near > 3 * study.distances[3].largest_single_points

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import pytest
+from astropy.io.fits import Header
+
+from psfcore.fits.gain import noise_for, saturation_for
+from psfcore.instruments.model import GainMode, Instrument, load_instrument
+from psfcore.noise import Noise
+
+
+@pytest.fixture
+def instrument() -> Instrument:
+    hri = load_instrument("hri_euv")
+    modes = {
+        "combined": GainMode(saturation_dn=48000, photon_gain_dn=6.0, read_noise_dn=2.0, basis="assumed"),
+        "high-only": GainMode(saturation_dn=3500, basis="assumed"),
+    }
+    detector = hri.detector.model_copy(update={"gain_modes": modes})
+    return hri.model_copy(update={"detector": detector})
+
+
+@pytest.mark.parametrize(
+    ("mode", "level"),
+    [
+        ("combined", 48000),
+        (" Combined ", 48000),
+        ("high-only", 3500),
+        ("low-only", None),
+        ("", None),
+        (3, None),
+    ],
+)
+def test_saturation_goes_by_gain_mode(instrument: Instrument, mode: object, level: float | None) -> None:
+    assert saturation_for(instrument, Header({"GAINCOMB": mode})) == level
+
+
+def test_an_image_without_a_mode_has_no_level(instrument: Instrument) -> None:
+    assert saturation_for(instrument, Header()) is None
+
+
+def test_noise_needs_both_of_its_figures(instrument: Instrument) -> None:
+    assert noise_for(instrument, Header({"GAINCOMB": "combined"})) == Noise(6.0, 2.0)
+    assert noise_for(instrument, Header({"GAINCOMB": "high-only"})) is None
+    assert noise_for(instrument, Header()) is None

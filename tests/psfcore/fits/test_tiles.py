@@ -1,0 +1,109 @@
+"""Compressed tiles that hold more than they say are refused before they take the room; honest ones pass."""
+
+from __future__ import annotations
+
+import gzip
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from psfcore.errors import DataError
+from psfcore.fits.fits_io import read_image, read_psf
+from psfcore.fits.header import FitsLimits, check_all_headers
+from tests.fits_bombs import lying_tiles, psf_with_a_tail
+
+MIB = 2**20
+LIMITS = FitsLimits(max_pixels=4096 * 4096)
+
+
+def peak_mib_of_refusal(path: Path, code: str, *, psf: bool = False) -> float:
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError) as caught:
+            (read_psf if psf else read_image)(path, LIMITS)
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert caught.value.code == code and "expected" in caught.value.message
+    return peak / MIB
+
+
+@pytest.mark.parametrize("column", ["COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_half_a_megabyte_that_unfolds_to_537_takes_no_room(tmp_path: Path, column: str, packed: bool) -> None:
+    content = lying_tiles(gzip.compress(bytes(537_000_000)), column=column)
+    assert len(content) < 540_000
+    path = tmp_path / "bomb.fits"
+    path.write_bytes(gzip.compress(content) if packed else content)
+    assert peak_mib_of_refusal(path, "tile-too-large") < 30
+
+
+def test_a_little_more_than_a_tile_holds_is_refused_too(tmp_path: Path) -> None:
+    (tmp_path / "bomb.fits").write_bytes(lying_tiles(gzip.compress(bytes(64 * 8 + 1))))
+    assert peak_mib_of_refusal(tmp_path / "bomb.fits", "tile-too-large") < 10
+
+
+def test_long_streams_of_nothing_that_many_tiles_share_take_no_time(tmp_path: Path) -> None:
+    """Empty blocks of deflate: they hold nothing, and each of 64 descriptors would have all of them read."""
+    nothing = gzip.compress(b"")[:10] + bytes.fromhex("000000ffff") * 2_000_000 + gzip.compress(b"")[10:]
+    (tmp_path / "bomb.fits").write_bytes(lying_tiles(nothing))
+    started = time.monotonic()
+    peak_mib_of_refusal(tmp_path / "bomb.fits", "tile-too-large")
+    assert time.monotonic() - started < 5
+
+
+WHOLE, FLOATS = ("u1", "i2", "i4"), ("f4", "f8")
+EXACT = [(codec, dtype) for codec in ("GZIP_1", "GZIP_2", "NOCOMPRESS") for dtype in (*WHOLE, *FLOATS)]
+
+
+@pytest.mark.parametrize(("codec", "dtype"), [*EXACT, *(("RICE_1", dtype) for dtype in WHOLE)])
+@pytest.mark.parametrize("tile", [(7, 9), (1, 50), (40, 50)])
+def test_honest_tiles_pass(tmp_path: Path, codec: str, dtype: str, tile: tuple[int, int]) -> None:
+    pixels = np.random.default_rng(0).integers(1, 200, (40, 50)).astype(dtype)
+    hdu = fits.CompImageHDU(pixels, compression_type=codec, tile_shape=tile, quantize_level=0)
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "tiles.fits")
+    assert np.array_equal(read_image(tmp_path / "tiles.fits", LIMITS).pixels, pixels)
+
+
+@pytest.mark.parametrize("codec", ["RICE_1", "GZIP_1", "GZIP_2"])
+def test_honest_quantised_floats_pass_with_tiles_that_could_not_be_quantised(
+    tmp_path: Path, codec: str
+) -> None:
+    pixels = np.random.default_rng(0).normal(100, 1, (40, 50)).astype("f4")
+    pixels[3] *= 1e30  # goes to GZIP_COMPRESSED_DATA
+    hdu = fits.CompImageHDU(pixels, compression_type=codec)
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "tiles.fits")
+    assert np.allclose(read_image(tmp_path / "tiles.fits", LIMITS).pixels, pixels, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("tail", "code"),
+    [("many HDUs", "too-many-hdus"), ("long header", "header-too-long"), ("inflated data", "too-many-bytes")],
+)
+def test_what_stands_behind_a_psf_is_bounded_too(tmp_path: Path, tail: str, code: str) -> None:
+    path = tmp_path / "psf.fits"
+    path.write_bytes(psf_with_a_tail(tail))
+    read_psf(path, LIMITS, parts=False)  # a convolution does not look there
+    assert peak_mib_of_refusal(path, code, psf=True) < 60
+
+
+def test_a_compressed_component_is_not_unfolded(tmp_path: Path) -> None:
+    path = tmp_path / "psf.fits"
+    path.write_bytes(psf_with_a_tail("component of tiles"))
+    assert read_psf(path, LIMITS).components == {}
+
+
+def test_headers_share_one_allowance(tmp_path: Path) -> None:
+    long = fits.PrimaryHDU()
+    for number in range(400):
+        long.header.add_history(f"{number}")
+    more = [fits.ImageHDU(header=long.header.copy()) for _ in range(5)]
+    fits.HDUList([long, *more]).writeto(tmp_path / "long.fits")
+    check_all_headers(tmp_path / "long.fits", FitsLimits(max_pixels=100, max_header_bytes=250_000))
+    with pytest.raises(DataError) as caught:
+        check_all_headers(tmp_path / "long.fits", FitsLimits(max_pixels=100, max_header_bytes=150_000))
+    assert caught.value.code == "header-too-long"

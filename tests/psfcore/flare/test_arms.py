@@ -1,0 +1,181 @@
+"""Arms put into a simulated flare come out again, with errors that cover what is left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from psfcore.convolution.convolver import linear_convolve
+from psfcore.diffraction.mesh_series import order_spacing_px, rotated_mesh_kernel
+from psfcore.errors import DataError
+from psfcore.flare.arms import ArmMeasurement, measure_arms
+from psfcore.flare.arms_plot import arms_png
+
+ANGLE_DEG = 1.3
+SPACING_PX = order_spacing_px(
+    wavelength_angstrom=174.0, distance_mm=4187.0, pitch_um=1270.0, pixel_pitch_um=10.0
+)
+SIZE = 240
+FINE = 6  # samples a pixel, so that orders are not put on whole pixels
+CENTRE = (123.3, 118.8)
+FLARE_PX = 5
+FLARE_PHOTONS = 6e4  # a pixel of the core
+SATURATION = 20_000.0
+READ_NOISE = 2.0
+
+
+def flare_light() -> NDArray[np.float64]:
+    """Expected light [y, x] of a 5 x 5 px flare of one photon a pixel: mesh orders and a wide halo."""
+    n = SIZE * FINE
+    kernel = rotated_mesh_kernel(
+        wavelength_angstrom=174.0,
+        distance_mm=4187.0,
+        pitch_um=1270.0,
+        wire_um=40.0,
+        windows=37,
+        pixel_pitch_um=10.0 / FINE,
+        angle_deg=ANGLE_DEG,
+        size=n,
+    )
+    fine = (np.arange(n) + 0.5) / FINE - 0.5
+    x, y = fine[None, :] - CENTRE[0], fine[:, None] - CENTRE[1]
+    uneven = 1 + 0.3 * x / FLARE_PX - 0.2 * y / FLARE_PX
+    flare = np.where((abs(x) < FLARE_PX / 2) & (abs(y) < FLARE_PX / 2), uneven, 0.0)
+    flare *= FLARE_PX**2 / flare.sum()
+    seen = linear_convolve(flare, kernel, (n, n), threads=2)
+    pixels = seen.reshape(SIZE, FINE, SIZE, FINE).sum(axis=(1, 3))
+    yy, xx = np.indices((SIZE, SIZE))
+    radius = np.hypot(xx - CENTRE[0], yy - CENTRE[1])
+    return np.maximum(pixels, 0) + FLARE_PX**2 * 0.152 / (6.15 + radius) ** 2.53
+
+
+def corona() -> NDArray[np.float64]:
+    yy, xx = np.indices((SIZE, SIZE))
+    return 50.0 * (1 + 0.3 * np.sin(xx / 90) + 0.2 * np.cos(yy / 70))
+
+
+@pytest.fixture(scope="module")
+def expected() -> NDArray[np.float64]:
+    return FLARE_PHOTONS * flare_light() + corona()
+
+
+def observed(expected: NDArray[np.float64], seed: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    rng = np.random.default_rng(seed)
+    image = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
+    saturated = image >= SATURATION
+    return np.minimum(image, SATURATION), saturated
+
+
+def measured(expected: NDArray[np.float64], seed: int) -> ArmMeasurement:
+    image, saturated = observed(expected, seed)
+    return measure_arms(image, noise=(1.0, READ_NOISE), saturated=saturated)
+
+
+@pytest.mark.parametrize("seed", [100, *(pytest.param(n, marks=pytest.mark.slow) for n in (101, 102))])
+def test_angle_and_spacing_come_out(expected: NDArray[np.float64], seed: int) -> None:
+    found = measured(expected, seed)
+    assert found.angles_deg == pytest.approx((ANGLE_DEG - 90, ANGLE_DEG), abs=0.1)
+    assert found.spacing_px == pytest.approx(SPACING_PX, abs=0.02)
+    assert 0.005 < min(found.angles_sigma_deg) <= max(found.angles_sigma_deg) < 0.05
+    assert 0.0005 < found.spacing_sigma_px < 0.005
+    assert 0.9 < found.reduced_chi2 < 1.5  # a sharp-edged flare is a little more than the spline can follow
+    assert len(found.peaks) > 40
+    assert "less than" in found.stopped_because
+
+
+@pytest.mark.slow
+def test_errors_cover_the_truth(expected: NDArray[np.float64]) -> None:
+    pulls = []
+    for seed in range(36):
+        found = measured(expected, seed)
+        truth = (ANGLE_DEG - 90, ANGLE_DEG, SPACING_PX)
+        values = (*found.angles_deg, found.spacing_px)
+        errors = (*found.angles_sigma_deg, found.spacing_sigma_px)
+        pulls.append([(v - t) / e for v, t, e in zip(values, truth, errors, strict=True)])
+    mean, width = np.mean(pulls, axis=0), np.std(pulls, axis=0, ddof=1)
+    assert np.all(np.abs(mean) < 0.4), mean
+    assert np.all((width > 0.7) & (width < 1.4)), width
+
+
+def test_a_difference_of_two_images_serves_as_well(expected: NDArray[np.float64]) -> None:
+    image, saturated = observed(expected, 5)
+    before = np.random.default_rng(6).poisson(corona()).astype(float)
+    found = measure_arms(image, reference=before, noise=(1.0, READ_NOISE), saturated=saturated)
+    assert found.spacing_px == pytest.approx(SPACING_PX, abs=0.02)
+    assert found.angles_deg == pytest.approx((ANGLE_DEG - 90, ANGLE_DEG), abs=0.1)
+
+
+def test_noise_unknown_centre_a_little_off_and_holes(expected: NDArray[np.float64]) -> None:
+    image, saturated = observed(expected, 7)
+    image[30:40, 100:140] = np.nan
+    found = measure_arms(image, (124.5, 118.0), saturated=saturated, spacing_range_px=(5.0, 7.0))
+    assert found.spacing_px == pytest.approx(SPACING_PX, abs=0.02)
+    assert found.angles_deg == pytest.approx((ANGLE_DEG - 90, ANGLE_DEG), abs=0.1)
+    assert found.centre_xy == (124.5, 118.0)
+    assert not any(30 <= peak.y_px < 40 and 100 <= peak.x_px < 140 for peak in found.peaks)
+
+
+def test_the_fit_is_drawn(expected: NDArray[np.float64], tmp_path: Path) -> None:
+    image, saturated = observed(expected, 8)
+    found = measure_arms(image, noise=(1.0, READ_NOISE), saturated=saturated)
+    arms_png(image, found, tmp_path / "arms.png")
+    assert matplotlib.image.imread(tmp_path / "arms.png").std() > 0.05
+
+
+def flat(seed: int = 0) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).poisson(100, (SIZE, SIZE)).astype(float)
+
+
+def test_what_cannot_be_measured_is_refused() -> None:
+    image = flat()
+    with_spot = image.copy()
+    with_spot[110:115, 110:115] = 1e5
+    everything = np.ones(image.shape, dtype=bool)
+    cases: list[tuple[str, dict[str, object]]] = [
+        ("no-flare", {"image": image}),
+        ("all-masked", {"image": image, "saturated": everything}),
+        ("all-masked", {"image": np.full(image.shape, np.nan)}),
+        ("too-few-peaks", {"image": with_spot, "saturated": with_spot > 1e4}),
+        ("arms-bad-input", {"image": image, "reference": image[:100]}),
+        ("arms-bad-input", {"image": image, "centre_xy": (1e4, 3.0)}),
+        # Every direction scores alike: the arms that are taken leave the image at once.
+        ("too-few-peaks", {"image": image, "reference": image, "centre_xy": (1.0, 1.0)}),
+        ("too-few-peaks", {"image": image, "reference": image, "centre_xy": (SIZE - 1.0, SIZE - 1.0)}),
+    ]
+    for code, arguments in cases:
+        with pytest.raises(DataError, match=r"expected .*;") as caught:
+            measure_arms(**arguments)  # type: ignore[arg-type]
+        assert caught.value.code == code
+
+
+def test_aiapys_arms_are_measured_in_its_psf(shared: Path) -> None:
+    """Its own input, 16.26 px and four angles; the errors are small and not of noise, so not asked to cover."""
+    path = shared / "data" / "real" / "psf" / "derived_aia171_psf_aiapy0.10.2.fits"
+    if not path.exists():
+        pytest.skip(f"real data not at hand: {path}")
+    middle = slice(2048 - 250, 2048 + 251)
+    psf = np.asarray(fits.getdata(path), dtype=np.float64)[middle, middle]
+    found = measure_arms(psf, (250.0, 250.0), n_arms=4)
+    assert found.angles_deg == pytest.approx((-50.38, -40.13, 39.57, 49.81), abs=0.05)
+    assert found.spacing_px == pytest.approx(16.26, abs=0.005)
+
+
+def test_loops_at_the_limb_are_no_flare_to_measure(shared: Path) -> None:
+    """Loops 100 px across: their orders, 16 px apart, run together. The answer is no, not a number."""
+    folder = shared / "data" / "real" / "aia" / "limbflare_20120719"
+    files = sorted(folder.glob("*.fits"))
+    if not files:
+        pytest.skip(f"real data not at hand: {folder}")
+    with fits.open(files[1]) as hdus:
+        image = np.asarray(next(h.data for h in hdus if h.data is not None), dtype=np.float64)
+    for near in (None, (49.81, 39.57, -40.13, -50.38)):
+        with pytest.raises(DataError) as caught:
+            measure_arms(
+                image, saturated=image > 15_000, n_arms=4, spacing_range_px=(14.0, 19.0), angles_near_deg=near
+            )
+        assert caught.value.code == "too-few-peaks"

@@ -1,0 +1,51 @@
+"""A small transit with a gap of known cause, diagnosed once with a few effects, for tests of what is made of that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from unittest.mock import patch
+
+import numpy as np
+
+from psfcore.gap.diagnose import Diagnosis, diagnose
+from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.verdict import where
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
+from psfcore.transit.transit import Transit
+from tests.transit_files import TRUTH, diffraction
+
+OFFSET_DN = 6.0
+QUICK = patch.object(where, "DRAWS", 99)  # quicker than 999
+# Of each stage one, one that these data cannot show, and a probe: a diagnosis with them takes seconds.
+FEW = tuple(
+    effect
+    for effect in LIBRARY
+    if effect.name
+    in ("dark_offset", "gain_mismatch", "core_blur", "scene_evolution", "saturation_fill", "patch_of_light")
+)
+
+
+@cache
+def clean() -> Transit:
+    """Twelve images of 96 px, some tens of photons a pixel in the discs."""
+    plan = default_plan(12, 96, oversampling=1, brightness=6.0)
+    return simulate(plan, TRUTH, diffraction(), seed=8).transit
+
+
+@cache
+def with_offset() -> Transit:
+    """The same, OFFSET_DN too much in every readout."""
+    frames = tuple(
+        replace(frame, pixels=(frame.pixels + OFFSET_DN / frame.exposure_s).astype(np.float32))
+        for frame in clean().frames
+    )
+    return replace(clean(), frames=frames, sha256={"000.fits": "ab" * 32, "transit.json": "cd" * 32})
+
+
+@cache
+def found() -> Diagnosis:
+    """The diagnosis of the second: attributed, and added to the model."""
+    with QUICK:
+        return diagnose(with_offset(), library=FEW)

@@ -1,0 +1,231 @@
+"""The gap on small simulated transits: none where there is none, the effect that was put in where there is one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from psfcore.blind.effects.scene import patches
+from psfcore.errors import DataError
+from psfcore.gap.diagnose import Diagnosis, diagnose, diagnose_solution
+from psfcore.gap.evidence.measured_noise import measured_noise
+from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.report.report import gap_report
+from psfcore.gap.verdict.judge import LEFT_SHARE
+from psfcore.noise import Noise
+from psfcore.scatter.inversion import Solution, invert
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
+from psfcore.transit.transit import Frame, Transit
+from tests.transit_files import TRUTH, diffraction
+
+
+@pytest.fixture(scope="module")
+def clean() -> Transit:
+    """Twelve images of 160 px, some tens of photons a pixel in the discs."""
+    plan = default_plan(12, 160, oversampling=1, brightness=4.0)
+    return simulate(plan, TRUTH, diffraction(), seed=8).transit
+
+
+@pytest.fixture(scope="module")
+def solution(clean: Transit) -> Solution:
+    return invert(clean)
+
+
+def changed(transit: Transit, change: Callable[[int, Frame], np.ndarray]) -> Transit:
+    """The transit with every image changed."""
+    frames = tuple(
+        replace(frame, pixels=change(n, frame).astype(np.float32)) for n, frame in enumerate(transit.frames)
+    )
+    return replace(transit, frames=frames)
+
+
+def verdict(transit: Transit) -> Diagnosis:
+    return diagnose(transit, refit=False)
+
+
+def tried(found: Diagnosis, name: str) -> dict[str, tuple[float, float, str]]:
+    return next(t for t in found.judgement.tried if t.names == (name,)).values
+
+
+@pytest.fixture(scope="module")
+def of_clean(solution: Solution) -> Diagnosis:
+    return diagnose_solution(solution, noise=None)
+
+
+def test_clean_images_have_no_gap_and_the_report_is_json(of_clean: Diagnosis) -> None:
+    found = of_clean
+    # Loosened from "none": on twelve images of 160 px one seed in a hundred may look like a gap, which is said to be
+    # inconclusive. What must never be is an effect named where there is none.
+    assert found.judgement.verdict in ("none", "inconclusive") and found.judgement.answer == ()
+    report = json.loads(json.dumps(gap_report(found), allow_nan=False))
+    assert report["schema"] == "gap/1" and report["sentence"].startswith("No gap")
+    names = {effect["name"] for effect in report["effects"]} | {e["name"] for e in report["untestable"]}
+    assert names == {effect.name for effect in LIBRARY if effect.named}
+    assert report["gap"]["p_value"] > 1e-3
+    assert all(effect["closure"] is None for effect in report["effects"])
+    assert sum(axis["share"] for axis in report["where"]) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("offset_dn", [3.0, pytest.param(-3.0, marks=pytest.mark.slow)])
+def test_a_dark_offset_is_found_with_its_size_and_taken_out(
+    clean: Transit, of_clean: Diagnosis, offset_dn: float
+) -> None:
+    found = diagnose(changed(clean, lambda n, f: f.pixels + offset_dn / f.exposure_s))
+    assert found.judgement.answer == ("dark_offset",)
+    (fit,) = found.corrected
+    value, sigma, unit = fit.values["offset"]
+    assert unit == "DN" and value == pytest.approx(offset_dn, abs=max(4 * sigma, 0.05))
+    closure = found.shrinking["dark_offset"].closure
+    assert closure is not None and closure.value > 0.7
+    # What is left is what images of 160 px leave without it too.
+    assert found.after.value < of_clean.rms.value + 0.5
+    # A dark level added to the PSF's fit bends it; with the effect in the model it is straight again.
+    bent, straight = (s.inversion.values["total"] for s in (found.solution, fit.solution))
+    assert abs(straight - TRUTH.total) < abs(bent - TRUTH.total) + 0.01
+
+
+def test_a_gain_that_differs_between_modes_hides_in_the_discs_and_shows_in_the_lit_part(
+    clean: Transit,
+) -> None:
+    found = verdict(changed(clean, lambda n, f: f.pixels * (1.08 if f.gain_mode == "combined" else 1.0)))
+    assert found.judgement.answer == ("gain_mismatch",)
+    value, sigma, _ = tried(found, "gain_mismatch")["excess"]
+    assert value == pytest.approx(0.08, abs=max(5 * sigma, 0.02))
+    assert found.rms.value < 3.0  # percent: the discs hardly know
+    assert found.where[0].name in ("gain_mode", "exposure")
+
+
+def test_what_earlier_images_left_is_found_however_fast_it_fades(clean: Transit) -> None:
+    frames = clean.frames
+    fades_s = 1.6 * (frames[-1].time_s - frames[0].time_s) / (len(frames) - 1)
+
+    def remembered(n: int, f: Frame) -> np.ndarray:
+        left = sum(
+            np.exp((earlier.time_s - f.time_s) / fades_s) * earlier.pixels * earlier.exposure_s / f.exposure_s
+            for earlier in frames[:n]
+        )
+        return np.asarray(f.pixels + 0.06 * left, dtype=np.float32)
+
+    found = verdict(changed(clean, remembered))
+    assert found.judgement.answer == ("persistence",)
+    best = found.judgement.best
+    assert best is not None and best.left_share is not None and best.left_share < 0.05
+    assert sum(value for value, _, _ in best.values.values()) == pytest.approx(0.06, rel=0.3)
+
+
+def test_a_flat_field_of_patches_is_found_as_one(clean: Transit) -> None:
+    uneven = 1 + 0.15 * patches(clean.shape[0], seed=3, patch=0.2)
+    found = verdict(changed(clean, lambda n, f: f.pixels * uneven))
+    assert found.judgement.answer == ("flat_field_residual",)
+    (best, *_) = found.judgement.tried
+    closure = found.shrinking["flat_field_residual"].closure
+    assert closure is not None and closure.value > 0.3
+    # Many numbers, each near nothing where the discs say nothing of it: together no more than the patches are.
+    assert np.linalg.norm([value for value, _, _ in best.values.values()]) < 0.2
+    assert f"{len(best.values)} numbers" in gap_report(found)["sentence"]
+
+
+def test_a_sun_that_changes_faster_than_it_is_followed_is_named_all_the_same() -> None:
+    plan = default_plan(18, 128, oversampling=1, brightness=4.0)
+    one, other = (patches(128, seed=seed, patch=0.1) for seed in (3, 4))
+
+    def flickering(n: int, f: Frame) -> np.ndarray:
+        return np.asarray(f.pixels * np.exp(0.3 * (one * np.sin(0.9 * n) + other * np.cos(0.9 * n))))
+
+    found = verdict(changed(simulate(plan, TRUTH, diffraction(), seed=8).transit, flickering))
+    best = found.judgement.best
+    assert best is not None and best.left_share is not None and best.left_share > LEFT_SHARE
+    assert found.judgement.answer == ("scene_evolution",)
+
+
+def test_a_patch_of_light_is_nobodys_effect(clean: Transit) -> None:
+    ny, nx = clean.shape
+    glow = 40 * np.exp(-0.5 * ((np.arange(nx) - 60) / 14) ** 2) * np.ones((ny, 1))
+    found = verdict(changed(clean, lambda n, f: f.pixels + glow))
+    assert found.judgement.verdict in ("unknown", "inconclusive")
+    report = gap_report(found)
+    assert "patch of added light" in report["looks_like"][0]["form"]
+
+
+def test_a_pattern_of_the_readout_is_nobodys_effect(clean: Transit) -> None:
+    x = np.arange(clean.shape[1])
+    stripes = 20 * np.sin(2 * np.pi * x / 45) * np.ones((clean.shape[0], 1))
+    found = verdict(changed(clean, lambda n, f: f.pixels + stripes / f.exposure_s))
+    assert found.judgement.verdict == "unknown"
+    assert "same in every readout" in gap_report(found)["looks_like"][0]["form"]
+    (rms, *_) = found.judgement.probes[0].values.values()
+    assert rms[0] == pytest.approx(20 / np.sqrt(2), rel=0.2)
+
+
+def test_light_that_clipping_took_from_a_brightening_is_known_by_its_place(clean: Transit) -> None:
+    """One pointing's images are clipped round a place: nothing shows the scene there as it is."""
+    fov = 2
+    y, x = np.indices(clean.shape)
+    inside = 30 - np.hypot(y - 60, x - 80)
+    filled = inside > 0
+    lost = np.where(filled, np.sqrt(np.maximum(inside, 0)) / 7, 0.0)
+    frames = tuple(
+        replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=filled) if f.fov == fov else f
+        for f in clean.frames
+    )
+    found = verdict(replace(clean, frames=frames))
+    assert found.judgement.answer == ("saturation_fill",)
+    values = tried(found, "saturation_fill")
+    # More inside than at the rim, as it was taken.
+    assert values["excess_inside"][0] < -2 * values["excess_inside"][1]
+
+
+@pytest.mark.slow
+def test_brightness_that_wavers_from_image_to_image_is_no_gap(clean: Transit) -> None:
+    rng = np.random.default_rng(3)
+    waver = 1 + 0.01 * rng.standard_normal(len(clean.frames))
+    found = verdict(changed(clean, lambda n, f: f.pixels * waver[n]))
+    assert found.judgement.verdict in ("none", "inconclusive") and found.judgement.answer == ()
+
+
+@pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
+def test_noise_figures_that_are_wrong_are_noticed_and_no_gap(clean: Transit, factor: float) -> None:
+    wrong = Noise(clean.noise.photon_gain_dn * factor, clean.noise.read_noise_dn * factor)
+    found = verdict(replace(clean, noise=wrong))
+    assert found.judgement.verdict in ("none", "inconclusive") and found.judgement.answer == ()
+    assert any("as noisy" in caution for caution in found.cautions)
+
+
+def test_the_noise_of_the_images_is_measured(clean: Transit) -> None:
+    found = measured_noise(clean)
+    assert found is not None and found.agrees
+    # Loosened from a tenth: of pixels with a few photons the median deviation is less than a normal one's by that.
+    assert found.noise.photon_gain_dn == pytest.approx(clean.noise.photon_gain_dn, rel=0.2)
+    first, second = clean.frames[:2]
+    assert measured_noise(replace(clean, frames=(first, replace(second, fov=2)))) is None
+
+
+@pytest.mark.slow
+def test_one_pointing_and_few_images_say_what_they_cannot(clean: Transit) -> None:
+    one = replace(clean, frames=tuple(f for f in clean.frames if f.fov == 2))
+    found = verdict(one)
+    assert found.judgement.answer == ()
+    assert any("One pointing" in c for c in found.cautions) and any(
+        "One exposure" in c for c in found.cautions
+    )
+    untestable = {e["name"] for e in gap_report(found)["untestable"]}
+    assert {"gain_mismatch", "saturation_fill"} <= untestable
+    three = replace(clean, frames=one.frames[:3])
+    few = verdict(three)
+    assert few.judgement.verdict in ("none", "inconclusive")
+    assert any("held out" in c for c in few.cautions)
+    with pytest.raises(DataError) as raised:
+        verdict(replace(clean, frames=one.frames[:2]))
+    assert raised.value.code == "too-few-frames"
+
+
+def test_a_library_without_effects_is_refused(clean: Transit) -> None:
+    probes = tuple(effect for effect in LIBRARY if not effect.named)
+    with pytest.raises(DataError) as raised:
+        diagnose(clean, library=probes)
+    assert raised.value.code == "bad-library"

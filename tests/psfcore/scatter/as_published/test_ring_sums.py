@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from psfcore.convolution.convolver import Convolver
+from psfcore.errors import DataError
+from psfcore.scatter.as_published.ring_sums import ring_sums, segment_sums
+from psfcore.scatter.as_published.segments import Segments, fine_shells, shells_as_published
+from tests.psfcore.scatter.as_published.ring_sum_references import segment_sums_fft, segment_sums_plain
+
+FINE = tuple(fine_shells(90.0))
+PUBLISHED = tuple(shells_as_published(90.0))
+
+
+def scene(shape: tuple[int, int], seed: int = 0) -> NDArray[np.float64]:
+    """A bright side and a faint one, a hundred times fainter."""
+    falling = np.geomspace(1.0, 0.01, shape[1])
+    return np.random.default_rng(seed).gamma(2.0, 100.0, shape) * falling
+
+
+def some_targets(shape: tuple[int, int], n: int, seed: int = 0) -> NDArray[np.int64]:
+    """Neighbours in a disc, places anywhere, corners, and one of them twice."""
+    rng = np.random.default_rng(seed)
+    y, x = np.indices(shape)
+    disc = np.argwhere((y - shape[0] // 3) ** 2 + (x - shape[1] // 2) ** 2 <= 30)
+    anywhere = np.column_stack([rng.integers(0, side, n) for side in shape])
+    corners = [(0, 0), (0, shape[1] - 1), (shape[0] - 1, 0), (shape[0] - 1, shape[1] - 1)]
+    chosen = np.concatenate((disc, anywhere, corners, anywhere[:1]))
+    return rng.permutation(chosen)
+
+
+SIDES = st.integers(1, 90)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIDES, SIDES, st.integers(1, 80), st.sampled_from([1, 2, 12]), st.integers(0, 2**32 - 1))
+def test_equals_the_plain_sum_for_any_shape_and_reach(
+    ny: int, nx: int, grid_px: int, sectors: int, seed: int
+) -> None:
+    image, targets = scene((ny, nx), seed), some_targets((ny, nx), 9, seed)
+    segments = Segments(FINE, sectors, grid_px)
+    expected = segment_sums_plain(image, targets, segments)
+    np.testing.assert_allclose(segment_sums(image, targets, segments), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("edges", [PUBLISHED, FINE])
+@pytest.mark.parametrize("sectors", [1, 12, 24])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, ">f4", np.uint16])
+def test_rings_and_sectors_of_any_kind_of_image_equal_the_plain_sum(
+    edges: tuple[float, ...], sectors: int, dtype: str
+) -> None:
+    image, targets = scene((101, 140)).astype(dtype), some_targets((101, 140), 30)
+    segments = Segments(edges, sectors, 128)
+    expected = segment_sums_plain(image, targets, segments)
+    np.testing.assert_allclose(segment_sums(image, targets, segments), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("sectors", [1, 12])
+def test_equals_one_convolution_a_segment(sectors: int) -> None:
+    image, targets = scene((75, 90)), some_targets((75, 90), 30)
+    segments = Segments(PUBLISHED, sectors, 128)
+    expected = segment_sums_fft(image, targets, segments)
+    np.testing.assert_allclose(segment_sums(image, targets, segments), expected, rtol=1e-6, atol=1e-7)
+
+
+def test_published_shells_of_a_large_image_equal_the_plain_sum() -> None:
+    image = scene((1024, 1024)).astype(np.float32)
+    targets = np.array([[0, 0], [500, 700], [500, 701], [1023, 1023]])
+    segments = Segments(tuple(shells_as_published()))
+    expected = segment_sums_plain(image, targets, segments)
+    np.testing.assert_allclose(segment_sums(image, targets, segments), expected, rtol=1e-9, atol=1e-6)
+    np.testing.assert_array_equal(
+        ring_sums(image, targets, shells_as_published()), segment_sums(image, targets, segments)
+    )
+
+
+def test_light_lands_at_source_plus_offset() -> None:
+    """A source at (20, 20): a target to its right sees it in sector 0, one below it (larger y) in sector 1."""
+    image = np.zeros((41, 41))
+    image[20, 20] = 7.0
+    segments = Segments((0.5, 12.0), 4, 64)
+    targets = np.array([[20, 25], [25, 20], [20, 15], [15, 20], [20, 20]])
+    expected = np.vstack((7.0 * np.eye(4), np.zeros(4)))
+    np.testing.assert_array_equal(segment_sums(image, targets, segments), expected)
+
+
+def test_a_flat_image_gives_the_counts() -> None:
+    segments = Segments(PUBLISHED, 12, 128)
+    sums = segment_sums(np.full((260, 270), 3.0, np.float32), np.array([[130, 130]]), segments)
+    np.testing.assert_array_equal(sums[0], 3.0 * segments.counts)
+
+
+def test_sums_weighted_by_segment_are_the_convolution() -> None:
+    """sum over S of psf_S A_S is the image convolved with the kernel that is psf_S on S."""
+    image, targets = scene((64, 80)), some_targets((64, 80), 30)
+    segments = Segments(FINE, 12, 128)
+    weights = np.random.default_rng(1).random(segments.size)
+    kernel = np.append(weights, 0.0)[segments.label_map(128)]
+    convolved = Convolver(kernel, image.shape, dtype=np.float64).apply(image)
+    np.testing.assert_allclose(
+        segment_sums(image, targets, segments) @ weights, convolved[tuple(targets.T)], rtol=1e-9
+    )
+
+
+def test_dark_segments_of_a_bright_image_are_exactly_dark() -> None:
+    image = scene((100, 100))
+    y, x = np.indices(image.shape)
+    image[(y - 50) ** 2 + (x - 50) ** 2 < 20**2] = 0.0
+    sums = ring_sums(image, np.array([[50, 50]]), np.array([0.5, 10.0, 20.0, 30.0]))
+    assert sums[0, 0] == sums[0, 1] == 0.0
+    assert sums[0, 2] > 0.0
+
+
+@pytest.mark.parametrize("sectors", [1, 24])
+def test_the_same_for_any_number_of_threads(sectors: int) -> None:
+    image, targets = scene((101, 340)), some_targets((101, 340), 400)
+    targets = targets[targets[:, 1] > 160]  # running sums begin within the image
+    segments = Segments(FINE, sectors, 128)
+    alone = segment_sums(image, targets, segments)
+    for threads in (2, 3, 16):
+        np.testing.assert_array_equal(segment_sums(image, targets, segments, threads=threads), alone)
+
+
+def test_no_target_and_no_segment_on_the_grid_give_nothing() -> None:
+    image = scene((20, 20))
+    assert segment_sums(image, np.empty((0, 2), int), Segments(FINE)).shape == (0, len(FINE) - 1)
+    far = Segments((200.0, 300.0), reach_grid_px=64)
+    np.testing.assert_array_equal(segment_sums(image, np.array([[3, 4]]), far), [[0.0]])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_image_with_a_pixel_that_is_not_finite_is_refused(value: float) -> None:
+    image = scene((60, 60))
+    image[50, 10] = value
+    with pytest.raises(DataError, match=r"image-nonfinite: .* got 1"):
+        segment_sums(image, np.array([[2, 40]]), Segments((0.5, 5.0)))
+
+
+@pytest.mark.parametrize(
+    ("shape", "targets", "message"),
+    [
+        ((20,), [[1, 1]], "two axes"),
+        ((20, 20), [1, 1], "whole-numbered"),
+        ((20, 20), [[1.0, 1.0]], "whole-numbered"),
+        ((20, 20), [[20, 1]], "off it"),
+        ((20, 20), [[1, -1]], "off it"),
+    ],
+)
+def test_what_cannot_be_summed_is_refused(shape: tuple[int, ...], targets: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        segment_sums(np.zeros(shape), np.array(targets), Segments(FINE))

@@ -1,0 +1,206 @@
+"""Cross-validation: draws, both schemes beside a fit from the start, bands, and free fit beside formula."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from psfcore.errors import DataError
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.optics import Lanes, Optics
+from psfcore.scatter.shapes import SHAPES
+from psfcore.scatter.validation.cross_validation import (
+    LIMITS,
+    ONE_SIGMA,
+    TWO_SIGMA,
+    Bands,
+    Excess,
+    FoldFit,
+    FoldShells,
+    bands,
+    draws,
+    exact_fit,
+    shared_fits,
+    shared_step,
+    shell_bands,
+)
+from psfcore.scatter.validation.cross_validation_plot import cross_validation_png
+from psfcore.scatter.validation.free_shells import shells
+from psfcore.transit.blocks import folds
+from tests.psfcore.small_transits import IMAGES, observed, sky, solved
+
+
+@cache
+def shared() -> tuple[FoldFit, ...]:
+    return shared_fits(solved(), draws(IMAGES, runs=5))
+
+
+@cache
+def in_bands() -> Bands:
+    return bands(shared(), solved().inversion.radii_px)
+
+
+def test_percentiles_are_a_gaussians() -> None:
+    assert np.array(ONE_SIGMA) / 100 == pytest.approx(norm.cdf([-1, 1]), abs=1e-12)
+    assert np.array(TWO_SIGMA) / 100 == pytest.approx(norm.cdf([-2, 2]), abs=1e-12)
+    assert list(LIMITS) == sorted(LIMITS)
+
+
+def test_a_draw_holds_its_block_and_guard_out_and_keeps_the_blocks_sizes() -> None:
+    parts = folds(IMAGES)
+    for draw in draws(IMAGES, runs=3):
+        fitted = set(parts[draw.fold].fitted)
+        assert draw.held_out == parts[draw.fold].held_out
+        assert {n for n, k in enumerate(draw.counts) if k} <= fitted and sum(draw.counts) == len(fitted)
+    with pytest.raises(DataError, match="too-few-images"):
+        draws(5)
+
+
+def test_an_exact_fold_is_what_a_fit_from_the_start_finds() -> None:
+    """Begun at the shared step it ends, within what a fit settles to, where `invert` ends with the same counts."""
+    draw = draws(IMAGES, runs=1)[1]
+    slow = invert(observed(sky()).transit, counts=draw.counts)
+    found = exact_fit(solved(), draw)
+    sigma = solved().inversion.curve_sigma
+    apart = np.abs(np.array(found.curve_pct) - slow.inversion.curve_pct)
+    assert (apart < np.maximum(0.1 * sigma, 0.03)).all()
+    assert set(found.held_out_pct) == set(draw.held_out)
+
+
+def test_the_solution_is_as_it_was_after_its_folds() -> None:
+    before = [scene.copy() for scene in solved().sky.scenes]
+    places = list(solved().sky.found)
+    exact_fit(solved(), draws(IMAGES, runs=1)[0])
+    assert all((a == b).all() for a, b in zip(before, solved().sky.scenes, strict=True))
+    assert places == solved().sky.found
+
+
+def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So a worker's lease outlasts what is done in silence, and a cancel is seen."""
+    since_report, most = 0, 0
+    undo = Optics.undo
+
+    def counted(optics: Optics, observed: Lanes, start: Lanes | None = None, *, steps: int) -> Lanes:
+        nonlocal since_report, most
+        since_report += 1
+        most = max(most, since_report)
+        return undo(optics, observed, start, steps=steps)
+
+    stages: dict[str, list[int]] = {}
+
+    def progress(stage: str, step: int, steps: int) -> None:
+        nonlocal since_report
+        since_report = 0
+        stages.setdefault(stage, []).append(step)
+        assert 0 <= step < steps
+
+    monkeypatch.setattr(Optics, "undo", counted)
+    draw = draws(IMAGES, runs=1)[1]
+    exact_fit(solved(), draw, progress=progress)
+    assert most == 1
+    assert stages["images held out"] == list(range(len(draw.held_out)))
+    assert stages["settling"] == stages["free shells"] != []
+
+
+@pytest.mark.parametrize("stage", ["images held out", "settling"])
+def test_a_fold_stops_where_its_report_says_so(stage: str) -> None:
+    class Stop(Exception):
+        pass
+
+    def progress(now: str, _step: int, _steps: int) -> None:
+        if now == stage:
+            raise Stop
+
+    with pytest.raises(Stop):
+        exact_fit(solved(), draws(IMAGES, runs=1)[1], progress=progress)
+
+
+def test_both_schemes_agree() -> None:
+    wanted = draws(IMAGES, runs=1)
+    quick = shared_fits(solved(), wanted)
+    assert quick == shared()[: len(wanted)]
+    exactly = tuple(exact_fit(solved(), draw) for draw in wanted)
+    half_width = (in_bands().curve_pct[3] - in_bands().curve_pct[1]) / 2
+    apart = np.subtract([f.curve_pct for f in exactly], [f.curve_pct for f in quick]) / half_width
+    assert np.sqrt((apart**2).mean()) < 0.35
+    one, other = (bands(fits, solved().inversion.radii_px).shells for fits in (exactly, quick))
+    assert one is not None and other is not None
+    assert one.near_centre.points == pytest.approx(
+        other.near_centre.points, abs=0.5 * other.near_centre.sigma
+    )
+
+
+def test_all_images_once_take_no_step() -> None:
+    everything = dataclasses.replace(draws(IMAGES, runs=1)[0], counts=(1,) * IMAGES)
+    moved = np.abs(shared_step(solved(), everything))
+    assert (moved < 0.05 * np.sqrt(np.diag(solved().inversion.covariance))).all()
+
+
+def test_a_draw_of_nothing_is_refused() -> None:
+    nothing = dataclasses.replace(draws(IMAGES, runs=1)[0], counts=(0,) * IMAGES)
+    with pytest.raises(DataError, match=r"transit-says-too-little.*run 0, fold 0"):
+        shared_fits(solved(), (nothing,))
+    with pytest.raises(DataError, match="transit-says-too-little"):
+        exact_fit(solved(), nothing)
+
+
+def test_free_fit_and_formula_do_not_part_where_the_truth_is_the_formula() -> None:
+    found = in_bands().shells
+    assert found is not None
+    assert not found.largest.parts
+    assert abs(found.near_centre.points) < 3 * found.near_centre.sigma
+    assert found.near_centre.within_px == pytest.approx(3.1)
+    assert (found.free_weight >= 0).all() and (np.diff(found.free_weight, axis=0) >= 0).all()
+    total = found.law_beyond_pct[2, 0] / 100
+    assert total == pytest.approx(np.median([f.values["total"] for f in shared()]), rel=1e-6)
+
+
+def made(extra: float, sigma: float, seed: int) -> FoldShells:
+    """A draw whose free fit has `extra` more light in its fourth shell, give or take a little."""
+    law = np.full(shells().size, 0.4 / shells().size)
+    free = law.copy()
+    free[3] += extra + 1e-4 * np.random.default_rng(seed).standard_normal()
+    return FoldShells(tuple(free), tuple(law), (sigma,) * shells().size)
+
+
+def test_an_excess_is_told_with_the_larger_of_its_errors() -> None:
+    found = shell_bands([made(0.05, 0.01, seed) for seed in range(200)])
+    near = found.near_centre
+    assert near.points == pytest.approx(5.0, abs=0.01) and near.sigma == pytest.approx(1.0)
+    assert near.of_formula_pct == pytest.approx(100 * 0.05 / (6 * 0.4 / shells().size), rel=0.01)
+    assert found.largest.parts and near.parts
+    assert not Excess(3.1, points=2.9, sigma=1.0, of_formula_pct=10.0).parts
+    by_draws = shell_bands([made(0.05, 1e-9, seed) for seed in range(200)])
+    assert by_draws.near_centre.sigma == pytest.approx(0.01, rel=0.2)
+    beyond = by_draws.free_beyond_pct[2] - by_draws.law_beyond_pct[2]
+    np.testing.assert_allclose(beyond[:4], 5.0, atol=0.02)
+    np.testing.assert_allclose(beyond[4:], 0.0, atol=1e-9)
+
+
+def test_folds_go_to_json_and_back() -> None:
+    said = json.loads(json.dumps([fit.to_json() for fit in shared()], allow_nan=False))
+    assert tuple(FoldFit.from_json(fold) for fold in said) == shared()
+    json.dumps(in_bands().to_json(), allow_nan=False)
+    without = dataclasses.replace(shared()[0], shells=None)
+    assert FoldFit.from_json(json.loads(json.dumps(without.to_json()))) == without
+
+
+def test_a_shape_that_is_stretched_has_no_shells() -> None:
+    start = SHAPES["stretched"].coordinates(solved().inversion.values)
+    solution = invert(observed(sky()).transit, SHAPES["stretched"], start=start)
+    found = bands(shared_fits(solution, draws(IMAGES, runs=1)), solution.inversion.radii_px)
+    assert found.shells is None and found.to_json()["shells"] is None
+
+
+def test_the_picture_has_a_row_more_with_a_free_fit(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    heights = []
+    for fits in (shared(), tuple(dataclasses.replace(fit, shells=None) for fit in shared())):
+        path = tmp_path / "p.png"
+        cross_validation_png(bands(fits, solved().inversion.radii_px), fits, [1] * IMAGES, path)
+        heights.append(int.from_bytes(path.read_bytes()[20:24], "big"))
+    assert heights[0] == 2 * heights[1]

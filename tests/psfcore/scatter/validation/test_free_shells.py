@@ -1,0 +1,134 @@
+"""Free fits beside the formula: slopes of the shells, sums over images, and what is found where it was put in."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from psfcore.convolution.convolver import Convolver
+from psfcore.psf import REACH_GRID_PX
+from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.optics import Blur
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.scatter.total_psf import TotalPsf
+from psfcore.scatter.validation.free_shells import (
+    FreeShares,
+    free_kernel,
+    free_shares,
+    law_light,
+    loosely,
+    shells,
+)
+from tests.psfcore.small_transits import BRIGHT, noise_free, sky, solved
+
+
+@cache
+def shares() -> FreeShares:
+    return free_shares(solved(), solved().inversion.coordinates)
+
+
+def once() -> list[int]:
+    return [1] * len(solved().transit.frames)
+
+
+def shell_blur(solution: Solution, shell: int) -> Blur:
+    """What a unit of light that goes from the centre to a shell does to an image."""
+    size = solution.total.size
+    ring = np.where(shells().label_map(size) == shell, 1 / shells().counts[shell], 0.0)
+    ring[size // 2, size // 2] = -1.0
+    diffract = Convolver(solution.transit.diffraction, (size, size), dtype=np.float64)
+    return Blur(np.asarray(diffract.apply(ring)), solution.transit.shape)
+
+
+@pytest.mark.parametrize("shell", [0, 3, 8, 15, 22])
+def test_slopes_are_those_of_the_inversion(shell: int) -> None:
+    """Images' J^T w J and J^T w r beside those of the whole model's slopes; the field's edge is near to all discs."""
+    solution = solved()
+    blur = shell_blur(solution, shell)
+    for k, n in list(enumerate(solution.part))[::4]:
+        residual, expected = solution.residual(n)
+        slope = solution.answer(n, blur)
+        weight = solution.weight(n, expected)
+        normal = float(weight @ slope**2)
+        assert shares().normal[k, shell, shell] == pytest.approx(normal, rel=0.2)  # slopes to a tenth
+        error = shares().score[k, shell] - float(weight @ (slope * residual))
+        assert abs(error) < 0.1 * np.sqrt(normal)  # a tenth of what its noise makes of it
+
+
+def test_images_add_up() -> None:
+    """An image drawn twice counts as two images; one that was not drawn does not count."""
+    of = shares()
+    twice = [0, 2, *([1] * (len(once()) - 2))]
+    listed = [k for k, n in enumerate(of.frames) for _ in range(twice[n])]
+    by_hand = FreeShares(
+        frames=tuple(range(len(listed))),
+        law_light=of.law_light,
+        normal=of.normal[listed],
+        score=of.score[listed],
+    )
+    expected = by_hand.fit([1] * len(listed), of.law_light)
+    found = of.fit(twice, of.law_light)
+    np.testing.assert_allclose(found.light, expected.light, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-6, atol=1e-12)
+    assert np.abs(found.light - of.fit(once(), of.law_light).light).max() > 1e-4
+
+
+def test_no_shell_takes_light_away_and_none_that_is_undecided_moves_much() -> None:
+    found = shares().fit(once(), shares().law_light)
+    assert found.light.min() >= 0
+    beyond = np.array(shells().edges_px[:-1]) > 200.0  # farther than any two pixels of a field of 128 px
+    np.testing.assert_allclose(found.light[beyond], found.law_light[beyond], rtol=0.02)
+    held = np.sqrt(np.diag(found.covariance))[beyond]
+    np.testing.assert_allclose(held, loosely(shares().law_light)[beyond], rtol=0.02)
+
+
+def test_where_the_formula_goes_the_undecided_shells_follow() -> None:
+    moved = 1.1 * shares().law_light
+    found = shares().fit(once(), moved)
+    beyond = np.array(shells().edges_px[:-1]) > 200.0
+    np.testing.assert_allclose(found.light[beyond], moved[beyond], rtol=0.02)
+
+
+def test_light_near_the_centre_that_the_formula_leaves_out_is_found() -> None:
+    """A noise-free transit of a power law, about a formula that lacks 2 % of all light at 3 to 10 px."""
+    transit = noise_free(sky(brightness=BRIGHT))
+    solution = invert(transit)
+    right = free_shares(solution, solution.inversion.coordinates)
+    missing = np.zeros_like(right.law_light)
+    band = (np.array(shells().edges_px[:-1]) >= 2.9) & (np.array(shells().edges_px[1:]) <= 10.0)
+    missing[band] = 0.02 / band.sum()
+    # To first order a model without that light leaves J d unexplained.
+    lacking = FreeShares(
+        frames=right.frames,
+        law_light=right.law_light,
+        normal=right.normal,
+        score=right.score + np.einsum("nij,j->ni", right.normal, missing),
+    )
+    counts = [1] * len(transit.frames)
+    excess = lacking.fit(counts, right.law_light).light - right.fit(counts, right.law_light).light
+    assert excess[band].sum() == pytest.approx(0.02, rel=0.1)
+    assert np.abs(excess[~band]).sum() < 0.004
+
+
+def test_the_free_kernel_of_the_formulas_light_is_the_formulas() -> None:
+    solution = solved()
+    at, shape = solution.inversion.coordinates, SOFTENED_POWER_LAW
+    free = shares().fit(once(), shares().law_light)
+    same = type(free)(free.law_light, free.law_light, free.covariance)
+    diffraction, size = solution.transit.diffraction, solution.total.size
+    kernel = free_kernel(same, shape, at, diffraction, size)
+    np.testing.assert_allclose(kernel, solution.total.kernel(at), atol=1e-9)
+    changed = free_kernel(free, shape, at, diffraction, size)
+    point = np.zeros((1, 1)) + 1.0
+    scatter = free_kernel(free, shape, at, point, REACH_GRID_PX)
+    assert scatter.sum() == pytest.approx(1.0, abs=1e-6) and changed.min() > -1e-6
+    light = shells().mean_of_map(scatter) * shells().counts
+    np.testing.assert_allclose(light, free.light, atol=1e-6)
+
+
+def test_light_of_the_formula_is_all_that_is_scattered() -> None:
+    at = SOFTENED_POWER_LAW.coordinates({"total": 0.4})
+    assert law_light(SOFTENED_POWER_LAW, at).sum() == pytest.approx(0.4, rel=1e-9)
+    assert TotalPsf(np.ones((1, 1)), SHAPES["knee"], (64, 64)).shape.isotropic

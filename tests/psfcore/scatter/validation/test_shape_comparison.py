@@ -1,0 +1,110 @@
+"""What other shapes add to a fit: found where it is there, and not where it is not."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from psfcore.errors import DataError
+from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.optics import Blur
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.scatter.total_psf import TotalPsf
+from psfcore.scatter.validation.shape_comparison import ComparedShape, compare_shapes
+from psfcore.transit.blocks import folds
+from tests.psfcore.small_transits import STRETCHED, fitted, observed, sky, solved
+
+
+@cache
+def compared_stretched() -> dict[str, ComparedShape]:
+    return by_name(compare_shapes(invert(observed(sky(STRETCHED)).transit)))
+
+
+def by_name(shapes: tuple[ComparedShape, ...]) -> dict[str, ComparedShape]:
+    return {shape.name: shape for shape in shapes}
+
+
+def test_a_stretch_put_in_is_found() -> None:
+    """To first order, about the best fit that has none."""
+    log, turn = math.log(1.15), math.radians(2 * -15.0)
+    found = compared_stretched()["stretched"].added
+    for name, true in (("stretch_p", log * math.cos(turn)), ("stretch_q", log * math.sin(turn))):
+        value, sigma = found[name]
+        assert abs(value - true) < 3 * sigma
+        assert abs(value) > 8 * sigma
+
+
+def test_the_shape_that_was_put_in_gains_most() -> None:
+    shapes = compared_stretched()
+    by_gain = sorted(shapes, key=lambda name: -shapes[name].gain)
+    held_out = {name: shape.held_out_gain or 0.0 for name, shape in shapes.items()}
+    assert by_gain[0] == "stretched" == max(held_out, key=lambda name: held_out[name])
+    assert shapes["stretched"].gain > shapes["stretched-along-x"].gain > 100
+    assert shapes["stretched"].significance == shapes["stretched"].gain / 2
+
+
+@pytest.mark.slow
+def test_nothing_is_found_where_nothing_was_put_in() -> None:
+    shapes = fitted().shapes
+    assert [shape.name for shape in shapes] == [name for name in SHAPES if name != SOFTENED_POWER_LAW.name]
+    for shape in shapes:
+        assert set(shape.added) == set(SHAPES[shape.name].names) - set(SOFTENED_POWER_LAW.names)
+        for value, sigma in shape.added.values():
+            assert abs(value) < 4 * sigma
+        assert 0 <= shape.gain < 16
+        assert shape.held_out_gain is not None and shape.held_out_gain < 16
+
+
+def test_gains_are_what_the_residuals_say() -> None:
+    """The steps of each fold, and chi2 on the images held out before and after, from pixels."""
+    solution, shape = solved(), SHAPES["knee"]
+    found = by_name(fitted().shapes)["knee"]
+    slopes = [*solution.total.slopes(solution.inversion.coordinates), bend_slope(solution)]
+    blurs = [Blur(slope, solution.transit.shape) for slope in slopes]
+    frames = []
+    for n in solution.part:
+        residual, expected = solution.residual(n)
+        answers = np.array([solution.answer(n, blur) for blur in blurs])
+        frames.append((residual, answers, solution.weight(n, expected)))
+
+    def step(of: list[int], size: int) -> np.ndarray:
+        lines = np.concatenate([(frames[n][1][:size] * np.sqrt(frames[n][2])).T for n in of])
+        target = np.concatenate([frames[n][0] * np.sqrt(frames[n][2]) for n in of])
+        return np.linalg.lstsq(lines, target, rcond=None)[0]
+
+    def chi2(of: list[int], moved: np.ndarray) -> float:
+        return sum(
+            float(np.sum(frames[n][2] * (frames[n][0] - moved @ frames[n][1][: moved.size]) ** 2)) for n in of
+        )
+
+    everything = list(range(len(frames)))
+    whole, alone = step(everything, 4), step(everything, 3)
+    assert found.added["bend"][0] == pytest.approx(whole[3], rel=1e-3)
+    assert found.gain == pytest.approx(chi2(everything, alone) - chi2(everything, whole), abs=0.01)
+    gained = 0.0
+    for fold in folds(len(frames)):
+        fitted_frames, held = list(fold.fitted), list(fold.held_out)
+        gained += chi2(held, step(fitted_frames, 3)) - chi2(held, step(fitted_frames, 4))
+    assert found.held_out_gain == pytest.approx(gained, rel=0.01, abs=0.05)
+    assert shape.names[3] == "bend"
+
+
+def bend_slope(solution: Solution) -> np.ndarray:
+    shape = SHAPES["knee"]
+    total = TotalPsf(solution.transit.diffraction, shape, solution.transit.shape)
+    return total.slope(shape.coordinates(solution.inversion.values), 3)
+
+
+def test_too_few_images_for_folds_have_no_held_out_gain() -> None:
+    few = dataclasses.replace(solved(), part=solved().part[3:8])
+    assert all(shape.held_out_gain is None for shape in compare_shapes(few))
+
+
+def test_only_the_softened_power_law_is_compared_with() -> None:
+    inversion = dataclasses.replace(solved().inversion, shape=SHAPES["knee"])
+    with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*knee"):
+        compare_shapes(dataclasses.replace(solved(), inversion=inversion))

@@ -1,0 +1,466 @@
+"""A simulated transit is what its plan and its truth say it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+from scipy.signal import fftconvolve
+
+from psfcore.convolution.convolver import Convolver
+from psfcore.errors import DataError
+from psfcore.fits.fits_io import read_image
+from psfcore.psf import cumulative_curve
+from psfcore.scatter.power_law import scatter_kernel
+from psfcore.simulate.disc import Behind, covered_share, fully_dark
+from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan, plan_from_json
+from psfcore.simulate.pointings import drawn_scene, scene_from_image
+from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel, total_kernel
+from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.sky import TrueSky, true_sky
+from psfcore.simulate.transit import SimulatedTransit, observed_transit, simulate
+from psfcore.simulate.transit_files import read_sky, write
+from psfcore.transit.transit import Place
+from tests.psfcore.conftest import LIMITS, gaussian
+
+SCATTER = ScatterTruth(6.15, 2.53, 0.411)
+DIFFRACTION = gaussian(31, 1.5)
+
+
+@pytest.fixture(scope="module")
+def small() -> SimulatedTransit:
+    return simulate(default_plan(6, 96), SCATTER, DIFFRACTION, 3)
+
+
+@pytest.fixture(scope="module")
+def beyond() -> TrueSky:
+    """A field of 96 px, and as much of the Sun again on each side."""
+    return true_sky(default_plan(6, 96, beyond="on", beyond_px=96), SCATTER, DIFFRACTION, 3)
+
+
+def flat_sky(plan: Plan, dn_per_s: float) -> TrueSky:
+    """Even light in every pointing."""
+    edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
+    scenes = {fov: np.full((edge, edge), dn_per_s) for fov in plan.fovs}
+    return true_sky(plan, SCATTER, DIFFRACTION, 1, scenes=scenes)
+
+
+# --- the plan ---------------------------------------------------------------------------------------------
+
+
+def counts(plan: Plan) -> list[tuple[int, float, str, int]]:
+    kinds = [(shot.fov, shot.exposure_s, shot.gain_mode) for shot in plan.shots]
+    return [(*kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)]
+
+
+def test_126_images_are_shared_out_as_in_the_paper() -> None:
+    assert counts(default_plan(126, 512)) == [
+        (1, 5.0, COMBINED, 10),
+        (1, 0.9, HIGH, 14),
+        (2, 1.8, HIGH, 78),
+        (3, 0.9, HIGH, 14),
+        (3, 5.0, COMBINED, 10),
+    ]
+
+
+@pytest.mark.parametrize("images", [1, 2, 3, 7, 30, 61, 200])
+@pytest.mark.parametrize("size_px", [64, 100, 512])
+def test_any_number_of_images_on_any_field(images: int, size_px: int) -> None:
+    plan = default_plan(images, size_px)
+    assert len(plan.shots) == images
+    times = [shot.time_s for shot in plan.shots]
+    assert times == sorted(times) and len(set(times)) == images
+    for index in range(images):
+        place = plan.place(index)
+        assert place.radius_px < min(place.x_px, place.y_px)
+        assert max(place.x_px, place.y_px) < size_px - 1 - place.radius_px
+    if images == 30:
+        assert [sum(shot.fov == fov for shot in plan.shots) for fov in (1, 2, 3)] == [10, 10, 10]
+
+
+def test_a_plan_is_read_back_from_json() -> None:
+    plan = default_plan(7, 128, saturation_dn=900.0, beyond="on", beyond_px=10)
+    assert plan_from_json(json.loads(json.dumps(plan.as_json()))) == plan
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"oversampling": 3},
+        {"beyond": "dim"},
+        {"brightness": 0.0},
+        {"saturation_dn": float("nan")},
+        {"dark_offset_dn": float("inf")},
+        {"radius_px": 40.0},
+        {"views": ("disc", "disc")},
+    ],
+)
+def test_a_plan_that_cannot_be_is_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(DataError, match="bad-plan"):
+        default_plan(6, 64, **changes)
+
+
+# --- the occulter -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fine", [1, 2])
+def test_covered_area_is_the_circles(fine: int) -> None:
+    place = Place(20.3, 18.77, 10.75)
+    share = covered_share(place, (0, 0), (40, 41), fine)
+    assert share.sum() / fine**2 == pytest.approx(np.pi * 10.75**2, rel=1e-12)
+    # Brute force: 40 points a pixel and axis.
+    n = 40 * fine
+    y, x = ((np.arange(40 * 41) + 0.5) / 40 - 0.5 for _ in range(2))
+    inside = np.hypot(x[None, :] - place.x_px, y[: 40 * 40, None] - place.y_px) <= place.radius_px
+    counted = inside.reshape(40 * fine, n // fine**2, 41 * fine, n // fine**2).mean(axis=(1, 3))
+    np.testing.assert_allclose(share, counted, atol=0.03)
+
+
+def test_fully_dark_pixels_are_those_covered_whole() -> None:
+    place = Place(20.3, 18.77, 10.75)
+    dark = fully_dark(place, (3, 5), (36, 35))
+    np.testing.assert_array_equal(dark, covered_share(place, (3, 5), (36, 35)) > 1 - 1e-12)
+    assert 290 < dark.sum() < 350
+
+
+def test_what_a_shift_hides_is_its_slope() -> None:
+    rng = np.random.default_rng(1)
+    around = Behind((4, 6), rng.uniform(50, 150, (60, 60)), 2)
+    by_x, by_y = around.hidden_slopes(Place(20.2, 19.1, 10.75))
+    for slope, shift in ((by_x, (0.02, 0.0)), (by_y, (0.0, 0.02))):
+        ahead = around.hidden(Place(20.2 + shift[0] / 2, 19.1 + shift[1] / 2, 10.75))
+        back = around.hidden(Place(20.2 - shift[0] / 2, 19.1 - shift[1] / 2, 10.75))
+        np.testing.assert_allclose((ahead - back) / 0.02, slope, atol=0.5)
+        assert abs(slope).max() > 50
+
+
+# --- the PSF ----------------------------------------------------------------------------------------------
+
+
+def test_without_direction_it_is_the_power_law() -> None:
+    expected = scatter_kernel(6.15, 2.53, 0.411, 128)
+    np.testing.assert_allclose(anisotropic_kernel(SCATTER, 128), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("stretch, dipole", [(0.0, 0.0), (0.15, 0.0), (-0.1, 0.3)])
+def test_light_is_kept(stretch: float, dipole: float) -> None:
+    scatter = dataclasses.replace(SCATTER, stretch=stretch, angle_deg=30.0, dipole=dipole)
+    kernel = anisotropic_kernel(scatter)
+    assert kernel.sum() == pytest.approx(1, abs=1e-12)
+    assert kernel[1024, 1024] == pytest.approx(1 - 0.411, abs=1e-12)
+    assert total_kernel(scatter, DIFFRACTION).sum() == pytest.approx(1, abs=3e-5)  # 1e-5 falls past the reach
+
+
+def test_stretch_follows_its_definition() -> None:
+    """Along t the radius is u / (1 + s), across it v (1 + s)."""
+    scatter = dataclasses.replace(SCATTER, stretch=0.2, angle_deg=90.0)
+    kernel = anisotropic_kernel(scatter, 256)
+    up, right = kernel[128 + 60, 128], kernel[128, 128 + 60]
+    assert up == pytest.approx(scatter.a * (6.15 + 60 / 1.2) ** -2.53, rel=1e-12)
+    assert right == pytest.approx(scatter.a * (6.15 + 60 * 1.2) ** -2.53, rel=1e-12)
+
+
+def test_dipole_follows_its_definition() -> None:
+    scatter = dataclasses.replace(SCATTER, dipole=0.25, angle_deg=0.0)
+    kernel = anisotropic_kernel(scatter, 128)
+    assert kernel[64, 64 + 20] / kernel[64, 64 - 20] == pytest.approx(1.25 / 0.75, rel=1e-12)
+    assert kernel[64 + 20, 64] == pytest.approx(kernel[64 - 20, 64], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"b_px": 0.0}, {"c": float("nan")}, {"total": 1.0}, {"stretch": -1.0}, {"dipole": 1.1}]
+)
+def test_a_scatter_that_is_no_psf_is_refused(changes: dict[str, float]) -> None:
+    with pytest.raises(DataError, match="bad-scatter"):
+        dataclasses.replace(SCATTER, **changes)
+
+
+def test_a_diffraction_that_loses_light_is_refused() -> None:
+    with pytest.raises(DataError, match="bad-diffraction"):
+        simulate(default_plan(1, 64), SCATTER, 0.9 * DIFFRACTION, 1)
+
+
+# --- what a camera without noise sees ---------------------------------------------------------------------
+
+
+def test_hiding_a_patch_is_seeing_the_dark_scene(small: SimulatedTransit, beyond: TrueSky) -> None:
+    for sky in (small.sky, beyond):
+        margin = sky.plan.margin_px
+        edge = sky.plan.size_px + 2 * margin
+        whole = Convolver(sky.kernel, (edge, edge), dtype=np.float64)
+        for index in (0, 3, 5):
+            direct = whole.apply(sky.true_scene_and_beyond(index))
+            direct = direct[margin : edge - margin, margin : edge - margin]
+            np.testing.assert_allclose(sky.expected(index), direct, rtol=1e-9)
+
+
+def test_a_pixel_is_the_sum_that_the_definition_says(beyond: TrueSky) -> None:
+    """Scene, diffracted without an edge, then the power law written out, pixel by pixel."""
+    index, margin = 2, beyond.plan.margin_px
+    diffracted = fftconvolve(beyond.true_scene_and_beyond(index), DIFFRACTION)  # 15 px more on each side
+    expected = beyond.expected(index)
+    first = -margin - DIFFRACTION.shape[0] // 2
+    rows, columns = (np.arange(n) + first for n in diffracted.shape)
+    for y, x in ((10, 80), (47, 33), (95, 0)):
+        r = np.hypot(columns[None, :] - x, rows[:, None] - y)
+        weights = np.where(r > 0, SCATTER.a / (6.15 + r) ** 2.53, 1 - 0.411)
+        assert expected[y, x] == pytest.approx((weights * diffracted).sum(), rel=1e-9)
+
+
+def test_all_light_of_a_field_lands_on_the_full_reach(small: SimulatedTransit) -> None:
+    scene = small.true_scene(4)
+    kernel = total_kernel(SCATTER, DIFFRACTION, 256)
+    wide = np.zeros((352, 352))
+    wide[128:224, 128:224] = scene
+    seen = Convolver(kernel, wide.shape, dtype=np.float64).apply(wide)
+    lost = cumulative_curve(kernel, [1e9])[0] / 100
+    assert seen.sum() == pytest.approx(scene.sum() * (1 - lost), rel=1e-9)
+    assert 0.0 < lost < 0.15
+
+
+def test_the_occulter_is_dark_in_the_true_scene_and_lit_by_scatter(small: SimulatedTransit) -> None:
+    for index in range(6):
+        dark = fully_dark(small.plan.place(index), (0, 0), (96, 96))
+        assert small.true_scene(index)[dark].max() < 1e-9
+        assert small.noise_free[index][dark].min() > 0
+        lit = covered_share(small.plan.place(index), (0, 0), (96, 96)) == 0
+        fov = small.plan.shots[index].fov
+        np.testing.assert_array_equal(small.true_scene(index)[lit], small.scenes[fov][lit])
+
+
+def test_half_pixels_are_binned_after_the_edge_is_drawn() -> None:
+    """Light in one half pixel, the disc's edge between it and the other."""
+    plan = default_plan(1, 64)
+    plan = dataclasses.replace(plan, shots=(dataclasses.replace(plan.shots[0], x_px=32 - 10.75, y_px=30.0),))
+    fine = np.zeros((128, 128))
+    fine[60, 64] = 4.0  # the left half of column 32, row 30, ends at the disc's edge at x = 32
+    fine[60, 65] = 8.0
+    sky = true_sky(plan, SCATTER, DIFFRACTION, 1, scenes={2: fine})
+    assert sky.scenes[2][30, 32] == pytest.approx(3.0)
+    assert sky.true_scene(0)[30, 32] == pytest.approx(2.0, abs=0.02)
+
+
+def test_light_from_beyond_the_field_raises_the_discs(beyond: TrueSky) -> None:
+    """The same field with darkness round it: far off the limb the discs lose most."""
+    plan = dataclasses.replace(beyond.plan, beyond="dark", beyond_px=None, oversampling=1)
+    fields = {fov: scene[96:-96, 96:-96] for fov, scene in beyond.scenes.items()}
+    dark = true_sky(plan, SCATTER, DIFFRACTION, 3, scenes=fields)
+    ratios = []
+    for index in range(6):
+        disc = fully_dark(plan.place(index), (0, 0), (96, 96))
+        ratios.append(beyond.expected(index)[disc].mean() / dark.expected(index)[disc].mean())
+    assert min(ratios) > 1.01
+    assert ratios[0] > 1.3 and ratios[5] > 1.3  # far off the limb
+    assert ratios[0] > ratios[1] and ratios[5] > ratios[4]
+
+
+# --- noise, ephemeris, camera -----------------------------------------------------------------------------
+
+
+def test_noise_has_the_variance_of_photons_and_readout() -> None:
+    plan = default_plan(6, 64, whole_dn=False)
+    sky = flat_sky(plan, 60.0)
+    pulls: dict[int, list[NDArray[np.float64]]] = {index: [] for index in range(6)}
+    for seed in range(12):
+        for index, frame in enumerate(observed_transit(sky, seed).transit.frames):
+            expected = sky.noise_free[index]
+            sigma = np.sqrt(6.0 * expected * frame.exposure_s + 2.0**2) / frame.exposure_s
+            pulls[index].append((frame.pixels - expected) / sigma)
+    for found in pulls.values():
+        stacked = np.stack(found)
+        assert stacked.mean() == pytest.approx(0, abs=4 / np.sqrt(stacked.size))
+        assert stacked.std() == pytest.approx(1, abs=0.015)
+        assert abs(np.corrcoef(stacked.reshape(12, -1))[0, 1:]).max() < 0.08  # no seed repeats another's
+    frames = np.corrcoef([np.concatenate(pulls[index]).ravel() for index in range(6)])
+    assert abs(frames - np.eye(6)).max() < 0.03  # nor an image another's
+
+
+def test_images_are_whole_dn_over_the_exposure(small: SimulatedTransit) -> None:
+    for frame in small.transit.frames:
+        dn = frame.pixels.astype(np.float64) * frame.exposure_s
+        np.testing.assert_allclose(dn, np.rint(dn), atol=1e-3)
+        assert len(np.unique(np.rint(dn))) > 20
+    part = simulate(default_plan(1, 64, whole_dn=False), SCATTER, DIFFRACTION, 1)
+    dn = part.transit.frames[0].pixels * part.transit.frames[0].exposure_s
+    assert abs(dn - np.rint(dn)).mean() == pytest.approx(0.25, abs=0.02)
+
+
+def test_high_gain_saturates_and_combined_does_not() -> None:
+    plan = default_plan(6, 64, saturation_dn=250.4)
+    frames = observed_transit(flat_sky(plan, 400.0), 1).transit.frames
+    for frame in frames:
+        dn = frame.pixels * frame.exposure_s
+        if frame.gain_mode == HIGH:
+            assert dn.max() == pytest.approx(250, abs=1e-3)
+            assert (abs(dn - 250) < 1e-3).sum() > 100
+        else:
+            assert dn.max() > 1000
+
+
+def test_a_dark_offset_is_added_to_every_pixel() -> None:
+    sky = flat_sky(default_plan(3, 64, dark_offset_dn=7.0), 100.0)
+    for index, frame in enumerate(observed_transit(sky, 1).transit.frames):
+        added = (frame.pixels - sky.expected(index)) * frame.exposure_s
+        assert added.mean() == pytest.approx(7.0, abs=4 * added.std() / 64)
+
+
+def test_the_ephemeris_errs_by_its_rms() -> None:
+    sky = flat_sky(default_plan(6, 64), 1.0)
+    errors = []
+    for seed in range(100):
+        simulated = observed_transit(sky, seed)
+        for frame, exact in zip(simulated.transit.frames, simulated.truth.places, strict=True):
+            assert round(frame.place.x_px, 1) == frame.place.x_px
+            errors.append((frame.place.x_px - exact.x_px, frame.place.y_px - exact.y_px))
+    assert np.std(errors, axis=0) == pytest.approx(0.6, abs=0.05)
+    assert np.mean(errors, axis=0) == pytest.approx(0.0, abs=0.1)
+    exact_plan = dataclasses.replace(sky.plan, ephemeris_error_px=0.0)
+    known = observed_transit(dataclasses.replace(sky, plan=exact_plan), 1)
+    for frame, place in zip(known.transit.frames, known.truth.places, strict=True):
+        assert frame.place.x_px == pytest.approx(place.x_px, abs=0.0501)
+
+
+def test_one_seed_gives_one_transit(small: SimulatedTransit) -> None:
+    again = simulate(small.plan, SCATTER, DIFFRACTION, 3)
+    other = observed_transit(small.sky, 4)
+    for one, same, differs in zip(
+        small.transit.frames, again.transit.frames, other.transit.frames, strict=True
+    ):
+        np.testing.assert_array_equal(one.pixels, same.pixels)
+        assert one.place == same.place
+        assert not np.array_equal(one.pixels, differs.pixels)
+        assert one.place != differs.place
+    shared = simulate(small.plan, SCATTER, DIFFRACTION, 4, scene_seed=3)
+    np.testing.assert_array_equal(shared.transit.frames[2].pixels, other.transit.frames[2].pixels)
+    assert shared.truth == other.truth
+
+
+# --- scenes -----------------------------------------------------------------------------------------------
+
+
+def test_the_limb_is_on_the_side_that_the_pointing_says() -> None:
+    plan = default_plan(3, 128)
+    east, disc, west = (drawn_scene(plan, fov, 5) for fov in (1, 2, 3))
+    assert east[:, -20:].mean() > 20 * east[:, :20].mean()
+    assert west[:, :20].mean() > 20 * west[:, -20:].mean()
+    assert np.percentile(disc, 1) > 20
+    assert abs(np.corrcoef(east.ravel(), west[:, ::-1].ravel())[0, 1]) < 0.999  # not the same limb
+
+
+def test_discs_are_as_bright_as_in_practice() -> None:
+    """Two or three photons a pixel far off the limb, hundreds of DN on the disc."""
+    simulated = simulate(default_plan(6, 192), SCATTER, DIFFRACTION, 2)
+    means = []
+    for index, shot in enumerate(simulated.plan.shots):
+        disc = fully_dark(simulated.plan.place(index), (0, 0), (192, 192))
+        means.append(simulated.noise_free[index][disc].mean() * shot.exposure_s)
+    assert 6 < means[0] < 90 and 6 < means[5] < 90
+    assert min(means[2:4]) > 150 and max(means[2:4]) < 1500
+
+
+def test_the_drawn_scene_without_a_layout_is_what_it_always_was() -> None:
+    for shape, seed, mean, brightest in (
+        ((64, 64), 5, 1806.6784176258332, 57303.802124101276),
+        ((33, 128), 5, 1685.2884243856727, 31376.684082156185),
+    ):
+        scene = solar_scene(shape, seed)
+        assert scene.mean() == pytest.approx(mean, rel=1e-9)
+        assert scene.max() == pytest.approx(brightest, rel=1e-9)
+
+
+def test_a_margin_draws_on_beyond_the_field() -> None:
+    scene = solar_scene((96, 96), 4, margin_px=30)
+    assert scene.shape == (156, 156)
+    # The limb is where it is without a margin: dim to its left, bright to its right.
+    inner = scene[30:-30, 30:-30]
+    assert inner[30, 40:].mean() > 1.5 * scene[60, :25].mean()
+
+
+def test_a_scene_from_an_image_is_cut_or_enlarged() -> None:
+    plan = default_plan(3, 64)
+    large = np.random.default_rng(1).uniform(0, 100, (300, 280))
+    large[5, 5], large[150, 140] = np.nan, -3.0
+    scene = scene_from_image(large, plan)
+    assert scene.shape == (128, 128)
+    np.testing.assert_array_equal(scene[64, 65:], large[150, 141:204])
+    assert scene[64, 64] == 0
+    small = scene_from_image(np.full((40, 50), 7.0), plan)
+    np.testing.assert_allclose(small, 7.0)
+    seen = simulate(plan, SCATTER, DIFFRACTION, 1, scenes={1: scene, 2: small, 3: scene})
+    assert seen.scenes[2].max() == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize("image", [np.zeros((70, 70)), np.full((70, 70), np.nan), np.ones(9)])
+def test_an_image_without_light_is_refused(image: NDArray[np.float64]) -> None:
+    with pytest.raises(DataError, match="bad-scene"):
+        scene_from_image(image, default_plan(3, 64))
+
+
+def test_scenes_of_another_shape_are_refused() -> None:
+    with pytest.raises(DataError, match="bad-scene"):
+        true_sky(default_plan(1, 64), SCATTER, DIFFRACTION, 1, scenes={2: np.ones((64, 64))})
+
+
+# --- files ------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_holds_the_transit_and_its_truth(tmp_path: Path) -> None:
+    plan = default_plan(6, 64, saturation_dn=300.0)
+    simulated = simulate(plan, dataclasses.replace(SCATTER, stretch=0.1), DIFFRACTION, 9)
+    write(simulated, tmp_path / "t")
+    described = json.loads((tmp_path / "t/transit.json").read_text())
+    assert described["schema"] == "transit/1" and described["known_psf"] == "diffraction.fits"
+    assert described["noise"] == {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
+    for frame, shot, entry in zip(simulated.transit.frames, plan.shots, described["images"], strict=True):
+        path = tmp_path / "t" / entry["file"]
+        with fits.open(path) as hdus:
+            assert hdus[0].data.dtype.kind == "i" and hdus[0].data.dtype.itemsize == 4
+            assert hdus[0].header["GAINCOMB"] == shot.gain_mode
+            assert ("SATURATE" in hdus[0].header) == (shot.gain_mode == HIGH)
+        image = read_image(path, LIMITS)
+        assert image.unit == "DN" and image.exposure_s == shot.exposure_s
+        np.testing.assert_allclose(image.pixels / shot.exposure_s, frame.pixels, rtol=1e-6, atol=1e-6)
+        assert (entry["fov"], entry["x"], entry["y"], entry["r"]) == (
+            frame.fov,
+            frame.place.x_px,
+            frame.place.y_px,
+            10.75,
+        )
+    truth = json.loads((tmp_path / "t/truth.json").read_text())
+    assert truth["effects"] == [] and truth["seed"] == 9
+    assert truth["psf"]["total"] == 0.411 and truth["psf"]["stretch"] == 0.1
+    assert truth["exact"][1] == {"x": plan.shots[1].x_px, "y": plan.shots[1].y_px}
+    diffraction = fits.getdata(tmp_path / "t/diffraction.fits")
+    np.testing.assert_allclose(diffraction, DIFFRACTION, rtol=1e-6, atol=1e-30)
+    noise_free = fits.getdata(tmp_path / "t/noise_free/002.fits")
+    np.testing.assert_allclose(noise_free, simulated.noise_free[2], rtol=1e-6)
+
+
+def test_a_sky_is_read_back(tmp_path: Path) -> None:
+    plan = default_plan(3, 64, beyond="on", beyond_px=20)
+    simulated = simulate(plan, SCATTER, DIFFRACTION, 2)
+    write(simulated, tmp_path)
+    sky = read_sky(tmp_path)
+    assert sky.scatter == SCATTER and sky.plan.margin_px == 20
+    for index in range(3):
+        # Half pixels at the disc's edge are gone: what they hide differs a little, and only there.
+        dark = fully_dark(plan.place(index), (0, 0), (64, 64))
+        ratio = sky.expected(index) / simulated.noise_free[index]
+        assert ratio[dark].mean() == pytest.approx(1, abs=0.02)
+        share = covered_share(plan.place(index), (0, 0), (64, 64))
+        np.testing.assert_allclose(
+            sky.true_scene(index)[share == 0], simulated.true_scene(index)[share == 0], rtol=1e-6
+        )
+
+
+def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not-simulated"):
+        read_sky(tmp_path)
+    (tmp_path / "truth.json").write_text('{"psf": {"b": 1}}')
+    with pytest.raises(DataError, match="not-simulated"):
+        read_sky(tmp_path)

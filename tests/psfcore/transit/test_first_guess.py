@@ -1,0 +1,161 @@
+"""The first guess is the light beyond the occulter's radius, where the Sun is even."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psfcore.convolution.convolver import Convolver
+from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits
+from psfcore.noise import Noise
+from psfcore.psf import cumulative_curve
+from psfcore.transit.first_guess import ESTIMATORS, first_guess
+from psfcore.transit.folder import read_transit
+from psfcore.transit.transit import Frame, Place, Transit
+
+SIZE = 160
+RADIUS_PX = 6.0
+Flat = NDArray[np.float64]
+
+
+def wide_kernel() -> Flat:
+    """A core and wings; sum 1 on 161 px."""
+    y, x = np.indices((161, 161)) - 80
+    wings = 1.0 / (3.0 + np.hypot(x, y)) ** 3
+    wings[80, 80] = 0.0
+    kernel = 0.4 * wings / wings.sum()
+    kernel[80, 80] = 0.6
+    return np.asarray(kernel)
+
+
+def seen(scene: Flat, place: Place, kernel: Flat) -> Flat:
+    """The scene behind a dark disc, through the PSF; what lies beyond the frame is like its edge."""
+    y, x = np.indices(scene.shape)
+    dark = np.hypot(x - place.x_px, y - place.y_px) <= place.radius_px
+    pad = 81
+    return Convolver(kernel, (SIZE + 2 * pad,) * 2).apply(
+        np.pad(np.where(dark, 0.0, scene), pad, mode="edge")
+    )[pad:-pad, pad:-pad]
+
+
+def transit_of(*frames: tuple[Flat, int, Place]) -> Transit:
+    made = tuple(
+        Frame(
+            file=f"{index}.fits",
+            pixels=pixels.astype(np.float32),
+            fov=fov,
+            place=place,
+            exposure_s=1.0,
+            time_s=60.0 * index,
+        )
+        for index, (pixels, fov, place) in enumerate(frames)
+    )
+    return Transit(frames=made, diffraction=wide_kernel(), noise=Noise(1.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def two_pointings() -> Transit:
+    """An even Sun in pointing 2, a limb in pointing 1."""
+    even, limb = np.full((SIZE, SIZE), 100.0), np.full((SIZE, SIZE), 100.0)
+    limb[:, 90:] = 2.0
+    places = [Place(70.0 + 5 * i, 80.0, RADIUS_PX) for i in range(3)]
+    kernel = wide_kernel()
+    return transit_of(
+        *((seen(limb, place, kernel), 1, place) for place in places),
+        *((seen(even, place, kernel), 2, place) for place in places),
+    )
+
+
+def test_before_an_even_sun_it_is_the_light_beyond_the_radius(two_pointings: Transit) -> None:
+    guess = first_guess(two_pointings)
+    truth = float(cumulative_curve(wide_kernel(), RADIUS_PX)) / 100
+    assert 0.1 < truth < 0.3
+    assert guess.best_fov == 2 and guess.radius_px == RADIUS_PX
+    assert guess.share == pytest.approx(truth, rel=0.05)
+    assert guess.share_spread < 0.02 * guess.share
+    limb, even = guess.pointings
+    assert (limb.fov, limb.images, even.fov, even.images) == (1, 3, 2, 3)
+    assert limb.inhomogeneity > 10 * even.inhomogeneity
+    assert all(even.mean[name] == pytest.approx(truth, rel=0.05) for name in ESTIMATORS)
+    assert limb.scatter["image_mean"] > 5 * even.scatter["image_mean"]
+
+
+def test_it_is_told_against_time(two_pointings: Transit) -> None:
+    told = []
+    content = first_guess(two_pointings, progress=lambda done, of: told.append((done, of))).to_json()
+    assert told == [(i, 6) for i in range(1, 7)]
+    assert [frame["time_s"] for frame in content["frames"]] == [60.0 * i for i in range(6)]
+    assert set(content["frames"][0]["ratio"]) == set(ESTIMATORS)
+    json.dumps(content, allow_nan=False)
+
+
+def test_the_estimators_are_what_they_are_called() -> None:
+    """Known numbers: 30 in the disc, 100 in the shell, 60 beyond it, and one pixel of 10^6."""
+    y, x = np.indices((SIZE, SIZE))
+    r = np.hypot(x - 80, y - 75)
+    pixels = np.select([r <= RADIUS_PX + 2, r <= RADIUS_PX + 52], [30.0, 100.0], 60.0)
+    pixels[0, 0] = 1e6
+    frame = first_guess(transit_of((pixels, 1, Place(80.0, 75.0, RADIUS_PX)))).frames[0]
+    assert frame.characteristic_dn_s == pytest.approx(
+        {"image_mean": pixels.mean(), "image_median": 60.0, "shell": 100.0}
+    )
+    assert frame.ratio == pytest.approx({"image_mean": 30 / pixels.mean(), "image_median": 0.5, "shell": 0.3})
+
+
+def test_exact_places_go_before_the_ephemeris(two_pointings: Transit) -> None:
+    frame = two_pointings.frames[4]
+    wrong = Place(frame.place.x_px + 15, frame.place.y_px, RADIUS_PX)
+    off = transit_of((frame.pixels.astype(np.float64), 2, wrong))
+    assert first_guess(off).share > 0.9
+    assert first_guess(off, places=[frame.place]).share == pytest.approx(
+        first_guess(two_pointings).share, rel=0.05
+    )
+
+
+def test_filled_pixels_do_not_count(two_pointings: Transit) -> None:
+    frame = two_pointings.frames[4]
+    pixels, filled = frame.pixels.copy(), np.zeros(frame.pixels.shape, dtype=bool)
+    filled[80, round(frame.place.x_px)] = filled[80, round(frame.place.x_px) + 20] = True
+    pixels[filled] = 1e4
+    marked = Transit(
+        frames=(Frame("a", pixels, 1, frame.place, 1.0, 0.0, filled=filled),),
+        diffraction=wide_kernel(),
+        noise=Noise(1.0, 1.0),
+    )
+    assert first_guess(marked).frames[0].centre_dn_s == pytest.approx(
+        first_guess(two_pointings).frames[4].centre_dn_s, rel=0.01
+    )
+
+
+def test_what_cannot_be_seen_is_null(two_pointings: Transit) -> None:
+    """An occulter whose middle is off the frame, and a frame without light."""
+    frame = two_pointings.frames[4]
+    outside = (frame.pixels.astype(np.float64), 3, Place(-5.0, 80.0, RADIUS_PX))
+    night = (np.full((SIZE, SIZE), -1.0), 4, frame.place)
+    good = (frame.pixels.astype(np.float64), 2, frame.place)
+    guess = first_guess(transit_of(outside, night, good))
+    assert guess.best_fov == 2 and math.isnan(guess.frames[0].centre_dn_s)
+    content = guess.to_json()
+    assert content["frames"][0]["ratio"] == dict.fromkeys(ESTIMATORS)
+    assert content["frames"][1]["ratio"] == dict.fromkeys(ESTIMATORS)
+    assert content["pointings"][2]["inhomogeneity"] is None
+    json.dumps(content, allow_nan=False)
+    with pytest.raises(DataError) as caught:
+        first_guess(transit_of(outside, night))
+    assert caught.value.code == "no-first-guess"
+
+
+def test_practice(shared: Path) -> None:
+    """p1 was made without any effect; its PSF's curve at the occulter's radius is known."""
+    folder = shared / "data/practice/p1"
+    guess = first_guess(read_transit(folder, FitsLimits(max_pixels=1024 * 1024)))
+    truth = json.loads((folder.parent / "p1.truth.json").read_text())["psf"]
+    assert guess.best_fov == 2 and guess.radius_px == 10.75
+    assert 0.5 * truth["total"] < guess.share < 1.5 * truth["total"]
+    assert guess.share_spread < 0.5 * guess.share

@@ -1,0 +1,300 @@
+"""A transit comes out of its folder as it was written, and a folder that cannot be used says why."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError, HeaderError
+from psfcore.fits.header import FitsLimits
+from psfcore.noise import Noise
+from psfcore.transit.folder import checked_kernel, read_prepared, read_transit
+from tests.transit_files import (
+    SHAPE,
+    load_manifest,
+    place_of,
+    save_manifest,
+    true_rate,
+    write_frame,
+    write_kernel,
+    write_transit,
+)
+
+LIMITS = FitsLimits(max_pixels=512 * 512)
+Flat = NDArray[np.float64]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_transit(tmp_path / "transit")
+
+
+def refusal(folder: Path, code: str, **options: Any) -> str:
+    with pytest.raises(DataError) as caught:
+        read_transit(folder, LIMITS, **options)
+    assert caught.value.code == code, caught.value
+    return caught.value.message
+
+
+def change_image(folder: Path, index: int, **values: object) -> None:
+    content = load_manifest(folder)
+    content["images"][index].update(values)
+    save_manifest(folder, content)
+
+
+def gaussian(n: int) -> Flat:
+    y, x = np.indices((n, n)) - n // 2
+    kernel = np.exp(-0.5 * (x * x + y * y) / 1.5**2)
+    return np.asarray(kernel / kernel.sum())
+
+
+# --- what is read -----------------------------------------------------------------------------------------
+
+
+def test_a_transit_is_read_in_dn_per_second(folder: Path) -> None:
+    told: list[tuple[int, int]] = []
+    transit = read_transit(folder, LIMITS, progress=lambda done, of: told.append((done, of)))
+    assert told == [(done, 6) for done in range(1, 7)]
+    assert [frame.file for frame in transit.frames] == [f"{i:03d}.fits" for i in range(6)]
+    assert [frame.time_s for frame in transit.frames] == [60.0 * i for i in range(6)]
+    assert [frame.fov for frame in transit.frames] == [1, 1, 1, 2, 2, 2]
+    assert [frame.exposure_s for frame in transit.frames] == [2, 1, 2, 1, 2, 1]
+    assert {frame.gain_mode for frame in transit.frames} == {"high-only"}
+    assert transit.shape == SHAPE and transit.noise == Noise(6.0, 2.0)
+    assert (transit.instrument, transit.plate_scale_arcsec) == ("hri_euv", 0.492)
+    for index, frame in enumerate(transit.frames):
+        assert frame.pixels.dtype == np.float32 and frame.filled is None
+        assert (frame.place.x_px, frame.place.y_px) == place_of(index)
+        y, x = np.indices(SHAPE)
+        far = np.hypot(x - frame.place.x_px, y - frame.place.y_px) > 8
+        assert np.allclose(frame.pixels[far], true_rate(frame.fov)[far], atol=0.51)  # whole DN are stored
+        assert np.allclose(frame.pixels[20, round(frame.place.x_px)], 10, atol=0.51)
+    names = {path.name for path in folder.iterdir()}
+    assert transit.sha256 == {
+        name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names
+    }
+
+
+def test_pixels_in_dn_per_second_stay(folder: Path) -> None:
+    dn = read_transit(folder, LIMITS).frames[0].pixels
+    write_transit(folder, cards={"BUNIT": "DN / s"})
+    assert np.array_equal(read_transit(folder, LIMITS).frames[0].pixels, 2 * dn)
+
+
+def test_frames_come_in_the_order_of_time_and_equal_times_in_that_of_the_manifest(folder: Path) -> None:
+    for index, date in (
+        (0, "2023-01-03T05:00:00Z"),
+        (4, "2023-01-03T04:01:00.000"),
+        (5, "2023-01-03T03:59:30"),
+    ):
+        write_frame(folder / f"{index:03d}.fits", index, 1 + index // 3, {"DATE-BEG": date})
+    frames = read_transit(folder, LIMITS).frames
+    assert [frame.file[:3] for frame in frames] == ["005", "001", "004", "002", "003", "000"]
+    assert [frame.time_s for frame in frames] == [0, 90, 90, 150, 210, 3630]
+    assert [frame.place.x_px for frame in frames] == [place_of(i)[0] for i in (5, 1, 4, 2, 3, 0)]
+
+
+@pytest.mark.parametrize("date", [None, "yesterday", "2023-01-03T23:59:60"])
+def test_without_a_date_the_order_of_the_manifest_counts(folder: Path, date: str | None) -> None:
+    write_frame(folder / "003.fits", 3, 2, {"DATE-BEG": date})
+    frames = read_transit(folder, LIMITS).frames
+    assert [frame.time_s for frame in frames] == [0, 1, 2, 3, 4, 5]
+    assert [frame.file for frame in frames] == [f"{i:03d}.fits" for i in range(6)]
+
+
+def test_date_obs_stands_in_for_date_beg(folder: Path) -> None:
+    write_transit(folder, cards={"DATE-BEG": None, "DATE-OBS": "2023-01-03T04:00:00"})
+    assert [frame.time_s for frame in read_transit(folder, LIMITS).frames] == [0.0] * 6
+
+
+def test_the_noise_given_goes_before_the_manifest_s(folder: Path) -> None:
+    assert read_transit(folder, LIMITS, noise=Noise(1.0, 0.5)).noise == Noise(1.0, 0.5)
+    write_transit(folder, noise=None)
+    assert read_transit(folder, LIMITS, noise=Noise(1.0, 0.5)).noise == Noise(1.0, 0.5)
+    message = refusal(folder, "no-noise-figures")
+    assert "photon_gain_dn" in message and "read_noise_dn" in message
+
+
+def test_the_instrument_is_the_headers_where_the_manifest_names_none(folder: Path) -> None:
+    write_transit(folder, instrument=None)
+    assert read_transit(folder, LIMITS).instrument == "hri_euv"
+    write_transit(folder, instrument=None, cards={"DETECTOR": "other"})
+    assert read_transit(folder, LIMITS).instrument is None
+
+
+def test_saturated_pixels_are_filled_and_counted(folder: Path) -> None:
+    write_transit(folder, cards={"SATURATE": 1500.0})
+    transit, prepared = read_prepared(folder, LIMITS)
+    first = transit.frames[0]
+    assert first.filled is not None and np.count_nonzero(first.filled) == 48
+    assert np.allclose(first.pixels[first.filled], 1000, rtol=2e-3)
+    assert transit.frames[1].filled is None
+    assert [count.from_frames for count in prepared.frames] == [48, 0, 48, 0, 48, 0]
+    assert prepared.to_json()["unfilled"] == 0
+
+
+def test_a_saturation_level_can_be_given(folder: Path) -> None:
+    _, prepared = read_prepared(folder, LIMITS, saturation_dn=1500.0)
+    assert [count.saturated for count in prepared.frames] == [48, 0, 48, 0, 48, 0]
+
+
+# --- the known part of the PSF ----------------------------------------------------------------------------
+
+
+def test_a_known_psf_sums_to_one_exactly(folder: Path) -> None:
+    write_kernel(folder / "diffraction.fits", gaussian(32)[:, 4:28] * 1.0009)
+    kernel = read_transit(folder, LIMITS).diffraction
+    assert kernel.shape == (32, 24) and kernel.dtype == np.float64
+    assert kernel.sum() == pytest.approx(1, abs=1e-14)
+    assert np.unravel_index(kernel.argmax(), kernel.shape) == (16, 12)
+
+
+def dirty(at: tuple[int, int], value: float) -> Flat:
+    kernel = gaussian(32)
+    kernel[at] = value
+    return kernel
+
+
+@pytest.mark.parametrize(
+    ("kernel", "code", "told"),
+    [
+        (gaussian(32) * 1.002, "known-psf-sum", "1.002"),
+        (gaussian(32) * 0.9, "known-psf-sum", "0.9"),
+        (np.zeros((32, 32)), "known-psf-sum", "0"),
+        (gaussian(15), "known-psf-small", "(15, 15)"),
+        (gaussian(32)[:, 10:25], "known-psf-small", "(32, 15)"),
+        (np.roll(gaussian(32), 1, axis=0), "known-psf-not-centred", "(17, 16)"),
+        (np.fft.ifftshift(gaussian(32)), "known-psf-not-centred", "(0, 0)"),
+        (dirty((3, 3), np.nan), "known-psf-nonfinite", "1"),
+        (dirty((3, 3), -0.01), "known-psf-negative", "-0.01"),
+    ],
+)
+def test_a_wrong_known_psf_is_told(folder: Path, kernel: Flat, code: str, told: str) -> None:
+    write_kernel(folder / "diffraction.fits", kernel)
+    message = refusal(folder, code)
+    assert "diffraction.fits" in message and "expected" in message and told in message
+
+
+def test_where_none_is_named_one_is_brought(folder: Path) -> None:
+    write_transit(folder, known_psf=None)
+    assert "known_psf" in refusal(folder, "no-known-psf")
+    assert read_transit(folder, LIMITS, diffraction=gaussian(20)).diffraction.shape == (20, 20)
+    asked: list[tuple[str | None, tuple[int, int]]] = []
+
+    def made(instrument: str | None, shape: tuple[int, int]) -> Flat:
+        asked.append((instrument, shape))
+        return gaussian(24)
+
+    transit = read_transit(folder, LIMITS, diffraction=made)
+    assert asked == [("hri_euv", SHAPE)] and transit.diffraction.shape == (24, 24)
+    assert "diffraction.fits" not in transit.sha256
+    refusal(folder, "known-psf-sum", diffraction=2 * gaussian(20))
+
+
+def test_a_named_one_goes_before_what_is_brought(folder: Path) -> None:
+    assert read_transit(folder, LIMITS, diffraction=gaussian(20)).diffraction.shape == (32, 32)
+
+
+def test_rounding_below_zero_is_taken_out() -> None:
+    kernel = checked_kernel(dirty((3, 3), -1e-9), "k")
+    assert kernel.min() == 0 and kernel.sum() == pytest.approx(1, abs=1e-14)
+
+
+# --- what cannot be used ----------------------------------------------------------------------------------
+
+
+def test_missing_files_are_named(folder: Path) -> None:
+    for name in ("002.fits", "diffraction.fits"):
+        (folder / name).unlink()
+    message = refusal(folder, "missing-file")
+    assert "002.fits" in message and "diffraction.fits" in message and "001.fits" not in message
+
+
+def test_no_manifest_and_no_images(folder: Path) -> None:
+    write_transit(folder, images=0)
+    assert "images" in refusal(folder, "bad-manifest")
+    (folder / "transit.json").unlink()
+    refusal(folder, "no-manifest")
+
+
+def test_a_frame_of_another_shape(folder: Path) -> None:
+    header = fits.getheader(folder / "004.fits")
+    fits.PrimaryHDU(np.ones((64, 64), "i4"), header).writeto(folder / "004.fits", overwrite=True)
+    message = refusal(folder, "transit-shapes")
+    assert "images[4] (004.fits)" in message and "64 x 64" in message and "80 x 64" in message
+
+
+@pytest.mark.parametrize(("x", "y"), [(-4.6, 20), (83.6, 20), (10, -4.6), (10, 67.6), (1e5, 20)])
+def test_an_occulter_outside_the_frame(folder: Path, x: float, y: float) -> None:
+    change_image(folder, 2, x=x, y=y)
+    message = refusal(folder, "occulter-outside")
+    assert "images[2] (002.fits)" in message
+
+
+@pytest.mark.parametrize(("x", "y"), [(-4.4, 20), (83.4, 20), (10, -4.4), (10, 67.4)])
+def test_an_occulter_that_reaches_in(folder: Path, x: float, y: float) -> None:
+    change_image(folder, 2, x=x, y=y)
+    assert read_transit(folder, LIMITS).frames[2].place.x_px == x
+
+
+def test_an_occulter_too_large_for_the_frame(folder: Path) -> None:
+    change_image(folder, 1, r=16.5)
+    assert "images[1] (001.fits)" in refusal(folder, "occulter-too-large")
+    change_image(folder, 1, r=16.0)
+    read_transit(folder, LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("cards", "code"),
+    [
+        ({"BUNIT": "photon"}, "unknown-unit"),
+        ({"BUNIT": None}, "unknown-unit"),
+        ({"XPOSURE": None}, "no-exposure"),
+        ({"XPOSURE": 0.0}, "no-exposure"),
+        ({"SATURATE": 1.0}, "all-saturated"),
+    ],
+)
+def test_frames_that_cannot_be_used(folder: Path, cards: dict[str, object], code: str) -> None:
+    write_frame(folder / "005.fits", 5, 2, cards)
+    assert "005.fits" in refusal(folder, code)
+
+
+def test_files_that_cannot_be_used(folder: Path) -> None:
+    whole = (folder / "001.fits").read_bytes()
+    (folder / "001.fits").write_bytes(whole[:6000])
+    with pytest.raises(HeaderError, match=r"001\.fits"):
+        read_transit(folder, LIMITS)
+    (folder / "001.fits").write_bytes(whole)
+    with pytest.raises(HeaderError, match=r"000\.fits") as caught:
+        read_transit(folder, FitsLimits(max_pixels=1000))
+    assert caught.value.code == "too-many-pixels"
+    (folder / "diffraction.fits").write_text("hello")
+    with pytest.raises(HeaderError, match=r"diffraction\.fits"):
+        read_transit(folder, LIMITS)
+
+
+def test_all_nan_is_told(folder: Path) -> None:
+    header = fits.getheader(folder / "003.fits")
+    fits.PrimaryHDU(np.full(SHAPE, np.nan, "f4"), header).writeto(folder / "003.fits", overwrite=True)
+    assert "003.fits" in refusal(folder, "all-nan")
+
+
+def test_practice(shared: Path) -> None:
+    transit, prepared = read_prepared(shared / "data/practice/p1", LIMITS_PRACTICE)
+    assert len(transit.frames) == 30 and transit.shape == (512, 512)
+    assert transit.diffraction.shape == (1024, 1024) and transit.diffraction.sum() == pytest.approx(1)
+    assert transit.noise == Noise(6.0, 2.0) and transit.plate_scale_arcsec == pytest.approx(0.492)
+    assert [frame.fov for frame in transit.frames] == [1] * 10 + [2] * 10 + [3] * 10
+    assert all(
+        later.time_s > frame.time_s for frame, later in zip(transit.frames, transit.frames[1:], strict=False)
+    )
+    assert prepared.unfilled == 0 and len(transit.sha256) == 32
+
+
+LIMITS_PRACTICE = FitsLimits(max_pixels=1024 * 1024)

@@ -1,0 +1,154 @@
+"""A bulk whose request was sent again, and one that is cancelled while it looks for files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from service.cli import bulk as cli_bulk
+from service.cli.main import main
+from service.client.http import Heliopsf
+from tests.conftest import write_image
+from tests.service.conftest import upload
+from workers.bulk.turns import keep_turns
+from workers.catalogue.catalogue import Catalogue
+from workers.files import archive as archive_files
+from workers.files.store import Store
+from workers.run.runner import Runner
+from workers.settings import Settings
+
+FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """An image, a file that is none, and a name that is not UTF-8."""
+    root = tmp_path / "archive"
+    root.mkdir()
+    write_image(root / "a.fits")
+    (root / "letter.fits").write_text("Dear archive,\n" * 300)
+    write_image(root / os.fsdecode(b"Sonne\xf6.fits"))
+    for number in range(20):
+        (root / f"{number:02}").mkdir()
+    return root
+
+
+@pytest.fixture
+def settings(settings: Settings, archive: Path) -> Settings:
+    return settings.model_copy(update={"bulk_roots": str(archive)})
+
+
+@pytest.fixture
+def api(settings: Settings) -> Iterator[TestClient]:
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def catalogue(settings: Settings, api: TestClient) -> Iterator[Catalogue]:
+    catalogue = Catalogue(settings.catalogue_url)
+    yield catalogue
+    catalogue.close()
+
+
+def turns(catalogue: Catalogue, settings: Settings) -> None:
+    """Turns run until no bulk goes on."""
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    while catalogue.bulks.at_work():
+        keep_turns(catalogue, settings)
+        for turn in catalogue.jobs.of_kind("bulk"):
+            runner.run(turn.id)
+
+
+def test_what_failed_is_tried_again_once_the_equal_bulk_has_ended(
+    api: TestClient,
+    archive: Path,
+    psf_file: Path,
+    catalogue: Catalogue,
+    settings: Settings,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    psf_id = upload(api, psf_file, "/v1/psfs")
+    request = {"files": [{"glob": f"{archive}/*.fits"}], "psf_id": psf_id, "parameters": FEW}
+    first = api.post("/v1/bulk", json=request).json()
+    turns(catalogue, settings)
+    ended = api.get(f"/v1/bulk/{first['id']}").json()
+    assert (ended["phase"], ended["images"]["done"], ended["images"]["failed"]) == ("COMPLETED", 1, 2)
+    failed = {line["error"]["code"]: line for line in api.get(ended["failures"]).json()["items"]}
+    assert set(failed) == {"not-fits", "path-not-utf-8"}
+    assert failed["path-not-utf-8"]["source"] == f"{archive}/Sonne\\xf6.fits"
+    assert "expected a path in UTF-8; got" in failed["path-not-utf-8"]["error"]["message"]
+
+    second = api.post("/v1/bulk", json=request).json()
+    refused = api.post(f"/v1/bulk/{first['id']}/retry")
+    assert (refused.status_code, refused.json()["type"]) == (409, "urn:heliopsf:equal-bulk-open")
+    assert f"bulk {second['id']} is LISTING" in refused.json()["detail"]
+    assert api.get(f"/v1/bulk/{first['id']}").json() == ended
+
+    class Here(Heliopsf):
+        def close(self) -> None:
+            """The transport is the application's: it goes on."""
+
+    client = Here("http://testserver", transport=api._transport)
+    monkeypatch.setattr(cli_bulk, "remote", lambda server: client)
+    answer = CliRunner().invoke(main, ["bulk", "retry", first["id"]])
+    assert answer.exit_code == 1
+    (line,) = answer.output.splitlines()
+    assert line.startswith("Error: ") and f"bulk {second['id']} is LISTING" in line
+
+    turns(catalogue, settings)
+    (archive / "letter.fits").unlink()
+    write_image(archive / "letter.fits", seed=1)
+    assert CliRunner().invoke(main, ["bulk", "retry", first["id"]]).exit_code == 0
+    turns(catalogue, settings)
+    again = api.get(f"/v1/bulk/{first['id']}").json()
+    assert (again["phase"], again["images"]["done"], again["images"]["failed"]) == ("COMPLETED", 2, 1)
+    (line,) = api.get(ended["failures"]).json()["items"]
+    assert line == failed["path-not-utf-8"], "its reason stays: there is no path to try again"
+
+
+def test_a_bulk_that_finds_no_file_is_cancelled_while_it_looks(
+    api: TestClient,
+    archive: Path,
+    psf_file: Path,
+    catalogue: Catalogue,
+    settings: Settings,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("workers.run.runner.REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr("workers.bulk.task.TELL_EVERY_S", 0.0)
+    psf_id = upload(api, psf_file, "/v1/psfs")
+    request = {"files": [{"glob": f"{archive}/**/*.none"}], "psf_id": psf_id, "parameters": FEW}
+    bulk = api.post("/v1/bulk", json=request).json()
+    keep_turns(catalogue, settings)
+    (turn,) = catalogue.jobs.of_kind("bulk")
+    looked: list[Any] = []
+    real = os.scandir
+
+    def counted(folder: Any) -> Any:
+        looked.append(folder)
+        if len(looked) == 3:
+            assert api.post(f"/v1/bulk/{bulk['id']}/cancel").json()["phase"] == "CANCELLED"
+        return real(folder)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(archive_files.os, "scandir", counted)
+        Runner(settings, catalogue, Store(settings.data_dir)).run(turn.id)
+    assert len(looked) == 3, "of 21"
+    row = catalogue.jobs.get(turn.id)
+    assert row is not None and row.phase == "ABORTED"
+    assert api.get(f"/v1/bulk/{bulk['id']}").json()["phase"] == "CANCELLED"
+
+
+def test_a_pattern_below_a_link_to_itself_is_refused(api: TestClient, archive: Path, psf_file: Path) -> None:
+    (archive / "loop").symlink_to(archive / "loop")
+    psf_id = upload(api, psf_file, "/v1/psfs")
+    answer = api.post("/v1/bulk", json={"files": [{"glob": f"{archive}/loop/*.fits"}], "psf_id": psf_id})
+    assert (answer.status_code, answer.json()["type"]) == (422, "urn:heliopsf:bad-path"), answer.text

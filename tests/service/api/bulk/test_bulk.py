@@ -1,0 +1,582 @@
+"""Bulk over HTTP, its turns run in this process: from uploads and from an archive, into the service and into a folder."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from tests.conftest import write_image, write_psf
+from tests.service.conftest import upload
+from tests.service.keyed import keyed
+from workers.bulk import image as bulk_image
+from workers.bulk.turns import keep_turns
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.keys import Scope
+from workers.contract.queues import Queue
+from workers.files.store import Store
+from workers.run.runner import Runner
+from workers.settings import Settings
+from workers.tasks import deconvolve as deconvolve_task
+
+FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """Five images of two channels, one file that is none, and one with nothing in it but its name."""
+    root = tmp_path / "archive"
+    for number, channel in enumerate((174, 174, 174, 304, 304)):
+        path = root / str(2020 + number) / f"image {number}.fits"
+        path.parent.mkdir(parents=True)
+        cards = {"WAVELNTH": channel, "INSTRUME": "EUI", "DATE-BEG": f"{2020 + number}-03-01T12:00:00"}
+        write_image(path, seed=number, **cards)
+    (root / "2020" / "letter.fits").write_text("Dear archive,\n" * 300)
+    return root
+
+
+@pytest.fixture
+def settings(tmp_path: Path, archive: Path) -> Settings:
+    return Settings(
+        data_dir=tmp_path / "data",
+        database_url=None,
+        broker_url="filesystem://",
+        allowed_hosts="testserver",
+        max_upload_mib=2,
+        max_pixels=512 * 512,
+        bulk_roots=str(archive),
+        bulk_output_roots=str(tmp_path / "out"),
+    )
+
+
+@pytest.fixture
+def api(settings: Settings) -> Iterator[TestClient]:
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def psf_id(api: TestClient, tmp_path: Path) -> str:
+    write_psf(tmp_path / "psf.fits")
+    return upload(api, tmp_path / "psf.fits", "/v1/psfs")
+
+
+@pytest.fixture
+def work(settings: Settings, api: TestClient) -> Iterator[Callable[[], None]]:
+    """Turns run until no bulk goes on."""
+    catalogue = Catalogue(settings.catalogue_url)
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+
+    def run() -> None:
+        while catalogue.bulks.at_work():
+            keep_turns(catalogue, settings)
+            for turn in catalogue.jobs.of_kind("bulk"):
+                assert turn.queue == Queue.BULK
+                runner.run(turn.id)
+
+    yield run
+    catalogue.close()
+
+
+def asked(api: TestClient, **request: Any) -> dict[str, Any]:
+    answer = api.post("/v1/bulk", json={"parameters": FEW, **request})
+    assert answer.status_code == 202, answer.text
+    assert answer.headers["Location"] == f"/v1/bulk/{answer.json()['id']}"
+    return dict(answer.json())
+
+
+def seen(api: TestClient, bulk: dict[str, Any]) -> dict[str, Any]:
+    return dict(api.get(f"/v1/bulk/{bulk['id']}").json())
+
+
+def results(api: TestClient, bulk: dict[str, Any], **query: str) -> list[dict[str, Any]]:
+    answer = api.get(f"/v1/bulk/{bulk['id']}/results", params=query)
+    assert answer.status_code == 200 and answer.headers["Content-Type"].startswith("application/x-ndjson")
+    return [json.loads(line) for line in answer.text.splitlines()]
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_uploads_become_products_and_a_manifest(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None]
+) -> None:
+    ids = [upload(api, path) for path in sorted(archive.glob("*/image*"))[:3]]
+    bulk = asked(api, images=[*ids, ids[0]], psf_id=psf_id, name="three")
+    assert bulk["phase"] == "RUNNING" and bulk["images"]["total"] == 3
+    work()
+    bulk = seen(api, bulk)
+    assert bulk["phase"] == "COMPLETED" and bulk["images"]["done"] == 3 and bulk["images"]["failed"] == 0
+    assert bulk["images_an_hour"] > 0 and bulk["time_left_s"] is None
+    manifest = results(api, bulk)
+    assert [line["source"] for line in manifest] == ids
+    for line in manifest:
+        file = api.get(line["file"]).content
+        assert hashlib.sha256(file).hexdigest() == line["sha256"] and len(file) == line["bytes"]
+        product = api.get(f"/v1/products/{line['product_id']}").json()
+        assert line["score"] == product["details"]["effects"]["artefacts"]["score"]
+        assert line["flux_change_pct"] == product["details"]["flux_change_pct"]
+        assert product["details"]["job_id"] == bulk["id"]
+        assert line["psf_id"] == psf_id and line["seconds"] >= line["kernel_seconds"] > 0
+    ordinary = api.post(
+        "/v1/jobs",
+        json={"kind": "deconvolve", "parameters": {"image_id": ids[0], "psf_id": psf_id, **FEW}},
+    ).json()
+    assert ordinary["id"], "the same product, asked for as a job, is there already"
+    assert [line["id"] for line in api.get("/v1/bulk").json()["items"]] == [bulk["id"]]
+
+
+def test_files_are_found_by_pattern_and_header(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None]
+) -> None:
+    files = [{"glob": f"{archive}/**/*.fits", "where": {"INSTRUME": "EUI", "WAVELNTH": 174}}]
+    bulk = asked(api, files=files, psf_id=psf_id)
+    assert bulk["phase"] == "LISTING"
+    work()
+    bulk = seen(api, bulk)
+    assert bulk["phase"] == "COMPLETED"
+    assert bulk["images"] | {"to_look_at": 0} == {
+        "total": 4, "waiting": 0, "at_work": 0, "done": 3, "reused": 0, "failed": 1, "to_look_at": 0,
+    }  # fmt: skip
+    assert [Path(line["source"]).name for line in results(api, bulk)] == [f"image {n}.fits" for n in range(3)]
+    (failed,) = api.get(bulk["failures"]).json()["items"]
+    assert failed["source"].endswith("letter.fits") and failed["error"]["code"] == "not-fits"
+    assert failed["error"]["fault"] == "user"
+
+
+def test_a_product_that_is_there_is_not_made_again(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [{"glob": f"{archive}/*/image*.fits"}]
+    first = asked(api, files=files, psf_id=psf_id)
+    assert api.post("/v1/bulk", json={"files": files, "psf_id": psf_id, "parameters": FEW}).status_code == 200
+    work()
+    monkeypatch.delattr(deconvolve_task, "method_named")
+    second = asked(api, files=files, psf_id=psf_id)
+    assert second["id"] != first["id"]
+    work()
+    assert seen(api, second)["images"]["reused"] == 5
+    different = ("reused", "seconds", "kernel_seconds", "ended_at")
+    assert [
+        {name: value for name, value in line.items() if name not in different}
+        for line in results(api, second)
+    ] == [
+        {name: value for name, value in line.items() if name not in different} for line in results(api, first)
+    ]
+
+
+def test_products_in_a_folder_beside_the_service(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], tmp_path: Path
+) -> None:
+    bulk = asked(
+        api,
+        files=[{"glob": f"{archive}/2020/image*"}],
+        psf_id=psf_id,
+        output={"folder": str(tmp_path / "out" / "run 1")},
+    )
+    work()
+    (line,) = results(api, bulk)
+    written = Path(line["output"])
+    assert written.parent == tmp_path / "out" / "run 1"
+    assert written.name == f"image_0-{line['product_id'][:16]}.fits"
+    assert sha256(written) == line["sha256"] == hashlib.sha256(api.get(line["file"]).content).hexdigest()
+    with fits.open(written, checksum=True) as hdus:
+        assert hdus[0].header["PRODID"] == line["product_id"]
+    assert [path.name for path in written.parent.iterdir()] == [written.name], "nothing half-written is left"
+
+
+def test_an_output_folder_that_cannot_be_written_to_is_told_before_the_work(
+    api: TestClient,
+    archive: Path,
+    psf_id: str,
+    work: Callable[[], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run").write_text("a file where the folder is to be")
+    # Root may write to any folder: what the system would answer to another user.
+    monkeypatch.setattr(bulk_image.os, "access", lambda *_: False)
+    monkeypatch.delattr(bulk_image.deconvolve_task, "make")
+    for folder, reason in (("run", "File exists"), ("other", "Permission denied")):
+        bulk = asked(
+            api,
+            files=[{"glob": f"{archive}/2020/image*"}],
+            psf_id=psf_id,
+            output={"folder": str(tmp_path / "out" / folder)},
+        )
+        work()
+        (failed,) = api.get(bulk["failures"]).json()["items"]
+        assert failed["error"]["code"] == "output-not-written"
+        assert failed["error"]["message"] == f"expected an output folder that can be written to: {reason}"
+
+
+def test_products_in_a_folder_alone(
+    api: TestClient,
+    archive: Path,
+    psf_id: str,
+    work: Callable[[], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    request = {
+        "files": [{"glob": f"{archive}/*/image*"}],
+        "psf_id": psf_id,
+        "output": {"folder": str(tmp_path / "out"), "only": True},
+    }
+    first = asked(api, **request)
+    work()
+    made = results(api, first)
+    assert len(made) == 5 and all(line["file"] is None and not line["reused"] for line in made)
+    assert all(sha256(Path(line["output"])) == line["sha256"] for line in made)
+    assert api.get("/v1/products").json()["items"] == []
+    blobs = [path for path in (tmp_path / "data" / "blobs").rglob("*") if path.is_file()]
+    assert len(blobs) == 1, "the PSF"
+    gone, changed = Path(made[0]["output"]), Path(made[1]["output"])
+    gone.unlink()
+    changed.write_bytes(b"something else")
+    computed: list[object] = []
+    real = deconvolve_task.make
+    monkeypatch.setattr(
+        bulk_image.deconvolve_task, "make", lambda *a, **k: computed.append(a) or real(*a, **k)
+    )
+    second = asked(api, **request)
+    work()
+    again = results(api, second)
+    assert [line["reused"] for line in again] == [False, False, True, True, True] and len(computed) == 2
+    assert [line["sha256"] for line in again] == [line["sha256"] for line in made]
+    assert sha256(gone) == made[0]["sha256"] and sha256(changed) == made[1]["sha256"]
+
+
+@pytest.mark.parametrize("job_ends", [True, False])
+def test_an_image_that_a_job_is_at_is_waited_for(
+    api: TestClient,
+    archive: Path,
+    psf_id: str,
+    settings: Settings,
+    work: Callable[[], None],
+    monkeypatch: pytest.MonkeyPatch,
+    job_ends: bool,
+) -> None:
+    """Its product is made once: by the job, or, where that has lost its worker, by the bulk."""
+    image_id = upload(api, archive / "2020" / "image 0.fits")
+    body = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id, **FEW}}
+    job = api.post("/v1/jobs", json=body).json()
+    catalogue = Catalogue(settings.catalogue_url)
+    lease = catalogue.jobs.claim(job["id"], worker="another")
+    assert lease is not None
+    rests: list[bool] = []
+
+    def rest() -> None:
+        rests.append(True)
+        if len(rests) < 3:
+            return
+        catalogue.jobs.requeue(lease)
+        if job_ends:
+            Runner(settings, catalogue, Store(settings.data_dir)).run(job["id"])
+
+    computed: list[object] = []
+    real = deconvolve_task.make
+    monkeypatch.setattr(deconvolve_task, "make", lambda *a, **k: computed.append(a) or real(*a, **k))
+    monkeypatch.setattr(bulk_image, "_rest", rest)
+    bulk = asked(api, images=[image_id], psf_id=psf_id)
+    work()
+    (line,) = results(api, bulk)
+    assert len(rests) == 3 and len(computed) == 1 and line["reused"] == job_ends
+    assert seen(api, bulk)["images"]["done"] == 1
+    if not job_ends:
+        Runner(settings, catalogue, Store(settings.data_dir)).run(job["id"])
+        assert len(computed) == 1
+    product = api.get(f"/v1/jobs/{job['id']}").json()["result"]
+    assert product == f"/v1/products/{line['product_id']}"
+    catalogue.close()
+
+
+def test_what_fails_is_apart_and_tried_again(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], tmp_path: Path
+) -> None:
+    good, bad = archive / "2020" / "image 0.fits", archive / "2024" / "image 4.fits"
+    held = bad.read_bytes()
+    fits.PrimaryHDU(np.full((64, 64), np.nan, "f4")).writeto(bad, overwrite=True)
+    bulk = asked(api, files=[{"glob": str(path)} for path in (good, bad)], psf_id=psf_id)
+    work()
+    assert seen(api, bulk)["images"]["failed"] == 1 and seen(api, bulk)["phase"] == "COMPLETED"
+    (failed,) = api.get(f"/v1/bulk/{bulk['id']}/failures").json()["items"]
+    assert failed["error"]["code"] == "all-nan" and failed["attempts"] == 1
+    bad.write_bytes(held)
+    assert api.post(f"/v1/bulk/{bulk['id']}/retry").json()["phase"] == "RUNNING"
+    work()
+    bulk = seen(api, bulk)
+    assert (bulk["images"]["done"], bulk["images"]["failed"], bulk["phase"]) == (2, 0, "COMPLETED")
+
+
+def test_an_error_of_ours_stops_one_image_and_not_the_bulk(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = bulk_image.treat
+
+    def breaks(context: Any, bulk: Any, request: Any, taken: Any) -> Any:
+        if taken.position == 1:
+            raise ZeroDivisionError("secret place")
+        return real(context, bulk, request, taken)
+
+    monkeypatch.setattr("workers.bulk.task.treat", breaks)
+    bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
+    work()
+    bulk = seen(api, bulk)
+    assert (bulk["images"]["done"], bulk["images"]["failed"], bulk["phase"]) == (4, 1, "COMPLETED")
+    (failed,) = api.get(bulk["failures"]).json()["items"]
+    assert failed["error"]["code"] == "internal-error" and "secret" not in json.dumps(failed)
+
+
+def test_the_most_doubtful_first_and_as_a_table(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None]
+) -> None:
+    bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
+    empty = api.get(f"/v1/bulk/{bulk['id']}/results", params={"format": "csv"})
+    assert empty.headers["Content-Type"].startswith("text/csv") and empty.text.startswith("position,source,")
+    work()
+    worst = results(api, bulk, order="worst")
+    scores = [line["score"] for line in worst]
+    assert scores == sorted(scores, reverse=True) and len(worst) == 5
+    assert results(api, bulk, order="worst", limit="2") == worst[:2]
+    table = api.get(f"/v1/bulk/{bulk['id']}/results", params={"format": "csv"}).text
+    rows = list(csv.DictReader(io.StringIO(table)))
+    assert [row["sha256"] for row in rows] == [line["sha256"] for line in results(api, bulk)]
+    assert [float(row["bright_sum_pct"]) for row in rows] == [
+        line["bright"]["sum_pct"] for line in results(api, bulk)
+    ]
+
+
+def test_paused_it_begins_nothing_and_resumed_it_goes_on(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None]
+) -> None:
+    bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
+    here = f"/v1/bulk/{bulk['id']}"
+    assert api.post(f"{here}/pause").json()["phase"] == "PAUSED"
+    assert api.post(f"{here}/pause").status_code == 409
+    work()
+    assert seen(api, bulk)["images"]["done"] == 0
+    assert api.post(f"{here}/resume").json()["phase"] == "LISTING"
+    work()
+    assert seen(api, bulk)["phase"] == "COMPLETED"
+    assert api.post(f"{here}/resume").status_code == api.post(f"{here}/cancel").status_code == 409
+
+
+def test_cancelled_it_stops_at_the_next_step_that_it_tells_of(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[int] = []
+    bulk = asked(
+        api,
+        files=[{"glob": f"{archive}/*/image*"}],
+        psf_id=psf_id,
+        parameters={"method": {"name": "richardson-lucy", "steps": 200}},
+    )
+    monkeypatch.setattr("workers.run.runner.REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr("workers.bulk.task.TELL_EVERY_S", 0.0)
+    real = deconvolve_task._Work.progress
+
+    def counted(work: Any, stage: str) -> Callable[[int, int], None]:
+        inner = real(work, stage)
+
+        def report(step: int, of: int) -> None:
+            steps.append(step)
+            if step == 3:
+                assert api.post(f"/v1/bulk/{bulk['id']}/cancel").json()["phase"] == "CANCELLED"
+            inner(step, of)
+
+        return report
+
+    monkeypatch.setattr(deconvolve_task._Work, "progress", counted)
+    work()
+    assert steps == [1, 2, 3]
+    bulk = seen(api, bulk)
+    assert bulk["phase"] == "CANCELLED" and bulk["images"]["waiting"] == 5
+    assert api.get("/v1/products").json()["items"] == []
+    assert api.post(f"/v1/bulk/{bulk['id']}/retry").status_code == 409
+
+
+def test_files_that_are_nowhere_stop_the_bulk_with_the_reason(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None]
+) -> None:
+    bulk = asked(api, files=[{"glob": f"{archive}/**/*.nothing"}], psf_id=psf_id)
+    work()
+    assert seen(api, bulk)["error"]["code"] == "no-images" and seen(api, bulk)["phase"] == "ERROR"
+    write_image(archive / "2020" / "late.nothing")
+    assert api.post(f"/v1/bulk/{bulk['id']}/resume").json()["error"] is None
+    work()
+    assert seen(api, bulk)["images"]["done"] == 1
+
+
+def test_a_context_pins_the_psf_of_each_image(
+    api: TestClient, archive: Path, work: Callable[[], None], tmp_path: Path
+) -> None:
+    of_channel = []
+    for channel in (174, 304):
+        write_psf(tmp_path / f"{channel}.fits", size=channel // 4 // 2 * 2)
+        of_line = f"/v1/psfs?instrument=eui&channel={channel}&kind=total"
+        of_channel.append(upload(api, tmp_path / f"{channel}.fits", of_line))
+    pins = [{"psf_id": one} for one in of_channel]
+    context = api.post("/v1/contexts", json={"name": "both", "pins": pins}).json()
+    bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], context="both")
+    assert bulk["context_id"] == context["id"] and bulk["psf_id"] is None
+    work()
+    expected = [of_channel[0]] * 3 + [of_channel[1]] * 2
+    assert [line["psf_id"] for line in results(api, bulk)] == expected
+
+
+@pytest.mark.parametrize(
+    ("request_", "status", "code"),
+    [
+        ({}, 422, "invalid-request"),
+        ({"psf_id": "{psf}"}, 422, "invalid-request"),
+        ({"images": ["a" * 64], "psf_id": "{psf}"}, 404, "no-such-image"),
+        ({"files": [{"glob": "{root}/*"}]}, 422, "invalid-request"),
+        ({"files": [{"glob": "{root}/*"}], "psf_id": "a" * 64}, 404, "no-such-psf"),
+        ({"files": [{"glob": "{root}/*"}], "context": "none"}, 404, "no-such-context"),
+        ({"files": [{"glob": "{root}/*"}], "context": "now"}, 404, "no-such-context"),
+        ({"files": [{"glob": "{root}/*"}], "psf_id": "{psf}", "context": "x"}, 422, "invalid-request"),
+        ({"files": [{"glob": "/etc/*"}], "psf_id": "{psf}"}, 422, "path-not-allowed"),
+        ({"files": [{"glob": "{root}/../../etc/*"}], "psf_id": "{psf}"}, 422, "bad-path"),
+        ({"files": [{"glob": "*.fits"}], "psf_id": "{psf}"}, 422, "bad-path"),
+        ({"files": [{"glob": "{root}/\x00*"}], "psf_id": "{psf}"}, 422, "invalid-request"),
+        ({"files": [{"glob": "{root}/*", "where": {"x": 1}}], "psf_id": "{psf}"}, 422, "invalid-request"),
+        (
+            {"files": [{"glob": "{root}/*"}], "psf_id": "{psf}", "output": {"folder": "{root}"}},
+            422,
+            "path-not-allowed",
+        ),
+        (
+            {"files": [{"glob": "{root}/*"}], "psf_id": "{psf}", "output": {"folder": "out"}},
+            422,
+            "bad-path",
+        ),
+        ({"images": ["a" * 64] * 100_001, "psf_id": "{psf}"}, 422, "invalid-request"),
+    ],
+)
+def test_what_is_refused(
+    api: TestClient, archive: Path, psf_id: str, request_: dict[str, Any], status: int, code: str
+) -> None:
+    body = json.dumps(request_).replace("{psf}", psf_id).replace("{root}", str(archive))
+    answer = api.post("/v1/bulk", content=body, headers={"Content-Type": "application/json"})
+    assert (answer.status_code, answer.json()["type"]) == (status, f"urn:heliopsf:{code}"), answer.text
+    assert api.get("/v1/bulk").json()["items"] == []
+
+
+def test_a_link_that_is_put_there_later_is_not_followed(
+    api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], tmp_path: Path
+) -> None:
+    bulk = asked(api, files=[{"glob": f"{archive}/2020/image*"}], psf_id=psf_id)
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    real = catalogue.bulks.take
+    path = archive / "2020" / "image 0.fits"
+    write_image(tmp_path / "secret.fits")
+
+    def swapped(*arguments: Any) -> Any:
+        if path.is_file() and not path.is_symlink():
+            path.unlink()
+            os.symlink(tmp_path / "secret.fits", path)
+        return real(*arguments)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(
+            "workers.catalogue.bulks.Bulks.take",
+            lambda self, *arguments: swapped(*arguments) if self is not None else None,
+        )
+        work()
+    (failed,) = api.get(f"/v1/bulk/{bulk['id']}/failures").json()["items"]
+    assert failed["error"]["code"] == "path-not-allowed"
+
+
+def test_a_bulk_is_its_owner_s_and_takes_a_key_for_bulk(settings: Settings, psf_file: Path) -> None:
+    with keyed(settings) as service:
+        mine, other = service.client("mine"), service.client("other")
+        psf_id = upload(mine, psf_file, "/v1/psfs")
+        request = {"files": [{"glob": f"{settings.bulk_roots}/*/*"}], "psf_id": psf_id}
+        for client, status in (
+            (service.client("mine", Scope.READ, Scope.SUBMIT), 403),
+            (service.api, 401),
+            (other, 404),
+        ):
+            assert client.post("/v1/bulk", json=request).status_code == status
+        here = f"/v1/bulk/{mine.post('/v1/bulk', json=request).json()['id']}"
+        for address in (here, f"{here}/results", f"{here}/failures", f"{here}/events"):
+            assert other.get(address).status_code == 404, address
+            assert service.api.get(address).status_code == 401, address
+        for action in ("pause", "resume", "cancel", "retry"):
+            assert other.post(f"{here}/{action}").status_code == 404, action
+            assert service.client("mine", Scope.READ).post(f"{here}/{action}").status_code == 403, action
+        assert other.get("/v1/bulk").json()["items"] == []
+        assert mine.get(here).json()["phase"] == "LISTING", "nobody else changed anything"
+
+
+def test_the_turns_of_a_bulk_are_jobs_like_others_while_they_last(
+    api: TestClient, archive: Path, psf_id: str, settings: Settings, work: Callable[[], None]
+) -> None:
+    bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    keep_turns(catalogue, settings)
+    (turn,) = api.get("/v1/jobs").json()["items"]
+    assert (turn["kind"], turn["queue"]) == ("bulk", "bulk")
+    assert turn["parameters"]["bulk_id"] == bulk["id"]
+    assert api.get(f"/uws/jobs/{turn['id']}").status_code == api.get("/uws/jobs").status_code == 200
+    keep_turns(catalogue, settings)
+    assert len(api.get("/v1/jobs").json()["items"]) == 1, "a turn for a worker, and no more"
+    assert api.delete(f"/v1/jobs/{turn['id']}").json()["phase"] == "ABORTED"
+    work()
+    assert seen(api, bulk)["images"]["done"] == 5, "who cancels a turn does not cancel the bulk"
+    keep_turns(catalogue, settings)
+    assert api.get("/v1/jobs").json()["items"] == [], "what ended has nothing to say"
+
+
+def test_a_turn_that_fails_for_a_reason_of_its_own_stops_the_bulk_with_it(
+    api: TestClient, archive: Path, psf_id: str, settings: Settings, work: Callable[[], None]
+) -> None:
+    bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("workers.bulk.task._list", lambda *_: 1 / 0)
+        work()
+    stopped = seen(api, bulk)
+    assert stopped["phase"] == "ERROR" and stopped["error"]["code"] == "internal-error"
+    assert api.post(f"/v1/bulk/{bulk['id']}/resume").status_code == 200
+    work()
+    assert seen(api, bulk)["images"]["done"] == 5
+
+
+def test_a_turn_lets_others_go_first_after_each_image(
+    api: TestClient, archive: Path, psf_id: str, settings: Settings
+) -> None:
+    bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    again: list[tuple[str, Queue]] = []
+
+    def submit(job_id: str, queue: Queue) -> bool:
+        again.append((job_id, queue))
+        return True
+
+    runner = Runner(settings, catalogue, Store(settings.data_dir), submit=submit)
+    keep_turns(catalogue, settings)
+    (turn,) = catalogue.jobs.of_kind("bulk")
+    waiting, _ = catalogue.jobs.submit("psf-build", {"instrument": "hri_euv"}, "k", "somebody")
+    for done in (1, 2):
+        runner.run(turn.id)
+        assert seen(api, bulk)["images"]["done"] == done
+        row = catalogue.jobs.get(turn.id)
+        assert row is not None and (row.phase, row.attempt, row.lease) == ("QUEUED", 0, None)
+        assert again == [(turn.id, Queue.BULK)] * done and row.submitted_at is not None
+    catalogue.jobs.cancel(waiting.id)
+    runner.run(turn.id)
+    assert seen(api, bulk)["images"]["done"] == 5 and len(again) == 2

@@ -1,0 +1,165 @@
+"""Limits of an operator's before an image of a bulk is worked on: those of single jobs, to the letter."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from tests.conftest import write_image
+from tests.service.conftest import upload
+from workers.bulk import task as bulk_task
+from workers.bulk.turns import keep_turns
+from workers.catalogue.catalogue import Catalogue
+from workers.files import archive as archive_files
+from workers.files.store import Store
+from workers.intake import estimates
+from workers.run import runner
+from workers.run.runner import Runner
+from workers.settings import Settings
+from workers.tasks import deconvolve as deconvolve_task
+
+FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
+
+
+@pytest.mark.parametrize("where", ["uploads", "files"])
+@pytest.mark.parametrize(
+    ("limit", "code"),
+    [({"max_job_memory_mib": 420}, "too-much-memory"), ({"max_job_s": 60.0}, "too-much-time")],
+)
+def test_an_image_over_a_limit_is_put_apart_as_a_single_job_is_refused(
+    settings: Settings,
+    tmp_path: Path,
+    psf_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+    limit: dict[str, Any],
+    code: str,
+) -> None:
+    # So slow a machine that the limit parts the images, and no clock does.
+    monkeypatch.setattr(estimates, "ONCE_NS", 1e6)
+    shapes = {"a": (96, 128), "b": (512, 512), "c": (96, 128)}
+    archive = tmp_path / "archive"
+    archive.mkdir()
+    for number, (name, shape) in enumerate(shapes.items()):
+        write_image(archive / f"{name}.fits", shape=shape, seed=number)
+    limited = settings.model_copy(
+        update={"worker_threads": 1, "bulk_roots": str(archive), "max_upload_mib": 4, **limit}
+    )
+    worked_on: list[tuple[int, ...]] = []
+    make = deconvolve_task.make
+
+    def seen(context: Any, request: Any, psf_row: Any, image: Any, **more: Any) -> Any:
+        worked_on.append(image.pixels.shape)
+        return make(context, request, psf_row, image, **more)
+
+    monkeypatch.setattr(deconvolve_task, "make", seen)
+    with TestClient(create_app(limited)) as api:
+        psf_id = upload(api, psf_file, "/v1/psfs")
+        ids = [upload(api, archive / f"{name}.fits") for name in shapes]
+        alone = api.post(
+            "/v1/jobs",
+            json={"kind": "deconvolve", "parameters": {"image_id": ids[1], "psf_id": psf_id, **FEW}},
+        )
+        assert alone.status_code == (413 if code == "too-much-memory" else 422)
+        asked = {"images": ids} if where == "uploads" else {"files": [{"glob": f"{archive}/*.fits"}]}
+        bulk = api.post("/v1/bulk", json={"psf_id": psf_id, "parameters": FEW, **asked}).json()
+        catalogue = Catalogue(limited.catalogue_url)
+        turns = Runner(limited, catalogue, Store(limited.data_dir))
+        while catalogue.bulks.at_work():
+            keep_turns(catalogue, limited)
+            for turn in catalogue.jobs.of_kind("bulk"):
+                turns.run(turn.id)
+        catalogue.close()
+        ended = api.get(f"/v1/bulk/{bulk['id']}").json()
+        assert (ended["phase"], ended["images"]["done"], ended["images"]["failed"]) == ("COMPLETED", 2, 1)
+        (failed,) = api.get(f"/v1/bulk/{bulk['id']}/failures").json()["items"]
+        assert failed["error"] == {"fault": "user", "code": code, "message": alone.json()["detail"]}
+        assert alone.json()["type"] == f"urn:heliopsf:{code}"
+        assert failed["source"] in (ids[1], str(archive / "b.fits"))
+        assert worked_on == [(96, 128), (96, 128)]
+
+
+def test_an_image_that_takes_too_long_is_put_apart_and_a_turn_may_last_longer(
+    settings: Settings, tmp_path: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limited = settings.model_copy(update={"max_job_s": 30.0})
+    clock = _Clock()
+    monkeypatch.setattr(runner, "time", clock)
+    monkeypatch.setattr(bulk_task, "TELL_EVERY_S", 0.0)
+    make = deconvolve_task.make
+
+    def slow(context: Any, request: Any, psf_row: Any, image: Any, **more: Any) -> Any:
+        clock.ahead_s += 100.0 if image.pixels.shape == (80, 128) else 20.0
+        return make(context, request, psf_row, image, **more)
+
+    monkeypatch.setattr(deconvolve_task, "make", slow)
+    with TestClient(create_app(limited)) as api:
+        psf_id = upload(api, psf_file, "/v1/psfs")
+        ids = []
+        for number, shape in enumerate([(96, 128), (96, 128), (80, 128), (96, 128)]):
+            write_image(tmp_path / f"{number}.fits", shape=shape, seed=number)
+            ids.append(upload(api, tmp_path / f"{number}.fits"))
+        bulk = api.post("/v1/bulk", json={"images": ids, "psf_id": psf_id, "parameters": FEW}).json()
+        catalogue = Catalogue(limited.catalogue_url)
+        keep_turns(catalogue, limited)
+        (turn,) = catalogue.jobs.of_kind("bulk")
+        Runner(limited, catalogue, Store(limited.data_dir)).run(turn.id)
+        catalogue.close()
+        ended = api.get(f"/v1/bulk/{bulk['id']}").json()
+        assert (ended["phase"], ended["images"]["done"], ended["images"]["failed"]) == ("COMPLETED", 3, 1)
+        (failed,) = api.get(f"/v1/bulk/{bulk['id']}/failures").json()["items"]
+        assert (failed["source"], failed["error"]["code"]) == (ids[2], "took-too-long")
+        assert failed["error"]["fault"] == "user" and "30 s" in failed["error"]["message"]
+
+
+def test_looking_for_files_is_stopped_where_it_takes_too_long_though_it_finds_none(
+    settings: Settings, tmp_path: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive = tmp_path / "archive"
+    for number in range(20):
+        (archive / f"{number:02}").mkdir(parents=True)
+    limited = settings.model_copy(update={"max_job_s": 30.0, "bulk_roots": str(archive)})
+    clock = _Clock()
+    monkeypatch.setattr(runner, "time", clock)
+    monkeypatch.setattr(bulk_task, "TELL_EVERY_S", 0.0)
+    looked: list[Any] = []
+    real = os.scandir
+
+    def slow(folder: Any) -> Any:
+        looked.append(folder)
+        clock.ahead_s += 20.0
+        return real(folder)
+
+    with TestClient(create_app(limited)) as api:
+        psf_id = upload(api, psf_file, "/v1/psfs")
+        files = [{"glob": f"{archive}/**/*.none"}]
+        bulk = api.post("/v1/bulk", json={"files": files, "psf_id": psf_id, "parameters": FEW}).json()
+        catalogue = Catalogue(limited.catalogue_url)
+        keep_turns(catalogue, limited)
+        (turn,) = catalogue.jobs.of_kind("bulk")
+        with monkeypatch.context() as patched:
+            patched.setattr(archive_files.os, "scandir", slow)
+            Runner(limited, catalogue, Store(limited.data_dir)).run(turn.id)
+        keep_turns(catalogue, limited)
+        catalogue.close()
+        stopped = api.get(f"/v1/bulk/{bulk['id']}").json()
+        assert (stopped["phase"], stopped["error"]["code"]) == ("ERROR", "took-too-long")
+        assert len(looked) == 2
+
+
+class _Clock:
+    """The runner's clock, which can be put ahead."""
+
+    ahead_s = 0.0
+
+    def monotonic(self) -> float:
+        return time.monotonic() + self.ahead_s
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(seconds)

@@ -1,0 +1,213 @@
+"""Progress as server-sent events, from a server that listens: what comes, when, how it ends, and to whom."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from service.api import events
+from service.app import create_app
+from service.client.http import Heliopsf, ServiceError
+from tests.whole.stack import free_port, wait_for
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.bulks import new_id
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.jobs import Lease
+from workers.catalogue.tables import DEFAULT_OWNER
+from workers.contract.bulk import BulkPhase
+from workers.settings import Settings
+
+
+@dataclass
+class Live:
+    """A server in a thread of this process."""
+
+    url: str
+    app: FastAPI
+    client: Heliopsf
+
+    @property
+    def catalogue(self) -> Catalogue:
+        found = self.app.state.heliopsf.catalogue
+        assert isinstance(found, Catalogue)
+        return found
+
+    def streams(self) -> int:
+        return sum(self.app.state.heliopsf.streams._open.values())
+
+    def job(self) -> tuple[str, Lease]:
+        """A job that is at work."""
+        row, _ = self.catalogue.jobs.submit("psf-build", {}, new_id(), DEFAULT_OWNER)
+        lease = self.catalogue.jobs.claim(row.id, "w")
+        assert lease is not None
+        return row.id, lease
+
+
+@pytest.fixture
+def live(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
+    monkeypatch.setattr(events, "LOOK_EVERY_S", 0.05)
+    port = free_port()
+    app = create_app(settings.model_copy(update={"streams_per_caller": 2}))
+    server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", timeout_graceful_shutdown=1))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    url = f"http://127.0.0.1:{port}"
+    with Heliopsf(url) as client:
+        client.wait_until_up()
+        yield Live(url, app, client)
+    server.should_exit = True
+    thread.join()
+
+
+class Following(threading.Thread):
+    """What a stream says, gathered beside the test."""
+
+    def __init__(self, url: str, **headers: str) -> None:
+        super().__init__(daemon=True)
+        self.url, self.headers = url, headers
+        self.lines: list[str] = []
+        self.status = 0
+        self.start()
+
+    def run(self) -> None:
+        with (
+            suppress(httpx.TransportError),  # the test may end before the stream
+            httpx.stream("GET", self.url, headers=self.headers, timeout=30) as answer,
+        ):
+            self.status = answer.status_code
+            self.type = answer.headers.get("content-type", "")
+            for line in answer.iter_lines():
+                self.lines.append(line)
+
+    def said(self, start: str) -> list[str]:
+        return [line.removeprefix(start).strip() for line in self.lines if line.startswith(start)]
+
+
+def test_a_job_is_followed_to_its_end(live: Live) -> None:
+    job_id, lease = live.job()
+    seen: list[dict[str, Any]] = []
+
+    def follow() -> None:
+        seen.extend(live.client.follow(f"/v1/jobs/{job_id}"))
+
+    following = threading.Thread(target=follow)
+    following.start()
+    wait_for(lambda: len(seen) == 1, "the first event", timeout_s=10)
+    live.catalogue.jobs.progress(lease, "building", 1, 2)
+    wait_for(lambda: len(seen) == 2, "the second", timeout_s=10)
+    time.sleep(0.3)
+    assert len(seen) == 2, "nothing is said where nothing has changed"
+    live.catalogue.jobs.complete(lease, "r" * 64)
+    following.join(10)
+    assert [event["phase"] for event in seen] == ["EXECUTING", "EXECUTING", "COMPLETED"]
+    assert seen[1]["progress"]["stage"] == "building" and seen[2] == live.client.job(job_id)
+    assert live.streams() == 0
+
+
+def test_who_comes_back_hears_of_what_changed_meanwhile(live: Live) -> None:
+    job_id, lease = live.job()
+    first = Following(f"{live.url}/v1/jobs/{job_id}/events")
+    wait_for(lambda: len(first.said("id:")) == 1, "an event", timeout_s=10)
+    assert first.type.startswith("text/event-stream") and first.said("retry:") == ["2000"]
+    knows = {"Last-Event-ID": first.said("id:")[0]}
+    second = Following(f"{live.url}/v1/jobs/{job_id}/events", **knows)
+    time.sleep(0.4)
+    assert second.said("event:") == [], "it knows what there is to know"
+    live.catalogue.jobs.complete(lease, "r" * 64)
+    second.join(10), first.join(10)
+    assert second.said("event:") == ["end"] and first.said("event:") == ["progress", "end"]
+    again = httpx.get(f"{live.url}/v1/jobs/{job_id}/events", headers=knows)
+    assert again.status_code == 200 and "event: end" in again.text
+    ended = {"Last-Event-ID": second.said("id:")[0]}
+    assert httpx.get(f"{live.url}/v1/jobs/{job_id}/events", headers=ended).status_code == 204
+
+
+def test_a_stream_says_that_it_is_there(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events, "ALIVE_EVERY_S", 0.1)
+    job_id, lease = live.job()
+    following = Following(f"{live.url}/v1/jobs/{job_id}/events")
+    wait_for(lambda: len(following.said(": still here")) >= 3, "it says so again and again", timeout_s=10)
+    live.catalogue.jobs.complete(lease, "r" * 64)
+    following.join(10)
+    assert following.said("event:") == ["progress", "end"]
+
+
+def test_a_caller_has_so_many_streams_and_no_more(live: Live) -> None:
+    (job_id, lease), (other_id, _) = live.job(), live.job()
+    both = [Following(f"{live.url}/v1/jobs/{one}/events") for one in (job_id, other_id)]
+    wait_for(lambda: all(one.said("event:") for one in both), "two are open", timeout_s=10)
+    refused = httpx.get(f"{live.url}/v1/jobs/{job_id}/events")
+    assert refused.status_code == 429 and refused.json()["type"] == "urn:heliopsf:too-many-streams"
+    live.catalogue.jobs.complete(lease, "r" * 64)
+    both[0].join(10)
+    assert httpx.get(f"{live.url}/v1/jobs/{job_id}/events").status_code == 200
+
+
+def test_who_goes_away_gives_the_place_back(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events, "ALIVE_EVERY_S", 0.1)
+    job_id, _ = live.job()
+    with httpx.stream("GET", f"{live.url}/v1/jobs/{job_id}/events") as answer:
+        lines = answer.iter_lines()  # let go of, it would close the connection
+        next(lines)
+        assert live.streams() == 1
+    wait_for(lambda: live.streams() == 0, "the place is free", timeout_s=10)
+
+
+def test_a_job_that_is_destroyed_ends_its_stream(live: Live) -> None:
+    job_id, _ = live.job()
+    following = Following(f"{live.url}/v1/jobs/{job_id}/events")
+    wait_for(lambda: bool(following.said("event:")), "an event", timeout_s=10)
+    live.catalogue.uws.destroy(job_id)
+    following.join(10)
+    assert following.said("event:") == ["progress", "gone"]
+    with pytest.raises(ServiceError, match="there is no job"):
+        list(live.client.follow(f"/v1/jobs/{job_id}"))
+
+
+def test_a_server_that_stops_ends_its_streams(live: Live) -> None:
+    job_id, _ = live.job()
+    following = Following(f"{live.url}/v1/jobs/{job_id}/events")
+    wait_for(lambda: bool(following.said("event:")), "an event", timeout_s=10)
+    live.app.state.stopping = True
+    following.join(5)
+    assert not following.is_alive() and following.said("event:") == ["progress"]
+
+
+def test_a_bulk_is_followed(live: Live) -> None:
+    row = BulkRow(
+        id=new_id(), owner=DEFAULT_OWNER, name="", phase=BulkPhase.RUNNING, request={}, request_key="k",
+        psf_id="p" * 64, created_at=time.time(), running_since=time.time(), listed=True,
+    )  # fmt: skip
+    bulk_id = live.catalogue.bulks.create(row, ["a" * 64, "b" * 64])[0].id
+    following = Following(f"{live.url}/v1/bulk/{bulk_id}/events")
+    wait_for(lambda: bool(following.said("data:")), "an event", timeout_s=10)
+    assert '"total":2' in following.said("data:")[0]
+    live.client.pause_bulk(bulk_id)
+    wait_for(lambda: len(following.said("data:")) == 2, "the next", timeout_s=10)
+    assert live.client.wait_for_bulk(bulk_id)["phase"] == "PAUSED", "nobody waits for what does not go on"
+    live.client.cancel_bulk(bulk_id)
+    following.join(10)
+    assert following.said("event:") == ["progress", "progress", "end"]
+
+
+def test_a_stream_lasts_so_long_and_is_gone_on_with(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "LOOK_EVERY_S", 0.02)
+    with TestClient(create_app(settings.model_copy(update={"stream_s": 0.2}))) as api:
+        catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+        job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+        said = api.get(f"/v1/jobs/{job.id}/events").text
+        assert said.count("event: progress") == 1 and "event: end" not in said
+        known = said.split("id: ")[1].split()[0]
+        assert "event:" not in api.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": known}).text

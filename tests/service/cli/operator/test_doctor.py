@@ -1,0 +1,266 @@
+"""``heliopsf doctor``: with nothing there, with what is broken, and with what a service left behind."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from sqlalchemy import text
+
+from service.cli.main import main
+from service.cli.operator import doctor as cli_doctor
+from tests.whole.stack import free_port
+from workers import checks
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.census import Census
+from workers.catalogue.tables import DEFAULT_OWNER
+from workers.settings import Settings, software_version
+
+
+@pytest.fixture(autouse=True)
+def plain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("DATABASE_URL", "BROKER_URL", "WORKER_THREADS", "WORKER_PROCESSES"):
+        monkeypatch.delenv(f"HELIOPSF_{name}", raising=False)
+    for name in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
+        monkeypatch.delenv(f"{name}_NUM_THREADS", raising=False)
+    monkeypatch.setenv("HELIOPSF_DATA_DIR", str(tmp_path / "data"))
+
+
+@pytest.fixture
+def catalogue(tmp_path: Path) -> Catalogue:
+    (tmp_path / "data").mkdir()
+    catalogue = Catalogue(Settings().catalogue_url)
+    catalogue.upgrade()
+    return catalogue
+
+
+def ask(*options: str) -> Result:
+    return CliRunner().invoke(main, ["doctor", *options])
+
+
+def findings() -> dict[str, dict[str, str]]:
+    answer = json.loads(ask("--json").output)
+    assert answer["ok"] == all(one["state"] != "broken" for one in answer["findings"])
+    return {one["what"]: one for one in answer["findings"]}
+
+
+def states() -> dict[str, str]:
+    return {what: one["state"] for what, one in findings().items()}
+
+
+def test_with_nothing_there_it_says_so_and_makes_nothing(tmp_path: Path) -> None:
+    answer = ask()
+    assert answer.exit_code == 0, answer.output
+    said = " ".join(answer.output.split())
+    assert "is not there yet -> `heliopsf serve` makes it" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue) -> None:
+    catalogue.census.announce("host:1", time.time(), software_version())
+    assert set(states()) == {
+        "versions", "threads", "storage", "broker", "database", "schema", "clock", "workers", "stuck jobs",
+    }  # fmt: skip
+    found = findings()
+    for what in ("storage", "broker", "database", "schema", "clock", "workers", "stuck jobs"):
+        assert found[what]["state"] == "ok", found[what]
+    assert "host:1" in found["workers"]["found"]
+
+
+@pytest.mark.parametrize(
+    ("variable", "url", "what", "says"),
+    [
+        ("DATABASE_URL", "postgresql://u:s3cret@127.0.0.1:PORT/x", "database", "refused"),
+        ("DATABASE_URL", "postgresql://u@127.0.0.1:PORT/x?password=s3cret", "database", "refused"),
+        ("DATABASE_URL", "nonsense:s3cret", "database", "cannot be used"),
+        ("DATABASE_URL", "mysql://u:s3cret@127.0.0.1/x", "database", "cannot be used"),
+        ("DATABASE_URL", "postgresql://u:s3cret@127.0.0.1:x3s3cret/x", "database", "cannot be used"),
+        ("BROKER_URL", "redis://:s3cret@127.0.0.1:PORT/0", "broker", "does not answer (ConnectionError)"),
+        ("BROKER_URL", "redis://:s3/s3cret@127.0.0.1:PORT/0", "broker", "broker"),
+        ("BROKER_URL", "nope://u:s3cret@127.0.0.1", "broker", "cannot be used"),
+        ("BROKER_URL", "s3cret", "broker", "cannot be used"),
+        ("BROKER_URL", "", "broker", "cannot be used"),
+        ("BROKER_URL", "amqp://u:s3cret@127.0.0.1:PORT//", "broker", "does not answer"),
+    ],
+)
+def test_a_broken_url_is_a_plain_sentence_without_its_password(
+    variable: str, url: str, what: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(f"HELIOPSF_{variable}", url.replace("PORT", str(free_port())))
+    answer = ask()
+    assert answer.exit_code == 1 and isinstance(answer.exception, SystemExit), answer.output
+    assert "s3cret" not in answer.output and "Traceback" not in answer.output
+    found = findings()[what]
+    assert found["state"] == "broken" and says in found["found"] and found["advice"]
+
+
+def test_a_file_that_is_no_database_is_broken(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "catalogue.sqlite").write_bytes(b"Dear editor," * 1000)
+    assert "no SQLite database" in findings()["database"]["found"]
+
+
+def test_storage_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("HELIOPSF_DATA_DIR", str(tmp_path / "file" / "data"))
+    assert states()["storage"] == "broken"
+
+
+@pytest.mark.parametrize(("free", "state"), [(2**20, "broken"), (2**30, "warning"), (2**40, "ok")])
+def test_room(free: int, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "free_bytes", lambda _folder: free)
+    assert states()["storage"] == state
+
+
+@pytest.mark.parametrize(
+    ("statement", "state", "says"),
+    [
+        ("ALTER TABLE jobs DROP COLUMN worker", "broken", "jobs.worker"),
+        ("DROP INDEX jobs_tallied", "warning", "jobs_tallied"),
+        ("DROP TABLE workers", "warning", "workers"),
+    ],
+)
+def test_a_database_of_another_version(catalogue: Catalogue, statement: str, state: str, says: str) -> None:
+    with catalogue._engine.begin() as connection:
+        connection.execute(text(statement))
+    found = findings()["schema"]
+    assert found["state"] == state and says in found["found"]
+
+
+@pytest.mark.parametrize(
+    ("statement", "state", "says"),
+    [
+        ("DROP TABLE alembic_version", "warning", "no revision"),
+        ("UPDATE alembic_version SET version_num = '0001'", "warning", "at revision 0001"),
+        ("UPDATE alembic_version SET version_num = '9999'", "broken", "made by a later version"),
+    ],
+)
+def test_a_database_at_another_revision(catalogue: Catalogue, statement: str, state: str, says: str) -> None:
+    with catalogue._engine.begin() as connection:
+        connection.execute(text(statement))
+    found = findings()["schema"]
+    assert found["state"] == state and says in found["found"]
+    assert ("heliopsf database upgrade" if state == "warning" else "run the version") in found["advice"]
+
+
+@pytest.mark.parametrize(
+    ("apart", "state"), [(0.2, "ok"), (-3.0, "warning"), (60.0, "warning"), (-60.0, "warning")]
+)
+def test_clocks(catalogue: Catalogue, apart: float, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Census.clock
+    monkeypatch.setattr(Census, "clock", lambda self: real(self) + apart)
+    assert states()["clock"] == state
+
+
+def test_a_worker_of_another_version(catalogue: Catalogue) -> None:
+    catalogue.census.announce("host:1", time.time(), "0.0.1")
+    assert findings()["workers"]["state"] == "warning" and "0.0.1" in findings()["workers"]["found"]
+
+
+def test_jobs_that_nobody_takes(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+    assert states()["workers"] == "warning" and states()["stuck jobs"] == "ok"
+    with catalogue._engine.begin() as connection:
+        connection.execute(text("UPDATE jobs SET created_at = created_at - 7200"))
+    found = findings()
+    assert "1 queued" in found["stuck jobs"]["found"] and found["stuck jobs"]["state"] == "warning"
+    assert "waited for 2 h" in found["workers"]["found"]
+    monkeypatch.setenv("HELIOPSF_BROKER_URL", f"redis://127.0.0.1:{free_port()}")
+    assert states()["workers"] == states()["stuck jobs"] == "broken"
+
+
+def test_a_job_whose_worker_is_gone(catalogue: Catalogue) -> None:
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+    catalogue.jobs.claim(job.id, "host:1")
+    assert states()["stuck jobs"] == "ok"
+    with catalogue._engine.begin() as connection:
+        connection.execute(text("UPDATE jobs SET heartbeat_at = heartbeat_at - 7200"))
+    assert "1 at work" in findings()["stuck jobs"]["found"]
+
+
+@pytest.mark.parametrize(
+    ("environment", "says"),
+    [
+        ({"OMP_NUM_THREADS": "4096"}, "OMP_NUM_THREADS"),
+        ({"OMP_NUM_THREADS": "many"}, "OMP_NUM_THREADS is no number"),
+        ({"HELIOPSF_WORKER_THREADS": "4096"}, "HELIOPSF_WORKER_THREADS=2"),
+        ({"HELIOPSF_WORKER_PROCESSES": "4096"}, "fewer processes"),
+        ({}, ""),
+    ],
+)
+def test_threads(
+    environment: dict[str, str], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(cli_doctor, "cores", lambda: 2)
+    monkeypatch.setattr("workers.settings.cores", lambda: 2)
+    found = cli_doctor.threads(Settings(), tmp_path / "no-limit")
+    assert found.state == ("warning" if environment else "ok") and says in found.advice
+
+
+def test_a_container_that_may_use_fewer_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli_doctor, "cores", lambda: 8)
+    monkeypatch.setattr("workers.settings.cores", lambda: 8)
+    (tmp_path / "cpu.max").write_text("200000 100000\n")
+    found = cli_doctor.threads(Settings(), tmp_path / "cpu.max")
+    assert found.state == "warning" and "HELIOPSF_WORKER_THREADS=2" in found.advice
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    assert cli_doctor.threads(Settings(), tmp_path / "cpu.max").state == "ok"
+
+
+def test_versions_are_compared_with_what_was_tested_and_what_is_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pins = tmp_path / "constraints.txt"
+    pins.write_text("# tested\nNumPy==0.0.1\n")
+    found = cli_doctor.versions(pins)
+    assert found.state == "warning" and "tested with 0.0.1" in found.found
+    assert "no constraints.txt" in cli_doctor.versions(tmp_path / "none").found
+
+    def needs(*_: Any) -> list[str]:
+        return ["numpy>=9999", "no-such-library>=1", "pytest>=9999; extra == 'dev'"]
+
+    monkeypatch.setattr(cli_doctor, "requires", needs)
+    found = cli_doctor.versions(pins)
+    assert (
+        found.state == "broken"
+        and "no-such-library is missing" in found.found
+        and "pytest" not in found.found
+    )
+
+
+def test_the_table_says_what_state_found_and_what_to_do() -> None:
+    found = [
+        cli_doctor.Finding("one", "ok", "well"),
+        cli_doctor.Finding("another", "broken", "a long story " * 20, "mend it"),
+    ]
+    lines = list(cli_doctor.table(found, 80))
+    assert lines[0].split()[::2] == ["one", "well"] and "another" in lines[1] and "broken" in lines[1]
+    assert lines[-2].strip() == "-> mend it" and lines[-1] == "1 ok, 1 broken"
+    assert max(map(len, lines[2:])) <= 80
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("postgresql://u:s3cret@db:5432/heliopsf?sslmode=require", "postgresql://db:5432/heliopsf"),
+        ("redis://:s3/cret@db", "the URL that is set"),
+        ("redis://:s3#cret@db", "the URL that is set"),
+        ("redis://:s3?cret@db", "the URL that is set"),
+        ("redis://u:s3@cret@db/0", "redis://db/0"),
+        ("s3cret", "the URL that is set"),
+    ],
+)
+def test_an_address_has_no_secret(url: str, said: str) -> None:
+    assert cli_doctor.address(url) == said
+
+
+def test_a_setting_that_is_none_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HELIOPSF_LEASE_S", "-1")
+    answer = ask()
+    assert answer.exit_code == 1 and "HELIOPSF_LEASE_S" in answer.output and "Traceback" not in answer.output

@@ -1,0 +1,208 @@
+"""A diagnosis over HTTP and on the command line: page with its policy, an effect of one's own, and what cannot be."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner, Result
+from fastapi.testclient import TestClient
+
+from psfcore.gap.diagnose import Diagnosis
+from psfcore.transit.archive import pack
+from service.api.reports import PAGE_POLICY
+from service.cli.main import main
+from tests.gap_files import EDGE_GLOW, GLOW_DN_S, answer_at_once, quick_diagnosis, write_gap
+from tests.html_page import check_stands_alone, read_page
+from tests.psfcore.gap import small_gaps
+from tests.service.conftest import upload
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A transit with light at its right edge."""
+    return write_gap(tmp_path_factory.mktemp("simulated") / "transit", light_dn_s=GLOW_DN_S)
+
+
+def without_gap() -> Diagnosis:
+    judged = replace(small_gaps.found().judgement, verdict="none", answer=())
+    return replace(small_gaps.found(), judgement=judged, corrected=(), residual_after=None)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["gap", *(str(one) for one in arguments)])
+
+
+def test_an_effect_of_one_s_own_is_found_with_its_size(folder: Path, tmp_path: Path) -> None:
+    """Nothing is patched but the library's length; the light that the file describes is in the images."""
+    (tmp_path / "mine.py").write_text(EDGE_GLOW)
+    numbers, page, picture = tmp_path / "g.json", tmp_path / "g.html", tmp_path / "g.png"
+    corrected = tmp_path / "psf.fits"
+    with quick_diagnosis():
+        done = run(
+            folder, "--local", "--effects", tmp_path / "mine.py", "--json", numbers, "--html", page,
+            "--plot", picture, "--corrected", corrected,
+        )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    report = json.loads(numbers.read_text())
+    assert report["verdict"] == "attributed" and report["answer"] == ["edge_glow"]
+    height = report["effects"][0]["parameters"]["height"]
+    assert height["value"] == pytest.approx(GLOW_DN_S, abs=4 * height["sigma"])
+    assert height["unit"] == "DN/s" and height["sigma"] < GLOW_DN_S / 5
+    said = done.output.splitlines()
+    assert said[:2] == [report["sentence"], "verdict: attributed (edge_glow)"]
+    assert "  not testable: saturation_fill (no pixel was filled in)" in said
+    html = page.read_text("utf-8")
+    check_stands_alone(html)
+    assert "A lamp beside the detector lights its right edge." in html
+    # Its code's hash is among what made the report.
+    (digest,) = report["provenance"]["added_effects"].values()
+    assert digest in [tag.text for tag in read_page(html) if tag.name == "dd"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    header = fits.getheader(corrected)
+    assert header["PSFNAME"] == "hri_euv-gap-corrected"
+    assert "edge_glow" in "".join(header["HISTORY"]).replace("\n", "")
+
+
+def test_a_transit_becomes_a_page_over_http(
+    api: TestClient,
+    run_jobs: Callable[[], None],
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    answer_at_once(monkeypatch, small_gaps.found())
+    pack(folder, tmp_path / "transit.tar")
+    parameters = {"transit_id": upload(api, tmp_path / "transit.tar", "/v1/transits"), "seed": 7}
+    asked = api.post("/v1/jobs", json={"kind": "gap-diagnose", "parameters": parameters})
+    assert asked.status_code == 202, asked.text
+    assert asked.json()["parameters"]["added_effects"] == []
+    run_jobs()
+    job = api.get(asked.headers["location"]).json()
+    assert job["phase"] == "COMPLETED", job["error"]
+    report = api.get(job["result"]).json()
+    assert report["kind"] == "gap" and report["details"]["verdict"] == "attributed"
+    page = api.get(report["html"])
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    assert page.headers["content-security-policy"] == PAGE_POLICY
+    assert page.headers["x-content-type-options"] == "nosniff"
+    check_stands_alone(page.text)
+    lead = next(tag for tag in read_page(page.text) if tag.attributes.get("class") == "lead")
+    assert lead.text.replace("\N{NO-BREAK SPACE}", " ") == report["details"]["sentence"]
+    again = api.get(report["html"], headers={"If-None-Match": page.headers["etag"]})
+    assert again.status_code == 304 and again.headers["content-security-policy"] == PAGE_POLICY
+    said = api.get(report["file"])
+    assert said.json()["schema"] == "gap/1" and said.json()["provenance"]["seed"] == 7
+    assert api.get(report["preview"]).content.startswith(b"\x89PNG")
+    psf = api.get(f"/v1/psfs/{report['details']['corrected_psf_id']}").json()
+    assert psf["details"]["parents"] == {"transit": parameters["transit_id"], "report": report["id"]}
+    equal = api.post("/v1/jobs", json={"kind": "gap-diagnose", "parameters": parameters})
+    assert equal.status_code == 200 and equal.json()["id"] == job["id"]
+    listed = api.get("/v1/reports", params={"transit_id": parameters["transit_id"]}).json()
+    assert [one["id"] for one in listed["items"]] == [report["id"]]
+
+
+def test_requests_that_cannot_be(api: TestClient, folder: Path, tmp_path: Path) -> None:
+    def ask(**parameters: Any) -> tuple[int, str]:
+        answer = api.post("/v1/jobs", json={"kind": "gap-diagnose", "parameters": parameters})
+        return answer.status_code, answer.json()["type"].removeprefix("urn:heliopsf:")
+
+    assert ask(transit_id="0" * 64) == (404, "no-such-transit")
+    pack(folder, tmp_path / "transit.tar")
+    transit_id = upload(api, tmp_path / "transit.tar", "/v1/transits")
+    assert ask(transit_id=transit_id, psf_id="0" * 64) == (404, "no-such-psf")
+    wrong: tuple[dict[str, Any], ...] = (
+        {"seed": -1},
+        {"correct": "perhaps"},
+        {"psf_id": "mine"},
+        {"added_effects": ["os"]},  # whose code is run is the operator's to say
+        {"effects": "mine.py"},
+    )
+    for one in wrong:
+        assert ask(transit_id=transit_id, **one)[0] == 422, one
+
+
+def test_a_psf_that_was_not_fitted_is_no_start(
+    api: TestClient, run_jobs: Callable[[], None], folder: Path, tmp_path: Path
+) -> None:
+    kernel = np.zeros((33, 33), "f4")
+    kernel[16, 16] = 1.0
+    fits.PrimaryHDU(kernel).writeto(tmp_path / "point.fits")
+    pack(folder, tmp_path / "transit.tar")
+    parameters = {
+        "transit_id": upload(api, tmp_path / "transit.tar", "/v1/transits"),
+        "psf_id": upload(api, tmp_path / "point.fits", "/v1/psfs"),
+    }
+    asked = api.post("/v1/jobs", json={"kind": "gap-diagnose", "parameters": parameters})
+    run_jobs()
+    job = api.get(asked.headers["location"]).json()
+    assert job["phase"] == "ERROR"
+    assert job["error"]["code"] == "psf-not-fitted" and job["error"]["fault"] == "user"
+    done = run(folder, "--local", "--psf", tmp_path / "point.fits")
+    assert done.exit_code == 1 and "expected a PSF that was fitted to a transit" in done.output
+
+
+def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer_at_once(monkeypatch, without_gap())
+    psf, numbers = tmp_path / "psf.fits", tmp_path / "g.json"
+    done = run(folder, "--local", "--corrected", psf, "--json", numbers)
+    assert done.exit_code == 1 and not psf.exists()
+    assert done.output.splitlines()[1] == "verdict: none"
+    assert "was not written: no effect was found that could be added (verdict none)" in done.output
+    assert json.loads(numbers.read_text())["verdict"] == "none"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--json", "no/such/folder/g.json", "--local"], "there is no folder"),
+        (["--corrected", "no/such/folder/p.fits", "--local"], "there is no folder"),
+        (["--psf", "missing.fits", "--local"], "expected a PSF id (64 hexadecimal digits) or a file"),
+        (["--psf", "0" * 64, "--local"], "the catalogue holds no PSF with id"),
+        (["--effects", "mine.py"], "--effects: expected --local with it"),
+        (["--effects", "mine.py", "--local"], "effects of mine.py: expected a Python file"),
+        (["--effects", "no_such_module_anywhere", "--local"], "No module named 'no_such_module_anywhere'"),
+        (["--effects", "json", "--local"], "effects of json: expected EFFECTS, a tuple of Effect"),
+        (["--noise", "-1", "2", "--local"], "greater than or equal to 0"),
+        (["--seed", "-1", "--local"], "not in the range"),
+        (["--server", "http://127.0.0.1:9"], "127.0.0.1:9"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run(folder, *arguments)
+    assert done.exit_code != 0 and said in done.output and "Traceback" not in done.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_effects_that_clash_with_the_library_s_are_told(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(EDGE_GLOW.replace("edge_glow", "ghost"))
+    done = run(folder, "--local", "--effects", tmp_path / "mine.py")
+    assert done.exit_code == 1
+    assert "expected names that nothing else has; got 'ghost' twice" in done.output
+
+
+def test_a_folder_without_a_transit_and_a_word_that_is_neither_are_told(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = run(tmp_path / "empty", "--local")
+    assert done.exit_code == 1 and "transit.json" in done.output
+    done = run(tmp_path / "nothing-here", "--local")
+    assert done.exit_code == 2 and "does not exist" in done.output
+
+
+def test_the_transit_may_come_after_the_options_and_help_names_both_commands(folder: Path) -> None:
+    done = run("--seed", "-1", folder)
+    assert done.exit_code == 2 and "not in the range" in done.output
+    helped = run("--help").output
+    assert "diagnose" in helped and "blind" in helped
+    assert "--effects" in run("diagnose", "-h").output

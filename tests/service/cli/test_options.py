@@ -1,0 +1,117 @@
+"""What the commands share: limits of the operator's, folders checked first, errors in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner
+
+from psfcore.errors import DataError
+from service.cli import options as cli_options
+from service.cli.main import main
+from service.client.http import ServiceError
+
+
+@pytest.fixture
+def psf_file(tmp_path: Path) -> Path:
+    kernel = np.zeros((33, 33))
+    kernel[16, 16] = 1.0
+    fits.PrimaryHDU(kernel).writeto(tmp_path / "psf.fits")
+    return tmp_path / "psf.fits"
+
+
+def test_a_command_reads_as_many_pixels_as_the_settings_let_it(
+    psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert CliRunner().invoke(main, ["psf", "query", str(psf_file)]).exit_code == 0
+    monkeypatch.setenv("HELIOPSF_MAX_PIXELS", str(32 * 32))
+    for command in (["query"], ["show"]):
+        result = CliRunner().invoke(main, ["psf", *command, str(psf_file)])
+        assert result.exit_code == 1
+        assert str(32 * 32) in result.output.replace(",", "")
+
+
+def test_a_setting_that_is_wrong_is_named_in_one_line(
+    psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HELIOPSF_MAX_PIXELS", "many")
+    result = CliRunner().invoke(main, ["psf", "query", str(psf_file)])
+    assert result.exit_code == 1
+    assert "HELIOPSF_MAX_PIXELS" in result.output
+    assert "'many'" in result.output
+
+
+def test_results_that_could_not_be_written_are_said_before_the_work(psf_file: Path, tmp_path: Path) -> None:
+    nowhere = tmp_path / "nowhere" / "result"
+    for command in (
+        ["psf", "query", str(psf_file), "--json", str(nowhere)],
+        ["psf", "cutout", str(psf_file), "--size", "9", "-o", str(nowhere)],
+        ["psf", "rebin", str(psf_file), "--factor", "3", "-o", str(nowhere)],
+        ["arms", str(psf_file), "--plot", str(nowhere)],
+        ["fresnel", "--json", str(nowhere)],
+        ["design", "--json", str(nowhere)],
+    ):
+        result = CliRunner().invoke(main, command)
+        assert result.exit_code == 1, command
+        assert result.output == f"Error: cannot write {nowhere}: there is no folder {nowhere.parent}\n"
+
+
+def test_a_folder_to_fill_is_taken_where_it_is_empty_or_forced(tmp_path: Path) -> None:
+    cli_options.check_fresh_folder(tmp_path / "new")
+    (tmp_path / "full").mkdir()
+    cli_options.check_fresh_folder(tmp_path / "full")
+    (tmp_path / "full" / "file").touch()
+    with pytest.raises(click.ClickException, match="not empty"):
+        cli_options.check_fresh_folder(tmp_path / "full")
+    cli_options.check_fresh_folder(tmp_path / "full", force=True)
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (DataError("code", "expected a; got b"), "expected a; got b"),
+        (ServiceError("refused"), "refused"),
+        (OSError("disk full"), "disk full"),
+        (TimeoutError("late"), "late"),
+    ],
+)
+def test_an_error_of_the_user_s_is_a_line(error: Exception, told: str) -> None:
+    with pytest.raises(click.ClickException) as caught, cli_options.user_errors():
+        raise error
+    assert caught.value.message == told
+
+
+def test_an_error_of_ours_keeps_its_traceback() -> None:
+    with pytest.raises(ZeroDivisionError), cli_options.user_errors():
+        raise ZeroDivisionError
+
+
+def test_json_is_written_where_a_path_is_given_and_holds_no_nan(tmp_path: Path) -> None:
+    cli_options.write_json(None, {"x": 1})
+    cli_options.write_json(tmp_path / "x.json", {"x": 1})
+    assert json.loads((tmp_path / "x.json").read_text()) == {"x": 1}
+    with pytest.raises(ValueError, match="JSON"):
+        cli_options.write_json(tmp_path / "y.json", {"x": float("nan")})
+    assert not (tmp_path / "y.json").exists()
+    with pytest.raises(click.ClickException, match="cannot write"):
+        cli_options.write_json(tmp_path, {"x": 1})
+
+
+def test_progress_says_stage_and_steps_on_a_terminal_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with cli_options.progress_bar() as report:
+        report("reading", 1, 2)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    with cli_options.progress_bar() as report:
+        report("reading", 1, 2)
+        report("nothing to do", 0, 0)
+    told = capsys.readouterr().err
+    assert f"[{'#' * 10}{'-' * 10}] 1/2" in told
+    assert "0/0" in told

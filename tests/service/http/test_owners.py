@@ -1,0 +1,237 @@
+"""Nothing goes across owners: what is another's is answered as if it were not there."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from psfcore.transit.archive import pack
+from tests.conftest import SMALL_INSTRUMENT, write_image
+from tests.service.conftest import upload
+from tests.service.keyed import Keyed, keyed
+from tests.transit_files import write_transit
+from workers.catalogue.contexts import Pin
+from workers.catalogue.keys import Scope
+from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
+from workers.files.store import Store
+from workers.settings import Settings
+
+UNKNOWN = {64: "f" * 64, 32: "f" * 32}
+
+
+@pytest.fixture
+def service(settings: Settings) -> Iterator[Keyed]:
+    with keyed(settings) as running:
+        yield running
+
+
+@pytest.fixture
+def anns(
+    service: Keyed, settings: Settings, image_file: Path, psf_file: Path, tmp_path: Path
+) -> dict[str, str]:
+    """One of everything, ann's; by the name that it has in addresses."""
+    ann = service.client("ann")
+    image_id, psf_id = upload(ann, image_file), upload(ann, psf_file, "/v1/psfs")
+    job = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id}}
+    pending = ann.post("/uws/jobs", data={"KIND": "deconvolve", "image_id": image_id}, follow_redirects=False)
+    store, about = (
+        Store(settings.data_dir),
+        {"owner": "ann", "created_at": time.time(), "details": {}, "bytes": 4},
+    )
+    with store.temporary() as path:
+        path.write_bytes(b"kept")
+        digest = store.keep(path)
+    files = {"file_sha256": digest, "preview_sha256": digest}
+    shown = {
+        "effects_picture_sha256": digest,
+        "page_sha256": digest,
+        "report_sha256": digest,
+        "tables_sha256": digest,
+    }
+    rows: list[Any] = [
+        ProductRow(
+            **about | {"details": shown},
+            **files,
+            id="1" * 64,
+            kind="x",
+            image_id=image_id,
+            psf_id=psf_id,
+            psf_version="1",
+        ),
+        ReportRow(**about | {"details": shown}, **files, id="2" * 64, kind="x", transit_id="3" * 64),
+        PsfRow(
+            **about | {"details": shown},
+            **files,
+            id="4" * 64,
+            name="s3cret",
+            version="1",
+            instrument="hri_euv",
+            line="hri_euv/174/total",
+            status="draft",
+            origin="built",
+        ),
+    ]
+    for row in rows:
+        service.catalogue.add(row)
+    context, _ = service.catalogue.contexts.create("s3cret", "ann", "ann", pins=[Pin("4" * 64)])
+    transit = write_transit(tmp_path / "transit", images=3)
+    pack(transit, tmp_path / "transit.tar")
+    sent = ann.post("/v1/transits", content=(tmp_path / "transit.tar").read_bytes())
+    bulk = ann.post("/v1/bulk", json={"images": [image_id], "psf_id": psf_id})
+    return {
+        "bulk_id": bulk.json()["id"],
+        "image_id": image_id,
+        "psf_id": "4" * 64,
+        "other_id": "4" * 64,
+        "product_id": "1" * 64,
+        "report_id": "2" * 64,
+        "transit_id": sent.json()["id"],
+        "context": context.id,
+        "job_id": ann.post("/v1/jobs", json=job).json()["id"],
+        "uws": pending.headers["location"].rpartition("/")[2],
+        "name": "result",
+    }
+
+
+def asked(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str, str]]:
+    """Every method and address that names something, with these ids, and with ids of nothing."""
+    paths = client.get("/openapi.json").json()["paths"]
+    for path, operations in paths.items():
+        names = re.findall(r"\{(\w+)\}", path)
+        if not names:
+            continue
+        known = {**ids, "job_id": ids["uws"]} if path.startswith("/uws") else ids
+        missing = set(names) - known.keys()
+        assert not missing, (
+            f"{path}: say above what {missing} is of ann's, so that it is asked for as another"
+        )
+        nothing = {name: UNKNOWN.get(len(value), "nothing") for name, value in known.items()}
+        query = {"annulus": "?inner=0&outer=1", "encircled": "?radius=1", "cutout": "?size=2"}
+        tail = query.get(path.rpartition("/")[2], "")
+        for method in operations:
+            yield method.upper(), path.format(**known) + tail, path.format(**nothing) + tail
+
+
+def plain(answer: Any, *ids: str) -> tuple[int, str, str]:
+    """An answer without the ids that were asked for."""
+    text = answer.text
+    for one in ids:
+        text = text.replace(one, "ID")
+    return answer.status_code, answer.headers.get("content-type", ""), text
+
+
+def knock_everywhere(bob: TestClient, anns: dict[str, str]) -> int:
+    """Ask for all that is ann's in every way; returns how often that was."""
+    count = 0
+    for method, address, unknown in asked(bob, anns):
+        for headers in ({}, {"If-None-Match": "*"}, {"Range": "bytes=0-1"}):
+            data = {"PHASE": "RUN", "ACTION": "DELETE", "DESTRUCTION": "2090-01-01", "EXECUTIONDURATION": "9"}
+            body = {"data": data} if address.startswith("/uws") and method == "POST" else {}
+            others = bob.request(method, address, headers=headers, follow_redirects=False, **body)
+            nobodys = bob.request(method, unknown, headers=headers, follow_redirects=False, **body)
+            ids = [*anns.values(), *UNKNOWN.values()]
+            assert plain(others, *ids) == plain(nobodys, *ids), (method, address)
+            assert others.status_code in (404, 422), (method, address, others.text)
+            assert others.status_code == 404 or method != "GET"
+            assert "ETag" not in others.headers and "s3cret" not in others.text
+            count += 1
+    return count
+
+
+def test_another_s_things_are_answered_as_if_there_were_none(service: Keyed, anns: dict[str, str]) -> None:
+    assert knock_everywhere(service.client("bob"), anns) > 100
+
+
+def test_what_another_asked_to_change_has_not_changed(service: Keyed, anns: dict[str, str]) -> None:
+    bob, ann = service.client("bob"), service.client("ann")
+    knock_everywhere(bob, anns)
+    assert bob.delete(f"/v1/jobs/{anns['job_id']}").status_code == 404
+    job = ann.get(f"/v1/jobs/{anns['job_id']}").json()
+    assert job["phase"] == "QUEUED" and not job["cancel_requested"]
+    assert ann.get(f"/uws/jobs/{anns['uws']}/phase").text == "PENDING"
+    assert ann.get(f"/uws/jobs/{anns['uws']}/executionduration").text != "9"
+
+
+def test_lists_show_one_s_own_alone(service: Keyed, anns: dict[str, str]) -> None:
+    bob, ann = service.client("bob"), service.client("ann")
+    lists = [
+        p
+        for p, o in ann.get("/openapi.json").json()["paths"].items()
+        if p.startswith("/v1/") and "{" not in p and "get" in o and p != "/v1/psfs/best"  # one, and no list
+    ]
+    assert len(lists) >= 6
+    for path in lists:
+        anns_page = ann.get(path, params={"limit": 1})
+        assert anns_page.status_code == bob.get(path).status_code == 200, path
+        if anns_page.json().get("items"):
+            assert bob.get(path).json()["items"] == [], path
+            later = anns_page.json()["next"]
+            if later is not None:  # a cursor is a place, and gives nobody a right
+                assert bob.get(later).json()["items"] == []
+    assert service.client("bob").get("/uws/jobs").text.count("jobref") == 0
+    assert ann.get("/uws/jobs").text.count("</uws:jobref>") >= 2
+    assert "<uws:ownerId>ann</uws:ownerId>" in ann.get(f"/uws/jobs/{anns['uws']}").text
+    assert ann.get(f"/uws/jobs/{anns['uws']}/owner").text == "ann"
+
+
+@pytest.mark.parametrize(
+    "kind", ["deconvolve", "deconvolve psf", "psf-tables", "psf-build", "evaluate", "psf-fit", "gap-diagnose"]
+)
+def test_a_job_uses_one_s_own_things_alone(
+    service: Keyed, anns: dict[str, str], kind: str, tmp_path: Path
+) -> None:
+    bob = service.client("bob")
+    write_image(tmp_path / "bobs.fits", seed=2)
+    own = upload(bob, tmp_path / "bobs.fits")
+    parameters: dict[str, Any] = {
+        "deconvolve": {"image_id": anns["image_id"]},
+        "deconvolve psf": {"image_id": own, "psf_id": anns["psf_id"]},
+        "psf-tables": {"psf_id": anns["psf_id"]},
+        "psf-build": {"instrument_file": SMALL_INSTRUMENT, "mask_id": anns["image_id"]},
+        "evaluate": {"transit_id": anns["transit_id"]},
+        "psf-fit": {"transit_id": anns["transit_id"]},
+        "gap-diagnose": {"transit_id": anns["transit_id"]},
+    }[kind]
+    answer = bob.post("/v1/jobs", json={"kind": kind.split()[0], "parameters": parameters})
+    assert answer.status_code == 404, answer.text
+
+
+def test_the_same_bytes_are_uploaded_by_each_for_themselves(service: Keyed, image_file: Path) -> None:
+    ann, bob = service.client("ann"), service.client("bob")
+    content = image_file.read_bytes()
+    assert ann.post("/v1/images?filename=anns.fits", content=content).status_code == 201
+    digest = hashlib.sha256(content).hexdigest()
+    assert bob.get(f"/v1/images/{digest}").status_code == 404, "whoever knows the bytes knows no more"
+    again = bob.post("/v1/images?filename=bobs.fits", content=content)
+    assert again.status_code == 201 and again.json()["filename"] == "bobs.fits"
+    assert ann.get(f"/v1/images/{digest}").json()["filename"] == "anns.fits"
+
+
+def test_equal_requests_of_two_owners_are_two_jobs(service: Keyed) -> None:
+    body = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
+    jobs = [service.client(owner).post("/v1/jobs", json=body) for owner in ("ann", "bob", "ann")]
+    assert [job.status_code for job in jobs] == [202, 202, 200]
+    assert jobs[0].json()["id"] == jobs[2].json()["id"] != jobs[1].json()["id"]
+
+
+def test_an_administrator_may_act_for_an_owner_and_nobody_else_may(
+    service: Keyed, anns: dict[str, str]
+) -> None:
+    for_ann = {"X-Owner": "ann"}
+    address = f"/v1/jobs/{anns['job_id']}"
+    root = service.client("root", *Scope)
+    assert root.get(address).status_code == 404
+    assert root.get(address, headers=for_ann).status_code == 200
+    assert root.get(address, headers={"X-Owner": "a b"}).status_code == 403
+    bob, ann = service.client("bob"), service.client("ann")
+    assert bob.get(address, headers=for_ann).status_code == 403
+    assert ann.get(address, headers=for_ann).status_code == 200, "that is who asks anyway"
+    reader = service.client("root", Scope.ADMIN)
+    assert reader.get(address, headers=for_ann).status_code == 403, "not without the scope to read"

@@ -1,0 +1,298 @@
+"""What an operator sees: request ids, log lines, metrics, readiness."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy import event, text
+from sqlalchemy.exc import OperationalError
+
+from service.app import create_app
+from service.http.state import State
+from tests.service.conftest import upload
+from tests.whole.stack import Missing, Redis, free_port
+from workers import logs
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import DEFAULT_OWNER
+from workers.settings import Settings
+
+AWAY = OperationalError("SELECT 1", None, Exception("no route to s3cret.example"))
+
+
+@pytest.fixture
+def lines() -> Iterator[Callable[[], list[dict[str, Any]]]]:
+    """All that is logged, as the JSON that it is written as."""
+    written = io.StringIO()
+    handler = logging.StreamHandler(written)
+    handler.setFormatter(logs.JsonFormatter())
+    root = logging.getLogger()
+    before = root.level
+    root.addHandler(handler)
+    root.setLevel(logging.INFO)
+    logging.getLogger("httpx").setLevel(logging.WARNING)  # the client that asks
+    yield lambda: [json.loads(line) for line in written.getvalue().splitlines()]
+    root.removeHandler(handler)
+    root.setLevel(before)
+
+
+def handles(api: TestClient) -> State:
+    """The application's own state."""
+    state: State = api.app.state.heliopsf  # type: ignore[attr-defined]
+    return state
+
+
+def scrape(api: TestClient) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
+    answer = api.get("/metrics")
+    assert answer.status_code == 200 and answer.headers["Content-Type"].startswith("text/plain")
+    return {
+        (sample.name, frozenset(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(answer.text)
+        for sample in family.samples
+    }
+
+
+def sample(name: str, **labels: str) -> tuple[str, frozenset[tuple[str, str]]]:
+    return name, frozenset(labels.items())
+
+
+# Requests and logs ----------------------------------------------------------------------------------
+
+
+def test_a_request_keeps_its_id_and_gets_one_where_it_has_none(api: TestClient) -> None:
+    assert api.get("/v1/jobs", headers={"X-Request-ID": "from-me.1"}).headers["X-Request-ID"] == "from-me.1"
+    made = [api.get("/v1/jobs").headers["X-Request-ID"] for _ in range(2)]
+    assert made[0] != made[1] and all(len(one) == 32 for one in made)
+
+
+@pytest.mark.parametrize("sent", ["two words", "x" * 65, 'a"b', ""])
+def test_an_id_that_could_disturb_a_log_is_not_taken(api: TestClient, sent: str) -> None:
+    assert api.get("/v1/jobs", headers={"X-Request-ID": sent}).headers["X-Request-ID"] != sent
+
+
+def test_a_line_says_when_who_what_and_for_which_request(
+    api: TestClient, lines: Callable[[], list[dict[str, Any]]]
+) -> None:
+    api.get("/v1/jobs/" + 32 * "0", headers={"X-Request-ID": "r1"})
+    (line,) = (one for one in lines() if one["logger"] == "service.http.observation")
+    assert line["time"].endswith("+00:00") and line["level"] == "INFO" and line["request"] == "r1"
+    assert (line["route"], line["status"]) == ("/v1/jobs/{job_id}", 404)
+
+
+def test_a_failure_of_ours_has_the_request_s_id_in_answer_and_log(
+    api: TestClient, lines: Callable[[], list[dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("oh")
+
+    monkeypatch.setattr(handles(api).catalogue, "page", fail)
+    answer = api.get("/v1/jobs", headers={"X-Request-ID": "r2"})
+    assert answer.status_code == 500 and answer.headers["X-Request-ID"] == "r2"
+    (line,) = (one for one in lines() if one["logger"] == "service.http.observation")
+    assert line["request"] == "r2" and line["status"] == 500
+
+
+def test_no_header_query_or_file_is_logged(
+    api: TestClient, lines: Callable[[], list[dict[str, Any]]], image_file: Path
+) -> None:
+    header = {"Authorization": "Bearer s3cret", "Cookie": "s3cret"}
+    api.post(
+        "/v1/images",
+        params={"filename": "s3cret.fits"},
+        content=image_file.read_bytes(),
+        headers=header | {"Content-Type": "application/fits"},
+    )
+    written = json.dumps(lines())
+    assert "/v1/images" in written and "s3cret" not in written and "SIMPLE" not in written
+
+
+def test_what_comes_from_outside_stays_on_its_line(
+    api: TestClient, lines: Callable[[], list[dict[str, Any]]]
+) -> None:
+    api.get("/v1/%0a%7b%22level%22:%22forged%22%7d")
+    (line,) = (one for one in lines() if one["logger"] == "service.http.observation")
+    assert "forged" in line["message"] and line["level"] == "INFO"
+
+
+def test_text_stays_on_its_line_too() -> None:
+    record = logging.LogRecord("x", logging.INFO, "", 0, "GET /\nforged \x1b[31m", None, None)
+    assert logs.TextFormatter().format(record).count("\n") == 0
+    assert "\x1b" not in logs.TextFormatter().format(record)
+
+
+@pytest.mark.parametrize(("asked", "form"), [("json", logs.JsonFormatter), ("text", logs.TextFormatter)])
+def test_the_setting_decides_the_form(
+    asked: str, form: type[logging.Formatter], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])  # the test runner's own come back afterwards
+    level = root.level
+    monkeypatch.setenv("HELIOPSF_LOG_FORMAT", asked)
+    try:
+        logs.configure(Settings())
+        assert [type(handler.formatter) for handler in root.handlers] == [form]
+    finally:
+        root.setLevel(level)
+        logging.captureWarnings(False)
+
+
+# Metrics --------------------------------------------------------------------------------------------
+
+
+def test_jobs_are_counted_wherever_they_were_worked_on(api: TestClient, settings: Settings) -> None:
+    elsewhere = Catalogue(settings.catalogue_url)  # as another process would have it
+    first, _ = elsewhere.jobs.submit("psf-build", {}, "a", DEFAULT_OWNER)
+    second, _ = elsewhere.jobs.submit("psf-build", {}, "b", DEFAULT_OWNER)
+    for _ in range(2):
+        lease = elsewhere.jobs.claim(first.id, "w")
+        assert lease is not None and elsewhere.jobs.requeue(lease)
+    lease = elsewhere.jobs.claim(second.id, "w")
+    assert lease is not None
+    time.sleep(0.05)
+    elsewhere.jobs.complete(lease, "r")
+    elsewhere.close()
+    found = scrape(api)
+    assert found[sample("heliopsf_jobs", kind="psf-build", phase="QUEUED")] == 1
+    assert found[sample("heliopsf_jobs", kind="psf-build", phase="COMPLETED")] == 1
+    assert found[sample("heliopsf_jobs", kind="deconvolve", phase="QUEUED")] == 0
+    assert found[sample("heliopsf_job_attempts", kind="psf-build")] == 3
+    assert found[sample("heliopsf_job_retries", kind="psf-build")] == 1
+    assert 0.05 <= found[sample("heliopsf_job_run_seconds", kind="psf-build")] < 5
+    assert 0.05 <= found[sample("heliopsf_oldest_queued_seconds", queue="interactive")] < 60
+
+
+def test_bytes_that_came_and_bytes_that_are_kept(api: TestClient, image_file: Path) -> None:
+    size = image_file.stat().st_size
+    for _ in range(2):  # sent twice, kept once
+        upload(api, image_file)
+    found = scrape(api)
+    assert found[sample("heliopsf_file_bytes", kind="image", origin="uploaded")] == size
+    assert found[sample("heliopsf_files", kind="image", origin="uploaded")] == 1
+    assert found[sample("heliopsf_http_received_bytes_total", route="/v1/images")] == 2 * size
+
+
+def test_workers_that_are_there_and_jobs_that_none_looks_after(api: TestClient, settings: Settings) -> None:
+    catalogue = handles(api).catalogue
+    assert scrape(api)[sample("heliopsf_workers")] == 0
+    catalogue.census.announce("host:1", time.time(), "1")
+    catalogue.census.announce("host:1", time.time(), "1")
+    catalogue.census.announce("host:2", time.time(), "1")
+    catalogue.census.take_leave("host:2")
+    found = scrape(api)
+    assert found[sample("heliopsf_workers")] == 1 and found[sample("heliopsf_jobs_silent")] == 0
+
+
+def test_requests_are_counted_by_route_and_never_by_path(api: TestClient) -> None:
+    for number in range(3):
+        api.get(f"/v1/jobs/{number:032x}")
+        api.get(f"/nowhere/{number}")
+        api.request(f"WORD{number}", "/v1/jobs")
+    found = scrape(api)
+    asked = {key: value for key, value in found.items() if key[0] == "heliopsf_http_requests_total"}
+    route = "/v1/jobs/{job_id}"
+    assert asked[sample("heliopsf_http_requests_total", route=route, method="GET", status="404")] == 3
+    assert asked[sample("heliopsf_http_requests_total", route="none", method="GET", status="404")] == 3
+    assert sum(value for (_, labels), value in asked.items() if ("method", "other") in labels) == 3
+    assert len(asked) == 3
+    bucket = sample("heliopsf_http_request_seconds_bucket", route=route, method="GET", le="+Inf")
+    assert found[bucket] == 3
+
+
+def test_a_scrape_reads_indexes_alone(api: TestClient) -> None:
+    asked: list[tuple[str, Any]] = []
+    engine = handles(api).catalogue._engine
+
+    def note(_c: Any, _cursor: Any, statement: str, parameters: Any, *_: Any) -> None:
+        asked.append((statement, parameters))
+
+    event.listen(engine, "before_cursor_execute", note)
+    scrape(api)
+    event.remove(engine, "before_cursor_execute", note)
+    queries = [one for one in asked if one[0].lstrip().startswith("SELECT") and "FROM " in one[0]]
+    tables = {"jobs", "images", "transits", "psfs", "products", "reports"}
+    seen = set()
+    with engine.connect() as connection:
+        for statement, parameters in queries:
+            plan = connection.exec_driver_sql("EXPLAIN QUERY PLAN " + statement, parameters).all()
+            for step in (str(row[-1]) for row in plan):
+                table = step.split()[1] if step.split()[0] in ("SCAN", "SEARCH") else ""
+                if table in tables:
+                    seen.add(table)
+                    assert "COVERING INDEX" in step or step.startswith("SEARCH"), (statement, step)
+    assert seen == tables
+
+
+def test_metrics_say_that_the_database_is_away(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert scrape(api)[sample("heliopsf_database_up")] == 1
+
+    def away() -> None:
+        raise AWAY
+
+    monkeypatch.setattr(handles(api).catalogue.census, "tally", away)
+    found = scrape(api)
+    assert found[sample("heliopsf_database_up")] == 0
+    assert not any(name == "heliopsf_jobs" for name, _ in found)
+
+
+# Readiness ------------------------------------------------------------------------------------------
+
+
+def test_ready_once_the_embedded_worker_is_there(api: TestClient) -> None:
+    answer = api.get("/readyz")
+    assert answer.status_code == 503 and answer.headers["Content-Type"] == "application/problem+json"
+    parts = answer.json()["parts"]
+    assert parts["database"] == parts["storage"] == "ok" and "no worker" in parts["worker"]
+    assert api.get("/healthz").status_code == 200
+    handles(api).catalogue.census.announce("host:1", time.time(), "1")
+    assert api.get("/readyz").json() == {
+        "status": "ready",
+        "parts": {"database": "ok", "storage": "ok", "worker": "ok"},
+    }
+    with handles(api).catalogue._engine.begin() as connection:  # a worker that was killed falls silent
+        connection.execute(text("UPDATE workers SET heartbeat_at = heartbeat_at - 3000"))
+    assert api.get("/readyz").status_code == 503
+
+
+def test_not_ready_where_files_cannot_be_written(api: TestClient, settings: Settings) -> None:
+    settings.data_dir.rename(settings.data_dir.with_name("gone"))
+    parts = api.get("/readyz").json()["parts"]
+    settings.data_dir.with_name("gone").rename(settings.data_dir)
+    assert "cannot be written" in parts["storage"]
+
+
+def test_not_ready_without_a_database(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away() -> None:
+        raise AWAY
+
+    monkeypatch.setattr(handles(api).catalogue, "ping", away)
+    answer = api.get("/readyz")
+    assert answer.status_code == 503 and "does not answer" in answer.json()["parts"]["database"]
+    assert "s3cret" not in answer.text
+
+
+def test_ready_with_a_broker_that_answers(settings: Settings, tmp_path: Path) -> None:
+    try:
+        redis = Redis(tmp_path)
+    except Missing as missing:
+        pytest.skip(str(missing))
+    with redis, TestClient(create_app(settings.model_copy(update={"broker_url": redis.url}))) as api:
+        assert api.get("/readyz").json()["parts"] == {"database": "ok", "storage": "ok", "broker": "ok"}
+        redis.kill()
+        assert api.get("/readyz").status_code == 503
+
+
+def test_not_ready_without_the_broker(settings: Settings) -> None:
+    nobody = settings.model_copy(update={"broker_url": f"redis://:s3cret@127.0.0.1:{free_port()}/0"})
+    with TestClient(create_app(nobody)) as api:
+        answer = api.get("/readyz")
+    assert answer.status_code == 503 and set(answer.json()["parts"]) == {"database", "storage", "broker"}
+    assert "does not answer" in answer.json()["parts"]["broker"]
+    assert "s3cret" not in answer.text

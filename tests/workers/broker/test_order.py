@@ -1,0 +1,146 @@
+"""Queues: who waits where, in which order messages are taken, and what goes up when somebody wants it at once."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from queue import Empty
+
+import pytest
+from click.testing import CliRunner
+from kombu import pools
+from pydantic import ValidationError
+from sqlalchemy import update
+
+from service.cli.main import main
+from workers.broker import app as queue
+from workers.broker.order import FolderTransport, MostUrgentFirst
+from workers.broker.reconciler import AT_ONCE, reconcile
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import JobRow
+from workers.contract.queues import Queue, broker_name, by_urgency, queue_of, queues_named
+from workers.settings import Settings
+
+
+def test_the_most_urgent_come_first_whatever_order_they_are_named_in() -> None:
+    assert queues_named(" bulk,interactive ") == (Queue.INTERACTIVE, Queue.BULK)
+    names = [broker_name(one) for one in (Queue.BULK, Queue.INTERACTIVE, Queue.CROSSVAL)]
+    ours = [broker_name(one) for one in Queue]
+    assert by_urgency([*names, "celery@host.pidbox"]) == ["celery@host.pidbox", *ours]
+    assert MostUrgentFirst(list(names)).consume(3) == ours
+
+
+@pytest.mark.parametrize("names", ["", ",", "interactive,soon", "Bulk"])
+def test_queues_that_are_none_are_refused(names: str) -> None:
+    with pytest.raises(ValueError, match="expected queues of interactive, crossval, bulk"):
+        queues_named(names)
+    with pytest.raises(ValidationError):
+        Settings(worker_queues=names)
+    answer = CliRunner().invoke(main, ["worker", "--queues", names])
+    assert answer.exit_code == 2 and "expected queues of" in answer.output
+
+
+def test_a_job_waits_where_its_kind_does_or_where_it_was_told_to(catalogue: Catalogue) -> None:
+    kinds = {"deconvolve": Queue.INTERACTIVE, "cross-validate": Queue.CROSSVAL, "bulk": Queue.BULK}
+    for kind, expected in kinds.items():
+        row, _ = catalogue.jobs.submit(kind, {}, kind, "o")
+        assert row.queue == expected == queue_of(kind)
+    assert catalogue.jobs.submit("deconvolve", {}, "later", "o", queue=Queue.BULK)[0].queue == Queue.BULK
+    assert catalogue.uws.draft("cross-validate", {}, owner="o").queue == Queue.CROSSVAL
+
+
+def test_what_is_most_urgent_is_submitted_first_then_what_is_oldest(catalogue: Catalogue) -> None:
+    made = [
+        catalogue.jobs.submit("psf-build", {}, str(number), "o", queue=one)[0].id
+        for number, one in enumerate((Queue.BULK, Queue.INTERACTIVE, Queue.CROSSVAL, Queue.INTERACTIVE))
+    ]
+    expected = [made[1], made[3], made[2], made[0]]
+    waiting = catalogue.jobs.unsubmitted(0.0)
+    assert [job.id for job in waiting] == expected
+    assert [job.queue for job in waiting][-1] == Queue.BULK
+    assert [job.id for job in catalogue.jobs.unsubmitted(0.0, limit=3)] == expected[:3]
+    catalogue.jobs.mark_submitted(*made)
+    assert catalogue.jobs.unsubmitted(60.0) == []
+
+
+def test_an_equal_job_that_somebody_wants_at_once_goes_up_and_never_down(catalogue: Catalogue) -> None:
+    row, _ = catalogue.jobs.submit("deconvolve", {}, "k", "o", queue=Queue.BULK)
+    catalogue.jobs.mark_submitted(row.id)
+    assert catalogue.jobs.unsubmitted(60.0) == []
+    again, new = catalogue.jobs.submit("deconvolve", {}, "k", "o")
+    assert (again.id, new, again.queue) == (row.id, False, Queue.INTERACTIVE)
+    (waiting,) = catalogue.jobs.unsubmitted(60.0)
+    assert waiting.queue == Queue.INTERACTIVE, "it is submitted again, to the other queue"
+    assert catalogue.jobs.submit("deconvolve", {}, "k", "o", queue=Queue.BULK)[0].queue == Queue.INTERACTIVE
+    lease = catalogue.jobs.claim(row.id, "w")
+    assert lease is not None
+    catalogue.jobs.submit("deconvolve", {}, "k", "o")
+    found = catalogue.jobs.get(row.id)
+    assert found is not None and found.phase == "EXECUTING"
+
+
+def test_the_wait_of_a_job_that_is_submitted_over_and_over_doubles_and_ends_growing(
+    catalogue: Catalogue,
+) -> None:
+    catalogue.jobs.submit("psf-build", {}, "k", "o")
+    for submissions, wait_s in ((1, 10.0), (2, 20.0), (8, 1280.0), (9, 2560.0), (40, 2560.0)):
+        for ago_s, due in ((wait_s * 0.9, False), (wait_s * 1.1, True)):
+            with catalogue._engine.begin() as connection:
+                values = {"submissions": submissions, "submitted_at": time.time() - ago_s}
+                connection.execute(update(JobRow).values(**values))
+            assert bool(catalogue.jobs.unsubmitted(10.0)) is due, values
+
+
+def test_the_folder_s_messages_come_in_our_order(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://")
+    app = queue.make_app(settings)
+    catalogue = Catalogue(settings.catalogue_url)
+    catalogue.upgrade()
+    for number in range(AT_ONCE + 10):
+        catalogue.jobs.submit("psf-build", {}, str(number), "o", queue=Queue.BULK)
+    assert reconcile(catalogue, app, settings) == AT_ONCE
+    mine, _ = catalogue.jobs.submit("deconvolve", {}, "mine", "o")
+    folds, _ = catalogue.jobs.submit("cross-validate", {}, "folds", "o")
+    assert reconcile(catalogue, app, settings) == 12, "what is left of the many, after the two"
+    taken: list[str] = []
+    with app.connection_for_read() as connection:
+        channel = connection.default_channel
+        for one in (Queue.BULK, Queue.CROSSVAL, Queue.INTERACTIVE):
+            channel.basic_consume(
+                broker_name(one), True, lambda message: taken.append(message.payload[0][0]), str(one)
+            )
+        for _ in range(3):
+            channel.drain_events(timeout=1)
+        assert taken[:2] == [mine.id, folds.id]
+        for _ in range(AT_ONCE + 9):
+            channel.drain_events(timeout=1)
+        with pytest.raises(Empty):
+            channel.drain_events(timeout=1)
+    assert len(set(taken)) == AT_ONCE + 12
+    catalogue.close()
+
+
+def test_what_was_cut_in_the_folder_when_the_power_went_stops_nobody(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://")
+    broker = settings.data_dir / "broker"
+
+    def take() -> list[str]:
+        taken: list[str] = []
+        with queue.make_app(settings).connection_for_read() as connection:
+            channel = connection.default_channel
+            name = broker_name(Queue.BULK)
+            channel.basic_consume(name, True, lambda message: taken.append(message.payload[0][0]), "tag")
+            channel.drain_events(timeout=1)
+        return taken
+
+    assert queue.submit(queue.make_app(settings), "first", Queue.BULK)
+    assert take() == ["first"]
+    for content in ("", "[["):
+        (broker / "control" / f"{broker_name(Queue.INTERACTIVE)}.exchange").write_text(content)
+        # As in a process that has just started.
+        FolderTransport.global_state.clear()
+        pools.reset()
+        # A message that is being written is not taken.
+        (broker / "queue" / f"1_x.{broker_name(Queue.BULK)}.msg.ab.part").write_text("")
+        assert queue.submit(queue.make_app(settings), "second", Queue.BULK)
+        assert take() == ["second"]

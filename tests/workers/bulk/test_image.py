@@ -1,0 +1,52 @@
+"""An image of a bulk, with a store whose copies of the files here may be removed at any time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from tests.s3 import s3_bucket
+from tests.service.conftest import upload
+from workers.bulk import image as bulk_image
+from workers.bulk.turns import keep_turns
+from workers.catalogue.catalogue import Catalogue
+from workers.files.opened import open_store
+from workers.run.runner import Runner
+from workers.settings import Settings
+
+
+def test_an_upload_s_copy_that_is_removed_during_a_wait_is_fetched_again(
+    tmp_path: Path, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with s3_bucket(monkeypatch) as (url, _):
+        data = {"data_dir": tmp_path / "data", "store_url": url}
+        settings = Settings.model_validate(
+            data | {"broker_url": "filesystem://", "allowed_hosts": "testserver"}
+        )
+        with TestClient(create_app(settings)) as api:
+            image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+            few = {"method": {"name": "richardson-lucy", "steps": 1}}
+            body = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id, **few}}
+            job = api.post("/v1/jobs", json=body).json()
+            request = {"images": [image_id], "psf_id": psf_id, "parameters": few}
+            bulk = api.post("/v1/bulk", json=request).json()
+        catalogue = Catalogue(settings.catalogue_url)
+        lease = catalogue.jobs.claim(job["id"], worker="another")
+        assert lease is not None
+        (copy,) = (path for path in tmp_path.rglob(image_id) if path.is_file())
+
+        def rest() -> None:
+            copy.unlink()
+            assert catalogue.jobs.requeue(lease)
+
+        monkeypatch.setattr(bulk_image, "_rest", rest)
+        keep_turns(catalogue, settings)
+        (turn,) = catalogue.jobs.of_kind("bulk")
+        Runner(settings, catalogue, open_store(settings)).run(turn.id)
+        row = catalogue.bulks.get(bulk["id"])
+        assert row is not None and (row.done, row.failed) == (1, 0)
+        assert copy.is_file()
+        catalogue.close()

@@ -1,0 +1,245 @@
+"""The database's revision: new, adopted, older and newer databases; data that stay; processes that start at once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
+from sqlalchemy import insert, inspect, select, text
+from sqlalchemy.exc import DatabaseError
+
+from tests.tables import RUN_REVISIONS
+from tests.whole.stack import Missing, postgres_database
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.migrations.versions.r0001_baseline import METADATA as BASELINE
+from workers.catalogue.migrations.versions.r0003_psf_versions import BATCH
+from workers.catalogue.schema import Schema, SchemaError
+from workers.catalogue.tables import Base, ImageRow, ProductRow, PsfRow
+from workers.settings import Settings
+from workers.versions.series import line_of
+
+OLD_ROWS = {
+    "images": {"bytes": 5, "filename": "a.fits", "summary": {"instrument": "hri_euv"}},
+    "psfs": {
+        "name": "hri", "version": "1.0.0+0", "instrument": "hri_euv", "status": "draft", "origin": "built",
+        "file_sha256": "f" * 64, "bytes": 7, "details": {"shape": [4, 4], "components": ["AIRY"]},
+    },
+    "products": {
+        "kind": "deconvolved-image", "image_id": "a" * 64, "psf_id": "b" * 64, "psf_version": "1.0.0+0",
+        "file_sha256": "e" * 64, "bytes": 9, "preview_sha256": "d" * 64, "details": {"job_id": "1" * 32},
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.setattr(Schema, "upgrade", RUN_REVISIONS)
+    if request.param == "sqlite":
+        yield f"sqlite:///{tmp_path / 'c.sqlite'}"
+        return
+    with ExitStack() as resources:
+        try:
+            made = resources.enter_context(postgres_database())
+        except Missing as missing:
+            pytest.skip(str(missing))
+        yield Settings(database_url=made).catalogue_url
+
+
+@pytest.fixture
+def catalogue(url: str) -> Iterator[Catalogue]:
+    """On an empty database."""
+    catalogue = Catalogue(url)
+    yield catalogue
+    catalogue.close()
+
+
+def make_as_before_revisions(catalogue: Catalogue) -> None:
+    """The tables of the versions before revisions, with a row each."""
+    BASELINE.create_all(catalogue._engine)
+    with catalogue._engine.begin() as connection:
+        for number, (name, row) in enumerate(OLD_ROWS.items()):
+            identity = "abc"[number] * 64
+            connection.execute(
+                insert(BASELINE.tables[name]),
+                {"owner": "local", "id": identity, "created_at": float(number), **row},
+            )
+
+
+def differences(catalogue: Catalogue) -> list[object]:
+    """Between the database and the tables that the code works with, as alembic sees them."""
+    options = {"compare_type": True, "compare_server_default": True}
+    with catalogue._engine.connect() as connection:
+        found: list[object] = compare_metadata(
+            MigrationContext.configure(connection, opts=options), Base.metadata
+        )
+        return found
+
+
+def indexes(catalogue: Catalogue) -> set[str]:
+    """The database's indexes in its own words, with the condition of those that have one."""
+    statement = (
+        "SELECT sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL"
+        if catalogue._engine.dialect.name == "sqlite"
+        else "SELECT indexdef FROM pg_indexes WHERE schemaname = 'public' AND tablename <> 'alembic_version'"
+    )
+    with catalogue._engine.connect() as connection:
+        return set(connection.scalars(text(statement)))
+
+
+def test_a_new_database_has_the_tables_that_the_code_works_with(url: str, catalogue: Catalogue) -> None:
+    assert catalogue.schema.status().state == "empty"
+    catalogue.upgrade()
+    assert catalogue.schema.status().state == "current"
+    assert differences(catalogue) == []
+    upgraded = indexes(catalogue)
+    with catalogue._engine.begin() as connection:
+        Base.metadata.drop_all(connection)
+        Base.metadata.create_all(connection)
+    assert upgraded == indexes(catalogue)
+
+
+def test_a_database_from_before_revisions_is_adopted_with_its_data(catalogue: Catalogue) -> None:
+    make_as_before_revisions(catalogue)
+    with catalogue._engine.begin() as connection:  # as one of an even earlier version
+        connection.execute(text("DROP TABLE workers"))
+        connection.execute(text("DROP INDEX jobs_tallied"))
+    assert catalogue.schema.status().state == "unversioned"
+    catalogue.upgrade()
+    assert catalogue.schema.status().state == "current"
+    assert differences(catalogue) == []
+    image, psf, product = (
+        catalogue.get(table, letter * 64, "local")
+        for table, letter in ((ImageRow, "a"), (PsfRow, "b"), (ProductRow, "c"))
+    )
+    assert image is not None and image.summary == {"instrument": "hri_euv"}
+    assert psf is not None and psf.version == "1.0.0+0" and psf.details["shape"] == [4, 4]
+    assert product is not None and product.psf_id == psf.id and product.created_at == 2.0
+
+
+@pytest.mark.parametrize(
+    ("row", "line"),
+    [
+        ({"origin": "built", "details": {"wavelength_angstrom": 171.07}}, ("hri_euv", "171", "total")),
+        (
+            {
+                "origin": "built",
+                "details": {
+                    "wavelength_angstrom": 174.0,
+                    "provenance": {"parameters": {"component": "diffraction"}},
+                },
+            },
+            ("hri_euv", "174", "diffraction"),
+        ),
+        ({"origin": "fitted", "details": {"provenance": {"parameters": {}}}}, ("hri_euv", "174", "total")),
+        (
+            {"origin": "uploaded", "status": "uploaded", "instrument": None, "details": {}},
+            (None, None, "uploaded"),
+        ),
+        (
+            {"origin": "built", "status": "released", "instrument": "mine", "details": {}},
+            ("mine", None, "total"),
+        ),
+    ],
+)
+def test_psfs_get_the_line_that_their_rows_tell_of(
+    catalogue: Catalogue, row: dict[str, Any], line: tuple[str | None, ...]
+) -> None:
+    make_as_before_revisions(catalogue)
+    with catalogue._engine.begin() as connection:
+        connection.execute(
+            insert(BASELINE.tables["psfs"]),
+            {**OLD_ROWS["psfs"], "owner": "o", "id": "9" * 64, "created_at": 1.0, **row},
+        )
+    catalogue.upgrade()
+    psf = catalogue.get(PsfRow, "9" * 64, "o")
+    assert psf is not None and psf.status == "draft"
+    assert (psf.instrument, psf.channel, psf.kind) == line
+    assert psf.line == line_of(*line)
+
+
+def test_more_psfs_than_are_filled_at_a_time_are_all_filled(catalogue: Catalogue) -> None:
+    make_as_before_revisions(catalogue)
+    rows = [
+        {**OLD_ROWS["psfs"], "owner": "xyz"[n % 3], "id": f"{n:064x}", "created_at": 1.0}
+        for n in range(BATCH + 100)
+    ]
+    with catalogue._engine.begin() as connection:
+        connection.execute(insert(BASELINE.tables["psfs"]), rows)
+    catalogue.upgrade()
+    with catalogue._engine.connect() as connection:
+        assert set(connection.scalars(select(PsfRow.line))) == {"hri_euv/174/total"}
+
+
+def test_a_revision_between_is_upgraded(catalogue: Catalogue) -> None:
+    make_as_before_revisions(catalogue)
+    with catalogue._engine.begin() as connection:
+        connection.execute(
+            text("CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL PRIMARY KEY)")
+        )
+        connection.execute(text("INSERT INTO alembic_version VALUES ('0001')"))
+    assert catalogue.schema.status().state == "older"
+    catalogue.upgrade()
+    assert catalogue.schema.status().state == "current" and differences(catalogue) == []
+    with catalogue._engine.connect() as connection:
+        assert connection.scalar(select(PsfRow.bytes)) == 7
+
+
+def test_a_later_revision_is_refused_and_left_alone(catalogue: Catalogue) -> None:
+    catalogue.upgrade()
+    with catalogue._engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    with pytest.raises(SchemaError, match=r"at revision 9999.*knows revisions up to 0"):
+        catalogue.upgrade()
+    assert catalogue.schema.status().revision == "9999"
+
+
+def test_tables_that_were_never_ours_are_refused_and_left_alone(catalogue: Catalogue) -> None:
+    with catalogue._engine.begin() as connection:
+        connection.execute(text("CREATE TABLE images (id VARCHAR(64) PRIMARY KEY, pixels TEXT)"))
+    with pytest.raises(SchemaError, match=r"expected those of heliopsf 0\.1.*images\.owner.*images\.summary"):
+        catalogue.upgrade()
+    assert inspect(catalogue._engine).get_table_names() == ["images"]
+
+
+def test_an_upgrade_that_fails_leaves_nothing_behind(catalogue: Catalogue) -> None:
+    """Revisions are one transaction: tables that an earlier one made go where a later one fails."""
+    with catalogue._engine.begin() as connection:
+        connection.execute(text("CREATE TABLE keys (id INTEGER PRIMARY KEY)"))  # in the second one's way
+    with pytest.raises(DatabaseError, match="exists"):
+        catalogue.upgrade()
+    assert inspect(catalogue._engine).get_table_names() == ["keys"]
+
+
+STARTS = """
+import sys, time
+from workers.catalogue.catalogue import Catalogue
+catalogue = Catalogue(sys.argv[1])
+time.sleep(max(0.0, float(sys.argv[2]) - time.time()))
+catalogue.upgrade()
+print(catalogue.schema.status().state, catalogue.schema.faults().tables)
+"""
+
+
+@pytest.mark.parametrize("adopted", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_processes_that_start_at_once_make_one_upgrade(url: str, catalogue: Catalogue, adopted: bool) -> None:
+    if adopted:
+        make_as_before_revisions(catalogue)
+    at = str(time.time() + 4.0)
+    started = [
+        subprocess.Popen([sys.executable, "-c", STARTS, url, at], stdout=subprocess.PIPE, text=True)
+        for _ in range(3)
+    ]
+    said = [process.communicate(timeout=60)[0].strip() for process in started]
+    assert [process.returncode for process in started] == [0] * 3
+    assert said == ["current ()"] * 3
+    assert differences(catalogue) == []
+    with catalogue._engine.connect() as connection:
+        assert connection.scalar(text("SELECT count(*) FROM alembic_version")) == 1

@@ -1,0 +1,122 @@
+"""Jobs that are set up before they start: PENDING and what follows, and the terms that end them."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.contract.contract import Phase
+
+
+def drafted(catalogue: Catalogue, **terms: Any) -> JobRow:
+    return catalogue.uws.draft("psf-build", {"instrument": "hri_euv"}, owner=DEFAULT_OWNER, **terms)
+
+
+def phase(catalogue: Catalogue, job: JobRow) -> Phase:
+    row = catalogue.jobs.get(job.id)
+    assert row is not None
+    return Phase(row.phase)
+
+
+def test_a_pending_job_waits_to_be_told(catalogue: Catalogue) -> None:
+    job = drafted(catalogue)
+    assert phase(catalogue, job) == Phase.PENDING and not Phase.PENDING.ended
+    assert catalogue.jobs.claim(job.id, "me") is None
+    assert catalogue.jobs.unsubmitted(0.0) == [] and catalogue.jobs.give_up_silent(0.0, 3) == []
+    assert drafted(catalogue).id != job.id, "two may be set up alike"
+    assert catalogue.jobs.submit("psf-build", {"instrument": "hri_euv"}, "k", DEFAULT_OWNER)[1], (
+        "equal requests do not share it"
+    )
+
+
+def test_each_phase_after_pending(catalogue: Catalogue) -> None:
+    job = drafted(catalogue)
+    assert catalogue.uws.amend(job.id, lambda given: given | {"size": "64"})
+    assert not catalogue.uws.start(job.id, job.parameters, {"size": 0}, "k"), "it was changed since"
+    given = {"instrument": "hri_euv", "size": "64"}
+    assert catalogue.uws.start(job.id, given, {"instrument": "hri_euv", "size": 64}, "k")
+    row = catalogue.jobs.get(job.id)
+    assert row is not None and (row.phase, row.parameters["size"], row.request_key) == (Phase.QUEUED, 64, "k")
+    assert not catalogue.uws.start(job.id, row.parameters, {}, "k")
+    assert not catalogue.uws.amend(job.id, lambda given: {})
+    assert [waiting.id for waiting in catalogue.jobs.unsubmitted(0.0)] == [job.id]
+    assert catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)[0].id != job.id, (
+        "its client may destroy or limit it: an equal request does not share that end"
+    )
+    lease = catalogue.jobs.claim(job.id, "me")
+    assert lease is not None and not catalogue.uws.start(job.id, row.parameters, {}, "k")
+    assert catalogue.jobs.complete(lease, "r")
+    assert not catalogue.uws.start(job.id, row.parameters, {}, "k")
+    assert phase(catalogue, job) == Phase.COMPLETED
+
+    dropped = drafted(catalogue)
+    catalogue.jobs.cancel(dropped.id)
+    assert phase(catalogue, dropped) == Phase.ABORTED
+    assert not catalogue.uws.start(dropped.id, dropped.parameters, {}, "other")
+    assert not catalogue.uws.amend(dropped.id, lambda given: {})
+
+
+def test_of_many_that_start_a_job_one_does_and_equal_ones_all_run_in_turn(catalogue: Catalogue) -> None:
+    job = drafted(catalogue)
+    with ThreadPoolExecutor(8) as pool:
+        told = list(pool.map(lambda _: catalogue.uws.start(job.id, job.parameters, {}, "k"), range(16)))
+    assert sum(told) == 1
+    others = [drafted(catalogue) for _ in range(6)]
+    with ThreadPoolExecutor(6) as pool:
+        told = list(pool.map(lambda other: catalogue.uws.start(other.id, other.parameters, {}, "k"), others))
+    assert all(told)
+    for other in others:
+        lease = catalogue.jobs.claim(other.id, "me")
+        assert lease is not None and catalogue.jobs.complete(lease, "r")
+    assert len({row.request_key for row in catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=20)}) == 7
+
+
+def test_a_change_that_fails_changes_nothing(catalogue: Catalogue) -> None:
+    job = drafted(catalogue)
+
+    def change(given: dict[str, Any]) -> dict[str, Any]:
+        raise ValueError(given)
+
+    with pytest.raises(ValueError):
+        catalogue.uws.amend(job.id, change)
+    row = catalogue.jobs.get(job.id)
+    assert row is not None and row.parameters == job.parameters
+
+
+def test_a_destroyed_job_is_lost_to_its_worker(catalogue: Catalogue) -> None:
+    job = drafted(catalogue, run_id="mine", destruction_at=time.time() + 60)
+    assert catalogue.uws.start(job.id, job.parameters, {}, "k")
+    lease = catalogue.jobs.claim(job.id, "me")
+    assert lease is not None
+    assert catalogue.uws.destroy(job.id) and not catalogue.uws.destroy(job.id)
+    assert catalogue.jobs.get(job.id) is None and catalogue.uws.terms(job.id).run_id is None
+    assert not catalogue.jobs.heartbeat(lease) and not catalogue.jobs.progress(lease, "s", 1, 2)
+    assert not catalogue.jobs.complete(lease, "r") and not catalogue.jobs.abort(lease)
+    catalogue.uws.set_terms(job.id, execution_duration_s=5)
+    assert catalogue.uws.terms(job.id).execution_duration_s == 0, "a job that is gone gets no terms"
+    assert catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)[1], "an equal request is a new job"
+
+
+def test_terms_end_jobs(catalogue: Catalogue) -> None:
+    endless, slow, due, kept = (drafted(catalogue) for _ in range(4))
+    catalogue.uws.set_terms(slow.id, execution_duration_s=1)
+    catalogue.uws.set_terms(due.id, destruction_at=time.time() - 1)
+    catalogue.uws.set_terms(kept.id, destruction_at=time.time() + 60)
+    catalogue.uws.set_terms(kept.id, execution_duration_s=7)
+    assert catalogue.uws.terms(kept.id).destruction_at is not None, "one term is changed, the others stay"
+    leases = {}
+    for job in (endless, slow):
+        assert catalogue.uws.start(job.id, job.parameters, {}, job.id)
+        leases[job.id] = catalogue.jobs.claim(job.id, "me")
+    assert catalogue.uws.end_by_terms() == [due.id]
+    assert catalogue.jobs.heartbeat(leases[slow.id])
+    time.sleep(1.1)
+    assert catalogue.uws.end_by_terms() == []
+    assert not catalogue.jobs.heartbeat(leases[slow.id]) and catalogue.jobs.heartbeat(leases[endless.id])
+    assert catalogue.jobs.abort(leases[slow.id]) and phase(catalogue, slow) == Phase.ABORTED
+    assert [line.id for line in catalogue.uws.lines(owner=DEFAULT_OWNER)] == [kept.id, slow.id, endless.id]

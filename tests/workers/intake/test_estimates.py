@@ -1,0 +1,201 @@
+"""What a job is expected to need, what is refused for it, and what is stopped after all."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from psfcore.errors import DataError
+from service.client.http import ServiceError
+from service.local import LocalService
+from tests.conftest import SMALL_INSTRUMENT
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
+from workers.contract.contract import Method, PsfBuild, RichardsonLucy
+from workers.intake.estimates import MARGIN_SHARE, STEP_NS, _build, checked, estimate
+from workers.run import registry as tasks
+from workers.settings import Settings
+from workers.tasks.context import Context
+
+OWNER = "ann"
+
+
+def image(catalogue: Catalogue, px: int) -> str:
+    identity = f"{px:064x}"
+    catalogue.add(
+        ImageRow(
+            owner=OWNER, id=identity, created_at=0.0, bytes=1, filename=None, summary={"shape": [px, px]}
+        )
+    )
+    return identity
+
+
+def psf(catalogue: Catalogue, px: int, **details: Any) -> str:
+    identity = f"{px:064x}"
+    catalogue.add(
+        PsfRow(
+            owner=OWNER, id=identity, created_at=0.0, name="p", version="1", status="uploaded", origin="uploaded",
+            file_sha256=identity, bytes=1, details={"shape": [px, px], **details},
+        )
+    )  # fmt: skip
+    return identity
+
+
+def deconvolution(catalogue: Catalogue, px: int = 1024, **changes: Any) -> dict[str, Any]:
+    method = RichardsonLucy().model_dump(mode="json") | changes.pop("method", {})
+    wanted = {"image_id": image(catalogue, px), "psf_id": psf(catalogue, 512), "psf_recipe": None}
+    return {**wanted, "method": method, "error_draws": 0, **changes}
+
+
+def needs(
+    catalogue: Catalogue, kind: str, parameters: dict[str, Any], threads: int = 1
+) -> tuple[float, float]:
+    found = estimate(kind, parameters, catalogue, OWNER, threads)
+    assert found.as_json() == {"memory_mib": found.memory_mib, "seconds": found.seconds}
+    return found.seconds, found.memory_mib
+
+
+def test_every_method_has_its_figures() -> None:
+    names = {kind.model_fields["name"].annotation.__args__[0] for kind in Method.__args__[0].__args__}  # type: ignore[attr-defined]
+    assert set(STEP_NS) == names and names > set(MARGIN_SHARE)
+
+
+def test_more_to_do_needs_more(catalogue: Catalogue) -> None:
+    base = needs(catalogue, "deconvolve", deconvolution(catalogue))
+    bigger = needs(catalogue, "deconvolve", deconvolution(catalogue, 4096))
+    assert bigger[0] > 8 * base[0] and bigger[1] > base[1] + 1000
+    steps = needs(catalogue, "deconvolve", deconvolution(catalogue, method={"steps": 200}))
+    assert 3 * base[0] < steps[0] < 10 * base[0] and steps[1] == base[1]
+    drawn = needs(catalogue, "deconvolve", deconvolution(catalogue, error_draws=16))
+    assert drawn[0] > 3 * base[0] and drawn[1] > base[1]
+    wide = needs(catalogue, "deconvolve", deconvolution(catalogue, method={"margin_px": 2048}))
+    assert wide[0] > 5 * base[0] and wide[1] > base[1] + 500
+    none = needs(
+        catalogue, "deconvolve", deconvolution(catalogue, method={"edges": "zero", "margin_px": 2048})
+    )
+    assert none[0] <= base[0] and none[1] < base[1]
+    threads = needs(catalogue, "deconvolve", deconvolution(catalogue), threads=4)
+    assert base[0] / 4 < threads[0] < base[0] / 2 and threads[1] == base[1]
+
+
+def test_a_psf_that_may_have_to_be_built_first_counts(catalogue: Catalogue) -> None:
+    recipe = PsfBuild(instrument="hri_euv").model_dump(mode="json")
+    there = deconvolution(catalogue, 256)
+    missing = {**there, "psf_id": "f" * 64, "psf_recipe": recipe}
+    built = needs(catalogue, "psf-build", recipe)
+    assert needs(catalogue, "deconvolve", missing)[0] >= built[0] > needs(catalogue, "deconvolve", there)[0]
+    rerun = {"kind": "psf-build", "parameters": recipe, "of": "psf", "id": "f" * 64}
+    assert needs(catalogue, "rerun", rerun) == built
+
+
+@pytest.mark.parametrize(
+    ("change", "least"),
+    [
+        (
+            "bandpass = ["
+            + ",".join("{wavelength_angstrom=171.0,weight=1.0}" for _ in range(500))
+            + "]\n[aperture]",
+            500,
+        ),
+        (
+            "meshes = ["
+            + ",".join(
+                "{name='m',place='filter_wheel',pitch_um=9.0,wire_um=1.0,windows=9}" for _ in range(500)
+            )
+            + "]\n[aperture]",
+            400,
+        ),
+    ],
+)
+def test_an_instrument_file_that_asks_for_much_is_seen_for_it(
+    catalogue: Catalogue, change: str, least: float
+) -> None:
+    small = PsfBuild(instrument_file=SMALL_INSTRUMENT).model_dump(mode="json")
+    large = PsfBuild(instrument_file=SMALL_INSTRUMENT.replace("[aperture]", change)).model_dump(mode="json")
+    assert needs(catalogue, "psf-build", large)[0] >= least > 10 * needs(catalogue, "psf-build", small)[0]
+
+
+@pytest.mark.parametrize("extremes", list(itertools.product(("1e-9", "1e9"), repeat=4)))
+def test_an_instrument_file_of_extremes_can_be_estimated(extremes: tuple[str, ...]) -> None:
+    text = SMALL_INSTRUMENT
+    keys = ("wavelength_angstrom", "focal_length_mm", "diameter_mm", "pixel_pitch_um")
+    for key, value in zip(keys, extremes, strict=True):
+        text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
+    mount = "\n[mount]\nbasis = 'assumed'\nrays = [{count = 4, width_mm = 1e-9}]\n"
+    seconds, mib = _build(PsfBuild(instrument_file=text + mount))
+    assert 0 < seconds < 600 and 0 < mib < 4096
+
+
+def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:
+    for name, length in (("1", 10**6), ("2", 10**9)):
+        catalogue.add(
+            TransitRow(
+                owner=OWNER,
+                id=name * 64,
+                created_at=0.0,
+                bytes=1,
+                filename=None,
+                summary={"unpacked_bytes": length},
+            )
+        )
+    for kind, more in {
+        "psf-fit": {"as_published": False},
+        "evaluate": {},
+        "gap-diagnose": {},
+        "cross-validate": {"scheme": "shared", "runs": 10},
+    }.items():
+        small, large = (
+            needs(catalogue, kind, {"transit_id": name * 64, "diffraction_recipe": None, **more})
+            for name in "12"
+        )
+        assert large[0] > 10 * small[0] and large[1] > 3 * small[1]
+    given = {"transit_id": "2" * 64, "runs": 10, "diffraction_recipe": None}
+    shared, exact = (needs(catalogue, "cross-validate", given | {"scheme": s}) for s in ("shared", "exact"))
+    assert exact[0] > 5 * shared[0]
+
+
+def test_what_is_over_a_limit_is_refused_and_told_how_to_get_under_it(catalogue: Catalogue) -> None:
+    asked = deconvolution(catalogue, 4096, error_draws=64)
+    free = Settings(worker_threads=1)
+    said = checked("deconvolve", asked, catalogue, OWNER, free)
+    for setting, code, figure, way in (
+        ("max_job_memory_mib", "too-much-memory", said["memory_mib"], "margin_px"),
+        ("max_job_s", "too-much-time", f"{said['seconds']:g}", "fewer steps"),
+    ):
+        with pytest.raises(DataError) as refused:
+            checked("deconvolve", asked, catalogue, OWNER, free.model_copy(update={setting: 500}))
+        assert refused.value.code == code
+        for told in (str(figure), "500", setting.upper(), way):
+            assert told in refused.value.message
+
+
+def test_all_that_can_be_asked_for_with_one_image_is_taken_by_default(catalogue: Catalogue) -> None:
+    largest = {"name": "richardson-lucy-total-variation", "steps": 200}
+    checked("deconvolve", deconvolution(catalogue, 4096, method=largest), catalogue, OWNER, Settings())
+
+
+def test_a_job_that_executes_too_long_ends_with_its_next_step(
+    settings: Settings, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[int] = []
+
+    def slow(context: Context, _parameters: object) -> str:
+        for step in range(1, 100):
+            time.sleep(0.05)
+            steps.append(step)
+            context.report("working", step, 100)
+        return "0" * 64
+
+    monkeypatch.setitem(tasks.TASKS, "deconvolve", slow)
+    service = LocalService(settings.model_copy(update={"max_job_s": 0.3}))
+    with pytest.raises(ServiceError) as ended:
+        service.deconvolve(image_file, psf_id=service.upload_psf(psf_file)["id"])
+    service.close()
+    assert ended.value.code == "took-too-long"
+    assert "0.3 s" in str(ended.value) and "HELIOPSF_MAX_JOB_S" in str(ended.value)
+    assert 1 <= len(steps) < 20

@@ -1,0 +1,223 @@
+"""Jobs that make the same: one is at work at a time, and what it made is what the others end with."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import text
+
+from tests.whole.stack import wait_for
+from workers.broker import app as queue
+from workers.broker.reconciler import reconcile
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.jobs import Lease
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PsfRow
+from workers.contract.contract import Fault, JobError, Phase
+from workers.files.store import Store
+from workers.run import registry as tasks
+from workers.run.runner import Runner
+from workers.settings import Settings
+from workers.tasks.context import Context
+
+
+def started(catalogue: Catalogue, key: str = "k", owner: str = DEFAULT_OWNER) -> str:
+    """The id of a job of a UWS client's that was told to run."""
+    draft = catalogue.uws.draft("psf-build", {}, owner=owner)
+    assert catalogue.uws.start(draft.id, {}, {"key": key}, key)
+    return draft.id
+
+
+def row(catalogue: Catalogue, job_id: str) -> JobRow:
+    found = catalogue.jobs.get(job_id)
+    assert found is not None
+    return found
+
+
+def claim(catalogue: Catalogue, job_id: str) -> Lease | None:
+    return catalogue.jobs.claim(job_id, "w")
+
+
+def waiting(catalogue: Catalogue) -> set[str]:
+    return {job.id for job in catalogue.jobs.unsubmitted(3600.0)}
+
+
+def test_of_equal_jobs_that_are_claimed_at_one_moment_one_is_at_work(catalogue: Catalogue) -> None:
+    jobs = [started(catalogue) for _ in range(8)]
+    catalogue.jobs.mark_submitted(*jobs)
+    with ThreadPoolExecutor(8) as pool:
+        leases = list(pool.map(lambda job: claim(catalogue, job), jobs))
+    assert sum(lease is not None for lease in leases) == 1
+    phases = sorted(row(catalogue, job).phase for job in jobs)
+    assert phases == [Phase.EXECUTING] + 7 * [Phase.QUEUED]
+    assert waiting(catalogue) == set(), "none is given to the broker in vain"
+    assert not catalogue.jobs.others_wait("bulk"), "and a bulk does not make way for them"
+    assert catalogue.census.count_unsubmitted(-1.0) == 0, "nor does an operator have to look after them"
+    assert all(row(catalogue, job).attempt == 0 for job, lease in zip(jobs, leases, strict=True) if not lease)
+
+
+@pytest.mark.parametrize("end", ["complete", "fail", "requeue", "hand_back", "destroy", "silent"])
+def test_once_it_is_no_longer_at_work_the_next_may_be(catalogue: Catalogue, end: str) -> None:
+    first, second = started(catalogue), started(catalogue)
+    catalogue.jobs.mark_submitted(first, second)
+    lease = claim(catalogue, first)
+    assert lease is not None and claim(catalogue, second) is None
+    match end:
+        case "complete":
+            assert catalogue.jobs.complete(lease, "r")
+        case "fail":
+            assert catalogue.jobs.fail(lease, JobError(fault=Fault.INTERNAL, code="c", message="m"))
+        case "requeue":
+            assert catalogue.jobs.requeue(lease)
+        case "hand_back":
+            assert catalogue.jobs.hand_back(lease)
+        case "destroy":
+            assert catalogue.uws.destroy(first)
+        case "silent":
+            assert catalogue.jobs.give_up_silent(-1.0, 3) == [first]
+    assert second in waiting(catalogue)
+    assert claim(catalogue, second) is not None
+
+
+def test_others_are_not_kept_waiting(catalogue: Catalogue) -> None:
+    first = started(catalogue)
+    assert claim(catalogue, first) is not None
+    assert claim(catalogue, started(catalogue, key="other")) is not None
+    assert claim(catalogue, started(catalogue, owner="somebody")) is not None
+
+
+def test_two_at_once_compute_once(
+    tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://", reconcile_s=0.05)
+    computed: list[str] = []
+    at_work, go_on = threading.Event(), threading.Event()
+
+    def build(context: Context, parameters: Mapping[str, Any]) -> str:
+        if context.catalogue.get(PsfRow, parameters["key"], context.owner) is None:
+            computed.append(context.job_id)
+            at_work.set()
+            assert go_on.wait(60.0)
+            made = PsfRow(
+                owner=context.owner, id=parameters["key"], created_at=time.time(), name="n", version="1",
+                status="draft", origin="built", file_sha256="f", bytes=1, details={},
+            )  # fmt: skip
+            context.catalogue.add(made)
+        return str(parameters["key"])
+
+    monkeypatch.setitem(tasks.TASKS, "psf-build", build)
+    submitted: list[str] = []
+    monkeypatch.setattr(queue, "submit", lambda app, job_id, queue_name: submitted.append(job_id) or True)
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    first, second = started(catalogue), started(catalogue)
+    catalogue.jobs.mark_submitted(first, second)
+    worker = threading.Thread(target=runner.run, args=(first,))
+    worker.start()
+    try:
+        assert at_work.wait(60.0)
+        runner.run(second)  # another worker is given it now
+        assert row(catalogue, second).phase == Phase.QUEUED
+        assert reconcile(catalogue, queue.make_app(settings), settings) == 0
+    finally:
+        go_on.set()
+        worker.join()
+    wait_for(lambda: row(catalogue, first).phase == Phase.COMPLETED, "the first is done")
+    assert reconcile(catalogue, queue.make_app(settings), settings) == 1 and submitted == [second]
+    runner.run(second)
+    assert computed == [first]
+    assert row(catalogue, first).result_id == row(catalogue, second).result_id == "k"
+    assert row(catalogue, second).phase == Phase.COMPLETED
+
+
+def test_jobs_from_before_say_what_they_make_by_their_key(catalogue: Catalogue) -> None:
+    draft = catalogue.uws.draft("psf-build", {}, owner=DEFAULT_OWNER)
+    job = started(catalogue)
+    with catalogue._engine.begin() as connection:  # as revision 0008 had it
+        connection.execute(text("DROP INDEX one_at_work_a_result"))
+        connection.execute(text("ALTER TABLE jobs DROP COLUMN work_key"))
+        connection.execute(text("UPDATE alembic_version SET version_num = '0008'"))
+    catalogue.upgrade()
+    assert (row(catalogue, job).work_key, row(catalogue, draft.id).work_key) == ("k", None)
+    assert claim(catalogue, job) is not None and claim(catalogue, started(catalogue)) is None
+
+
+def asked_for(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, bool]:
+    return catalogue.jobs.submit("psf-build", {"key": key}, key, DEFAULT_OWNER)
+
+
+def test_a_job_that_was_told_to_stop_is_not_shared(catalogue: Catalogue) -> None:
+    doomed = asked_for(catalogue)[0].id
+    lease = claim(catalogue, doomed)
+    assert lease is not None
+    catalogue.jobs.cancel(doomed)
+    again, new = asked_for(catalogue)
+    assert new and again.id != doomed and (again.phase, again.work_key) == (Phase.QUEUED, "k")
+    shared, new = asked_for(catalogue)
+    assert shared.id == again.id and not new, "requests after it share the new one"
+    assert claim(catalogue, again.id) is None and waiting(catalogue) == set(), "one is at work at a time"
+    assert catalogue.jobs.abort(lease)
+    assert row(catalogue, again.id).phase == Phase.QUEUED and waiting(catalogue) == {again.id}
+    assert claim(catalogue, again.id) is not None
+
+
+def test_after_a_cancel_many_equal_requests_at_once_make_one_job(catalogue: Catalogue) -> None:
+    doomed = asked_for(catalogue)[0].id
+    assert claim(catalogue, doomed) is not None
+    catalogue.jobs.cancel(doomed)
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(lambda _: asked_for(catalogue), range(16)))
+    assert sum(new for _, new in answers) == 1
+    assert len({job.id for job, _ in answers}) == 1 and doomed not in {job.id for job, _ in answers}
+
+
+def test_a_second_cancel_does_not_take_a_third_request_with_it(catalogue: Catalogue) -> None:
+    first = asked_for(catalogue)[0].id
+    assert claim(catalogue, first) is not None
+    catalogue.jobs.cancel(first)
+    second = asked_for(catalogue)[0].id
+    catalogue.jobs.cancel(second)
+    assert row(catalogue, second).phase == Phase.ABORTED
+    third, new = asked_for(catalogue)
+    assert new and third.phase == Phase.QUEUED
+
+
+def test_a_job_that_was_done_before_it_could_stop_is_shared(catalogue: Catalogue) -> None:
+    done = asked_for(catalogue)[0].id
+    lease = claim(catalogue, done)
+    assert lease is not None
+    catalogue.jobs.cancel(done)
+    assert catalogue.jobs.complete(lease, "r")
+    shared, new = asked_for(catalogue)
+    assert shared.id == done and not new
+
+
+@pytest.mark.parametrize("end", ["too long", "destroyed"])
+def test_a_job_that_ends_on_terms_is_not_shared(catalogue: Catalogue, end: str) -> None:
+    limited = started(catalogue)
+    other, new = asked_for(catalogue)
+    assert new and other.id != limited and other.work_key == "k"
+    assert asked_for(catalogue)[0].id == other.id
+    lease = claim(catalogue, limited)
+    assert lease is not None and claim(catalogue, other.id) is None
+    if end == "too long":
+        catalogue.uws.set_terms(limited, execution_duration_s=1)
+        time.sleep(1.1)
+        assert catalogue.uws.end_by_terms() == [] and catalogue.jobs.abort(lease)
+    else:
+        catalogue.uws.set_terms(limited, destruction_at=time.time() - 1)
+        assert catalogue.uws.end_by_terms() == [limited]
+    assert row(catalogue, other.id).phase == Phase.QUEUED and not row(catalogue, other.id).cancel_requested
+    assert claim(catalogue, other.id) is not None
+
+
+def test_a_job_that_is_given_terms_is_shared_no_longer(catalogue: Catalogue) -> None:
+    job = asked_for(catalogue)[0].id
+    assert asked_for(catalogue)[0].id == job
+    catalogue.uws.set_terms(job, execution_duration_s=1)
+    other, new = asked_for(catalogue)
+    assert new and other.id != job and asked_for(catalogue)[0].id == other.id

@@ -1,0 +1,272 @@
+"""A worker that is told to stop: its job ends in time, or goes back into the queue as if it had not been started."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from sqlalchemy import inspect, text
+
+from tests.whole.stack import wait_for
+from workers import logs
+from workers.broker import app as queue
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.census import FileTally
+from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow, PsfRow
+from workers.contract.contract import Phase
+from workers.files.store import Store
+from workers.run import registry as tasks
+from workers.run.runner import Runner
+from workers.run.stopping import Stopping
+from workers.settings import Settings
+from workers.tasks.context import Context
+
+Task = Callable[[Context, Mapping[str, Any]], str]
+
+
+class Bench:
+    """A runner with one task of the test's own, in a thread."""
+
+    def __init__(self, folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.catalogue = catalogue
+        self.stopping = Stopping()
+        self._settings = Settings(data_dir=folder / "data", heartbeat_s=0.05, broker_url="filesystem://")
+        self._monkeypatch = monkeypatch
+
+    def run(self, task: Task) -> JobRow:
+        """The job's row after a run of it."""
+        self._monkeypatch.setitem(tasks.TASKS, "psf-build", task)
+        job, _ = self.catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+        self.catalogue.jobs.mark_submitted(job.id)
+        store = Store(self._settings.data_dir)
+        Runner(self._settings, self.catalogue, store, stopping=self.stopping).run(job.id)
+        return self.row(job.id)
+
+    def row(self, job_id: str) -> JobRow:
+        """The job's row."""
+        row = self.catalogue.jobs.get(job_id)
+        assert row is not None
+        return row
+
+
+@pytest.fixture
+def bench(tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return Bench(tmp_path, catalogue, monkeypatch)
+
+
+def steps_for(seconds: float, at_work: Callable[[], None] = lambda: None) -> Task:
+    """A task that says how far it is, again and again; ``at_work`` is called once it runs."""
+
+    def task(context: Context, _: Mapping[str, Any]) -> str:
+        at_work()
+        ends = time.monotonic() + seconds
+        while time.monotonic() < ends:
+            context.report("at work", 1, 2)
+            time.sleep(0.01)
+        return "result"
+
+    return task
+
+
+def test_a_job_that_lasts_is_handed_back_and_the_attempt_does_not_count(bench: Bench) -> None:
+    started = time.monotonic()
+    row = bench.run(steps_for(60.0, at_work=lambda: bench.stopping.ask(0.1)))
+    assert time.monotonic() - started < 30.0
+    assert (row.phase, row.attempt, row.lease) == (Phase.QUEUED, 0, None)
+    assert [job.id for job in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], (
+        "it is submitted again at once"
+    )
+    bench.stopping = Stopping()  # another worker
+    row = bench.run(steps_for(0.0))
+    assert (row.phase, row.attempt, row.result_id) == (Phase.COMPLETED, 1, "result")
+
+
+def test_a_job_that_ends_in_time_is_let_end(bench: Bench) -> None:
+    assert bench.run(steps_for(0.3, at_work=lambda: bench.stopping.ask(60.0))).phase == Phase.COMPLETED
+
+
+def test_a_task_that_does_not_listen_loses_its_job_all_the_same(bench: Bench) -> None:
+    seen: list[str] = []
+
+    def deaf(context: Context, _: Mapping[str, Any]) -> str:
+        bench.stopping.ask(0.0)
+        wait_for(lambda: bench.row(context.job_id).phase == Phase.QUEUED, "the job is handed back")
+        seen.append("handed back while it ran")
+        return "too late"
+
+    row = bench.run(deaf)
+    assert seen and (row.phase, row.result_id, row.attempt) == (Phase.QUEUED, None, 0)
+
+
+def test_a_worker_that_stops_takes_no_job(bench: Bench) -> None:
+    bench.stopping.ask(30.0)
+    row = bench.run(steps_for(0.0))
+    assert (row.phase, row.attempt) == (Phase.QUEUED, 0)
+    assert [job.id for job in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], (
+        "the message is gone, so it is submitted again"
+    )
+
+
+def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:
+    def cancelled(context: Context, _: Mapping[str, Any]) -> str:
+        bench.catalogue.jobs.cancel(context.job_id)
+        bench.stopping.ask(0.0)
+        return steps_for(60.0)(context, {})
+
+    assert bench.run(cancelled).phase == Phase.ABORTED
+
+
+def test_asking_again_does_not_move_the_moment() -> None:
+    stopping = Stopping()
+    assert not stopping.asked and not stopping.due
+    stopping.ask(0.0)
+    stopping.ask(60.0)
+    assert stopping.asked and stopping.due
+
+
+def test_the_lines_of_a_job_carry_its_id_and_owner(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    said: list[dict[str, str]] = []
+
+    class Keep(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            said.append({"message": record.getMessage(), **logs.about()})
+
+    keep = Keep()
+    logging.getLogger("workers.run.runner").addHandler(keep)
+    caplog.set_level(logging.INFO)
+    row = bench.run(steps_for(60.0, at_work=lambda: bench.stopping.ask(0.0)))
+    logging.getLogger("workers.run.runner").removeHandler(keep)
+    by_heart = [one for one in said if "handed back" in one["message"]]
+    assert by_heart and len(said) >= 3
+    assert all((one["job"], one["owner"]) == (row.id, "local") for one in said)
+    assert logs.about() == {}
+
+
+# The database, as it is counted and mended ----------------------------------------------------------
+
+
+def test_the_counts_of_files(catalogue: Catalogue) -> None:
+    for identity in "ab":
+        catalogue.add(
+            ImageRow(owner="o", id=identity, created_at=1.0, bytes=2**40, filename=None, summary={})
+        )
+    for identity, origin in (("a", "built"), ("b", "uploaded"), ("c", "uploaded")):
+        catalogue.add(
+            PsfRow(
+                owner="o", id=identity, created_at=1.0, name="n", version="1", status="s", origin=origin,
+                file_sha256="f", bytes=3, details={},
+            )
+        )  # fmt: skip
+    counted = set(catalogue.census.tally_files())
+    assert FileTally("image", "uploaded", 2, 2**41) in counted
+    assert {FileTally("psf", "built", 1, 3), FileTally("psf", "uploaded", 2, 6)} <= counted
+    assert FileTally("transit", "uploaded", 0, 0) in counted
+
+
+def test_the_counts_of_jobs(catalogue: Catalogue) -> None:
+    assert catalogue.census.tally() == [] and catalogue.census.oldest_queued_at() is None
+    job, _ = catalogue.jobs.submit("psf-build", {}, "a", DEFAULT_OWNER)
+    catalogue.jobs.submit("deconvolve", {}, "b", DEFAULT_OWNER)
+    lease = catalogue.jobs.claim(job.id, "w")
+    assert lease is not None and catalogue.jobs.complete(lease, "r")
+    (waiting, done) = sorted(catalogue.census.tally(), key=lambda tally: tally.kind)
+    assert (waiting.phase, waiting.jobs, waiting.attempts, waiting.run_s) == (Phase.QUEUED, 1, 0, 0.0)
+    assert (done.phase, done.jobs, done.attempts, done.retries) == (Phase.COMPLETED, 1, 1, 0)
+    assert abs(catalogue.census.clock() - time.time()) < 1.0
+
+
+def test_a_database_gets_back_the_indexes_that_it_lacks(catalogue: Catalogue) -> None:
+    with catalogue._engine.begin() as connection:
+        connection.execute(text("DROP INDEX jobs_tallied"))
+    assert catalogue.schema.faults().indexes == ("jobs_tallied",)
+    catalogue.schema.mend()
+    assert "jobs_tallied" in {index["name"] for index in inspect(catalogue._engine).get_indexes("jobs")}
+    assert catalogue.schema.faults().indexes == ()
+
+
+# Real processes -------------------------------------------------------------------------------------
+
+WORKER = """
+import time
+from workers import tasks
+
+def listens(context, _):
+    while True:
+        context.report("at work", 1, 2)
+        time.sleep(0.02)
+
+def deaf(context, _):
+    context.report("at work", 2, 2)
+    time.sleep(60)
+
+tasks.TASKS["psf-build"] = {task}
+from workers.run.worker import main
+main()
+"""
+
+
+@pytest.mark.parametrize("task", [pytest.param("listens", marks=pytest.mark.slow), "deaf"])
+def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
+    tmp_path: Path, task: str
+) -> None:
+    environment = {
+        "HELIOPSF_DATA_DIR": str(tmp_path / "data"),
+        "HELIOPSF_BROKER_URL": "filesystem://",
+        "HELIOPSF_STOP_S": "0.5",
+        "HELIOPSF_HEARTBEAT_S": "0.2",
+        "HELIOPSF_LEASE_S": "3",
+        "HELIOPSF_LOG_FORMAT": "json",
+        "OMP_NUM_THREADS": "1",
+    }
+    settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://", stop_s=0.5, heartbeat_s=0.2)
+    settings.data_dir.mkdir()
+    catalogue = Catalogue(settings.catalogue_url)
+    catalogue.upgrade()
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+    assert queue.submit(queue.make_app(settings), job.id)
+    log = tmp_path / "worker.log"
+    with log.open("wb") as written:
+        worker = subprocess.Popen(
+            [sys.executable, "-c", WORKER.format(task=task)],
+            env={k: v for k, v in os.environ.items() if not k.startswith("HELIOPSF_")} | environment,
+            stdout=subprocess.DEVNULL,
+            stderr=written,
+        )
+    try:
+        wait_for(lambda: _phase(catalogue, job) == "EXECUTING", "the job is at work")
+        wait_for(lambda: len(catalogue.census.workers(3.0)) == 1, "the worker says that it is there")
+        processes = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
+        worker.send_signal(signal.SIGTERM)
+        told = time.monotonic()
+        code = worker.wait(settings.gone_s + 15.0)  # the machine may be busy
+        took_s = time.monotonic() - told
+        _, left = psutil.wait_procs(processes, timeout=5)
+    finally:
+        if worker.poll() is None:
+            worker.kill()
+            worker.wait()
+    assert code == 0 and left == [], f"{code}, {left}; {log.read_text()}"
+    row = catalogue.jobs.get(job.id)
+    assert row is not None and (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
+    told_of = log.read_text()
+    assert ("left to another worker" in told_of) == (task == "listens"), told_of
+    assert "ending now" in told_of or task == "listens", f"{took_s:.1f} s; {told_of}"
+    assert catalogue.census.workers(60.0) == [], "it took its leave"
+    catalogue.close()
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert any(line.get("job") == job.id for line in lines)
+
+
+def _phase(catalogue: Catalogue, job: JobRow) -> str | None:
+    row = catalogue.jobs.get(job.id)
+    return row and row.phase

@@ -1,0 +1,271 @@
+"""The job gap-diagnose: from an archive of a transit to report, page, picture and a PSF with the answer in the model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psfcore.errors import DataError
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from service.client.http import ServiceError
+from service.local import LocalService
+from tests.gap_files import EDGE_GLOW, answer_at_once, write_gap
+from tests.html_page import check_stands_alone
+from tests.psfcore.gap import small_gaps
+from workers.catalogue.tables import DEFAULT_OWNER, PsfRow, ReportRow
+from workers.contract.contract import GapDiagnose, ResolvedGapDiagnose, corrected_psf_identity, gap_identity
+from workers.settings import Settings
+from workers.tasks import gap as gap_task
+
+
+def service_in(folder: Path, gap_effects: str = "") -> LocalService:
+    return LocalService(
+        Settings(data_dir=folder, database_url=None, broker_url="filesystem://", gap_effects=gap_effects)
+    )
+
+
+@pytest.fixture(scope="module")
+def transit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_gap(tmp_path_factory.mktemp("simulated") / "transit", offset_dn=small_gaps.OFFSET_DN)
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalService]:
+    local = service_in(tmp_path_factory.mktemp("service") / "data")
+    yield local
+    local.close()
+
+
+@pytest.fixture(scope="module")
+def made(service: LocalService, transit: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The job round a diagnosis that was made before, and all of its files; `heliopsf gap`'s tests do it for real."""
+    out = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(gap_task, "diagnose", lambda transit, **how: small_gaps.found())
+        row = service.diagnose_gap(
+            transit, out / "r.json", page=out / "r.html", preview=out / "r.png", seed=3
+        )
+    return {"row": row, "json": json.loads((out / "r.json").read_text()), "folder": out}
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """What a diagnosis is asked for; the answer is one that was made before."""
+    monkeypatch.setattr(gap_task, "gap_png", lambda found, report: b"\x89PNG")
+    return answer_at_once(monkeypatch, small_gaps.found())
+
+
+def test_the_answer_and_its_size_are_found_and_what_it_was_made_of_is_told(made: dict[str, Any]) -> None:
+    row, report = made["row"], made["json"]
+    assert row["kind"] == "gap" and row["html"] == f"/v1/reports/{row['id']}/page"
+    assert report["schema"] == "gap/1" and report["verdict"] == "attributed"
+    assert report["answer"] == row["details"]["answer"] == ["dark_offset"]
+    offset = report["effects"][0]["parameters"]["offset"]
+    assert offset["value"] == pytest.approx(small_gaps.OFFSET_DN, abs=4 * offset["sigma"])
+    assert row["details"]["sentence"] == report["sentence"]
+    assert row["details"]["strongest_axis"] == report["where"][0]["axis"]
+    provenance = report["provenance"]
+    assert provenance["seed"] == provenance["parameters"]["seed"] == 3
+    assert provenance["started_from_psf"] is None and provenance["added_effects"] == {}
+    assert {"numpy", "scipy", "numba", "astropy"} <= set(provenance["libraries"])
+    assert report["inputs_sha256"] == small_gaps.with_offset().sha256
+
+
+def test_its_page_and_picture_are_kept(made: dict[str, Any]) -> None:
+    html = (made["folder"] / "r.html").read_text("utf-8")
+    check_stands_alone(html)
+    assert "A light leak" not in html and "The dark level taken off every readout is wrong." in html
+    assert (made["folder"] / "r.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_corrected_psf_is_a_new_draft_that_names_its_parents_effects_and_the_gap(
+    service: LocalService, made: dict[str, Any]
+) -> None:
+    row, report = made["row"], made["json"]
+    psf = service.get(f"/v1/psfs/{row['details']['corrected_psf_id']}")
+    assert psf["id"] == corrected_psf_identity(row["id"]) == report["provenance"]["corrected_psf_id"]
+    assert psf["status"] == "draft" and psf["origin"] == "fitted"
+    assert psf["name"] == "hri_euv-gap-corrected" and psf["version"].startswith("0.1.0+")
+    details = psf["details"]
+    assert details["parents"] == {"transit": row["transit_id"], "report": row["id"]}
+    made_by = details["provenance"]
+    assert made_by["parents"] == details["parents"] and made_by["effects"] == ["dark_offset"]
+    assert made_by["effect_parameters"]["offset"] == report["effects"][0]["parameters"]["offset"]
+    assert made_by["gap_before_pct"] == report["gap"]["rms_pct"]
+    assert made_by["gap_after_pct"] == report["gap"]["after_pct"]
+    assert made_by["inputs_sha256"] == report["inputs_sha256"]
+    assert sum(details["shape"]) == 4096 and details["sum"] == pytest.approx(1, abs=1e-3)
+    # Questions about it can be answered at once.
+    assert service.ask(psf["id"], "encircled", radius=10.0)
+
+
+def test_the_corrected_psf_is_made_again_and_neither_it_nor_its_report_is_there_twice(
+    service: LocalService, transit: Path, asked: list[dict[str, Any]]
+) -> None:
+    def counts() -> list[int]:
+        page = service._catalogue.page
+        return [len(page(kind, owner=DEFAULT_OWNER, limit=200)) for kind in (PsfRow, ReportRow)]  # type: ignore[type-var]
+
+    psf_id = service.diagnose_gap(transit, seed=9)["details"]["corrected_psf_id"]
+    psfs, reports = counts()
+    report = service.get(service.wait(service.submit("rerun", of="psf", id=psf_id))["result"])
+    assert [how["seed"] for how in asked] == [9, 9]
+    assert report["details"]["same"] is True, report["details"]["sentence"]
+    assert counts() == [psfs, reports + 1]
+
+
+def test_an_equal_request_is_answered_with_what_is_there(
+    service: LocalService, made: dict[str, Any], transit: Path, asked: list[dict[str, Any]]
+) -> None:
+    again = service.diagnose_gap(transit, seed=3)
+    assert asked == [] and again["id"] == made["row"]["id"]
+    assert again["created_at"] == made["row"]["created_at"]
+    for kind, identity in ((ReportRow, again["id"]), (PsfRow, again["details"]["corrected_psf_id"])):
+        assert [row.id for row in service._catalogue.page(kind, owner=DEFAULT_OWNER, limit=100)].count(
+            identity
+        ) == 1  # type: ignore[arg-type]
+
+
+def test_a_job_that_lost_its_worker_after_the_psf_is_done_again_with_one_result(
+    service: LocalService, transit: Path, asked: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save, calls = gap_task._save, []
+
+    def once_lost(*given: Any) -> None:
+        calls.append(1)
+        if len(calls) == 1:
+            raise ConnectionError("the database is away")
+        save(*given)
+
+    monkeypatch.setattr(gap_task, "_save", once_lost)
+    row = service.diagnose_gap(transit, seed=4)
+    assert len(calls) == len(asked) == 2
+    psfs = [psf.id for psf in service._catalogue.page(PsfRow, owner=DEFAULT_OWNER, limit=100)]
+    assert psfs.count(row["details"]["corrected_psf_id"]) == 1
+
+
+def test_a_fitted_psf_is_where_the_fit_starts_and_a_parent_of_the_next(
+    service: LocalService, made: dict[str, Any], transit: Path, asked: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    parent = made["row"]["details"]["corrected_psf_id"]
+    row = service.diagnose_gap(transit, tmp_path / "r.json", psf_id=parent)
+    (how,) = asked
+    assert how["shape"] is SOFTENED_POWER_LAW and how["seed"] == 1
+    values = SOFTENED_POWER_LAW.values(np.array(how["start"]))
+    fitted = made["json"]["psf"]["with_answer"]
+    assert values["b_px"] == pytest.approx(fitted["b_px"]["value"], rel=1e-6)
+    psf = service.get(f"/v1/psfs/{row['details']['corrected_psf_id']}")
+    assert psf["details"]["parents"]["psf"] == parent == row["details"]["psf_id"]
+    started = json.loads((tmp_path / "r.json").read_text())["provenance"]["started_from_psf"]
+    assert started == {"name": "hri_euv-gap-corrected", "version": f"0.1.0+{parent[:8]}", "id": parent}
+
+
+def test_no_psf_is_made_where_none_is_wanted(
+    service: LocalService, transit: Path, asked: list[dict[str, Any]]
+) -> None:
+    before = len(service._catalogue.page(PsfRow, owner=DEFAULT_OWNER, limit=100))
+    row = service.diagnose_gap(transit, correct=False)
+    assert len(asked) == 1 and row["details"]["corrected_psf_id"] is None
+    assert len(service._catalogue.page(PsfRow, owner=DEFAULT_OWNER, limit=100)) == before
+
+
+def test_a_psf_that_was_not_fitted_is_refused(
+    service: LocalService, transit: Path, asked: list[dict[str, Any]]
+) -> None:
+    unfitted = service.upload_psf(transit / "diffraction.fits")["id"]
+    with pytest.raises(ServiceError, match="expected a PSF that was fitted to a transit") as caught:
+        service.diagnose_gap(transit, psf_id=unfitted)
+    assert caught.value.code == "psf-not-fitted" and asked == []
+    with pytest.raises(DataError) as unknown:
+        service.diagnose_gap(transit, psf_id="0" * 64)
+    assert unknown.value.code == "no-such-psf"
+
+
+def test_an_operator_s_effects_are_tried_and_hashed(
+    transit: Path, asked: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    (tmp_path / "mine.py").write_text(EDGE_GLOW)
+    local = service_in(tmp_path / "data", str(tmp_path / "mine.py"))
+    local.diagnose_gap(transit, tmp_path / "r.json", correct=False)
+    (how,) = asked
+    assert how["library"][-1].name == "edge_glow" and len(how["library"]) > 10
+    told = json.loads((tmp_path / "r.json").read_text())["provenance"]
+    assert list(told["added_effects"]) == [str(tmp_path / "mine.py")]
+    assert told["parameters"]["added_effects"] == [str(tmp_path / "mine.py")]
+    local.close()
+
+
+def test_a_worker_runs_its_own_operator_s_effects_and_no_others(
+    transit: Path, asked: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    """A job that was taken with effects which the worker was not started with."""
+    (tmp_path / "mine.py").write_text("raise SystemExit('code that a job named was run')")
+    taken = service_in(tmp_path / "data", str(tmp_path / "mine.py"))
+    job = taken.submit("gap-diagnose", transit_id=taken.upload_transit(transit)["id"])
+    taken.close()
+    worker = service_in(tmp_path / "data")
+    with pytest.raises(ServiceError, match="this worker adds none: submit the job again") as caught:
+        worker.wait(job)
+    assert caught.value.code == "effects-changed" and asked == []
+    worker.close()
+
+
+def test_effects_whose_text_was_changed_are_another_diagnosis_and_refused_by_an_earlier_job(
+    transit: Path, asked: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text(EDGE_GLOW)
+    local = service_in(tmp_path / "data", str(mine))
+    first = local.diagnose_gap(transit, correct=False)
+    assert local.diagnose_gap(transit, correct=False)["id"] == first["id"] and len(asked) == 1
+    mine.write_text(EDGE_GLOW.replace("5.0", "6.0"))
+    assert local.diagnose_gap(transit, correct=False)["id"] != first["id"] and len(asked) == 2
+    waiting = local.submit("gap-diagnose", transit_id=local.upload_transit(transit)["id"])
+    mine.write_text(EDGE_GLOW.replace("5.0", "7.0"))
+    with pytest.raises(ServiceError, match="or were changed since: submit the job again") as caught:
+        local.wait(waiting)
+    assert caught.value.code == "effects-changed" and len(asked) == 2
+    mine.unlink()
+    with pytest.raises(DataError, match="expected a Python file") as gone:
+        local.submit("gap-diagnose", transit_id=local.upload_transit(transit)["id"])
+    assert gone.value.code == "bad-effects"
+    local.close()
+
+
+def test_a_diagnosis_stands_where_the_psf_of_its_answer_cannot_be_made(
+    transit: Path, asked: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cannot(*_: object, **__: object) -> None:
+        raise DataError("bad-effects", "effects of mine: no image of a point")
+
+    monkeypatch.setattr("workers.tasks.gap.corrected_psf", cannot)
+    local = service_in(tmp_path / "data")
+    found = local.diagnose_gap(transit, tmp_path / "r.json", page=tmp_path / "r.html")
+    assert found["details"]["corrected_psf_id"] is None
+    told = json.loads((tmp_path / "r.json").read_text())["cautions"]
+    assert told[-1].endswith("could not be made: effects of mine: no image of a point")
+    assert "no image of a point" in (tmp_path / "r.html").read_text()
+    local.close()
+
+
+def test_diagnoses_of_other_parameters_are_others() -> None:
+    first = ResolvedGapDiagnose(transit_id="a" * 64)
+    others: tuple[dict[str, Any], ...] = (
+        {"seed": 2},
+        {"psf_id": "b" * 64},
+        {"correct": False},
+        {"saturation_dn": 9.0},
+        {"noise": {"photon_gain_dn": 1.0, "read_noise_dn": 2.0}},
+        {"transit_id": "c" * 64},
+        {"added_effects": ("mine",)},
+        {"added_effects": ("mine",), "added_effects_sha256": ("d" * 64,)},
+    )
+    identities = {gap_identity(ResolvedGapDiagnose(**({"transit_id": "a" * 64} | other))) for other in others}
+    assert len(identities | {gap_identity(first)}) == len(others) + 1
+    with pytest.raises(ValueError, match="added_effects"):
+        GapDiagnose(transit_id="a" * 64, added_effects=("mine",))  # type: ignore[call-arg]

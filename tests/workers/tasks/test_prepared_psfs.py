@@ -1,0 +1,85 @@
+"""PSFs that a process prepared: once for the images that follow, the same figures, within bounds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io.fits import Header
+
+from psfcore.deconvolve.conditions import new_engine
+from psfcore.fits.fits_io import read_psf
+from psfcore.fits.header import FitsLimits
+from psfcore.psf_sampling import psf_for_image
+from service.local import LocalService
+from tests.conftest import write_image, write_psf
+from workers.tasks import prepared_psfs
+from workers.tasks.prepared_psfs import PreparedPsfs
+
+LIMITS = FitsLimits(max_pixels=512 * 512)
+SHAPE = (96, 128)
+
+
+def test_a_psf_is_read_once_and_is_what_it_would_be_otherwise(
+    psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared = PreparedPsfs(2**30)
+    first = prepared.on_pixels_of(Header(), psf_file, LIMITS)
+    monkeypatch.delattr(prepared_psfs, "read_psf")
+    assert prepared.on_pixels_of(Header({"CDELT1": 7.0}), psf_file, LIMITS) is first
+    np.testing.assert_array_equal(first.kernel, read_psf(psf_file, LIMITS, parts=False).kernel)
+
+
+def test_a_binned_image_gets_the_psf_of_its_pixels_once(tmp_path: Path) -> None:
+    from astropy.io import fits
+
+    write_psf(tmp_path / "psf.fits")
+    fits.setval(tmp_path / "psf.fits", "CDELT1", value=0.5)
+    prepared, binned = PreparedPsfs(2**30), Header({"CDELT1": 1.0, "CDELT2": 1.0})
+    whole = prepared.on_pixels_of(Header({"CDELT1": 0.5}), tmp_path / "psf.fits", LIMITS)
+    assert whole.plate_scale_arcsec == 0.5
+    found = prepared.on_pixels_of(binned, tmp_path / "psf.fits", LIMITS)
+    assert found is not whole and prepared.on_pixels_of(binned, tmp_path / "psf.fits", LIMITS) is found
+    np.testing.assert_array_equal(found.kernel, psf_for_image(whole, binned).kernel)
+
+
+def test_an_engine_is_made_once_for_a_psf_and_a_shape(psf_file: Path) -> None:
+    prepared = PreparedPsfs(2**30)
+    psf, other = (read_psf(psf_file, LIMITS, parts=False) for _ in range(2))
+    engine = prepared.engine_for(psf, SHAPE, SHAPE, 1)
+    assert prepared.engine_for(psf, SHAPE, SHAPE, 1) is engine
+    others = [
+        prepared.engine_for(other, SHAPE, SHAPE, 1),
+        prepared.engine_for(psf, (64, 64), (64, 64), 1),
+        prepared.engine_for(psf, SHAPE, SHAPE, 2),
+    ]
+    assert len({id(one) for one in (engine, *others)}) == 4
+
+
+def test_the_least_recently_used_are_forgotten_and_the_last_never(psf_file: Path) -> None:
+    psf = read_psf(psf_file, LIMITS, parts=False)
+    size = new_engine(psf, SHAPE, SHAPE, 1).nbytes
+    assert size > 2 * 4 * SHAPE[0] * SHAPE[1]
+    prepared = PreparedPsfs(int(2.5 * size))
+    shapes = [SHAPE, (97, 128), (98, 128)]
+    first, second, third = (prepared.engine_for(psf, shape, shape, 1) for shape in shapes)
+    assert prepared.engine_for(psf, shapes[1], shapes[1], 1) is second
+    assert prepared.engine_for(psf, shapes[0], shapes[0], 1) is not first
+    assert prepared.engine_for(psf, shapes[2], shapes[2], 1) is not third, "it was used longest ago by then"
+    tiny = PreparedPsfs(0)
+    only = tiny.engine_for(psf, SHAPE, SHAPE, 1)
+    assert tiny.engine_for(psf, SHAPE, SHAPE, 1) is only
+
+
+def test_jobs_share_what_was_prepared(
+    local: LocalService, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[object] = []
+    real = prepared_psfs.new_engine
+    monkeypatch.setattr(prepared_psfs, "new_engine", lambda *given: made.append(given) or real(*given))
+    psf_id = local.upload_psf(psf_file)["id"]
+    for seed in range(3):
+        write_image(tmp_path / f"{seed}.fits", seed=seed)
+        local.deconvolve(tmp_path / f"{seed}.fits", psf_id=psf_id, steps=2)
+    assert len(made) == 1

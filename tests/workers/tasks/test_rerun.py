@@ -1,0 +1,275 @@
+"""Where things came from, and whether they come out the same when they are made again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from psfcore.errors import DataError
+from psfcore.fits.fits_io import read_plane
+from psfcore.fits.header import FitsLimits
+from service.local import LocalService
+from tests.conftest import SMALL_INSTRUMENT
+from tests.workers.psf_examples import OWNER, identity, product, psf
+from workers import lineage
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
+from workers.contract.contract import instrument_text
+from workers.lineage import Ancestor, made_by
+from workers.tasks import deconvolve as deconvolve_task
+
+ON_TRANSIT = {"transit_id": "1" * 64, "seed": 5}
+LIMITS = FitsLimits(max_pixels=2**24)
+MASKED = (
+    SMALL_INSTRUMENT + '\n[mount]\nbasis = "drawing"\nmask_image = { file = "mask.png", width_mm = 4.0 }\n'
+)
+
+
+@pytest.fixture
+def made(local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path) -> dict[str, Any]:
+    """A product of an uploaded PSF."""
+    psf_id = local.upload_psf(psf_file)["id"]
+    return local.deconvolve(
+        image_file, tmp_path / "first.fits", psf_id=psf_id, steps=3, noise=(6.0, 2.0), error_draws=4
+    )
+
+
+def again(local: LocalService, of: str, identity: str, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The description of a rerun's report and its JSON."""
+    row = local.get(local.wait(local.submit("rerun", of=of, id=identity))["result"])
+    local.download(row["file"], output)
+    return row, json.loads(output.read_text())
+
+
+def test_a_product_made_again_is_the_same_bit_for_bit_and_changes_nothing(
+    local: LocalService, made: dict[str, Any], tmp_path: Path
+) -> None:
+    before = local.get(f"/v1/products/{made['id']}")
+    row, report = again(local, "product", made["id"], tmp_path / "r.json")
+    assert (row["kind"], row["about_id"], row["transit_id"]) == ("rerun", made["id"], None)
+    assert row["details"]["same"] is True and row["details"]["largest_relative_difference"] == 0.0
+    assert set(report["arrays"]) == {"IMAGE", "QUALITY", "ERROR"}
+    for array in report["arrays"].values():
+        assert array["same"] and array["sha256"][0] == array["sha256"][1]
+    assert report["again"]["id"] == made["id"] and report["parameters"]["method"]["steps"] == 3
+    assert report["first"]["job_id"] != report["again"]["job_id"]
+    local.download(row["output"], tmp_path / "again.fits")
+    np.testing.assert_array_equal(
+        read_plane(tmp_path / "first.fits", LIMITS), read_plane(tmp_path / "again.fits", LIMITS)
+    )
+    assert local.get(f"/v1/products/{made['id']}") == before
+    assert len(local._catalogue.page(ProductRow, owner=OWNER, limit=10)) == 1
+
+
+def test_every_rerun_is_one_of_its_own(local: LocalService, made: dict[str, Any], tmp_path: Path) -> None:
+    first, _ = again(local, "product", made["id"], tmp_path / "1.json")
+    second, _ = again(local, "product", made["id"], tmp_path / "2.json")
+    assert first["id"] != second["id"]
+    reports = local._catalogue.page(ReportRow, owner=OWNER, limit=10, about_id=made["id"])
+    assert [row.id for row in reports] == [second["id"], first["id"]]
+
+
+def test_software_that_went_astray_is_found_out(
+    local: LocalService, made: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = deconvolve_task.write_image
+    first = read_plane(tmp_path / "first.fits", LIMITS)
+
+    def off(path: Path, image: Any, **how: Any) -> None:
+        pixels = image.pixels.copy()
+        pixels[5, 7] += 0.25 * np.nanmax(first)
+        real(path, type(image)(**{**vars(image), "pixels": pixels}), **how)
+
+    monkeypatch.setattr(deconvolve_task, "write_image", off)
+    row, report = again(local, "product", made["id"], tmp_path / "r.json")
+    assert row["details"]["same"] is False and row["details"]["same_file"] is False
+    assert report["arrays"]["IMAGE"]["largest_relative"] == pytest.approx(0.25, rel=1e-5)
+    assert report["arrays"]["IMAGE"]["values_that_differ"] == 1 and report["arrays"]["ERROR"]["same"]
+    assert "by 0.25 of the largest value at most, in IMAGE" in report["sentence"]
+    assert report["first"]["file_sha256"] != report["again"]["file_sha256"]
+    local.download(f"/v1/products/{made['id']}/file", tmp_path / "kept.fits")
+    assert (tmp_path / "kept.fits").read_bytes() == (tmp_path / "first.fits").read_bytes()
+    local.download(row["output"], tmp_path / "again.fits")
+    assert read_plane(tmp_path / "again.fits", LIMITS)[5, 7] != first[5, 7]
+
+
+def test_a_product_made_before_parameters_were_written_down_is_made_again_from_its_job(
+    local: LocalService, made: dict[str, Any], tmp_path: Path
+) -> None:
+    with local._catalogue._database.writing.begin() as session:
+        row = session.get(ProductRow, (OWNER, made["id"]))
+        assert row is not None
+        row.details = {
+            name: value for name, value in row.details.items() if name not in ("parameters", "libraries")
+        }
+    _, report = again(local, "product", made["id"], tmp_path / "r.json")
+    assert report["same"] and report["first"]["libraries"] is None
+    local._catalogue.uws.destroy(made["details"]["job_id"])
+    with pytest.raises(DataError) as caught:
+        local.submit("rerun", of="product", id=made["id"])
+    assert caught.value.code == "parameters-unknown"
+
+
+def test_what_was_uploaded_or_is_not_there_is_not_made_again(local: LocalService, psf_file: Path) -> None:
+    psf_id = local.upload_psf(psf_file)["id"]
+    for of, named, code in (
+        ("psf", psf_id, "not-made-here"),
+        ("psf", "0" * 64, "no-such-psf"),
+        ("product", "0" * 64, "no-such-product"),
+    ):
+        with pytest.raises(DataError) as caught:
+            local.submit("rerun", of=of, id=named)
+        assert caught.value.code == code
+
+
+def test_a_psf_built_with_a_mask_is_made_again_and_tells_where_it_is_from(
+    local: LocalService, tmp_path: Path
+) -> None:
+    file, mask = tmp_path / "small.toml", tmp_path / "mask.fits"
+    file.write_text(MASKED)
+    y, x = np.indices((64, 64)) - 31.5
+    fits.PrimaryHDU(((np.hypot(x, y) < 30) & (np.hypot(x, y) > 12)).astype("f4")).writeto(mask)
+    built = local.build_psf(file, size=128, mask=mask)
+    _, report = again(local, "psf", built["id"], tmp_path / "r.json")
+    assert report["same"] and {"PSF", "AIRY"} <= set(report["arrays"]), report["arrays"].keys()
+    assert report["again"]["id"] == built["id"]
+    kept = local._catalogue.get(PsfRow, built["id"], OWNER)
+    assert kept is not None and kept.details["job_id"] != report["again"]["job_id"]
+    told = lineage.lineage(local._catalogue, kept)
+    assert told.made is not None and told.made.parameters == built["details"]["provenance"]["parameters"]
+    assert told.made.libraries is not None and "numpy" in told.made.libraries
+    digest = built["details"]["provenance"]["instrument_file_sha256"]
+    assert [(parent.type, parent.id, parent.there) for parent in told.parents] == [
+        ("instrument-file", digest, False),
+        ("image", built["details"]["provenance"]["parameters"]["mask_id"], True),
+    ]
+
+
+def test_a_shipped_instrument_that_changed_since_is_made_again_as_it_was(
+    local: LocalService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its text is in the PSF's file; that of today is not asked."""
+    built = local.build_psf("aia_171", size=64, component="airy")
+    changed = instrument_text.__globals__["instrument_path"]("aia_171").read_text() + "\n# changed\n"
+    monkeypatch.setitem(
+        instrument_text.__globals__, "instrument_path", lambda name: _text(tmp_path / f"{name}.toml", changed)
+    )
+    _, report = again(local, "psf", built["id"], tmp_path / "r.json")
+    assert report["same"] and report["again"]["id"] == built["id"]
+
+
+def _text(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+# Lineage of rows alone ------------------------------------------------------------------------------
+
+
+def types(told: Ancestor) -> list[tuple[str, str, bool]]:
+    return [(parent.type, parent.id, parent.there) for parent in told.parents]
+
+
+def test_a_product_s_lineage_goes_back_to_what_was_uploaded(catalogue: Catalogue) -> None:
+    fitted = {
+        "transit_id": "1" * 64,
+        "diffraction_psf_id": identity("diffraction"),
+        "provenance": {"job_id": "j1"},
+    }
+    corrected = {
+        "transit_id": "1" * 64,
+        "parents": {"transit": "1" * 64, "report": "2" * 64, "psf": identity("fitted")},
+        "diffraction_psf_id": identity("diffraction"),
+        "provenance": {"software_version": "0.1.0", "algorithm_version": 1, "parameters": {"seed": 1}},
+    }
+    catalogue.add(
+        psf("diffraction", kind="diffraction", details={"provenance": {"instrument_file_sha256": "3" * 64}})
+    )
+    catalogue.add(psf("fitted", origin="fitted", details=fitted))
+    catalogue.add(psf("corrected", origin="fitted", details=corrected))
+    row, _ = catalogue.add(product("x", "corrected", details={"job_id": "j3", "parameters": {"steps": 3}}))
+    told = lineage.lineage(catalogue, row)
+    assert types(told) == [("image", row.image_id, False), ("psf", identity("corrected"), True)]
+    assert told.made is not None and (told.made.job_id, told.made.parameters) == ("j3", {"steps": 3})
+    (_, top) = told.parents
+    assert types(top) == [
+        ("transit", "1" * 64, False),
+        ("report", "2" * 64, False),
+        ("psf", identity("fitted"), True),
+        ("psf", identity("diffraction"), True),
+    ]
+    assert top.made is not None and (top.made.software_version, top.made.algorithm_version) == ("0.1.0", 1)
+    first = top.parents[2]
+    assert first.made is not None and first.made.job_id == "j1"
+    assert [parent.type for parent in first.parents] == ["transit", "psf"]
+    assert types(first.parents[1]) == [("instrument-file", "3" * 64, False)]
+    assert top.parents[3].cut and top.parents[3].parents == [], "told above"
+
+
+def test_a_lineage_is_bounded_and_needs_no_end(catalogue: Catalogue) -> None:
+    """Rows that name each other as parents cannot come to be; if they did, telling of them would end."""
+    for name, other in (("egg", "hen"), ("hen", "egg")):
+        catalogue.add(psf(name, origin="fitted", details={"parents": {"psf": identity(other)}}))
+    for n in range(lineage.MOST_DEEP + 5):
+        catalogue.add(psf(str(n), origin="fitted", details={"parents": {"psf": identity(str(n + 1))}}))
+
+    def depth(name: str) -> tuple[int, bool]:
+        row = catalogue.get(PsfRow, identity(name), OWNER)
+        assert row is not None
+        told, deep = lineage.lineage(catalogue, row), 0
+        while told.parents:
+            (told,) = told.parents
+            deep += 1
+        return deep, told.cut
+
+    assert depth("egg") == (2, True)
+    assert depth("0") == (lineage.MOST_DEEP, True)
+
+
+def test_an_owner_s_lineage_shows_nothing_of_another_s(catalogue: Catalogue) -> None:
+    catalogue.add(psf("secret", owner="somebody"))
+    row, _ = catalogue.add(product("x", "secret"))
+    assert types(lineage.lineage(catalogue, row))[1] == ("psf", identity("secret"), False)
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"),
+    [
+        ({"origin": "built", "details": {"provenance": {"parameters": {"size": 64}}}}, "psf-build"),
+        ({"origin": "fitted", "details": {"provenance": {"parameters": ON_TRANSIT}}}, "psf-fit"),
+        (
+            {"origin": "fitted", "details": {"parents": {}, "provenance": {"parameters": ON_TRANSIT}}},
+            "gap-diagnose",
+        ),
+    ],
+)
+def test_the_job_that_made_a_psf(catalogue: Catalogue, values: dict[str, Any], kind: str) -> None:
+    row, _ = catalogue.add(psf("p", **values))
+    found = made_by(catalogue, row)
+    assert (found.of, found.id, found.kind) == ("psf", row.id, kind)
+    said = values["details"]["provenance"]["parameters"]
+    assert {name: found.parameters[name] for name in said} == said
+    assert kind == "psf-build" or found.parameters["diffraction_recipe"] is None, (
+        "what was not said is filled in"
+    )
+
+
+def test_parameters_that_are_taken_no_more_say_so(catalogue: Catalogue) -> None:
+    row, _ = catalogue.add(product("x", "p", details={"parameters": {"image_id": "no id"}}))
+    with pytest.raises(DataError, match="does not take: image_id") as caught:
+        made_by(catalogue, row)
+    assert caught.value.code == "parameters-outdated"
+
+
+def test_another_owner_s_job_is_not_read(catalogue: Catalogue) -> None:
+    job, _ = catalogue.jobs.submit("deconvolve", {"secret": 1}, "k", "somebody")
+    lease = catalogue.jobs.claim(job.id, "w")
+    row, _ = catalogue.add(product("x", "p", details={"job_id": job.id}))
+    assert lease is not None and catalogue.jobs.complete(lease, row.id)
+    with pytest.raises(DataError, match="not written down"):
+        made_by(catalogue, row)

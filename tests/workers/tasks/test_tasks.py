@@ -1,0 +1,232 @@
+"""Tasks as functions on a temporary store: what goes in comes out right, and what is wrong says so."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from psfcore.deconvolve.methods.registry import method_names
+from psfcore.fits.fits_io import read_planes
+from psfcore.instruments.model import parse_instrument
+from service.cli.main import METHODS
+from service.client.http import ServiceError
+from service.local import LocalService
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
+from workers.contract.contract import Phase
+from workers.run import registry as tasks
+from workers.run import runner
+from workers.settings import Settings
+from workers.tasks import deconvolve as deconvolve_task
+
+
+def test_a_product_names_what_made_it_and_keeps_the_frame(
+    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
+) -> None:
+    psf = local.upload_psf(psf_file)
+    product = local.deconvolve(
+        image_file, tmp_path / "out.fits", psf_id=psf["id"], preview=tmp_path / "p.png"
+    )
+    with fits.open(tmp_path / "out.fits", checksum=True) as hdus:
+        header, pixels = hdus[0].header, hdus[0].data
+    assert header["PSFID"] == psf["id"] and header["PSFVERS"] == psf["version"]
+    assert header["INPSHA"] == product["image_id"] and header["PRODID"] == product["id"]
+    assert header["DCNVMETH"] == "richardson-lucy" and header["DCNVITER"] == 20
+    assert header["TELESCOP"] == "TEST" and header["XPOSURE"] == 2.0
+    assert "CHECKSUM" in header and "DATASUM" in header
+    before = fits.getdata(image_file)
+    assert pixels.shape == before.shape
+    assert pixels.max() > 1.2 * before.max()
+    assert pixels.sum() == pytest.approx(before.sum(), rel=1e-4)
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_progress_comes_step_by_step(local: LocalService, image_file: Path, psf_file: Path) -> None:
+    seen: list[tuple[str, int, int]] = []
+    psf_id = local.upload_psf(psf_file)["id"]
+    local.deconvolve(image_file, psf_id=psf_id, steps=4, progress=lambda *at: seen.append(at))
+    assert [at for at in seen if at[0] == "deconvolving"] == [("deconvolving", n, 4) for n in (1, 2, 3, 4)]
+
+
+def test_an_equal_request_is_not_computed_again(
+    local: LocalService, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    psf_id = local.upload_psf(psf_file)["id"]
+    first = local.deconvolve(image_file, psf_id=psf_id)
+    monkeypatch.delattr(deconvolve_task, "method_named")
+    assert local.deconvolve(image_file, psf_id=psf_id) == first
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_worker_of_one_thread_takes_no_second_one_for_the_picture(
+    settings: Settings, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    """A second would take the time of the worker next to it."""
+    of_threads: dict[str, int] = {}
+
+    def noted(name: str) -> None:
+        real = getattr(deconvolve_task, name)
+
+        def wrapped(*arguments: Any, **named: Any) -> Any:
+            of_threads[name] = threading.get_ident()
+            return real(*arguments, **named)
+
+        monkeypatch.setattr(deconvolve_task, name, wrapped)
+
+    noted("_preview")
+    noted("effects")
+    local = LocalService(settings.model_copy(update={"worker_threads": threads}))
+    local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"])
+    local.close()
+    assert (of_threads["_preview"] == of_threads["effects"]) == (threads == 1)
+
+
+def test_a_job_redelivered_after_its_end_does_nothing(
+    local: LocalService, settings: Settings, image_file: Path, psf_file: Path
+) -> None:
+    image_id, psf_id = local.upload_image(image_file)["id"], local.upload_psf(psf_file)["id"]
+    job = local.wait(local.submit("deconvolve", image_id=image_id, psf_id=psf_id))
+    local.wait(job)
+    rows = Catalogue(settings.catalogue_url).page(ProductRow, owner=DEFAULT_OWNER, limit=10)
+    assert len(rows) == 1
+    assert local.wait(job)["attempt"] == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "code"), [(np.nan, "all-nan"), (0.0, "no-signal")], ids=["all NaN", "all zero"]
+)
+def test_pixels_that_cannot_be_used_are_the_users_error(
+    local: LocalService, psf_file: Path, tmp_path: Path, value: float, code: str
+) -> None:
+    image = tmp_path / "bad.fits"
+    fits.PrimaryHDU(np.full((64, 64), value, "f4")).writeto(image)
+    with pytest.raises(ServiceError) as caught:
+        local.deconvolve(image, psf_id=local.upload_psf(psf_file)["id"])
+    assert caught.value.code == code
+    assert "expected" in str(caught.value)
+
+
+def test_a_psf_that_sums_to_three_is_the_users_error(
+    local: LocalService, image_file: Path, tmp_path: Path
+) -> None:
+    write_psf(tmp_path / "three.fits", scale=3.0)
+    psf_id = local.upload_psf(tmp_path / "three.fits")["id"]
+    with pytest.raises(ServiceError, match="expected"):
+        local.deconvolve(image_file, psf_id=psf_id)
+
+
+def test_a_built_psf_carries_where_it_came_from(local: LocalService, tmp_path: Path) -> None:
+    file = tmp_path / "small.toml"
+    file.write_text(SMALL_INSTRUMENT)
+    psf = local.build_psf(file, tmp_path / "psf.fits", size=256, preview=tmp_path / "psf.png")
+    assert psf["status"] == "draft" and psf["instrument"] == "small"
+    provenance = psf["details"]["provenance"]
+    assert len(provenance["instrument_file_sha256"]) == 64
+    assert provenance["software_version"] and provenance["algorithm_version"]
+    with fits.open(tmp_path / "psf.fits") as hdus:
+        assert hdus[0].header["PSFVERS"] == psf["version"]
+        assert hdus[0].data.shape == (256, 256)
+    assert (tmp_path / "psf.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_cancelled_job_stops_at_its_next_step(
+    local: LocalService, settings: Settings, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "REPORT_EVERY_S", 0.0)
+    write_image(tmp_path / "i.fits")
+    image_id, psf_id = local.upload_image(tmp_path / "i.fits")["id"], local.upload_psf(psf_file)["id"]
+    job = local.submit("deconvolve", image_id=image_id, psf_id=psf_id)
+    catalogue = Catalogue(settings.catalogue_url)
+    steps: list[int] = []
+
+    def cancel_at_five(stage: str, step: int, _steps: int) -> None:
+        steps.append(step)
+        if (stage, step) == ("deconvolving", 5):
+            catalogue.jobs.cancel(job["id"])
+
+    with pytest.raises(ServiceError, match="cancelled"):
+        local.wait(job, progress=cancel_at_five)
+    row = catalogue.jobs.get(job["id"])
+    assert row is not None and row.phase == Phase.ABORTED
+    assert max(steps) == 5
+    assert catalogue.page(ProductRow, owner=DEFAULT_OWNER, limit=1) == []
+
+
+def test_a_passing_failure_is_tried_again_and_then_given_up(
+    local: LocalService, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object) -> str:
+        raise ConnectionError("storage away")
+
+    monkeypatch.setitem(tasks.TASKS, "psf-build", away)
+    job = local.submit("psf-build", instrument="hri_euv", size=64)
+    catalogue = Catalogue(settings.catalogue_url)
+    phases = []
+    for _ in range(settings.max_attempts):
+        local._runner.run(job["id"])
+        row = catalogue.jobs.get(job["id"])
+        assert row is not None
+        phases.append(row.phase)
+    assert phases == [Phase.QUEUED] * (settings.max_attempts - 1) + [Phase.ERROR]
+    assert row.error is not None and row.error["fault"] == "transient"
+
+
+def test_our_own_failure_is_internal_and_is_logged(
+    local: LocalService, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*_: object) -> str:
+        raise ZeroDivisionError("ours")
+
+    monkeypatch.setitem(tasks.TASKS, "psf-build", broken)
+    with pytest.raises(ServiceError) as caught:
+        local.build_psf("hri_euv", size=64)
+    assert caught.value.code == "internal-error"
+    assert "Traceback" in caplog.text
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_of_the_contract_runs_and_says_what_it_did(
+    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path, method: str
+) -> None:
+    psf_id = local.upload_psf(psf_file)["id"]
+    product = local.deconvolve(image_file, tmp_path / "o.fits", psf_id=psf_id, method=method, steps=3)
+    details = product["details"]
+    assert details["steps_done"] == 3 and details["method"]["name"] == method
+    assert abs(details["flux_change_pct"]) < 5
+    with fits.open(tmp_path / "o.fits") as hdus:
+        assert hdus[0].header["DCNVMETH"] == method and hdus[0].header["DCNVEDGE"] == details["edges"]
+        assert "QUALITY" in hdus
+
+
+def test_the_contract_holds_the_methods_that_psfcore_has() -> None:
+    assert sorted(METHODS) == method_names()
+
+
+def test_errors_are_drawn_where_noise_is_known(
+    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
+) -> None:
+    psf_id = local.upload_psf(psf_file)["id"]
+    wanted = {"psf_id": psf_id, "steps": 3, "error_draws": 4}
+    with pytest.raises(ServiceError) as caught:
+        local.deconvolve(image_file, **wanted)
+    assert caught.value.code == "no-noise-figures"
+    product = local.deconvolve(image_file, tmp_path / "o.fits", noise=(6.0, 2.0), **wanted)
+    error = read_planes(tmp_path / "o.fits")["ERROR"]
+    assert error.shape == (96, 128) and (error > 0).all()
+    assert product["details"]["noise_amplification"] > 1
+
+
+def test_the_saturation_level_is_that_of_the_gain_mode_in_the_header(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = SMALL_INSTRUMENT + '[detector.gain_modes.combined]\nsaturation_dn = 4000.0\nbasis = "assumed"\n'
+    monkeypatch.setattr(deconvolve_task, "load_instrument", lambda name: parse_instrument(text, name))
+    level = deconvolve_task._known_saturation_dn
+    assert level({"instrument": "small", "gain_mode": "combined"}) == 4000.0
+    assert level({"instrument": "small", "gain_mode": "low-only"}) is None
+    assert level({"instrument": "small", "gain_mode": None}) is None
+    assert level({"instrument": None, "gain_mode": "combined"}) is None

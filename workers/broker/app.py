@@ -1,0 +1,93 @@
+"""The broker: a Celery application, and how a job's id is given to it.
+
+The broker is disposable. What it loses is submitted again from the job table, and what it delivers twice does
+nothing the second time, so nothing here has to be durable. Jobs are submitted by the task's name: the web
+process imports no task.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from celery import Celery
+from kombu import Connection
+from kombu import Queue as BrokerQueue
+from kombu.exceptions import KombuError, OperationalError
+from redis.exceptions import RedisError
+
+from workers.contract.queues import Queue, broker_name
+from workers.settings import Settings
+
+RUN_JOB = "heliopsf.run_job"
+ASSIST = "heliopsf.assist"
+AWAY = (OperationalError, KombuError, RedisError, OSError)
+log = logging.getLogger(__name__)
+
+
+def make_app(settings: Settings) -> Celery:
+    """A Celery application for these settings; with the embedded broker, its folders are made too."""
+    app = Celery("heliopsf", broker=settings.broker_url, set_as_current=False)
+    app.conf.update(
+        task_serializer="json",
+        accept_content=["json"],
+        task_ignore_result=True,
+        # Acknowledged early: the job table is the truth, and a worker that holds unacknowledged messages
+        # does not survive the loss of its broker (kombu 5.7).
+        task_acks_late=False,
+        worker_prefetch_multiplier=1,
+        task_queues=[BrokerQueue(broker_name(queue), routing_key=broker_name(queue)) for queue in Queue],
+        task_default_queue=broker_name(Queue.INTERACTIVE),
+        broker_connection_retry_on_startup=True,
+        worker_hijack_root_logger=False,
+        worker_send_task_events=False,
+        broker_transport="workers.broker.order:FolderTransport" if settings.embedded else None,
+        broker_transport_options=_transport_options(settings),
+    )
+    return app
+
+
+def submit(app: Celery, job_id: str, queue: Queue = Queue.INTERACTIVE) -> bool:
+    """Give the job's id to the broker; False where the broker is away (the reconciler tries again)."""
+    try:
+        app.send_task(RUN_JOB, args=[job_id], queue=broker_name(queue), retry=False)
+    except AWAY as error:
+        log.warning("broker away, job %s stays queued: %s", job_id, error)
+        return False
+    return True
+
+
+def call_for_help(app: Celery, job_id: str, workers: int) -> None:
+    """Ask idle workers to share a job's parts. Where the messages are lost, its own worker does them all."""
+    try:
+        for _ in range(workers):
+            app.send_task(ASSIST, args=[job_id], queue=broker_name(Queue.CROSSVAL), retry=False)
+    except AWAY as error:
+        log.warning("broker away, job %s goes on alone: %s", job_id, error)
+
+
+def check(settings: Settings) -> None:
+    """Raise where the broker, which is not the embedded one, does not answer within seconds.
+
+    What is raised is one of ``AWAY``, or what its transport makes of a URL that is none.
+    """
+    options = {"socket_connect_timeout": 2, "socket_timeout": 2}
+    with Connection(settings.broker_url, transport_options=options, connect_timeout=2) as connection:
+        connection.ensure_connection(max_retries=1, interval_start=0, timeout=3)
+
+
+def _transport_options(settings: Settings) -> dict[str, Any]:
+    if not settings.embedded:
+        patience = {"socket_connect_timeout": 5, "socket_timeout": 30}
+        return {**patience, "queue_order_strategy": "workers.broker.order:MostUrgentFirst"}
+    broker = settings.data_dir.resolve() / "broker"
+    queue, control = broker / "queue", broker / "control"
+    for folder in (queue, control):
+        folder.mkdir(parents=True, exist_ok=True)
+    return {
+        "data_folder_in": str(queue),
+        "data_folder_out": str(queue),
+        "control_folder": str(control),
+        "store_processed": False,
+        "polling_interval": 0.1,
+    }

@@ -1,0 +1,76 @@
+"""Keeps the broker in step with the job table: what it lost, and what a dead worker held, goes in again."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+from celery import Celery
+from sqlalchemy.exc import SQLAlchemyError
+
+from workers.broker import app as queue
+from workers.bulk import turns as bulk_turns
+from workers.catalogue.catalogue import Catalogue
+from workers.settings import Settings
+
+log = logging.getLogger(__name__)
+# So few that what is more urgent, and comes while many are submitted, does not wait for all of them.
+AT_ONCE = 50
+
+
+def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
+    """One pass; returns how many jobs were submitted, ``AT_ONCE`` at most. Any number of processes may do this at once."""
+    for job_id in catalogue.jobs.give_up_silent(settings.lease_s, settings.max_attempts):
+        log.warning("job %s: its worker fell silent; queued again", job_id)
+    for job_id in catalogue.uws.end_by_terms():
+        log.info("job %s: its time had come; destroyed", job_id)
+    bulk_turns.keep_turns(catalogue, settings)
+    submitted: list[str] = []
+    for job in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE):
+        if not queue.submit(app, job.id, job.queue):
+            break
+        submitted.append(job.id)
+    if submitted:
+        catalogue.jobs.mark_submitted(*submitted)
+    return len(submitted)
+
+
+class Reconciler:
+    """A thread that reconciles every ``settings.reconcile_s`` seconds, and at once when it is woken."""
+
+    def __init__(self, catalogue: Catalogue, app: Celery, settings: Settings) -> None:
+        self._catalogue, self._app, self._settings = catalogue, app, settings
+        self._wake = threading.Event()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._loop, name="reconciler", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread and wait for it."""
+        self._stopping = True
+        self._wake.set()
+        self._thread.join()
+
+    def wake(self) -> None:
+        """There is something to submit now."""
+        self._wake.set()
+
+    @property
+    def alive(self) -> bool:
+        """True while the thread runs."""
+        return self._thread.is_alive()
+
+    def _loop(self) -> None:
+        while not self._stopping:
+            self._wake.clear()
+            submitted = 0
+            try:
+                submitted = reconcile(self._catalogue, self._app, self._settings)
+            except SQLAlchemyError as error:
+                # The database may be restarting; the next pass finds out.
+                log.warning("reconciler: database away: %s", error)
+            if submitted < AT_ONCE:
+                self._wake.wait(self._settings.reconcile_s)

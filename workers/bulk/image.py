@@ -1,0 +1,274 @@
+"""One image of a bulk: from an upload or a file to a product in the service, a file in a folder, or both."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from psfcore.errors import DataError
+from psfcore.fits.header import read_summary
+from psfcore.whole_files import partials, whole_file
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.bulks import Taken
+from workers.catalogue.tables import ImageRow, ProductRow
+from workers.contract.bulk import BulkWork
+from workers.contract.contract import Deconvolve, ResolvedDeconvolve, product_identity
+from workers.files import archive as archive_files
+from workers.files.store import sha256_of, sync
+from workers.intake import estimates
+from workers.intake.requests import resolved_deconvolution
+from workers.tasks import deconvolve as deconvolve_task
+from workers.tasks.context import Context
+from workers.tasks.psf_build import psf_of
+
+# The structures that stand for an image, of all that its effects tell: blocks of 4 px, tails of 1 %.
+BLOCK_PX, TAIL_PCT = 4, 1.0
+LOOK_AGAIN_S = 0.5
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an image became, as its row keeps it."""
+
+    image_sha256: str
+    psf_id: str
+    product_id: str
+    reused: bool
+    kept: bool
+    output: str | None
+    sha256: str
+    bytes: int
+    score: float
+    statistics: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Source:
+    """An image's file, what its header says, and what its product may be called after."""
+
+    copy: Path | None  # of a file of the archive; an upload is in the store
+    sha256: str
+    summary: dict[str, Any]
+    name: str
+
+
+def treat(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Outcome:
+    """Deconvolve an image as the bulk asks, unless that was done before, or a job is at it: then when that has ended."""
+    with _source(context, taken) as source:
+        wanted = _resolved(context, bulk, request, source)
+        identity = product_identity(wanted)
+        target = _target(context, request, source, identity)
+        if target is not None and taken.attempt > 1:
+            _sweep(target)
+        before = _done_before(context, wanted, identity, request, target)
+        if before is None and target is not None:
+            _make_folder(target.parent)
+        if before is None and _waited(context, request, identity):
+            before = _done_before(context, wanted, identity, request, target)
+        return before or _done_now(context, wanted, request, source, target)
+
+
+def _waited(context: Context, request: BulkWork, identity: str) -> bool:
+    """Wait while a job makes the very product; whether one did. Where the service keeps none, nobody else makes it."""
+    waited = False
+    if not request.keeps_products:
+        return False
+    while context.catalogue.jobs.at_work_on(context.owner, identity):
+        waited = True
+        context.report("waiting for an equal job", 0, 1)  # raises where the bulk is to stop
+        _rest()
+    return waited
+
+
+def _rest() -> None:
+    time.sleep(LOOK_AGAIN_S)
+
+
+@contextmanager
+def _source(context: Context, taken: Taken) -> Iterator[_Source]:
+    if taken.uploaded:
+        row = context.catalogue.get(ImageRow, taken.source, context.owner)
+        if row is None:
+            raise DataError("no-such-image", f"no image was uploaded with id {taken.source}")
+        yield _Source(None, row.id, row.summary, row.filename or "image")
+        return
+    allowed = archive_files.roots(context.settings.bulk_roots)
+    path = archive_files.check_under(Path(taken.source), allowed)
+    with context.store.temporary() as copy:
+        try:
+            sha256 = archive_files.copy_hashed(path, copy, context.settings.max_upload_bytes)
+        except OSError as error:
+            reason = archive_files.reason_of(error)
+            raise DataError("unreadable-file", f"expected a file that can be read: {reason}") from error
+        summary = dataclasses.asdict(read_summary(copy, context.limits))
+        yield _Source(copy, sha256, summary, path.name)
+
+
+def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Source) -> ResolvedDeconvolve:
+    """The deconvolution with its PSF: the bulk's own, or the one that its context pins for the image."""
+    wanted = Deconvolve(
+        image_id=source.sha256,
+        psf_id=bulk.psf_id,
+        context=bulk.context_id,
+        **request.parameters.model_dump(),
+    )
+    return resolved_deconvolution(wanted, source.summary, context.catalogue, context.owner)
+
+
+def _target(context: Context, request: BulkWork, source: _Source, identity: str) -> Path | None:
+    """Where the product's file is to be; none where the service keeps it alone."""
+    if request.output is None:
+        return None
+    allowed = archive_files.roots(context.settings.bulk_output_roots)
+    folder = archive_files.check_under(Path(request.output.folder), allowed, "an output folder")
+    return folder / archive_files.safe_name(source.name, identity)
+
+
+def _done_before(
+    context: Context, wanted: ResolvedDeconvolve, identity: str, request: BulkWork, target: Path | None
+) -> Outcome | None:
+    """The product that is there, put into the output folder where it is not yet; None where there is none."""
+    if request.keeps_products:
+        row = context.catalogue.get(ProductRow, identity, context.owner)
+        return None if row is None else _kept(context, row, target, reused=True)
+    earlier = context.catalogue.bulks.done_before(context.owner, identity, str(target))
+    if earlier is None or target is None or not target.is_file() or sha256_of(target) != earlier.sha256:
+        return None
+    assert earlier.sha256 is not None and earlier.bytes is not None and earlier.score is not None
+    return Outcome(
+        image_sha256=wanted.image_id,
+        psf_id=wanted.psf_id,
+        product_id=identity,
+        reused=True,
+        kept=False,
+        output=str(target),
+        sha256=earlier.sha256,
+        bytes=earlier.bytes,
+        score=earlier.score,
+        statistics={
+            name: value for name, value in (earlier.statistics or {}).items() if not name.endswith("seconds")
+        },
+    )
+
+
+def _done_now(
+    context: Context,
+    wanted: ResolvedDeconvolve,
+    request: BulkWork,
+    source: _Source,
+    target: Path | None,
+) -> Outcome:
+    needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
+    estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
+    psf_row = psf_of(context, wanted)
+    # Asked for now: a store's local copy may be gone after a wait for an equal job, or after the PSF was built.
+    image_file = source.copy or context.store.path(source.sha256)
+    image = deconvolve_task.load(context, wanted, image_file, source.summary)
+    started = time.perf_counter()
+    made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
+    kernel = {"kernel_seconds": round(time.perf_counter() - started, 3)}
+    with context.store.temporary() as path:
+        deconvolve_task.write(made, path)
+        if request.keeps_products:
+            outcome = _kept(context, deconvolve_task.keep(made, path), target, reused=False)
+            return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
+        assert target is not None
+        sha256, size_bytes = sha256_of(path), path.stat().st_size
+        _put(path, target)
+    return Outcome(
+        image_sha256=wanted.image_id,
+        psf_id=wanted.psf_id,
+        product_id=made.identity,
+        reused=False,
+        kept=False,
+        output=str(target),
+        sha256=sha256,
+        bytes=size_bytes,
+        score=made.found.artefacts.score,
+        statistics=statistics_of(made.details) | kernel,
+    )
+
+
+def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: bool) -> Outcome:
+    """The outcome where the service has the product."""
+    if target is not None and not (
+        target.is_file() and target.stat().st_size == row.bytes and sha256_of(target) == row.file_sha256
+    ):
+        _put(context.store.path(row.file_sha256), target)
+    return Outcome(
+        image_sha256=row.image_id,
+        psf_id=row.psf_id,
+        product_id=row.id,
+        reused=reused,
+        kept=True,
+        output=None if target is None else str(target),
+        sha256=row.file_sha256,
+        bytes=row.bytes,
+        score=float(row.details["effects"]["artefacts"]["score"]),
+        statistics=statistics_of(row.details),
+    )
+
+
+def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
+    """Change and artefacts of an image, in short, of all that its product tells."""
+    found = details["effects"]
+    changes = {
+        row["kind"]: {"sum_pct": row["sum_pct"], "up_to_pct": row["up_to_pct"]}
+        for row in found["structures"]
+        if (row["block_px"], row["tail_pct"]) == (BLOCK_PX, TAIL_PCT)
+    }
+    return {
+        "flux_change_pct": details["flux_change_pct"],
+        "bright": changes.get("bright"),
+        "dark": changes.get("dark"),
+        "signs": found["artefacts"]["signs"],
+        "negative_pixels": details["negative_pixels"],
+        "steps_done": details["steps_done"],
+        "stopped_because": details["stopped_because"],
+    }
+
+
+def _sweep(target: Path) -> None:
+    """Remove what a worker that was killed left of this file."""
+    if target.parent.is_dir():
+        for partial in partials(target):
+            partial.unlink(missing_ok=True)
+
+
+def _make_folder(folder: Path) -> None:
+    """Make an output folder before the work is done that would be lost without it. Raises DataError "output-not-written"."""
+    with _written_or_said():
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+def _put(source: Path, target: Path) -> None:
+    """Copy a file to its place; whoever looks there sees all of it, or nothing.
+
+    Raises DataError "output-not-written".
+    """
+    with _written_or_said():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with source.open("rb") as file, whole_file(target) as copy:
+            shutil.copyfileobj(file, copy, 2**20)
+        sync(target.parent)  # its name too, before the image counts as done
+
+
+@contextmanager
+def _written_or_said() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = archive_files.reason_of(error)
+        raise DataError(
+            "output-not-written", f"expected an output folder that can be written to: {reason}"
+        ) from error

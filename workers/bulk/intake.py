@@ -1,0 +1,74 @@
+"""From what a user asks of a bulk to its row: what it names is there, what it may not touch is refused, its PSF is fixed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from psfcore.errors import DataError
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.bulks import new_id
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import PsfRow
+from workers.contract.bulk import BulkPhase, BulkRequest
+from workers.contract.contract import canonical_hash
+from workers.files import archive as archive_files
+from workers.settings import Settings
+
+
+def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Settings) -> tuple[BulkRow, bool]:
+    """A new bulk, or the open one of an equal request; and whether it is new.
+
+    Raises ``DataError``: "no-such-psf", "no-such-context", "no-such-image", "bad-path", "path-not-allowed".
+    """
+    psf_id, context_id = _pinned(request, catalogue, owner)
+    images = list(dict.fromkeys(request.images))
+    missing = catalogue.bulks.first_not_uploaded(images, owner)
+    if missing is not None:
+        raise DataError("no-such-image", f"no image was uploaded with id {missing}")
+    _check_places(request, settings)
+    asked = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
+    now = time.time()
+    row = BulkRow(
+        id=new_id(),
+        owner=owner,
+        name=request.name,
+        phase=BulkPhase.LISTING if request.files else BulkPhase.RUNNING,
+        request=asked,
+        request_key=_key(asked, images),
+        psf_id=psf_id,
+        context_id=context_id,
+        created_at=now,
+        running_since=now,
+        listed=not request.files,
+    )
+    return catalogue.bulks.create(row, images)
+
+
+def _pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str | None, str | None]:
+    """The ids of the PSF or of the context: what they name stays as it is."""
+    if request.psf_id is not None:
+        if catalogue.get(PsfRow, request.psf_id, owner) is None:
+            raise DataError("no-such-psf", f"the catalogue holds no PSF with id {request.psf_id}")
+        return request.psf_id, None
+    assert request.context is not None
+    return None, catalogue.contexts.named(request.context, owner).id
+
+
+def _check_places(request: BulkRequest, settings: Settings) -> None:
+    allowed = archive_files.roots(settings.bulk_roots)
+    for files in request.files:
+        archive_files.check_glob(files.glob, allowed)
+    if request.output is None:
+        return
+    folder = Path(request.output.folder)
+    if not folder.is_absolute() or ".." in folder.parts:
+        raise DataError("bad-path", "output: expected an absolute path without '..'")
+    archive_files.check_under(folder, archive_files.roots(settings.bulk_output_roots), "an output folder")
+
+
+def _key(asked: Mapping[str, Any], images: Sequence[str]) -> str:
+    """Identity of the request, whatever it is called."""
+    return canonical_hash({**asked, "name": None, "images": list(images)})

@@ -1,0 +1,121 @@
+"""Products that were made with a PSF that is no longer to be used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Select, exists, select, tuple_, union_all
+from sqlalchemy.orm import Session
+
+from workers.catalogue.database import Database
+from workers.catalogue.tables import ProductRow, PsfRow
+from workers.versions.status import PsfStatus
+
+PSFS_AT_A_TIME = 16
+MOST_SUCCESSORS = 32
+
+
+@dataclass(frozen=True)
+class Affected:
+    """A product, its PSF, and the certified PSF at the end of that one's successors, where there is one."""
+
+    product: ProductRow
+    psf: PsfRow
+    redo_with: PsfRow | None
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a page ended: PSFs come by id, and of each its products newest first."""
+
+    psf_id: str
+    created_at: float
+    product_id: str
+
+
+class AffectedProducts:
+    """Products by the status of their PSF; each method is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def of_psf(self, psf: PsfRow, *, limit: int, after: tuple[float, str] | None = None) -> list[Affected]:
+        """Products that were made with a PSF, newest first."""
+        with self._database.reading() as session:
+            return _told(session, [psf], session.scalars(_products(psf, limit, after)).all())
+
+    def page(self, owner: str, *, superseded: bool, limit: int, after: Place | None = None) -> list[Affected]:
+        """Products that were made with PSFs that are deprecated; superseded: and have a successor.
+
+        A join would put all products of a PSF in order before it gave the first; by steps, each reads what it gives.
+        """
+        found: list[Affected] = []
+        with self._database.reading() as session:
+            done = ""
+            if after is not None:
+                psf, done = session.get(PsfRow, (owner, after.psf_id)), after.psf_id
+                if psf is not None:
+                    rest = _products(psf, limit, (after.created_at, after.product_id))
+                    found += _told(session, [psf], session.scalars(rest).all())
+            while len(found) < limit:
+                psfs = session.scalars(_next_psfs(owner, superseded, done)).all()
+                if not psfs:
+                    break
+                found += _told(session, psfs, _first_products(session, psfs, limit - len(found)))
+                done = psfs[-1].id
+        return found[:limit]
+
+
+def _next_psfs(owner: str, superseded: bool, after: str) -> Select[Any]:
+    """Deprecated PSFs by id, those alone that products were made with."""
+    used = exists().where(ProductRow.owner == PsfRow.owner, ProductRow.psf_id == PsfRow.id)
+    query = select(PsfRow).where(
+        PsfRow.owner == owner, PsfRow.status == PsfStatus.DEPRECATED, PsfRow.id > after, used
+    )
+    if superseded:
+        query = query.where(PsfRow.successor_id.is_not(None))
+    return query.order_by(PsfRow.id).limit(PSFS_AT_A_TIME)
+
+
+def _products(psf: PsfRow, limit: int, after: tuple[float, str] | None = None) -> Select[Any]:
+    """Products of a PSF, newest first."""
+    query = select(ProductRow).where(ProductRow.owner == psf.owner, ProductRow.psf_id == psf.id)
+    if after is not None:
+        query = query.where(tuple_(ProductRow.created_at, ProductRow.id) < after)
+    return query.order_by(ProductRow.created_at.desc(), ProductRow.id.desc()).limit(limit)
+
+
+def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> list[ProductRow]:
+    """The first products of all these PSFs, in one statement: those of each in their order, PSF after PSF."""
+    each = [select(_products(psf, limit).subquery()) for psf in psfs]
+    rows = session.scalars(select(ProductRow).from_statement(union_all(*each))).all()
+    place = {psf.id: number for number, psf in enumerate(psfs)}
+    # A union promises no order.
+    return sorted(rows, key=lambda row: (-place[row.psf_id], row.created_at, row.id), reverse=True)
+
+
+def _told(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRow]) -> list[Affected]:
+    """Products with their PSFs, and the certified ones that the successors of these lead to."""
+    known = {psf.id: psf for psf in psfs}
+    for _ in range(MOST_SUCCESSORS):
+        further = {psf.successor_id for psf in known.values() if psf.successor_id is not None} - known.keys()
+        if not further:
+            break
+        query = select(PsfRow).where(PsfRow.owner == psfs[0].owner, PsfRow.id.in_(sorted(further)))
+        rows = session.scalars(query).all()
+        if not rows:
+            break
+        known |= {row.id: row for row in rows}
+    return [Affected(row, known[row.psf_id], _last_successor(known, known[row.psf_id])) for row in products]
+
+
+def _last_successor(known: dict[str, PsfRow], psf: PsfRow) -> PsfRow | None:
+    """The certified PSF at the end of the successors."""
+    at: PsfRow | None = psf
+    for _ in range(MOST_SUCCESSORS):
+        if at is None or at.successor_id is None:
+            break
+        at = known.get(at.successor_id)
+    return at if at is not None and at is not psf and at.status == PsfStatus.CERTIFIED else None

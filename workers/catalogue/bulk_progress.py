@@ -1,0 +1,127 @@
+"""What is seen of bulks and their images: how far, how fast, what was found."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+from sqlalchemy import func, select, tuple_
+
+from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
+from workers.catalogue.database import Database
+from workers.catalogue.tables import ImageRow
+from workers.contract.bulk import AT_WORK, OPEN, ItemState
+
+BATCH = 1000
+# What the pace is told from: the last hour at most, and these images at most.
+PACE_S, PACE_IMAGES = 3600.0, 500
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast a bulk goes, and what is at work now."""
+
+    taken: int
+    images_an_hour: float | None
+
+
+class BulkLooks:
+    """Reading the tables of bulk; each method is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def get(self, bulk_id: str) -> BulkRow | None:
+        """The bulk's row, or None."""
+        with self._database.reading() as session:
+            return session.get(BulkRow, bulk_id)
+
+    def at_work(self) -> Sequence[BulkRow]:
+        """Bulks that go on, oldest first."""
+        query = select(BulkRow).where(BulkRow.phase.in_(sorted(AT_WORK)))
+        with self._database.reading() as session:
+            return sorted(session.scalars(query), key=lambda bulk: bulk.created_at)
+
+    def first_not_uploaded(self, ids: Sequence[str], owner: str) -> str | None:
+        """The first of these ids that is no uploaded image of the owner's; None where all are."""
+        rest = iter(ids)
+        with self._database.reading() as session:
+            while batch := list(islice(rest, BATCH)):
+                query = select(ImageRow.id).where(ImageRow.owner == owner, ImageRow.id.in_(batch))
+                there = set(session.scalars(query))
+                for one in batch:
+                    if one not in there:
+                        return one
+        return None
+
+    def pace(self, bulk: BulkRow) -> Pace:
+        """Images at work, and how many are done an hour, by the last of them since it last began."""
+        until = bulk.ended_at or time.time()
+        since = max(bulk.running_since or bulk.created_at, until - PACE_S)
+        ended = select(BulkItemRow.ended_at).where(
+            BulkItemRow.bulk_id == bulk.id, BulkItemRow.ended_at >= since
+        )
+        last = ended.order_by(BulkItemRow.ended_at.desc()).limit(PACE_IMAGES).subquery()
+        taken = select(func.count()).select_from(BulkItemRow)
+        taken = taken.where(BulkItemRow.bulk_id == bulk.id, BulkItemRow.state == ItemState.TAKEN)
+        with self._database.reading() as session:
+            at_work = session.scalar(taken) or 0
+            count, first = session.execute(select(func.count(), func.min(last.c.ended_at))).one()
+        if not count:
+            return Pace(at_work, None)
+        # The first of so many ended when the others were still to do.
+        start, images = (first, count - 1) if count == PACE_IMAGES else (since, count)
+        lasted = until - start
+        return Pace(at_work, images * 3600.0 / lasted if lasted > 0 else None)
+
+    def to_look_at(self, bulk_id: str, score: float) -> int:
+        """Images that are done whose score is this or more."""
+        query = select(func.count()).select_from(BulkItemRow)
+        query = query.where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.score >= score)
+        with self._database.reading() as session:
+            return session.scalar(query) or 0
+
+    def items(
+        self, bulk_id: str, state: ItemState, *, after: int = -1, limit: int = BATCH
+    ) -> Sequence[BulkItemRow]:
+        """Images in a state, in the bulk's order, from behind ``after``."""
+        query = select(BulkItemRow).where(
+            BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == state, BulkItemRow.position > after
+        )
+        with self._database.reading() as session:
+            return session.scalars(query.order_by(BulkItemRow.position).limit(limit)).all()
+
+    def worst(
+        self, bulk_id: str, *, after: tuple[float, int] | None = None, limit: int = BATCH
+    ) -> Sequence[BulkItemRow]:
+        """Images that are done, the most doubtful first, from behind ``after`` = (score, position)."""
+        key = tuple_(BulkItemRow.score, BulkItemRow.position)
+        query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.score.is_not(None))
+        if after is not None:
+            query = query.where(key < after)
+        query = query.order_by(BulkItemRow.score.desc(), BulkItemRow.position.desc()).limit(limit)
+        with self._database.reading() as session:
+            return session.scalars(query).all()
+
+    def done_before(self, owner: str, product_id: str, output: str) -> BulkItemRow | None:
+        """An image that became this product in this file, in any bulk of the owner's."""
+        query = select(BulkItemRow).join(BulkRow, BulkRow.id == BulkItemRow.bulk_id)
+        query = query.where(
+            BulkItemRow.product_id == product_id,
+            BulkItemRow.state == ItemState.DONE,
+            BulkItemRow.output == output,
+            BulkRow.owner == owner,
+        )
+        with self._database.reading() as session:
+            return session.scalars(query.limit(1)).first()
+
+    def open_images(self) -> dict[str, int]:
+        """Images of all bulks that have not ended, by how far they are."""
+        left = BulkRow.total - BulkRow.done - BulkRow.failed
+        sums = [func.coalesce(func.sum(one), 0) for one in (left, BulkRow.done, BulkRow.failed)]
+        query = select(*sums).where(BulkRow.phase.in_(sorted(OPEN)))
+        with self._database.reading() as session:
+            found = session.execute(query).one()
+        return dict(zip(("left", "done", "failed"), map(int, found), strict=True))

@@ -1,0 +1,85 @@
+"""The tables of bulk: each bulk, and each of its images."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import JSON, BigInteger, Index, String, text
+from sqlalchemy.orm import Mapped, mapped_column
+
+from workers.catalogue.tables import Base
+
+MOST_LETTERS = 1024  # of a file's path
+_OPEN = text("phase IN ('ERROR', 'LISTING', 'PAUSED', 'RUNNING')")
+
+
+class BulkRow(Base):
+    """Many images that are deconvolved alike. Its counts are those of its items, changed where these change."""
+
+    __tablename__ = "bulks"
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    owner: Mapped[str] = mapped_column(String(64))
+    name: Mapped[str] = mapped_column(String(80))
+    phase: Mapped[str] = mapped_column(String(16))
+    request: Mapped[dict[str, Any]]  # without the uploaded images' ids, which are items
+    request_key: Mapped[str] = mapped_column(String(64))
+    psf_id: Mapped[str | None] = mapped_column(String(64))
+    context_id: Mapped[str | None] = mapped_column(String(64))
+    created_at: Mapped[float]
+    running_since: Mapped[float | None]
+    ended_at: Mapped[float | None]
+    listed: Mapped[bool]  # whether all its files are items
+    lister: Mapped[str | None] = mapped_column(String(32))  # the lease under which they are listed
+    total: Mapped[int] = mapped_column(default=0)
+    done: Mapped[int] = mapped_column(default=0)
+    reused: Mapped[int] = mapped_column(default=0)  # of those done: what was there before
+    failed: Mapped[int] = mapped_column(default=0)
+    error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+
+    __table_args__ = (
+        Index("bulks_listed", "owner", "created_at", "id"),
+        Index("bulks_by_phase", "phase"),
+        # Two equal requests at the same moment: the second insert fails and finds the first.
+        Index(
+            "one_open_bulk_a_request",
+            "owner",
+            "request_key",
+            unique=True,
+            sqlite_where=_OPEN,
+            postgresql_where=_OPEN,
+        ),
+    )
+
+
+class BulkItemRow(Base):
+    """An image of a bulk. Who has taken it holds the lease ``token`` of the job ``job_id``, and nobody else does."""
+
+    __tablename__ = "bulk_items"
+    bulk_id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    position: Mapped[int] = mapped_column(primary_key=True)
+    uploaded: Mapped[bool]
+    source: Mapped[str] = mapped_column(String(MOST_LETTERS))  # an upload's id, or a path
+    state: Mapped[str] = mapped_column(String(16))
+    attempts: Mapped[int] = mapped_column(default=0)
+    job_id: Mapped[str | None] = mapped_column(String(32))
+    token: Mapped[str | None] = mapped_column(String(32))
+    taken_at: Mapped[float | None]
+    ended_at: Mapped[float | None]
+    reused: Mapped[bool] = mapped_column(default=False)
+    image_sha256: Mapped[str | None] = mapped_column(String(64))
+    psf_id: Mapped[str | None] = mapped_column(String(64))
+    product_id: Mapped[str | None] = mapped_column(String(64))
+    kept: Mapped[bool] = mapped_column(default=False)  # whether the service has the product
+    output: Mapped[str | None] = mapped_column(String(1200))  # the file in the output folder
+    sha256: Mapped[str | None] = mapped_column(String(64))
+    bytes: Mapped[int | None] = mapped_column(BigInteger)
+    score: Mapped[float | None]  # of the artefact check
+    statistics: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+
+    __table_args__ = (
+        Index("bulk_items_by_state", "bulk_id", "state", "position"),
+        Index("bulk_items_by_score", "bulk_id", "score", "position"),
+        Index("bulk_items_by_end", "bulk_id", "ended_at"),
+        Index("bulk_items_by_product", "product_id"),
+    )

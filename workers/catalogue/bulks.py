@@ -1,0 +1,326 @@
+"""Bulks and their images in the catalogue: asked for, listed, taken, done.
+
+An image is taken by compare-and-set under the lease of a job (``workers.bulk.task``), and free again once that lease
+is gone. A bulk's counts and its end are written in the transaction that changes its images.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+from sqlalchemy import ColumnElement, Delete, Update, delete, insert, select, update
+from sqlalchemy.engine import CursorResult
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from psfcore.errors import DataError
+from workers.catalogue.bulk_progress import BATCH, BulkLooks
+from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
+from workers.catalogue.jobs import Lease
+from workers.catalogue.tables import JobRow
+from workers.contract.bulk import AT_WORK, OPEN, STOPPED, BulkPhase, ItemState
+from workers.contract.contract import Fault, JobError, Phase
+
+# Errors of files whose rows do not hold their paths: to try these again would find no file, or another one.
+NOT_UTF_8, TOO_LONG = "path-not-utf-8", "path-too-long"
+LOST = JobError(
+    fault=Fault.INTERNAL,
+    code="worker-lost",
+    message="a worker was lost each time that it worked on this image; it is not tried again",
+)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """An image to be worked on, or why it cannot be."""
+
+    source: str
+    uploaded: bool
+    error: JobError | None = None
+
+
+@dataclass(frozen=True)
+class Taken:
+    """The right to work on an image; what is written under a lost right does nothing."""
+
+    bulk_id: str
+    position: int
+    source: str
+    uploaded: bool
+    attempt: int
+    lease: Lease
+
+
+class Bulks(BulkLooks):
+    """The tables of bulk; each method is one transaction, or one a batch."""
+
+    # A bulk -------------------------------------------------------------------------------------------
+
+    def create(self, row: BulkRow, uploaded: Iterable[str]) -> tuple[BulkRow, bool]:
+        """A new bulk with these uploads as its first images, or the open one of an equal request; whether it is new."""
+        for _ in range(3):  # the equal bulk may end between the two statements
+            try:
+                with self._database.writing.begin() as session:
+                    session.add(row)
+                    session.flush()
+                    row.total = _add(session, row.id, 0, (Listed(one, True) for one in uploaded))
+                return row, True
+            except IntegrityError:
+                existing = self._equal_open(row)
+                if existing is not None:
+                    return existing, False
+        raise RuntimeError(f"bulk for request {row.request_key} neither inserted nor found")
+
+    def pause(self, bulk_id: str) -> bool:
+        """LISTING, RUNNING -> PAUSED; images at work are let end."""
+        return self._set(bulk_id, AT_WORK, phase=BulkPhase.PAUSED)
+
+    def resume(self, bulk_id: str) -> bool:
+        """PAUSED, ERROR -> where it was."""
+        now = {"running_since": time.time(), "error": None}
+        return self._set(bulk_id, STOPPED, BulkRow.listed, phase=BulkPhase.RUNNING, **now) or self._set(
+            bulk_id, STOPPED, BulkRow.listed.is_(False), phase=BulkPhase.LISTING, **now
+        )
+
+    def cancel(self, bulk_id: str) -> bool:
+        """Any phase but an end -> CANCELLED."""
+        return self._set(bulk_id, OPEN, phase=BulkPhase.CANCELLED, ended_at=time.time())
+
+    def stop_with(self, bulk_id: str, error: JobError) -> bool:
+        """LISTING, RUNNING -> ERROR, for a reason that is not one image's."""
+        return self._set(bulk_id, AT_WORK, phase=BulkPhase.ERROR, error=error.model_dump(mode="json"))
+
+    def retry(self, bulk_id: str) -> int | None:
+        """Let what failed wait again, but for files whose paths could not be kept; how many images that are.
+
+        None for a bulk that was cancelled.
+        Raises DataError "equal-bulk-open" for one that has ended, where an equal one is open.
+        """
+        for _ in range(3):  # the equal bulk may end between the two statements
+            try:
+                return self._retry(bulk_id)
+            except IntegrityError:
+                bulk = self.get(bulk_id)
+                equal = None if bulk is None else self._equal_open(bulk)
+            if equal is not None:
+                raise DataError(
+                    "equal-bulk-open",
+                    f"expected no other open bulk of the same request; bulk {equal.id} is {equal.phase}: "
+                    "cancel it, or try again when it has ended",
+                )
+        raise RuntimeError(f"bulk {bulk_id} neither opened again nor its equal found")
+
+    def _retry(self, bulk_id: str) -> int | None:
+        with self._database.writing.begin() as session:
+            bulk = session.get(BulkRow, bulk_id, with_for_update=True)
+            if bulk is None or bulk.phase == BulkPhase.CANCELLED:
+                return None
+            again = update(BulkItemRow).where(
+                BulkItemRow.bulk_id == bulk_id,
+                BulkItemRow.state == ItemState.FAILED,
+                BulkItemRow.error["code"].as_string().not_in((NOT_UTF_8, TOO_LONG)),
+            )
+            changed = _changed(
+                session, again.values(state=ItemState.WAITING, attempts=0, ended_at=None, error=None)
+            )
+            bulk.failed -= changed
+            if changed and bulk.phase == BulkPhase.COMPLETED:
+                bulk.phase, bulk.ended_at, bulk.running_since = BulkPhase.RUNNING, None, time.time()
+            return changed
+
+    def _equal_open(self, row: BulkRow) -> BulkRow | None:
+        """Another bulk, of an equal request, that is open."""
+        equal = select(BulkRow).where(
+            BulkRow.owner == row.owner,
+            BulkRow.request_key == row.request_key,
+            BulkRow.phase.in_(OPEN),
+            BulkRow.id != row.id,
+        )
+        with self._database.reading() as session:
+            return session.scalars(equal).first()
+
+    # Listing ------------------------------------------------------------------------------------------
+
+    def begin_listing(self, bulk_id: str, lease: Lease) -> bool:
+        """List files under this lease, from the start: what another listed before it was lost is forgotten.
+
+        False where the lease is lost, or there is nothing to list.
+        """
+        with self._database.writing.begin() as session:
+            bulk = session.get(BulkRow, bulk_id, with_for_update=True)
+            if bulk is None or bulk.phase != BulkPhase.LISTING or not _good(session, lease):
+                return False
+            files = delete(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.uploaded.is_(False))
+            bulk.lister, bulk.failed = lease.token, 0
+            bulk.total -= _changed(session, files)
+            return True
+
+    def add_listed(self, bulk_id: str, lease: Lease, images: Sequence[Listed]) -> bool:
+        """Add images to a bulk that is listed under this lease; False where the lease or the bulk is lost."""
+        with self._database.writing.begin() as session:
+            bulk = session.get(BulkRow, bulk_id, with_for_update=True)
+            if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
+                return False
+            bulk.failed += sum(image.error is not None for image in images)
+            bulk.total += _add(session, bulk_id, bulk.total, images)
+            return True
+
+    def end_listing(self, bulk_id: str, lease: Lease) -> bool:
+        """LISTING -> RUNNING, or COMPLETED where nothing is left to do."""
+        with self._database.writing.begin() as session:
+            bulk = session.get(BulkRow, bulk_id, with_for_update=True)
+            if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
+                return False
+            bulk.phase, bulk.listed, bulk.lister = BulkPhase.RUNNING, True, None
+            session.flush()
+            _end_if_done(session, bulk_id)
+            return True
+
+    # Images -------------------------------------------------------------------------------------------
+
+    def take(self, bulk_id: str, lease: Lease, max_attempts: int) -> Taken | None:
+        """An image whose worker was lost, or one that waits.
+
+        None where there is none, the bulk does not run, or the lease is lost.
+        """
+        while True:
+            with self._database.writing.begin() as session:
+                running = select(BulkRow.phase).where(BulkRow.id == bulk_id)
+                if session.scalar(running) != BulkPhase.RUNNING or not _good(session, lease):
+                    return None
+                item = session.scalars(_left(bulk_id)).first() or session.scalars(_waiting(bulk_id)).first()
+                if item is None:
+                    return None
+                if item.attempts >= max_attempts:
+                    item.state, item.ended_at = ItemState.FAILED, time.time()
+                    item.error, item.token = LOST.model_dump(mode="json"), None
+                    session.flush()
+                    _count(session, bulk_id, failed=BulkRow.failed + 1)
+                    continue
+                item.state, item.taken_at, item.attempts = ItemState.TAKEN, time.time(), item.attempts + 1
+                item.job_id, item.token = lease.job_id, lease.token
+                return Taken(bulk_id, item.position, item.source, item.uploaded, item.attempts, lease)
+
+    def release(self, taken: Taken) -> bool:
+        """Give an image back undone, as if it had not been taken."""
+        values = {"state": ItemState.WAITING, "attempts": BulkItemRow.attempts - 1, "token": None}
+        return bool(self._database.change(update(BulkItemRow).where(*_holding(taken)).values(**values)))
+
+    def finish(self, taken: Taken, *, reused: bool, **values: Any) -> bool:
+        """An image is done; False where the right to it was lost, and whoever has it now does it."""
+        done = update(BulkItemRow).where(*_holding(taken)).values(
+            state=ItemState.DONE, ended_at=time.time(), token=None, error=None, reused=reused, **values
+        )  # fmt: skip
+        with self._database.writing.begin() as session:
+            if not _changed(session, done):
+                return False
+            _count(session, taken.bulk_id, done=BulkRow.done + 1, reused=BulkRow.reused + int(reused))
+            return True
+
+    def fail(self, taken: Taken, error: JobError) -> bool:
+        """An image cannot be done; False where the right to it was lost."""
+        failed = update(BulkItemRow).where(*_holding(taken)).values(
+            state=ItemState.FAILED, ended_at=time.time(), token=None, error=error.model_dump(mode="json")
+        )  # fmt: skip
+        with self._database.writing.begin() as session:
+            if not _changed(session, failed):
+                return False
+            _count(session, taken.bulk_id, failed=BulkRow.failed + 1)
+            return True
+
+    def _set(
+        self,
+        bulk_id: str,
+        phases: Iterable[BulkPhase],
+        *conditions: ColumnElement[bool] | Any,
+        **values: Any,
+    ) -> bool:
+        changed = update(BulkRow).where(BulkRow.id == bulk_id, BulkRow.phase.in_(sorted(phases)), *conditions)
+        return bool(self._database.change(changed.values(**values)))
+
+
+def new_id() -> str:
+    """An id for a bulk."""
+    return uuid.uuid4().hex
+
+
+def _add(session: Session, bulk_id: str, first: int, images: Iterable[Listed]) -> int:
+    """Insert images behind those that are there, some at a time; how many."""
+    numbered = enumerate(images, first)
+    position = first
+    while batch := [_values(bulk_id, number, image) for number, image in islice(numbered, BATCH)]:
+        session.execute(insert(BulkItemRow), batch)
+        position += len(batch)
+    return position - first
+
+
+def _values(bulk_id: str, position: int, image: Listed) -> Mapping[str, Any]:
+    failed = image.error is not None
+    return {
+        "bulk_id": bulk_id,
+        "position": position,
+        "uploaded": image.uploaded,
+        "source": image.source,
+        "state": ItemState.FAILED if failed else ItemState.WAITING,
+        "ended_at": time.time() if failed else None,
+        "error": None if image.error is None else image.error.model_dump(mode="json"),
+    }
+
+
+def _waiting(bulk_id: str) -> Any:
+    query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.WAITING)
+    # Others that take at the same moment take the next ones.
+    return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
+
+
+def _left(bulk_id: str) -> Any:
+    """Taken under a lease that is gone."""
+    held = select(JobRow.id).where(
+        JobRow.id == BulkItemRow.job_id, JobRow.lease == BulkItemRow.token, JobRow.phase == Phase.EXECUTING
+    )
+    query = select(BulkItemRow).where(
+        BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.TAKEN, ~held.exists()
+    )
+    return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
+
+
+def _good(session: Session, lease: Lease) -> bool:
+    """Whether the job is still at work under this lease."""
+    held = select(JobRow.id).where(
+        JobRow.id == lease.job_id, JobRow.lease == lease.token, JobRow.phase == Phase.EXECUTING
+    )
+    return session.scalar(held) is not None
+
+
+def _holding(taken: Taken) -> Iterator[ColumnElement[bool]]:
+    yield BulkItemRow.bulk_id == taken.bulk_id
+    yield BulkItemRow.position == taken.position
+    yield BulkItemRow.state == ItemState.TAKEN
+    yield BulkItemRow.token == taken.lease.token
+
+
+def _changed(session: Session, statement: Update | Delete) -> int:
+    result = session.execute(statement.execution_options(synchronize_session=False))
+    assert isinstance(result, CursorResult)
+    return result.rowcount
+
+
+def _count(session: Session, bulk_id: str, **values: Any) -> None:
+    _changed(session, update(BulkRow).where(BulkRow.id == bulk_id).values(**values))
+    _end_if_done(session, bulk_id)
+
+
+def _end_if_done(session: Session, bulk_id: str) -> None:
+    """Any phase but an end -> COMPLETED, where no image is left."""
+    done = update(BulkRow).where(
+        BulkRow.id == bulk_id,
+        BulkRow.phase.in_(sorted(OPEN)),
+        BulkRow.listed,
+        BulkRow.done + BulkRow.failed == BulkRow.total,
+    )
+    _changed(session, done.values(phase=BulkPhase.COMPLETED, ended_at=time.time()))

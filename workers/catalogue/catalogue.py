@@ -1,0 +1,121 @@
+"""The catalogue: images, transits, PSFs, products and jobs, in SQLite or PostgreSQL through SQLAlchemy.
+
+What is done with each subject has a file of its own; here they are put together, with what all rows have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+from sqlalchemy import Select, select, tuple_
+from sqlalchemy.exc import IntegrityError
+
+from workers.catalogue.affected import AffectedProducts
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.bulks import Bulks
+from workers.catalogue.census import Census
+from workers.catalogue.contexts import Contexts
+from workers.catalogue.database import Database
+from workers.catalogue.jobs import Jobs
+from workers.catalogue.keys import Keys
+from workers.catalogue.named_files import NamedFiles
+from workers.catalogue.owners import Owners, add_bytes, hold_to_quota
+from workers.catalogue.parts import Parts
+from workers.catalogue.psfs import Psfs
+from workers.catalogue.schema import Schema
+from workers.catalogue.stage_times import KeptStageTimes
+from workers.catalogue.tables import (
+    ImageRow,
+    JobRow,
+    ProductRow,
+    PsfContextRow,
+    PsfRow,
+    ReportRow,
+    TransitRow,
+)
+from workers.catalogue.uws_jobs import UwsJobs
+
+Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow)
+AnyRow = TypeVar(
+    "AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow, PsfContextRow, BulkRow
+)
+
+
+class Catalogue:
+    """All reading and writing of rows; each method, here and of each subject, is one transaction."""
+
+    def __init__(self, url: str) -> None:
+        self._database = Database(url)
+        self._engine = self._database.engine
+        self.schema = Schema(self._database)
+        self.jobs = Jobs(self._database)
+        self.uws = UwsJobs(self._database, self.jobs)
+        self.parts = Parts(self._database)
+        self.bulks = Bulks(self._database)
+        self.psfs = Psfs(self._database)
+        self.contexts = Contexts(self._database)
+        self.affected = AffectedProducts(self._database)
+        self.census = Census(self._database)
+        self.stage_times = KeptStageTimes(self._database)
+        self.keys = Keys(self._database)
+        self.owners = Owners(self._database)
+        self.named_files = NamedFiles(self._database)
+
+    def upgrade(self) -> None:
+        """Bring the database to this version's tables. Raises ``workers.catalogue.schema.SchemaError`` where that cannot be."""
+        self.schema.upgrade()
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._database.engine.dispose()
+
+    def ping(self) -> None:
+        """Raise ``sqlalchemy.exc.SQLAlchemyError`` where the database does not answer."""
+        with self._database.reading() as session:
+            session.execute(select(1))
+
+    def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
+        """Insert a content-addressed row; returns the row of that identity, and whether it is new.
+
+        quota_mib: of owners who have none of their own, where the row is held to it; none: what was made is kept. Raises
+        ``owner_rows.OverQuota``, and adds nothing.
+        """
+        try:
+            with self._database.writing.begin() as session:
+                session.add(row)
+                session.flush()
+                add_bytes(session, row.owner, row.bytes)
+                if quota_mib is not None:
+                    hold_to_quota(session, row.owner, row.bytes, quota_mib)
+            return row, True
+        except IntegrityError:
+            existing = self.get(type(row), row.id, row.owner)
+            if existing is None:
+                raise
+            return existing, False
+
+    def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
+        """The row of this identity, or None."""
+        with self._database.reading() as session:
+            return session.get(table, (owner, identity))
+
+    def page(
+        self,
+        table: type[AnyRow],
+        *,
+        owner: str,
+        limit: int,
+        after: tuple[float, str] | None = None,
+        **equal: str | None,
+    ) -> Sequence[AnyRow]:
+        """Rows newest first, from ``after`` = (created_at, id) of the last row seen; ``equal`` filters columns."""
+        query: Select[AnyRow] = select(table).where(table.owner == owner)
+        for column, value in equal.items():
+            if value is not None:
+                query = query.where(getattr(table, column) == value)
+        if after is not None:
+            query = query.where(tuple_(table.created_at, table.id) < after)
+        query = query.order_by(table.created_at.desc(), table.id.desc()).limit(limit)
+        with self._database.reading() as session:
+            return session.scalars(query).all()

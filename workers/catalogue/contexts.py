@@ -1,0 +1,203 @@
+"""Contexts: sets of PSFs that stay as they are, so that what was looked up in one once is looked up the same for ever."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from sqlalchemy import select
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from psfcore.errors import DataError
+from workers.catalogue.database import Database
+from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
+from workers.contract.contract import canonical_hash
+from workers.versions.status import PsfStatus
+from workers.versions.validity import Validity, iso
+
+NOW = "now"  # for a context: what is certified at this moment, whatever the owner's default is
+RESERVED = (NOW, "default")
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$"  # shorter than an id
+_ID = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class Pin:
+    """A PSF for a range of times; none is the range that the PSF itself has."""
+
+    psf_id: str
+    validity: Validity | None = None
+
+
+class Contexts:
+    """The tables of contexts; each method is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(
+        self, name: str, owner: str, by: str, *, reason: str = "", pins: Sequence[Pin] | None = None
+    ) -> tuple[PsfContextRow, bool]:
+        """A context of these pins, or of all that is certified; and whether it is new.
+
+        Raises ``DataError``: "bad-name", "name-taken", "no-such-psf", "no-line", "nothing-to-pin", "ranges-overlap".
+        """
+        if not re.fullmatch(NAME, name) or name in RESERVED:
+            raise DataError(
+                "bad-name",
+                f"expected a name of up to 63 letters, digits and . _ - that is not {' or '.join(RESERVED)}; got "
+                f"{ascii(name)[:80]}",
+            )
+        try:
+            with self._database.writing.begin() as session:
+                rows = _certified(session, owner) if pins is None else _given(session, owner, pins)
+                made = _context(name, owner, by, reason, rows)
+                session.add_all((made, *rows))
+            return made, True
+        except IntegrityError:
+            existing = self.find(name, owner)
+            if existing is None:
+                raise
+            if existing.id != made.id:
+                raise DataError(
+                    "name-taken", f"context {name} is another set of PSFs, {existing.id}, and stays it"
+                ) from None
+            return existing, False
+
+    def find(self, id_or_name: str, owner: str) -> PsfContextRow | None:
+        """The context of this id or name, or None."""
+        with self._database.reading() as session:
+            if _ID.fullmatch(id_or_name):
+                return session.get(PsfContextRow, (owner, id_or_name))
+            named = select(PsfContextRow).where(
+                PsfContextRow.owner == owner, PsfContextRow.name == id_or_name
+            )
+            return session.scalars(named).first()
+
+    def named(self, id_or_name: str, owner: str) -> PsfContextRow:
+        """The context of this id or name. Raises ``DataError`` "no-such-context"."""
+        found = self.find(id_or_name, owner)
+        if found is None:
+            raise DataError("no-such-context", f"there is no context with the id or name {id_or_name!r}")
+        return found
+
+    def pins(self, context_id: str, owner: str) -> Sequence[PsfPinRow]:
+        """What a context pins, by line and time."""
+        query = select(PsfPinRow).where(PsfPinRow.owner == owner, PsfPinRow.context_id == context_id)
+        with self._database.reading() as session:
+            return session.scalars(query.order_by(PsfPinRow.line, PsfPinRow.valid_from)).all()
+
+    def any_pinned(self, context_id: str, line: str, owner: str) -> bool:
+        """Whether a context pins a PSF of the line."""
+        query = select(PsfPinRow.psf_id).where(
+            PsfPinRow.owner == owner, PsfPinRow.context_id == context_id, PsfPinRow.line == line
+        )
+        with self._database.reading() as session:
+            return session.scalars(query.limit(1)).first() is not None
+
+    # The default --------------------------------------------------------------------------------------
+
+    def default(self, owner: str) -> PsfContextRow | None:
+        """The context that an owner's images are looked up in; none: what is certified at the moment."""
+        query = select(DefaultContextRow.context_id).where(DefaultContextRow.owner == owner)
+        with self._database.reading() as session:
+            context_id = session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(1)).first()
+            return None if context_id is None else session.get(PsfContextRow, (owner, context_id))
+
+    def set_default(self, id_or_name: str | None, owner: str, by: str, reason: str = "") -> None:
+        """Move an owner's default; none: no context. Raises ``DataError`` "no-such-context"."""
+        context_id = None if id_or_name is None else self.named(id_or_name, owner).id
+        with self._database.writing.begin() as session:
+            session.add(
+                DefaultContextRow(owner=owner, context_id=context_id, at=time.time(), by=by, reason=reason)
+            )
+
+    def default_changes(self, owner: str, limit: int = 200) -> Sequence[DefaultContextRow]:
+        """Where an owner's default was moved to, the last move first."""
+        query = select(DefaultContextRow).where(DefaultContextRow.owner == owner)
+        with self._database.reading() as session:
+            return session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(limit)).all()
+
+    def asked_for(self, context: str | None, owner: str) -> PsfContextRow | None:
+        """The context to look in where a request says this: an id, a name, NOW for none, or nothing for the default."""
+        if context is None:
+            return self.default(owner)
+        return None if context == NOW else self.named(context, owner)
+
+
+def _certified(session: Session, owner: str) -> list[PsfPinRow]:
+    query = select(PsfRow).where(PsfRow.owner == owner, PsfRow.status == PsfStatus.CERTIFIED)
+    rows = session.scalars(query.order_by(PsfRow.line, PsfRow.valid_from)).all()
+    if not rows:
+        raise DataError("nothing-to-pin", "expected certified PSFs to pin; there is none yet")
+    return [_pin(row, None) for row in rows]
+
+
+def _given(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]:
+    if not pins:
+        raise DataError("nothing-to-pin", "expected PSFs to pin; got an empty list")
+    rows = []
+    for pin in pins:
+        row = session.get(PsfRow, (owner, pin.psf_id))
+        if row is None:
+            raise DataError("no-such-psf", f"the catalogue holds no PSF with id {pin.psf_id}")
+        rows.append(_pin(row, pin.validity))
+    rows.sort(key=lambda pinned: (pinned.line, pinned.valid_from))
+    _check_apart(rows)
+    return rows
+
+
+def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
+    if row.line is None:
+        raise DataError("no-line", f"expected PSFs of a known instrument; PSF {row.id} names none")
+    own = Validity(
+        -math.inf if row.valid_from is None else row.valid_from,
+        math.inf if row.valid_to is None else row.valid_to,
+    )
+    pinned = validity or own
+    return PsfPinRow(
+        owner=row.owner,
+        line=row.line,
+        valid_from=pinned.start,
+        valid_to=pinned.end,
+        psf_id=row.id,
+        version=row.version,
+    )
+
+
+def _check_apart(rows: Sequence[PsfPinRow]) -> None:
+    for one, other in pairwise(rows):
+        first, second = Validity(one.valid_from, one.valid_to), Validity(other.valid_from, other.valid_to)
+        if one.line == other.line and first.overlaps(second):
+            raise DataError(
+                "ranges-overlap",
+                f"expected one PSF of {one.line} at any time; got PSF {one.psf_id} for {first} and PSF "
+                f"{other.psf_id} for {second}",
+            )
+
+
+def _context(name: str, owner: str, by: str, reason: str, rows: Iterable[PsfPinRow]) -> PsfContextRow:
+    """The row of a context; its id goes into the rows of its pins."""
+    pins = list(rows)
+    identity = canonical_hash(
+        {
+            "name": name,
+            "pins": [[pin.line, iso(pin.valid_from), iso(pin.valid_to), pin.psf_id] for pin in pins],
+        }
+    )
+    for pin in pins:
+        pin.context_id = identity
+    return PsfContextRow(
+        owner=owner,
+        id=identity,
+        name=name,
+        created_at=time.time(),
+        created_by=by,
+        reason=reason,
+        pins=len(pins),
+    )

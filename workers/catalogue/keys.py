@@ -1,0 +1,121 @@
+"""Keys that let their owners in: made once, shown once, and from then on known by a hash alone.
+
+A key reads ``hpsf_ID_SECRET``. The id is public (lists and logs show it); the secret is 256 random bits, so that one
+round of SHA-256 is enough to keep it by: there is nothing in it to guess, unlike in a password.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+import time
+from collections.abc import Collection, Sequence
+from enum import StrEnum
+
+from sqlalchemy import func, or_, select, update
+
+from workers.catalogue.database import Database
+from workers.catalogue.tables import KeyRow
+
+OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
+LABEL_LENGTH = 80
+_KEY = re.compile(r"hpsf_([0-9a-f]{16})_([A-Za-z0-9_-]{43})", re.ASCII)
+_USE_NOTED_EVERY_S = 60.0  # a write a minute, not a write a request
+_NOBODY = hashlib.sha256(b"nobody").hexdigest()
+
+
+class Scope(StrEnum):
+    """What a key is good for; each says all that it allows, and none includes another."""
+
+    READ = "read"
+    SUBMIT = "submit"
+    CERTIFY = "certify"
+    BULK = "bulk"
+    ADMIN = "admin"
+
+
+class KeyRefused(Exception):
+    """A key that lets nobody in; ``code`` and the message say why, and never show it."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code, self.message = code, message
+
+
+class Keys:
+    """The table of keys; each method is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def make(
+        self, owner: str, scopes: Collection[Scope], *, label: str = "", expires_at: float | None = None
+    ) -> str:
+        """A new key, as its owner is to be told it: nobody can be told again."""
+        if not OWNER.fullmatch(owner):
+            raise ValueError(f"expected an owner of small letters, digits, '.', '_' and '-'; got {owner!r}")
+        if not scopes:
+            raise ValueError("expected a scope at least; a key without any is good for nothing")
+        identity, secret = secrets.token_hex(8), secrets.token_urlsafe(32)
+        row = KeyRow(
+            id=identity,
+            owner=owner,
+            secret_sha256=_hash(secret),
+            scopes=sorted(scopes),
+            label=label[:LABEL_LENGTH],
+            created_at=time.time(),
+            expires_at=expires_at,
+        )
+        with self._database.writing.begin() as session:
+            session.add(row)
+        return f"hpsf_{identity}_{secret}"
+
+    def check(self, key: str) -> KeyRow:
+        """The row of a key that is good now, whose use is noted. Raises ``KeyRefused``."""
+        parts = _KEY.fullmatch(key)
+        if parts is None:
+            raise KeyRefused("bad-key", "expected a key of the form hpsf_ID_SECRET; got something else")
+        with self._database.reading() as session:
+            row = session.get(KeyRow, parts[1])
+        same = hmac.compare_digest(_hash(parts[2]), _NOBODY if row is None else row.secret_sha256)
+        if row is None or not same:
+            raise KeyRefused("bad-key", "this key is not known here")
+        now = time.time()
+        # Only who has the secret is told these.
+        if row.revoked_at is not None:
+            raise KeyRefused("key-revoked", f"key {row.id} was revoked; ask for another")
+        if row.expires_at is not None and row.expires_at <= now:
+            raise KeyRefused("key-expired", f"key {row.id} has expired; ask for another")
+        if row.last_used_at is None or row.last_used_at < now - _USE_NOTED_EVERY_S:
+            self._note_use(row.id, now)
+        return row
+
+    def all(self) -> Sequence[KeyRow]:
+        """All keys, those of today and of the past, oldest first."""
+        with self._database.reading() as session:
+            return session.scalars(select(KeyRow).order_by(KeyRow.created_at, KeyRow.id)).all()
+
+    def revoke(self, identity: str) -> bool:
+        """Let a key in no more, from the next request on; False where there is none with this id."""
+        revoked = update(KeyRow).where(KeyRow.id == identity)
+        return bool(
+            self._database.change(revoked.values(revoked_at=func.coalesce(KeyRow.revoked_at, time.time())))
+        )
+
+    def any_good(self) -> bool:
+        """Whether there is a key that lets anybody in now."""
+        good = select(KeyRow.id).where(
+            KeyRow.revoked_at.is_(None), or_(KeyRow.expires_at.is_(None), KeyRow.expires_at > time.time())
+        )
+        with self._database.reading() as session:
+            return session.scalars(good.limit(1)).first() is not None
+
+    def _note_use(self, identity: str, now: float) -> None:
+        unnoted = or_(KeyRow.last_used_at.is_(None), KeyRow.last_used_at < now - _USE_NOTED_EVERY_S)
+        self._database.change(update(KeyRow).where(KeyRow.id == identity, unnoted).values(last_used_at=now))
+
+
+def _hash(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()

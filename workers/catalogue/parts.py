@@ -1,0 +1,100 @@
+"""Parts of jobs that several workers share, taken by compare-and-set under a lease of their own."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import and_, or_, select, update
+
+from workers.catalogue.database import Database
+from workers.catalogue.tables import PartRow
+
+
+@dataclass(frozen=True)
+class Part:
+    """The right to work on a part; who lost it may still bring the result, if nobody else has."""
+
+    owner: str
+    request_key: str
+    number: int
+    token: str
+
+
+class Parts:
+    """The table of parts; each method is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def open(self, owner: str, request_key: str, count: int) -> None:
+        """Make the parts 0 to count - 1 that are not there yet."""
+        with self._database.writing.begin() as session:
+            there = set(
+                session.scalars(
+                    select(PartRow.number).where(PartRow.owner == owner, PartRow.request_key == request_key)
+                )
+            )
+            for number in range(count):
+                if number not in there:
+                    session.add(PartRow(owner=owner, request_key=request_key, number=number))
+
+    def take(self, owner: str, request_key: str, lease_s: float) -> Part | None:
+        """A part that is open, or whose holder fell silent; None where there is none."""
+        free = [
+            PartRow.owner == owner,
+            PartRow.request_key == request_key,
+            PartRow.result.is_(None),
+            or_(PartRow.token.is_(None), PartRow.heartbeat_at < self._database.now - lease_s),
+        ]
+        while True:
+            with self._database.reading() as session:
+                number = session.scalars(select(PartRow.number).where(*free).order_by(PartRow.number)).first()
+            if number is None:
+                return None
+            part = Part(owner, request_key, number, uuid.uuid4().hex)
+            if self._set(
+                [*free, PartRow.number == number], token=part.token, heartbeat_at=self._database.now
+            ):
+                return part
+
+    def heartbeat(self, part: Part) -> bool:
+        """Say that the part is worked on; False where it was taken by another, or is done."""
+        return self._set(_holding(part), heartbeat_at=self._database.now)
+
+    def finish(self, part: Part, result: dict[str, Any]) -> bool:
+        """Write a part's result; False where it has one.
+
+        Whoever else took the part meanwhile: a result follows from the request alone, so the first one counts.
+        """
+        return self._set(_undone(part), result=result, token=None)
+
+    def release(self, part: Part) -> None:
+        """Give a part back undone."""
+        self._set(_holding(part), token=None)
+
+    def results(self, owner: str, request_key: str) -> list[dict[str, Any]]:
+        """Results of the parts that are done, in order."""
+        query = select(PartRow.result).where(
+            PartRow.owner == owner, PartRow.request_key == request_key, PartRow.result.is_not(None)
+        )
+        with self._database.reading() as session:
+            return [dict(result) for result in session.scalars(query.order_by(PartRow.number)) if result]
+
+    def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
+        return bool(self._database.change(update(PartRow).where(and_(*conditions)).values(**values)))
+
+
+def _undone(part: Part) -> list[Any]:
+    return [
+        PartRow.owner == part.owner,
+        PartRow.request_key == part.request_key,
+        PartRow.number == part.number,
+        PartRow.result.is_(None),
+    ]
+
+
+def _holding(part: Part) -> list[Any]:
+    return [*_undone(part), PartRow.token == part.token]

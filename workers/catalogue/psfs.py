@@ -1,0 +1,379 @@
+"""PSFs in the catalogue: found by what they are and what they are valid for, certified and deprecated.
+
+A change of status holds the lock on its line's row (PostgreSQL) or the database's one write lock (SQLite), from before
+it looks at the line's other PSFs until it is written: of two that cannot both be, the second sees the first.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from sqlalchemy import Select, and_, exists, select, tuple_
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.orm import Session
+
+from psfcore.errors import DataError
+from workers.catalogue.database import Database
+from workers.catalogue.tables import PsfChangeRow, PsfLineRow, PsfPinRow, PsfRow
+from workers.versions.series import UPLOADED, line_of
+from workers.versions.status import PsfStatus, check_transition, check_version
+from workers.versions.validity import Validity
+
+
+@dataclass(frozen=True)
+class StatusAsked:
+    """What a PSF is to become, and all that is said with it."""
+
+    status: PsfStatus
+    reason: str
+    version: str | None = None
+    validity: Validity | None = None
+    successor_id: str | None = None
+    supersedes: tuple[str, ...] = ()  # certified PSFs of the line, deprecated in the same step
+    # Of a draft of which nobody has said it yet.
+    instrument: str | None = None
+    channel: str | None = None
+    kind: str | None = None
+
+
+@dataclass(frozen=True)
+class PsfFilter:
+    """What PSFs are looked for by; none is anything."""
+
+    instrument: str | None = None
+    channel: str | None = None
+    kind: str | None = None
+    name: str | None = None
+    version: str | None = None
+    context_id: str | None = None
+    status: str | None = None
+    valid_at: float | None = None
+
+    @property
+    def line(self) -> str | None:
+        """The line, where all that makes one is given."""
+        whole = self.instrument and self.channel and self.kind
+        return line_of(self.instrument, self.channel, self.kind or "") if whole else None
+
+
+class Psfs:
+    """What is done with PSFs beside adding and getting them; each method is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def describe(self, psf_id: str, owner: str, *, tables_sha256: str, preview_sha256: str) -> None:
+        """Note where the tables and the picture of a PSF are; both follow from its file, which stays as it is."""
+        with self._database.writing.begin() as session:
+            row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
+            if row is not None:
+                row.details = {**row.details, "tables_sha256": tables_sha256}
+                row.preview_sha256 = preview_sha256
+
+    # Found by what they are ---------------------------------------------------------------------------
+
+    def page(
+        self, wanted: PsfFilter, owner: str, *, limit: int, after: tuple[float, str] | None = None
+    ) -> Sequence[PsfRow]:
+        """PSFs newest first, from ``after`` = (created_at, id) of the last row seen."""
+        query = _query(wanted, owner)
+        if after is not None:
+            query = query.where(tuple_(PsfRow.created_at, PsfRow.id) < after)
+        with self._database.reading() as session:
+            return session.scalars(query.order_by(*_NEWEST_FIRST).limit(limit)).all()
+
+    def emptied_by(self, wanted: PsfFilter, owner: str) -> str | None:
+        """The first filter, in their order, that leaves nothing beside those before it; none where PSFs are left."""
+        met = PsfFilter()
+        with self._database.reading() as session:
+            for name in (field.name for field in fields(PsfFilter)):
+                value = getattr(wanted, name)
+                if value is None:
+                    continue
+                met = replace(met, **{name: value})
+                first = (
+                    _query(met, owner).order_by(*_NEWEST_FIRST).limit(1)
+                )  # in the order that lists have an index for
+                if session.scalars(first).first() is None:
+                    return name.removesuffix("_id")
+        return None
+
+    def any_certified(self, line: str, owner: str) -> bool:
+        """Whether a PSF of the line is certified."""
+        certified = and_(PsfRow.owner == owner, PsfRow.line == line, PsfRow.status == PsfStatus.CERTIFIED)
+        with self._database.reading() as session:
+            return bool(session.scalar(select(exists().where(certified))))
+
+    # Status -------------------------------------------------------------------------------------------
+
+    def changes(self, psf_id: str, owner: str) -> Sequence[PsfChangeRow]:
+        """What was made of a PSF, the first change first."""
+        query = select(PsfChangeRow).where(PsfChangeRow.owner == owner, PsfChangeRow.psf_id == psf_id)
+        with self._database.reading() as session:
+            return session.scalars(query.order_by(PsfChangeRow.number)).all()
+
+    def released(self, line: str, owner: str) -> Sequence[str]:
+        """The versions that PSFs of a line were certified under."""
+        with self._database.reading() as session:
+            return session.scalars(_released(line, owner)).all()
+
+    def change(self, psf_id: str, owner: str, asked: StatusAsked, by: str) -> PsfRow:
+        """Certify a PSF, change the range of a certified one, deprecate it, or name a deprecated one's successor.
+
+        Raises ``DataError``: "no-such-psf", "no-line", "line-known", "wrong-transition", "not-of-this-change", what
+        ``check_version`` does, "ranges-overlap", "not-to-supersede", "no-such-successor", "successor-named",
+        "changed-meanwhile". Nothing is changed then.
+        """
+        with self._database.writing.begin() as session:
+            row = _found(session, psf_id, owner)
+            line = _line(row, asked)
+            self._lock(session, line, owner)
+            session.refresh(row, with_for_update=True)
+            if _line(row, asked) != line:
+                raise DataError("changed-meanwhile", f"PSF {psf_id} was just put in another line; ask again")
+            before = PsfStatus(row.status)
+            check_transition(before, asked.status)
+            if asked.status == PsfStatus.CERTIFIED:
+                _certify(session, row, line, asked, by)
+            else:
+                _deprecate(session, row, asked, by)
+            return row
+
+    def _lock(self, session: Session, line: str, owner: str) -> None:
+        """Hold the line until the transaction ends; SQLite's is held by now."""
+        insert = sqlite.insert if self._database.sqlite else postgresql.insert
+        session.execute(insert(PsfLineRow).values(owner=owner, line=line).on_conflict_do_nothing())
+        session.get(PsfLineRow, (owner, line), with_for_update=True)
+
+
+_NEWEST_FIRST = (PsfRow.created_at.desc(), PsfRow.id.desc())
+
+
+def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
+    """PSFs that meet a filter, in no order yet.
+
+    What is few by itself, the PSFs of a context or of a time, is found first and joined. That it is distinct keeps SQLite
+    from walking all PSFs in the order of a list until some of these turn up.
+    """
+    query = select(PsfRow).where(PsfRow.owner == owner)
+    if wanted.context_id is not None:
+        query = query.join(pinned := _pinned(wanted, owner).subquery(), PsfRow.id == pinned.c.psf_id)
+    elif wanted.valid_at is not None:
+        query = query.join(latest := _latest_from(wanted, owner).subquery(), PsfRow.id == latest.c.psf_id)
+        query = query.where(PsfRow.valid_to > wanted.valid_at)
+    # A line's name stands for all that makes it: indexes begin with it.
+    whole = ("line",) if wanted.line is not None else ("instrument", "channel", "kind")
+    for name in (*whole, "name", "version", "status"):
+        value = getattr(wanted, name)
+        if value is not None:
+            query = query.where(getattr(PsfRow, name) == value)
+    return query
+
+
+def _pinned(wanted: PsfFilter, owner: str) -> Select[Any]:
+    """Ids of the PSFs that a context pins, for a time where one is asked for."""
+    query = select(PsfPinRow.psf_id).where(
+        PsfPinRow.owner == owner, PsfPinRow.context_id == wanted.context_id
+    )
+    if wanted.line is not None:
+        query = query.where(PsfPinRow.line == wanted.line)
+    if wanted.valid_at is not None:
+        query = query.where(PsfPinRow.valid_from <= wanted.valid_at, PsfPinRow.valid_to > wanted.valid_at)
+    return query.distinct()  # one may be pinned for several ranges
+
+
+def _latest_from(wanted: PsfFilter, owner: str) -> Select[Any]:
+    """Of each line the id of the certified PSF whose range began last; ranges do not overlap: no other can hold the time."""
+    latest = (
+        select(PsfRow.id)
+        .where(
+            PsfRow.owner == PsfLineRow.owner,
+            PsfRow.line == PsfLineRow.line,
+            PsfRow.status == PsfStatus.CERTIFIED,
+            PsfRow.valid_from <= wanted.valid_at,
+        )
+        .order_by(PsfRow.valid_from.desc())
+        .limit(1)
+        .correlate(PsfLineRow)
+        .scalar_subquery()
+    )
+    query = select(latest.label("psf_id")).distinct()
+    query = query.select_from(PsfLineRow).where(PsfLineRow.owner == owner)
+    if wanted.line is not None:
+        query = query.where(PsfLineRow.line == wanted.line)
+    elif wanted.instrument is not None:
+        query = query.where(PsfLineRow.line.startswith(f"{wanted.instrument}/", autoescape=True))
+    return query
+
+
+def _released(line: str, owner: str) -> Select[Any]:
+    released = PsfRow.status.in_((PsfStatus.CERTIFIED, PsfStatus.DEPRECATED))
+    return select(PsfRow.version).where(PsfRow.owner == owner, PsfRow.line == line, released)
+
+
+def _found(session: Session, psf_id: str, owner: str) -> PsfRow:
+    row = session.get(PsfRow, (owner, psf_id))
+    if row is None:
+        raise DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+    return row
+
+
+def _line(row: PsfRow, asked: StatusAsked) -> str:
+    """The line of a PSF, with what is now said of it. Raises ``DataError`` "line-known" or "no-line"."""
+    instrument, channel, kind = _said_of_line(row, asked)
+    line = line_of(instrument, channel, kind)
+    if line is None:
+        raise DataError(
+            "no-line",
+            f"expected an instrument, which the file of PSF {row.id} does not name: say instrument, channel and kind",
+        )
+    return line
+
+
+def _said_of_line(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | None, str]:
+    open_to = row.status == PsfStatus.DRAFT
+    known = {
+        "instrument": row.instrument,
+        "channel": row.channel,
+        "kind": None if open_to and row.kind == UPLOADED else row.kind,
+    }
+    for name, value in known.items():
+        said = getattr(asked, name)
+        if said is not None and value is not None and said != value:
+            raise DataError("line-known", f"{name}: PSF {row.id} has {value!r}, which stays; got {said!r}")
+    return (
+        row.instrument or asked.instrument,
+        row.channel or asked.channel,
+        known["kind"] or asked.kind or row.kind,
+    )
+
+
+def _certify(session: Session, row: PsfRow, line: str, asked: StatusAsked, by: str) -> None:
+    _refuse(asked, "deprecation", successor_id=asked.successor_id)
+    version = row.version
+    if row.status == PsfStatus.DRAFT:
+        others = session.scalars(_released(line, row.owner)).all()
+        version = check_version(asked.version, others)
+    elif asked.version not in (None, row.version):
+        raise DataError(
+            "not-of-this-change", f"a certified PSF keeps its version, {row.version}; got {asked.version}"
+        )
+    validity = asked.validity or _validity(row)
+    for superseded_id in asked.supersedes:
+        superseded = session.get(PsfRow, (row.owner, superseded_id), with_for_update=True)
+        if (
+            superseded is None
+            or superseded is row
+            or superseded.line != line
+            or superseded.status != PsfStatus.CERTIFIED
+        ):
+            raise DataError(
+                "not-to-supersede", f"supersedes: expected certified PSFs of {line}; got {superseded_id}"
+            )
+        _write(session, superseded, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=row.id)
+    session.flush()
+    other = _overlapping(session, row, line, validity)
+    if other is not None:
+        raise DataError(
+            "ranges-overlap",
+            f"expected a range that no certified PSF of {line} has a part of; got {validity}, and PSF {other.id} "
+            f"({other.name} {other.version}) has {_validity(other)}: deprecate it, name it "
+            "under supersedes, or certify it for another range first",
+        )
+    row.instrument, row.channel, row.kind = _said_of_line(row, asked)
+    row.line = line
+    _write(
+        session,
+        row,
+        asked.reason,
+        by,
+        status=PsfStatus.CERTIFIED,
+        version=version,
+        valid_from=validity.start,
+        valid_to=validity.end,
+    )
+
+
+def _validity(row: PsfRow) -> Validity:
+    """The range that a PSF has; all times where it was given none."""
+    if row.valid_from is None or row.valid_to is None:
+        return Validity()
+    return Validity(row.valid_from, row.valid_to)
+
+
+def _overlapping(session: Session, row: PsfRow, line: str, validity: Validity) -> PsfRow | None:
+    """The certified PSF of the line that shares a time with the range. Theirs do not overlap: the last to begin decides."""
+    query = select(PsfRow).where(
+        PsfRow.owner == row.owner,
+        PsfRow.line == line,
+        PsfRow.status == PsfStatus.CERTIFIED,
+        PsfRow.id != row.id,
+        PsfRow.valid_from < validity.end,
+    )
+    last = session.scalars(query.order_by(PsfRow.valid_from.desc()).limit(1)).first()
+    return last if last is not None and _validity(last).overlaps(validity) else None
+
+
+def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> None:
+    _refuse(
+        asked,
+        "certification",
+        version=asked.version,
+        validity=asked.validity,
+        supersedes=asked.supersedes or None,
+    )
+    if row.status == PsfStatus.DEPRECATED and (row.successor_id is not None or asked.successor_id is None):
+        has = f"successor {row.successor_id}, which stays" if row.successor_id else "none"
+        raise DataError(
+            "successor-named",
+            f"PSF {row.id} is deprecated and has {has}; expected a first successor, got {asked.successor_id or 'none'}",
+        )
+    if asked.successor_id is not None:
+        successor = session.get(PsfRow, (row.owner, asked.successor_id))
+        if successor is None or successor.line != row.line or successor.status != PsfStatus.CERTIFIED:
+            raise DataError(
+                "no-such-successor",
+                f"successor: expected a certified PSF of {row.line}; got {asked.successor_id}"
+                + (
+                    ""
+                    if successor is None
+                    else f", a {successor.status} one of {successor.line or 'no line'}"
+                ),
+            )
+        if successor is row:
+            raise DataError("no-such-successor", f"successor: expected another PSF than {row.id} itself")
+    _write(session, row, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=asked.successor_id)
+
+
+def _refuse(asked: StatusAsked, other: str, **given: object) -> None:
+    for name, value in given.items():
+        if value is not None:
+            raise DataError(
+                "not-of-this-change", f"{name}: expected with a {other} alone; got it for {asked.status}"
+            )
+
+
+def _write(session: Session, row: PsfRow, reason: str, by: str, **values: object) -> None:
+    """The change itself, and its line in the PSF's history."""
+    before, version_before = row.status, row.version
+    for name, value in values.items():
+        setattr(row, name, value)
+    session.add(
+        PsfChangeRow(
+            owner=row.owner,
+            psf_id=row.id,
+            at=time.time(),
+            by=by,
+            status_before=before,
+            status=row.status,
+            version_before=version_before,
+            version=row.version,
+            valid_from=row.valid_from,
+            valid_to=row.valid_to,
+            successor_id=row.successor_id,
+            reason=reason,
+        )
+    )

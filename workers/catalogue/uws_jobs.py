@@ -1,0 +1,160 @@
+"""Jobs as clients of the UWS interface have them: set up before they start, on terms, destroyed, listed all at once."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import delete, select
+from sqlalchemy.engine import CursorResult
+from sqlalchemy.exc import IntegrityError
+
+from workers.catalogue.database import Database
+from workers.catalogue.jobs import Jobs
+from workers.catalogue.tables import JobRow, TermsRow
+from workers.contract.contract import Phase, canonical_hash
+from workers.contract.queues import queue_of
+
+
+@dataclass(frozen=True)
+class JobLine:
+    """A job as a list shows it."""
+
+    id: str
+    phase: str
+    owner: str
+    created_at: float
+    run_id: str | None
+
+
+class UwsJobs:
+    """What the UWS interface does with the table of jobs beside the jobs' own course; each method is one transaction."""
+
+    def __init__(self, database: Database, jobs: Jobs) -> None:
+        self._database, self._jobs = database, jobs
+
+    def draft(
+        self,
+        kind: str,
+        given: dict[str, Any],
+        *,
+        owner: str,
+        run_id: str | None = None,
+        execution_duration_s: int = 0,
+        destruction_at: float | None = None,
+    ) -> JobRow:
+        """A new PENDING job with the parameters that were given so far. It shares nothing with equal requests."""
+        row = JobRow(
+            id=uuid.uuid4().hex,
+            owner=owner,
+            kind=kind,
+            parameters=given,
+            request_key="",
+            phase=Phase.PENDING,
+            queue=queue_of(kind),
+            created_at=time.time(),
+        )
+        terms = TermsRow(
+            job_id=row.id,
+            run_id=run_id,
+            execution_duration_s=execution_duration_s,
+            destruction_at=destruction_at,
+        )
+        with self._database.writing.begin() as session:
+            session.add_all((row, terms))
+        return row
+
+    def amend(self, job_id: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> bool:
+        """Change what was given for a PENDING job; False, and nothing changed, in any other phase."""
+        with self._database.writing.begin() as session:
+            row = session.get(JobRow, job_id, with_for_update=True)
+            if row is None or row.phase != Phase.PENDING:
+                return False
+            row.parameters = change(dict(row.parameters))
+            return True
+
+    def start(
+        self,
+        job_id: str,
+        given: dict[str, Any],
+        parameters: dict[str, Any],
+        request_key: str,
+        estimate: dict[str, Any] | None = None,
+    ) -> bool:
+        """PENDING -> QUEUED with the parameters that ``given`` was resolved to.
+
+        False where the job is not PENDING, or what was given for it has changed since. Where an equal request has a
+        live job already this one runs under a key of its own: not while that job is at work, and then it finds what
+        that job made.
+        """
+        for key in (request_key, canonical_hash({"request_key": request_key, "job": job_id})):
+            try:
+                with self._database.writing.begin() as session:
+                    row = session.get(JobRow, job_id, with_for_update=True)
+                    if row is None or row.phase != Phase.PENDING or row.parameters != given:
+                        return False
+                    row.phase, row.parameters, row.request_key = Phase.QUEUED, parameters, key
+                    row.work_key, row.estimate = request_key, estimate
+                return True
+            except IntegrityError:
+                continue
+        raise RuntimeError(f"job {job_id} has an equal under a key of its own")
+
+    def destroy(self, job_id: str) -> bool:
+        """Remove the job in whatever phase; a worker that has it loses its lease and stops. What it made stays."""
+        with self._database.writing.begin() as session:
+            session.execute(delete(TermsRow).where(TermsRow.job_id == job_id))
+            result = session.execute(delete(JobRow).where(JobRow.id == job_id))
+            assert isinstance(result, CursorResult)
+            return bool(result.rowcount)
+
+    def terms(self, job_id: str) -> TermsRow:
+        """The terms of a job."""
+        with self._database.reading() as session:
+            return session.get(TermsRow, job_id) or TermsRow(job_id=job_id, execution_duration_s=0)
+
+    def set_terms(self, job_id: str, **values: Any) -> None:
+        """Change terms of a job."""
+        with self._database.writing.begin() as session:
+            # The lock on the job's row orders changes, and a job that is gone gets no terms.
+            if session.get(JobRow, job_id, with_for_update=True) is not None:
+                session.merge(TermsRow(job_id=job_id, **values))
+
+    def end_by_terms(self) -> list[str]:
+        """Ask jobs that execute longer than their terms allow to stop; destroy those that are due, and return their ids."""
+        now = self._database.now
+        too_long = select(JobRow.id).join(TermsRow, TermsRow.job_id == JobRow.id)
+        too_long = too_long.where(
+            JobRow.phase == Phase.EXECUTING,
+            JobRow.cancel_requested.is_(False),
+            TermsRow.execution_duration_s > 0,
+            JobRow.started_at + TermsRow.execution_duration_s < now,
+        )
+        with self._database.reading() as session:
+            stopped = list(session.scalars(too_long))
+            due = list(session.scalars(select(TermsRow.job_id).where(TermsRow.destruction_at < now)))
+        for job_id in stopped:
+            self._jobs.cancel(job_id)
+        return [job_id for job_id in due if self.destroy(job_id)]
+
+    def lines(
+        self,
+        *,
+        owner: str,
+        phases: Sequence[str] = (),
+        from_time: float | None = None,
+        last: int | None = None,
+    ) -> list[JobLine]:
+        """All jobs of an owner, newest first; of some phases, created at ``from_time`` or later, the ``last`` ones."""
+        query = select(JobRow.id, JobRow.phase, JobRow.owner, JobRow.created_at, TermsRow.run_id)
+        query = query.outerjoin(TermsRow, TermsRow.job_id == JobRow.id).where(JobRow.owner == owner)
+        if phases:
+            query = query.where(JobRow.phase.in_(phases))
+        if from_time is not None:
+            query = query.where(JobRow.created_at >= from_time)
+        query = query.order_by(JobRow.created_at.desc(), JobRow.id.desc()).limit(last)
+        with self._database.reading() as session:
+            return [JobLine(*line) for line in session.execute(query)]

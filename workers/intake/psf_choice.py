@@ -1,0 +1,148 @@
+"""The one PSF that fits: by filters, or for an image by what its header says; or why there is no one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from psfcore.errors import DataError
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.contexts import NOW
+from workers.catalogue.psfs import PsfFilter
+from workers.catalogue.tables import PsfContextRow, PsfRow
+from workers.versions.series import TOTAL, channel_of, instrument_of, line_of
+from workers.versions.status import PsfStatus
+from workers.versions.validity import iso, seconds
+
+MOST_NAMED = 20
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was looked for, where, and what was found of it: one PSF where all is well."""
+
+    wanted: PsfFilter
+    context: PsfContextRow | None  # none: among all PSFs
+    psfs: Sequence[PsfRow]  # MOST_NAMED + 1 at most
+    emptied_by: str | None  # where there are none, the filter that left none
+
+    def one(self) -> PsfRow:
+        """The PSF. Raises ``DataError`` "no-psf-fits" or "several-psfs-fit", which say why."""
+        if len(self.psfs) == 1:
+            return self.psfs[0]
+        if self.psfs:
+            named = [f"{psf.id} ({psf.name} {psf.version}, {psf.status})" for psf in self.psfs[:MOST_NAMED]]
+            more = ", and more" if len(self.psfs) > MOST_NAMED else ""
+            raise DataError(
+                "several-psfs-fit",
+                f"expected one PSF with {self._said()}; got {'; '.join(named)}{more}: narrow it by another filter",
+            )
+        raise DataError("no-psf-fits", self._why_none())
+
+    def _why_none(self) -> str:
+        given = self._given()
+        before = dict(list(given.items())[: list(given).index(self.emptied_by)]) if self.emptied_by else given
+        asked = f"{self.emptied_by} {given[self.emptied_by]}" if self.emptied_by else "any filter at all"
+        among = f"of those with {_joined(before)}" if before else "of all PSFs"
+        return f"expected one PSF with {self._said()}; {among} none has {asked}"
+
+    def _said(self) -> str:
+        return _joined(self._given()) or "no filter"
+
+    def _given(self) -> dict[str, str]:
+        """The filters as people wrote them, in the order in which they are met."""
+        wanted = self.wanted
+        at = wanted.valid_at
+        said = {
+            "instrument": wanted.instrument,
+            "channel": wanted.channel,
+            "kind": wanted.kind,
+            "name": wanted.name,
+            "version": wanted.version,
+            "context": None if self.context is None else self.context.name,
+            "status": wanted.status,
+            "valid_at": None if at is None else iso(at),
+        }
+        return {name: value for name, value in said.items() if value is not None}
+
+
+def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | None) -> Found:
+    """The PSFs that fit in a context (an id, a name, "now"; none: the owner's default); without one, certified ones.
+
+    Raises ``DataError`` "no-such-context".
+    """
+    pinned = catalogue.contexts.asked_for(context, owner)
+    if pinned is not None:
+        wanted = replace(wanted, context_id=pinned.id)
+    elif wanted.status is None:
+        wanted = replace(wanted, status=PsfStatus.CERTIFIED)
+    psfs = catalogue.psfs.page(wanted, owner, limit=MOST_NAMED + 1)
+    return Found(wanted, pinned, psfs, None if psfs else catalogue.psfs.emptied_by(wanted, owner))
+
+
+def look_for_image(
+    catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str = TOTAL
+) -> Found:
+    """The PSFs of an image's instrument, channel and time. header: the summary that its upload was kept with.
+
+    Raises ``DataError`` "no-instrument", "no-date" or "no-such-context".
+    """
+    instrument, channel = _seen_through(header)
+    if instrument is None:
+        raise DataError(
+            "no-instrument",
+            "expected DETECTOR or INSTRUME in the image's header, to find its PSF by; got neither",
+        )
+    at = _observed_at(header)
+    found = look(catalogue, PsfFilter(instrument, channel, kind, valid_at=at), owner, context)
+    if at is None and any(not _always(psf) for psf in found.psfs):
+        raise DataError(
+            "no-date",
+            f"expected DATE-BEG or DATE-OBS as 2024-03-01T12:00:00 in the image's header, since PSFs of "
+            f"{line_of(instrument, channel, kind)} are valid for some times alone; got {header['date_obs']!r}",
+        )
+    return found
+
+
+def picked_for_image(
+    catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None
+) -> Found | None:
+    """What an image is deconvolved with where nobody names a PSF; None where its line has none that was certified.
+
+    Raises ``DataError`` as ``look_for_image`` does, and "no-psf-fits" where the line has PSFs, but none in the context.
+    """
+    instrument, channel = _seen_through(header)
+    line = line_of(instrument, channel, TOTAL)
+    pinned = catalogue.contexts.asked_for(context, owner)
+    if line is not None and pinned is not None and catalogue.contexts.any_pinned(pinned.id, line, owner):
+        return look_for_image(catalogue, header, owner, context)
+    certified = line is not None and catalogue.psfs.any_certified(line, owner)
+    if pinned is not None and (certified or context is not None):
+        raise DataError(
+            "no-psf-fits",
+            f"expected context {pinned.name} to pin a PSF of {line or 'an instrument'}; it pins none: name a PSF, or "
+            f"context {NOW!r} for what is certified now",
+        )
+    return look_for_image(catalogue, header, owner, context) if certified else None
+
+
+def _seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    instrument = instrument_of(header)
+    return instrument, channel_of(instrument, header["wavelnth"])
+
+
+def _observed_at(header: Mapping[str, Any]) -> float | None:
+    try:
+        return seconds(header["date_obs"] or "")
+    except DataError:  # a card may hold anything; who needs the time says what it lacks
+        return None
+
+
+def _always(psf: PsfRow) -> bool:
+    return psf.valid_from == -math.inf and psf.valid_to == math.inf
+
+
+def _joined(given: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in given.items())

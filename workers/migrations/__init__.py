@@ -1,1 +1,0 @@
-"""Revisions of the catalogue's tables, run by alembic; ``workers.schema`` says when."""

@@ -1,0 +1,192 @@
+"""The worker process: ``celery -A workers.run.worker`` or ``heliopsf worker``.
+
+Nothing numerical is loaded before the fork: each child loads it for itself, with its share of the threads.
+
+Told to stop (SIGTERM, or once Control-C), it takes no more jobs. The one at work may go on for ``stop_s``; then it
+is handed back, queued as if it had not been started. After ``gone_s`` the worker is gone, whatever its job does.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from celery.signals import setup_logging, worker_init, worker_process_init, worker_shutting_down
+
+from workers import logs
+from workers.broker import app as queue
+from workers.broker.order import TakeWhatCanStart
+from workers.contract.queues import broker_name
+from workers.run.stopping import Stopping
+from workers.settings import Settings, software_version
+
+if TYPE_CHECKING:
+    from workers.catalogue.catalogue import Catalogue
+    from workers.run.runner import Runner
+
+log = logging.getLogger(__name__)
+settings = Settings()
+app = queue.make_app(settings)
+app.select_queues([broker_name(name) for name in settings.queues])
+app.steps["consumer"].add(TakeWhatCanStart)
+LOOK_EVERY_S = 0.5
+WAIT_S = 2.0  # for a database that does not answer, before it is asked again
+stopping = Stopping()  # made before the fork: the children see what is asked of their parent
+
+
+@app.task(name=queue.RUN_JOB)
+def run_job(job_id: str) -> None:
+    """Run one job by its id."""
+    _runner().run(job_id)
+
+
+@app.task(name=queue.ASSIST)
+def assist(job_id: str) -> None:
+    """Share the parts of a job that another worker runs."""
+    _runner().assist(job_id)
+
+
+@setup_logging.connect
+def _logs(**_: object) -> None:
+    """Celery leaves logging to us where this is connected."""
+    logs.configure(settings)
+
+
+@worker_init.connect
+def _watch(**_: object) -> None:
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from workers import checks
+    from workers.catalogue.schema import SchemaError
+
+    try:
+        check_tables()
+    # Celery goes on after an Exception here, but not after an exit.
+    except SchemaError as error:
+        raise SystemExit(f"Error: {error}") from error
+    except SQLAlchemyError as error:
+        raise SystemExit(f"Error: the database: {checks.database_said(error)}") from error
+    threading.Thread(target=_end_at_the_latest, name="end at the latest", daemon=True).start()
+
+
+@worker_shutting_down.connect
+def _stop(**_: object) -> None:
+    stopping.ask(settings.stop_s)
+
+
+def check_tables() -> None:
+    """Wait for a database that does not answer, and look whether its tables are this version's.
+
+    Raises ``workers.catalogue.schema.SchemaError`` where they are not.
+    """
+    from sqlalchemy.exc import OperationalError
+
+    from workers import checks
+    from workers.catalogue.catalogue import Catalogue
+
+    catalogue = Catalogue(settings.catalogue_url)  # closed again: no connection may be there at the fork
+    try:
+        while True:
+            try:
+                catalogue.schema.check()
+                return
+            except OperationalError as error:
+                log.warning("waiting for the database: %s", checks.database_said(error))
+                time.sleep(WAIT_S)
+    finally:
+        catalogue.close()
+
+
+def _end_at_the_latest() -> None:
+    while not stopping.asked:
+        time.sleep(LOOK_EVERY_S)
+    time.sleep(settings.gone_s)
+    log.warning("not ended in order %g s after the signal: ending now", settings.gone_s)
+    # The kernel ends the children with their parent (Celery asks for that where it can be had).
+    os._exit(0)
+
+
+@worker_process_init.connect
+def _prepare_child(**_: object) -> None:
+    """Load the kernels when the child starts, so that the first job does not wait for it."""
+    _runner()
+    threading.Thread(target=_be_present, name="presence", daemon=True).start()
+
+
+def _be_present() -> None:
+    """Say again and again that this child is there, at work or not; once it is to stop, that it is not."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from workers.run.runner import worker_name
+
+    started_at = time.time()
+    while True:
+        leaving = stopping.asked
+        try:
+            if leaving:
+                _catalogue().census.take_leave(worker_name())
+            else:
+                _catalogue().census.announce(worker_name(), started_at, software_version())
+        except SQLAlchemyError as error:
+            log.warning("presence not written: %s", str(error).splitlines()[0])
+        if leaving:
+            return
+        again = time.monotonic() + settings.presence_s
+        while time.monotonic() < again and not stopping.asked:
+            time.sleep(LOOK_EVERY_S)
+
+
+@lru_cache(maxsize=1)
+def _runner() -> Runner:
+    # Before numba is imported: the omp layer kills forked children.
+    os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
+    os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
+    from workers.files.opened import open_store
+    from workers.run.runner import Runner
+
+    return Runner(
+        settings,
+        _catalogue(),
+        open_store(settings),
+        call_for_help=lambda job_id, workers: queue.call_for_help(app, job_id, workers),
+        stopping=stopping,
+        submit=lambda job_id, queue_name: queue.submit(app, job_id, queue_name),
+    )
+
+
+@lru_cache(maxsize=1)
+def _catalogue() -> Catalogue:
+    from workers.catalogue.catalogue import Catalogue
+
+    return Catalogue(settings.catalogue_url)
+
+
+def main(parent: int | None = None) -> None:
+    """Run a worker in this process until it is told to stop, or until the process ``parent`` is gone.
+
+    SystemExit with a line and status 1 where the database is not at this version's revision.
+    """
+    logs.configure(settings)  # before Celery has anything to say
+    if parent is not None:
+        threading.Thread(target=_stop_with, args=(parent,), daemon=True).start()
+    pool = ["--pool", "prefork", "--concurrency", str(settings.worker_processes)]
+    quiet = ["--without-gossip", "--without-mingle", "--without-heartbeat"]
+    try:
+        app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])
+    except SystemExit as ended:
+        if ended.code == 0 and stopping.asked:
+            # All is ended in order. The interpreter's own end would wait for the idle threads of the pool.
+            logging.shutdown()
+            os._exit(0)
+        raise
+
+
+def _stop_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os.kill(os.getpid(), signal.SIGTERM)

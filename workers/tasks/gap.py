@@ -1,0 +1,176 @@
+"""The task ``gap-diagnose``: an uploaded transit in, a report on its gap out, and the PSF with the answer in the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from psfcore.drawing.plots import psf_png
+from psfcore.errors import DataError
+from psfcore.fits.fits_io import write_psf
+from psfcore.gap.corrected_psf import corrected_psf
+from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
+from psfcore.gap.library.added import Added, added_effects, library_with
+from psfcore.gap.report.page import gap_page
+from psfcore.gap.report.plot import gap_png
+from psfcore.gap.report.report import gap_report
+from psfcore.psf import Psf
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from workers.catalogue.tables import ReportRow
+from workers.contract.contract import (
+    ResolvedGapDiagnose,
+    corrected_psf_identity,
+    diffraction_identity,
+    gap_identity,
+)
+from workers.tasks.context import Context
+from workers.tasks.keep_report import keep_report, provenance_of, write_json
+from workers.tasks.psf_build import given_psf, psf_row
+from workers.tasks.psf_fit import load_transit
+
+KIND = "gap"
+
+
+def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Diagnose the gap of a transit; returns the report's id."""
+    request = ResolvedGapDiagnose.model_validate(parameters)
+    identity = gap_identity(request)
+    if context.catalogue.get(ReportRow, identity, context.owner) is not None:
+        return identity
+    added = _added(context, request)
+    parent = given_psf(context, request.psf_id)
+    shape, start = (SOFTENED_POWER_LAW, None) if parent is None else start_of(parent)
+    transit, _ = load_transit(context, request)
+    found = diagnose(
+        transit,
+        library=library_with(added),
+        shape=shape,
+        start=start,
+        seed=request.seed,
+        threads=context.settings.threads,
+        progress=context.report,
+    )
+    provenance = _provenance(context, request, identity, parent, added)
+    corrected = None
+    if request.correct and found.corrected:
+        try:
+            corrected = _save_psf(context, identity, found, provenance)
+        except DataError as error:
+            # An added effect may answer for images and not for a point alone: its diagnosis stands.
+            caution = f"The PSF with the answer in the model could not be made: {error.message}"
+            found = replace(found, cautions=(*found.cautions, caution))
+    _save(context, request, identity, found, provenance, corrected)
+    return identity
+
+
+def _added(context: Context, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
+    """The effects that are added. The worker runs code that its own operator names, never what a job says."""
+    if request.added_effects != context.settings.added_effects:
+        raise DataError(
+            "effects-changed",
+            f"expected the effects that the job was taken with ({', '.join(request.added_effects) or 'none'}); this worker "
+            f"adds {', '.join(context.settings.added_effects) or 'none'}: submit the job again",
+        )
+    added = added_effects(request.added_effects)
+    here = tuple(one.sha256 for one in added)
+    if here != request.added_effects_sha256:
+        raise DataError(
+            "effects-changed",
+            f"expected the texts that the job was taken with ({_short(request.added_effects_sha256)}); this worker's are "
+            f"others ({_short(here)}), or were changed since: submit the job again",
+        )
+    return added
+
+
+def _short(hashes: tuple[str, ...]) -> str:
+    return ", ".join(one[:12] for one in hashes) or "not noted"
+
+
+def _provenance(
+    context: Context,
+    request: ResolvedGapDiagnose,
+    identity: str,
+    parent: Psf | None,
+    added: tuple[Added, ...],
+) -> dict[str, Any]:
+    started = (
+        None if parent is None else {"name": parent.name, "version": parent.version, "id": request.psf_id}
+    )
+    return {
+        "report_id": identity,
+        "started_from_psf": started,
+        "diffraction_psf_id": diffraction_identity(request),
+        "seed": request.seed,
+        "added_effects": {one.source: one.sha256 for one in added},
+        **provenance_of(context, request),
+    }
+
+
+def _save_psf(context: Context, report_id: str, found: Diagnosis, provenance: dict[str, Any]) -> str:
+    """The PSF with the answer in the model, its tables and picture; its row a new draft. Returns its id."""
+    identity = corrected_psf_identity(report_id)
+    parents = {"transit": provenance["transit_sha256"], "report": report_id}
+    if provenance["started_from_psf"] is not None:
+        parents["psf"] = provenance["started_from_psf"]["id"]
+    psf = corrected_psf(
+        found,
+        name=f"{found.solution.transit.instrument or 'transit'}-gap-corrected",
+        version=f"0.1.0+{identity[:8]}",
+        provenance={"psf_id": identity, "parents": parents, **provenance},
+    )
+    with context.store.temporary() as file, context.store.temporary() as picture:
+        write_psf(file, psf)
+        psf_png(psf, picture)
+        row = psf_row(
+            psf,
+            identity,
+            context.owner,
+            origin="fitted",
+            file_sha256=context.store.keep(file),
+            store=context.store,
+            preview_sha256=context.store.keep(picture),
+            details={
+                "transit_id": parents["transit"],
+                "parents": parents,
+                "diffraction_psf_id": provenance["diffraction_psf_id"],
+            },
+            threads=context.settings.threads,
+        )
+    context.catalogue.add(row)
+    return identity
+
+
+def _save(
+    context: Context,
+    request: ResolvedGapDiagnose,
+    identity: str,
+    found: Diagnosis,
+    provenance: dict[str, Any],
+    corrected: str | None,
+) -> None:
+    """JSON, page and picture into the store, the row into the catalogue."""
+    said = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected}}
+    with (
+        context.store.temporary() as text,
+        context.store.temporary() as page,
+        context.store.temporary() as picture,
+    ):
+        write_json(text, said)
+        page.write_text(gap_page(found, said).html(), "utf-8")
+        picture.write_bytes(gap_png(found, said))
+        keep_report(
+            context,
+            identity,
+            KIND,
+            transit_id=request.transit_id,
+            text=text,
+            page=page,
+            picture=picture,
+            details={
+                **{name: said[name] for name in ("sentence", "verdict", "answer", "gap", "cautions")},
+                "strongest_axis": said["where"][0]["axis"],
+                "psf_id": request.psf_id,
+                "corrected_psf_id": corrected,
+            },
+        )

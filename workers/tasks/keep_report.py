@@ -1,0 +1,62 @@
+"""Reports: what made them, and their way into the store and the catalogue."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from workers.catalogue.tables import ReportRow
+from workers.contract.contract import ResolvedOnTransit
+from workers.settings import library_versions, software_version
+from workers.tasks.context import Context
+
+
+def provenance_of(context: Context, request: ResolvedOnTransit) -> dict[str, Any]:
+    """What whatever a job makes of a transit was made from, and with."""
+    return {
+        "transit_sha256": request.transit_id,
+        "parameters": request.model_dump(mode="json", exclude_none=True),
+        "algorithm_version": request.algorithm_version,
+        "software_version": software_version(),
+        "libraries": library_versions(),
+        "job_id": context.job_id,
+    }
+
+
+def keep_report(
+    context: Context,
+    identity: str,
+    kind: str,
+    *,
+    text: Path,
+    details: Mapping[str, Any],
+    picture: Path | None = None,
+    page: Path | None = None,
+    transit_id: str | None = None,
+    about_id: str | None = None,
+) -> None:
+    """A report's files, written already, into the store; its row, with these details, into the catalogue."""
+    file_sha256 = context.store.keep(text)
+    of_page = {} if page is None else {"page_sha256": context.store.keep(page)}
+    context.catalogue.add(
+        ReportRow(
+            owner=context.owner,
+            id=identity,
+            created_at=time.time(),
+            kind=kind,
+            transit_id=transit_id,
+            about_id=about_id,
+            file_sha256=file_sha256,
+            bytes=context.store.path(file_sha256).stat().st_size,
+            preview_sha256=None if picture is None else context.store.keep(picture),
+            details={**details, **of_page},
+        )
+    )
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """JSON for people too; a number that is none would be no JSON and is an error of ours."""
+    path.write_text(json.dumps(content, indent=1, allow_nan=False), "utf-8")

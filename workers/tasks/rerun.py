@@ -1,0 +1,167 @@
+"""The task ``rerun``: a product or a PSF is made again from its own parameters, and compared with the first.
+
+Nothing that is there is changed: what the rerun makes is kept beside its report alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.comparison import Comparison, compare
+from psfcore.errors import DataError
+from psfcore.fits.fits_io import read_plane, read_planes, read_psf
+from workers.catalogue.catalogue import Catalogue, Row
+from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
+from workers.contract.contract import ResolvedRerun, rerun_identity
+from workers.lineage import Made, lineage
+from workers.tasks.context import Context
+from workers.tasks.deconvolve import deconvolve
+from workers.tasks.gap import gap_diagnose
+from workers.tasks.keep_report import keep_report, write_json
+from workers.tasks.psf_build import named_psf, psf_build
+from workers.tasks.psf_fit import psf_fit
+
+KIND = "rerun"
+SCHEMA = 1
+TASKS: dict[str, Callable[[Context, Mapping[str, Any]], str]] = {
+    "deconvolve": deconvolve,
+    "psf-build": psf_build,
+    "psf-fit": psf_fit,
+    "gap-diagnose": gap_diagnose,
+}
+Thing = ProductRow | PsfRow
+
+
+class _Apart(Catalogue):
+    """The catalogue as if some things had not been made yet. What is added is kept in ``made`` and not written."""
+
+    def __init__(self, real: Catalogue, hidden: frozenset[str]) -> None:
+        vars(self).update(vars(real))  # the same database and subjects; no engine of its own
+        self._hidden = hidden
+        self.made: list[object] = []
+
+    def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
+        """The row of this identity, or None where it is there and hidden too."""
+        return None if identity in self._hidden else super().get(table, identity, owner)
+
+    def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
+        """Keep the row here, where it takes no room."""
+        self.made.append(row)
+        return row, True
+
+
+def rerun(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Make a thing again and compare; returns the report's id."""
+    request = ResolvedRerun.model_validate(parameters)
+    identity = rerun_identity(request, context.job_id)
+    if context.catalogue.get(ReportRow, identity, context.owner) is not None:
+        return identity
+    first = _first(context, request)
+    again = _made_again(context, request, first)
+    _save(context, identity, request, first, again)
+    return identity
+
+
+def _first(context: Context, request: ResolvedRerun) -> Thing:
+    if request.of == "psf":
+        return named_psf(context, request.id)
+    row = context.catalogue.get(ProductRow, request.id, context.owner)
+    if row is None:
+        raise DataError("no-such-product", f"there is no product with id {request.id}")
+    return row
+
+
+def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing:
+    """The thing as it comes out today, not in the catalogue; its file is in the store."""
+    named = first.details.get("parents") or {}
+    apart = _Apart(
+        context.catalogue, frozenset({first.id, *([named["report"]] if "report" in named else [])})
+    )
+    parameters = dict(request.parameters)
+    if request.kind == "psf-build":
+        parameters |= {"instrument": None, "instrument_file": _instrument_text(context, first)}
+    TASKS[request.kind](dataclasses.replace(context, catalogue=apart), parameters)
+    # Last comes what was asked for; before it what it needed and nobody has any more.
+    made = [row for row in apart.made if isinstance(row, type(first))]
+    if not made:
+        raise DataError(
+            "not-made-again",
+            f"expected the rerun to make a {request.of} as the first run did; it came to another end, as with other data",
+        )
+    found = made[-1]
+    assert isinstance(found, ProductRow | PsfRow)
+    return found
+
+
+def _instrument_text(context: Context, first: Thing) -> str:
+    """The instrument's text as it was: shipped ones change with the software."""
+    psf = read_psf(context.store.path(first.file_sha256), context.limits)
+    text: str = psf.provenance["instrument_toml"]
+    return text
+
+
+def _arrays(context: Context, row: Thing) -> dict[str, NDArray[Any]]:
+    """All that a thing's file holds of numbers per pixel, by name."""
+    path = context.store.path(row.file_sha256)
+    if isinstance(row, ProductRow):
+        return {"IMAGE": read_plane(path, context.limits), **read_planes(path)}
+    psf = read_psf(path, context.limits)
+    return {"PSF": psf.kernel, **psf.components}
+
+
+def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing, again: Thing) -> None:
+    context.report("comparing", 0, 1)
+    arrays, others = _arrays(context, first), _arrays(context, again)
+    nothing = np.zeros((0, 0))
+    compared = {
+        name: compare(arrays.get(name, nothing), others.get(name, nothing)) for name in {**arrays, **others}
+    }
+    said = {
+        "schema": SCHEMA,
+        "of": request.of,
+        "id": request.id,
+        "sentence": _sentence(request, first, again, compared),
+        "same": all(one.same for one in compared.values()),
+        "same_file": first.file_sha256 == again.file_sha256,
+        "largest_relative_difference": _largest(compared),
+        "arrays": {name: dataclasses.asdict(one) for name, one in compared.items()},
+        "first": _made(context, first),
+        "again": _made(context, again) | {"id": again.id},
+        "parameters": request.parameters,
+    }
+    with context.store.temporary() as text:
+        write_json(text, said)
+        named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
+        details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
+        context.report("comparing", 1, 1)  # whoever cancelled keeps nothing
+        keep_report(context, identity, KIND, text=text, details=details, about_id=request.id)
+
+
+def _made(context: Context, row: Thing) -> dict[str, Any]:
+    made = lineage(context.catalogue, row).made
+    assert isinstance(made, Made)
+    told: dict[str, Any] = json.loads(made.model_dump_json(exclude={"parameters"}))
+    return told
+
+
+def _largest(compared: Mapping[str, Comparison]) -> float | None:
+    """The largest of the arrays' differences; None where one of them has no measure."""
+    each = [one.largest_relative for one in compared.values()]
+    return None if None in each else max((one for one in each if one is not None), default=0.0)
+
+
+def _sentence(request: ResolvedRerun, first: Thing, again: Thing, compared: Mapping[str, Comparison]) -> str:
+    if first.file_sha256 == again.file_sha256:
+        return f"The {request.of} made again is the same file, bit for bit."
+    if all(one.same for one in compared.values()):
+        return f"The {request.of} made again has the same values, bit for bit; what its file says beside them differs."
+    differ = sorted(name for name, one in compared.items() if not one.same)
+    largest = _largest(compared)
+    by = "without a common measure" if largest is None else f"by {largest:.3g} of the largest value at most"
+    return f"The {request.of} made again differs {by}, in {', '.join(differ)}."

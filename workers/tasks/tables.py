@@ -1,0 +1,32 @@
+"""The task ``psf-tables``: the tables and the picture of a PSF that was uploaded, or made before there were tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from psfcore.drawing.plots import psf_png
+from psfcore.fits.fits_io import read_psf
+from workers.contract.contract import PsfTables
+from workers.tasks.context import Context
+from workers.tasks.psf_build import keep_tables, named_psf
+
+
+def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Make the tables of a PSF of the catalogue, and its picture where it has none; returns the PSF's id."""
+    request = PsfTables.model_validate(parameters)
+    row = named_psf(context, request.psf_id)
+    context.report("reading", 0, 3)
+    psf = read_psf(context.store.path(row.file_sha256), context.limits)
+    context.report("making tables", 1, 3)
+    tables_sha256 = keep_tables(psf, context.store, context.settings.threads)
+    context.report("drawing", 2, 3)
+    with context.store.temporary() as picture:
+        if row.preview_sha256 is None:
+            psf_png(psf, picture)
+        preview_sha256 = row.preview_sha256 or context.store.keep(picture)
+    context.report("drawing", 3, 3)
+    context.catalogue.psfs.describe(
+        row.id, context.owner, tables_sha256=tables_sha256, preview_sha256=preview_sha256
+    )
+    return row.id
