@@ -1,119 +1,73 @@
-"""The description of the interface as a page to read: ``/docs``.
+"""The interactive API reference at ``/docs``: Swagger UI, served from this host.
 
-A page of our own, and not one of the known viewers: those load their scripts from elsewhere, or want a copy of them
-kept up to date here. This one runs no script at all, and the machine's own description is at ``/openapi.json``.
+The package ``fastapi-swagger`` ships the scripts and the style sheet of Swagger UI. Its own page starts them with an
+inline script, which our content security policy forbids; so the page here is ours and starts them from a file.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
-from pathlib import Path
-from typing import Any
+from functools import cache
+from importlib.resources import files
 
-from fastapi import APIRouter, Request, Response
-from jinja2 import Environment, StrictUndefined
+from fastapi import APIRouter, HTTPException, Response
 
-PAGE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'"
-_BOUNDS = {
-    "minimum": "≥",
-    "exclusiveMinimum": ">",
-    "maximum": "≤",
-    "exclusiveMaximum": "<",
-    "pattern": "like",
+# Swagger UI draws its icons from data: addresses in its style sheet, and writes styles through scripts.
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>heliopsf API</title>
+<link rel="stylesheet" href="docs/swagger-ui.css">
+</head>
+<body>
+<div id="reference"></div>
+<noscript>This page needs JavaScript. The description itself is at <a href="openapi.json">openapi.json</a>.</noscript>
+<script src="docs/swagger-ui-bundle.js"></script>
+<script src="docs/start.js"></script>
+</body>
+</html>
+"""
+# validatorUrl: null keeps Swagger UI from asking another host to validate the description.
+START = """SwaggerUIBundle({
+  url: "openapi.json",
+  dom_id: "#reference",
+  deepLinking: true,
+  docExpansion: "none",
+  validatorUrl: null,
+  presets: [SwaggerUIBundle.presets.apis],
+});
+"""
+TYPES = {
+    "swagger-ui-bundle.js": "text/javascript",
+    "swagger-ui.css": "text/css",
+    "start.js": "text/javascript",
 }
-METHODS = ("get", "post", "put", "patch", "delete")
 router = APIRouter(include_in_schema=False)
 
 
 @router.get("/docs")
-def docs(request: Request) -> Response:
+def docs() -> Response:
     """The page."""
-    description = request.app.openapi()
-    page = _template().render(info=description["info"], groups=_groups(description))
-    headers = {"Content-Security-Policy": PAGE_POLICY}
-    return Response(page, media_type="text/html; charset=utf-8", headers=headers)
-
-
-@lru_cache(maxsize=1)
-def _template() -> Any:
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    return Response(
+        PAGE, media_type="text/html; charset=utf-8", headers={"Content-Security-Policy": PAGE_POLICY}
     )
-    return environment.from_string(Path(__file__).with_name("docs.html").read_text("utf-8"))
 
 
-def _groups(description: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """The operations by their tag, in the order of the application."""
-    schemas = description.get("components", {}).get("schemas", {})
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for path, operations in description["paths"].items():
-        for method in METHODS:
-            if method in operations:
-                operation = operations[method]
-                groups.setdefault(operation.get("tags", ["other"])[0], []).append(
-                    _operation(path, method, operation, schemas)
-                )
-    return groups
+@router.get("/docs/{name}")
+def part(name: str) -> Response:
+    """A script or the style sheet of the page."""
+    if name not in TYPES:
+        raise HTTPException(404, f"expected one of {', '.join(TYPES)}; got {name!r}")
+    return Response(_content(name), media_type=f"{TYPES[name]}; charset=utf-8")
 
 
-def _operation(path: str, method: str, operation: dict[str, Any], schemas: dict[str, Any]) -> dict[str, Any]:
-    scopes = [scope for way in operation.get("security", []) for asked in way.values() for scope in asked]
-    bodies = operation.get("requestBody", {}).get("content", {})
-    return {
-        "method": method.upper(),
-        "path": path,
-        "summary": operation.get("summary", ""),
-        "text": operation.get("description", ""),
-        "scope": scopes[0] if scopes else None,
-        "parameters": [
-            {
-                "name": one["name"],
-                "in": one["in"],
-                "needed": one.get("required", False),
-                "kind": _kind(one.get("schema", {}), schemas),
-                "text": one.get("description") or one.get("schema", {}).get("description", ""),
-            }
-            for one in operation.get("parameters", [])
-        ],
-        "bodies": {
-            media_type: _fields(content.get("schema", {}), schemas) for media_type, content in bodies.items()
-        },
-    }
-
-
-def _fields(schema: dict[str, Any], schemas: dict[str, Any]) -> list[dict[str, str]]:
-    """What a body holds, two levels deep: deeper things are named, and stand in the machine's description."""
-    resolved = _resolved(schema, schemas)
-    if "oneOf" in resolved:
-        return [field for one in resolved["oneOf"] for field in _fields(one, schemas)]
-    found = []
-    for name, field in resolved.get("properties", {}).items():
-        inner = _resolved(field, schemas)
-        text = inner.get("description", "")
-        found.append({"name": name, "kind": _kind(field, schemas), "text": text})
-        for inside, part in inner.get("properties", {}).items():
-            about = part.get("description") or _resolved(part, schemas).get("description", "")
-            found.append({"name": f"{name}.{inside}", "kind": _kind(part, schemas), "text": about})
-    return found
-
-
-def _resolved(schema: dict[str, Any], schemas: dict[str, Any]) -> dict[str, Any]:
-    if "$ref" in schema:
-        return dict(schemas[schema["$ref"].rpartition("/")[2]])
-    return schema
-
-
-def _kind(schema: dict[str, Any], schemas: dict[str, Any]) -> str:
-    """A type as people read it."""
-    if "$ref" in schema:
-        return _kind(_resolved(schema, schemas), schemas)
-    for several in ("anyOf", "oneOf"):
-        if several in schema:
-            return " or ".join(dict.fromkeys(_kind(one, schemas) for one in schema[several]))
-    if "const" in schema:
-        return repr(schema["const"])
-    if "enum" in schema:
-        return ", ".join(map(str, schema["enum"]))
-    kind = str(schema.get("type", "anything"))
-    bounds = [f"{sign} {schema[key]}" for key, sign in _BOUNDS.items() if key in schema]
-    return f"{kind} {' '.join(bounds)}".strip()
+@cache
+def _content(name: str) -> bytes:
+    if name == "start.js":
+        return START.encode()
+    return (files("fastapi_swagger") / "resources" / name).read_bytes()
