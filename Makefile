@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test test-full bench bench-peers blind chaos lint openapi clean
+.PHONY: demo test test-full bench bench-peers blind chaos lint openapi settings clean
 .DELETE_ON_ERROR:
 
 $(RUN): pyproject.toml constraints.txt
@@ -55,6 +55,10 @@ lint: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/house
+
+# The table of settings, made from the settings class.
+settings: $(DEV)
+	$(BIN)/python -m workers.settings_table docs/settings.md
 
 openapi: $(DEV)
 	$(BIN)/python -m service.openapi openapi/openapi.json

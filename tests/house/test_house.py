@@ -203,3 +203,10 @@ def test_the_dockerfile_copies_what_there_is() -> None:
             for source in line.split()[1:-1]:
                 assert (HERE / source).exists(), source
                 assert f"!{source}" in (HERE / ".dockerignore").read_text(), source
+
+
+def test_the_page_of_settings_is_made_from_the_settings_class() -> None:
+    from workers.settings_table import settings_table
+
+    kept = (HERE / "docs" / "settings.md").read_text("utf-8")
+    assert kept == settings_table(), "`make settings` writes it anew"

@@ -1,0 +1,84 @@
+"""Writes the table of all settings: ``python -m workers.settings_table docs/settings.md``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic.fields import FieldInfo
+
+from workers.settings import Settings
+
+PREFIX = "HELIOPSF_"
+_BOUNDS = {Ge: ("≥", "ge"), Gt: (">", "gt"), Le: ("≤", "le"), Lt: ("<", "lt")}
+_INTRODUCTION = """# Settings
+
+Each setting is an environment variable. All are optional: with none set, `heliopsf serve` keeps everything in one
+folder and needs no other server. Set the same variables for servers, workers and operator commands.
+Scientific choices are never settings; they are parameters of a job.
+
+This page is made from the class `workers.settings.Settings` by `make settings`; a test compares the two.
+
+| variable | type | default | meaning |
+|---|---|---|---|
+"""
+_CLIENT = """
+Commands and the Python client read two more variables:
+
+| variable | meaning |
+|---|---|
+| `HELIOPSF_SERVER` | Address of the service, for example `http://127.0.0.1:8765`. |
+| `HELIOPSF_KEY` | API key that commands and client send. |
+"""
+
+
+def settings_table() -> str:
+    """The page as Markdown."""
+    rows = (_row(name, field) for name, field in Settings.model_fields.items())
+    return _INTRODUCTION + "\n".join(rows) + "\n" + _CLIENT
+
+
+def _row(name: str, field: FieldInfo) -> str:
+    cells = (f"`{PREFIX}{name.upper()}`", _type(field), _default(field.default), field.description or "")
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _type(field: FieldInfo) -> str:
+    annotation = field.annotation
+    choices = [one for one in (get_args(annotation) or (annotation,)) if one is not NoneType]
+    name = (
+        " or ".join(_name(one) for one in choices)
+        if get_origin(annotation) is not Literal
+        else _name(annotation)
+    )
+    bounds = [
+        f"{sign} {getattr(one, attribute):,}"
+        for one in field.metadata
+        for kind, (sign, attribute) in _BOUNDS.items()
+        if isinstance(one, kind)
+    ]
+    return f"{name}, {', '.join(bounds)}" if bounds else name
+
+
+def _name(annotation: Any) -> str:
+    if get_origin(annotation) is Literal:
+        return " or ".join(f"`{one}`" for one in get_args(annotation))
+    return {"str": "text", "int": "integer", "float": "number", "Path": "path"}[annotation.__name__]
+
+
+def _default(value: Any) -> str:
+    return "not set" if value is None or value == "" else f"`{value}`"
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write the page to the file named."""
+    (target,) = arguments
+    Path(target).write_text(settings_table(), "utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
