@@ -1,7 +1,8 @@
-# One image for the service and its workers; docker-compose.yml says which is which.
+# One image for the service and its workers; docker-compose.yml selects the command.
 FROM python:3.11-slim AS build
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY heliopsf heliopsf
 COPY psfcore psfcore
 COPY service service
 COPY workers workers

@@ -1,4 +1,4 @@
-# The README's two commands are `make demo` and `make test`; each sets itself up.
+# `make demo` and `make test` are the commands of the README; each sets up its own environment.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -34,18 +34,18 @@ bench: $(DEV)
 	$(BIN)/python -m benchmarks.cross_validation
 	$(BIN)/python -m benchmarks.bulk --images 24
 
-# What others use, in an environment of its own, timed in turn with ours on the same data.
+# Other programs in their own environment, timed in turn with heliopsf on the same data.
 bench-peers: $(DEV)
 	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9'
 	$(BIN)/python -m benchmarks.peers .venv-peers/bin/python
 
-# Jobs while workers, Redis, PostgreSQL and the service are killed at random; needs both servers' programs.
+# Runs jobs while workers, Redis, PostgreSQL and the service are killed at random. Needs Redis and PostgreSQL.
 chaos: $(DEV)
 	$(BIN)/python -m studies.chaos
 	$(BIN)/python -m studies.chaos --seed 2 --redis-keeps
 
-# The gap diagnosis on cases whose effect it does not know: hours. Goes on where it was stopped.
+# Measures the gap diagnosis on cases whose effect is withheld. Takes hours; resumes where it was stopped.
 blind: $(RUN)
 	OMP_NUM_THREADS=1 $(BIN)/heliopsf gap blind --cases 204 --size 256 --images 18 -o heliopsf-blind
 	OMP_NUM_THREADS=1 $(BIN)/heliopsf gap blind --cases 12 --seed 2 --size 512 --images 30 -o heliopsf-blind-512
