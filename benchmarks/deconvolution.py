@@ -27,8 +27,8 @@ from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.diffraction.fraunhofer import FEWEST_SAMPLES, far_field
 from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.drawing.plots import preview_png
-from psfcore.fits.fits_io import read_image
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_image
 from psfcore.instruments.model import load_instrument
 from psfcore.psf import Psf
 from psfcore.simulate.observe import demo_image

@@ -24,8 +24,9 @@ from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image, read_psf, write_image
 from psfcore.fits.gain import noise_for, saturation_for
+from psfcore.fits.images import read_image, write_image
+from psfcore.fits.psfs import read_psf
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise

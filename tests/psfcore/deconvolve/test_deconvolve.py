@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image
+from psfcore.fits.images import read_image
 from psfcore.image import MaskBit
 from psfcore.psf import Psf, crop_centred
 from psfcore.simulate.observe import observe

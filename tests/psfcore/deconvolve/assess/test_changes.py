@@ -14,7 +14,7 @@ from psfcore.deconvolve.assess.changes import BLOCKS_PX, TAILS_PCT, Effects, blo
 from psfcore.deconvolve.assess.plots import effects_png
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image
+from psfcore.fits.images import read_image
 from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf, crop_centred
