@@ -284,7 +284,8 @@ def _numbers(plan: Plan) -> tuple[Any, ...]:
 def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
     """Separate a transformed block of rows into the spectra of its 32 rows.
 
-    Each complex signal of the block holds two real rows. With Z the transform of a + i b for real a, b: A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
+    Each complex signal of the block holds two real rows. With Z the transform of a + i b for real a and b:
+    A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
     """
     z = buffer.reshape((-1, 2, LANES))
     half = np.float32(0.5)

@@ -184,7 +184,10 @@ def contact_sheet_png(
         weight="bold",
         va="center",
     )
-    legend = f"each image: before, after (same scale), change from -{CHANGE_LIMIT_PCT:g} % (blue) to +{CHANGE_LIMIT_PCT:g} % (red); circles: suspected artefacts"
+    legend = (
+        f"each image: before, after (same scale), change from -{CHANGE_LIMIT_PCT:g} % (blue) to "
+        f"+{CHANGE_LIMIT_PCT:g} % (red); circles: suspected artefacts"
+    )
     figure.text(0.3 / width, 1 - 0.55 / height, legend, fontsize=9, color=INK, va="center")
     for index, row in enumerate(shown):
         down_at, across_at = divmod(index, across)

@@ -55,7 +55,7 @@ def found(image: Image, psf: Psf, steps: int) -> Changes:
 # --- figures ---
 
 
-def test_a_result_that_is_the_input_has_no_effect(seen: Image) -> None:
+def test_a_result_equal_to_the_image_has_no_changes(seen: Image) -> None:
     report = measure_changes(seen, seen.pixels, make_psf(delta(32)))
     assert report.flux_change_pct == 0
     assert set(report.change_pct.values()) == {0.0}
@@ -65,7 +65,7 @@ def test_a_result_that_is_the_input_has_no_effect(seen: Image) -> None:
 
 
 def test_known_changes_of_known_structures_are_found() -> None:
-    """A quarter of the pixels bright and raised by 40 %, a quarter dark and lowered by 85 %, in blocks of 32."""
+    """A quarter of the pixels is bright and rises by 40 %, a quarter is dark and falls by 85 %, in blocks of 32."""
     before = np.full((256, 256), 100.0)
     before[:64], before[-64:] = 1000.0, 10.0
     after = before * np.where(before == 1000, 1.4, np.where(before == 10, 0.15, 1.0))
@@ -115,7 +115,7 @@ def test_masked_pixels_are_left_out(seen: Image, psf: Psf) -> None:
     json.dumps(report.as_json(), allow_nan=False)
 
 
-def test_what_cannot_be_compared_is_refused(seen: Image, psf: Psf) -> None:
+def test_images_that_cannot_be_compared_are_refused(seen: Image, psf: Psf) -> None:
     with pytest.raises(DataError) as caught:
         measure_changes(seen, seen.pixels[:-1], psf)
     assert caught.value.code == "field-shape"
@@ -134,7 +134,7 @@ def test_twenty_steps_with_the_true_psf_are_clean(seen: Image, psf: Psf, noise: 
 
 
 def test_worse_deconvolutions_rank_above_better_ones(seen: Image, psf: Psf) -> None:
-    """Noise fitted by 200 steps; a core twice too wide, driven to its rings; light divided out where none is."""
+    """Noise fitted by 200 steps; a core twice too wide, which causes rings; an inverse without regularisation."""
     clean = found(seen, psf, 20).artefacts.score
     assert clean < 1 < found(seen, psf, 200).artefacts.score
     rings = found(seen, blurred(1.6), 100).artefacts
@@ -145,7 +145,7 @@ def test_worse_deconvolutions_rank_above_better_ones(seen: Image, psf: Psf) -> N
     assert measure_changes(seen, inverse, psf, edge_px=EDGE_PX).artefacts.score > 100
 
 
-def test_each_sign_is_seen_where_it_is(seen: Image, psf: Psf) -> None:
+def test_each_sign_is_found_at_its_place(seen: Image, psf: Psf) -> None:
     result = richardson_lucy(seen, psf, steps=20, threads=2).pixels
     quiet = seen.pixels > 300
     (y1, x1), (y2, x2), (y3, x3) = np.argwhere(quiet)[[20_000, 30_000, 40_000]]
@@ -171,7 +171,7 @@ def test_rings_are_measured_in_percent_of_the_peak() -> None:
     assert ringing_pct(np.ones((64, 64)), np.ones((64, 64)), np.ones((64, 64), bool))[0] is None
 
 
-def test_noise_is_found_from_the_pixels() -> None:
+def test_noise_is_estimated_from_the_pixels() -> None:
     expected = np.full((256, 256), 300.0) + np.linspace(0, 600, 256)
     noise = Noise(6.0, 2.0)
     pixels = noise.observe(expected, 1.4, np.random.default_rng(1))
