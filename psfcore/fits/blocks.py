@@ -33,7 +33,7 @@ ALLOWED_CODECS = ("RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 _BITPIX = (8, 16, 32, 64, -32, -64)
 _LARGEST_COUNT = 2**63 - 1
 _SKIP_BYTES = 1 << 20
-_END = b"END" + b" " * 77
+END_CARD = b"END" + b" " * 77
 # Exceptions that astropy raises for a damaged card. Which one depends on the damage.
 CARD_TROUBLE = (VerifyError, ValueError, TypeError, IndexError, OverflowError)
 _KNOWN_STARTS = (
@@ -205,7 +205,7 @@ def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) 
 
 def _find_end(block: bytes) -> int | None:
     for at in range(0, len(block) - CARD_BYTES + 1, CARD_BYTES):
-        if block[at : at + CARD_BYTES] == _END:
+        if block[at : at + CARD_BYTES] == END_CARD:
             return at
     return None
 

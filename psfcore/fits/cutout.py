@@ -15,10 +15,9 @@ from typing import BinaryIO
 from astropy.io.fits import Header
 
 from psfcore.errors import DataError
-from psfcore.fits.header import BLOCK_BYTES, FitsLimits, read_summary
+from psfcore.fits.blocks import BLOCK_BYTES, CARD_BYTES, END_CARD
+from psfcore.fits.header import FitsLimits, read_summary
 
-_CARD_BYTES = 80
-_END = b"END" + b" " * 77
 _FLOATS = {-32: "f", -64: "d"}
 # Cards of the whole image that are wrong for a cut-out. The cards that it needs are written again.
 _DROPPED = ("EXTEND", "CHECKSUM", "DATASUM", "DATAMIN", "DATAMAX", "DATAMEAN", "PCOUNT", "GCOUNT")
@@ -59,7 +58,7 @@ def _header(file: BinaryIO) -> Header:
     """Read the first header; the file is then at the first byte of its data."""
     raw = bytearray()
     block = b""
-    while not any(block[at : at + _CARD_BYTES] == _END for at in range(0, len(block), _CARD_BYTES)):
+    while not any(block[at : at + CARD_BYTES] == END_CARD for at in range(0, len(block), CARD_BYTES)):
         block = file.read(BLOCK_BYTES)  # ends: read_summary found END
         raw += block
     return Header.fromstring(bytes(raw))
