@@ -53,12 +53,12 @@ class Noise:
 
     def observe(self, expected: Plane, dn_per_unit: float, rng: np.random.Generator) -> Plane:
         """Simulate one exposure [y, x] of a scene whose noise-free image is `expected`."""
-        seen_dn: Plane = np.maximum(expected, 0.0) * dn_per_unit
+        exposure_dn: Plane = np.maximum(expected, 0.0) * dn_per_unit
         if self.photon_gain_dn > 0:
-            seen_dn = np.asarray(rng.poisson(seen_dn / self.photon_gain_dn) * self.photon_gain_dn)
+            exposure_dn = np.asarray(rng.poisson(exposure_dn / self.photon_gain_dn) * self.photon_gain_dn)
         if self.read_noise_dn > 0:
-            seen_dn = np.asarray(seen_dn + rng.normal(0.0, self.read_noise_dn, expected.shape))
-        return np.asarray(seen_dn / dn_per_unit)
+            exposure_dn = np.asarray(exposure_dn + rng.normal(0.0, self.read_noise_dn, expected.shape))
+        return np.asarray(exposure_dn / dn_per_unit)
 
 
 def dn_per_unit(image: Image) -> float:

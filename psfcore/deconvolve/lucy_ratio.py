@@ -81,11 +81,11 @@ def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums
             for side in range(2):
                 for w in range(LANES):
                     y = light[block, i, side, w]
-                    seen = max(z[i, side, w], floor)
-                    misfit = y - seen
-                    part = judged[block, side, w] * misfit * misfit / max(slope * seen + ground, least)
+                    model = max(z[i, side, w], floor)
+                    misfit = y - model
+                    part = judged[block, side, w] * misfit * misfit / max(slope * model + ground, least)
                     sum_row += part if y >= zero else zero
-                    z[i, side, w] = y / seen if y >= zero else -y
+                    z[i, side, w] = y / model if y >= zero else -y
             if first <= i < last:
                 sum_here += sum_row
         sums[block] = sum_here

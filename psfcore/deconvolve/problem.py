@@ -92,10 +92,10 @@ def first_estimate(problem: Problem) -> NDArray[np.float32]:
     if missing.any():
         observed = np.where(domain.trusted, domain.pixels, np.float32(0))
         near = engine.apply(domain.trusted.astype(np.float32))[missing]
-        seen = engine.apply(observed)[missing]
+        gathered = engine.apply(observed)[missing]
         everywhere = np.float32(domain.pixels[domain.trusted].mean())
         estimate[missing] = np.where(
-            near > _ENOUGH_NEIGHBOURS, seen / np.maximum(near, _ENOUGH_NEIGHBOURS), everywhere
+            near > _ENOUGH_NEIGHBOURS, gathered / np.maximum(near, _ENOUGH_NEIGHBOURS), everywhere
         )
     return estimate
 

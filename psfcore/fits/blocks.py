@@ -137,12 +137,12 @@ def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
 
 def first_image(source: Source, limits: FitsLimits) -> tuple[Header, int]:
     """Header and HDU number of the first 2-D image. Raises HeaderError if there is none."""
-    seen: list[str] = []
+    kinds: list[str] = []
     for header, hdu, kind in walk(source, limits, to_the_end=False):
         if kind == "image":
             return header, hdu
-        seen.append(kind)
-    raise _no_image(seen)
+        kinds.append(kind)
+    raise _no_image(kinds)
 
 
 def walk(source: Source, limits: FitsLimits, *, to_the_end: bool) -> Iterator[tuple[Header, int, str]]:
@@ -170,17 +170,17 @@ def walk(source: Source, limits: FitsLimits, *, to_the_end: bool) -> Iterator[tu
         raise HeaderError("too-many-hdus", message)
 
 
-def _no_image(seen: list[str]) -> HeaderError:
+def _no_image(kinds: list[str]) -> HeaderError:
     wanted = "expected a two-dimensional image"
-    if any(kind.startswith("cube") for kind in seen):
-        axes = next(kind for kind in seen if kind.startswith("cube")).split()[1]
+    if any(kind.startswith("cube") for kind in kinds):
+        axes = next(kind for kind in kinds if kind.startswith("cube")).split()[1]
         code = "three-axes" if axes == "3" else "not-2d"
         return HeaderError(code, f"{wanted}; got an image of {axes} axes")
-    if "line" in seen:
+    if "line" in kinds:
         return HeaderError("not-2d", f"{wanted}; got an image of one axis")
-    if "table" in seen:
-        return HeaderError("table-only", f"{wanted}; got only tables ({len(seen)} HDUs)")
-    return HeaderError("no-image", f"{wanted}; got {len(seen)} HDUs without data of two axes")
+    if "table" in kinds:
+        return HeaderError("table-only", f"{wanted}; got only tables ({len(kinds)} HDUs)")
+    return HeaderError("no-image", f"{wanted}; got {len(kinds)} HDUs without data of two axes")
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve, maximum_filter, minimum_filter
 
 HOLE_SHARE = 0.02
-SEEN_SIGMA = 5.0
+DETECTION_SIGMA = 5.0
 EXTREME_SIGMA = 8.0
 # Values from which a person should inspect the image: per million pixels, and percent of a source's peak.
 ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 2.0}
@@ -81,9 +81,9 @@ def find_artefacts(
     noise_before = (
         noise_from_pixels(filled_before, filled_before, counted, classes) if sigma is None else sigma
     )
-    seen = filled_before > SEEN_SIGMA * noise_before
-    holes = counted & seen & (filled_after < HOLE_SHARE * filled_before)  # Eq. (1)
-    limit = (filled_before + SEEN_SIGMA * noise_before) / peak_weight
+    detected = filled_before > DETECTION_SIGMA * noise_before
+    holes = counted & detected & (filled_after < HOLE_SHARE * filled_before)  # Eq. (1)
+    limit = (filled_before + DETECTION_SIGMA * noise_before) / peak_weight
     overshoots = counted & (filled_after > limit)  # Eq. (2)
     extremes = counted & _new_extremes(filled_before, filled_after, noise_before, noise_after)
     ringing, sources = ringing_pct(filled_before, filled_after, counted)

@@ -132,11 +132,13 @@ def expected_image(image: Image, estimate: Plane, psf: Psf, *, threads: int = 1)
     """m of Eq. (1): the noise-free model image of the scene `estimate` [y, x]; not below zero."""
     finite = np.isfinite(estimate)
     scene = np.where(finite, estimate, _local_mean(estimate, finite, MODEL_WINDOW_PX))
-    seen = np.maximum(Engine(psf.kernel, scene.shape, threads=threads).apply(scene).astype(np.float64), 0.0)
+    convolved = np.maximum(
+        Engine(psf.kernel, scene.shape, threads=threads).apply(scene).astype(np.float64), 0.0
+    )
     observed = np.maximum(_local_mean(image.pixels, image.valid, MODEL_WINDOW_PX), 0.0)
-    model = _local_mean(seen, image.valid, MODEL_WINDOW_PX)
+    model = _local_mean(convolved, image.valid, MODEL_WINDOW_PX)
     ratio = np.divide(observed, model, out=np.ones_like(model), where=model > 0)
-    return np.asarray(seen * ratio)  # Eq. (1)
+    return np.asarray(convolved * ratio)  # Eq. (1)
 
 
 def with_psf_error(planes: ErrorPlanes, psf_error: Plane) -> ErrorPlanes:

@@ -107,9 +107,9 @@ def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, sl
             sum_row, moved_row, total_row = zero, zero, zero
             for side in range(2):
                 for w in range(LANES):
-                    y, seen = observed[block, i, side, w], z[i, side, w]
-                    misfit = y - seen if y == y else zero
-                    variance = max(slope * max(seen, zero) + ground, least)
+                    y, model = observed[block, i, side, w], z[i, side, w]
+                    misfit = y - model if y == y else zero
+                    variance = max(slope * max(model, zero) + ground, least)
                     sum_row += judged[block, side, w] * misfit * misfit / variance
                     value = x[block, i, side, w] + misfit  # Eq. (1)
                     new[block, i, side, w] = value

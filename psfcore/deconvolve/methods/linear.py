@@ -117,9 +117,9 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
             sum_row = zero
             for side in range(2):
                 for w in range(LANES):
-                    y, seen = observed[block, i, side, w], z[i, side, w]
-                    misfit = y - seen if y == y else zero
-                    variance = max(slope * max(seen, zero) + ground, least)
+                    y, model = observed[block, i, side, w], z[i, side, w]
+                    misfit = y - model if y == y else zero
+                    variance = max(slope * max(model, zero) + ground, least)
                     sum_row += judged[block, side, w] * misfit * misfit / variance
                     z[i, side, w] = misfit
             if first <= i < last:

@@ -3,7 +3,7 @@
     x <- (x / a) * H^T( w y / (H x) ),   a = H^T w      Eq. (1), their Eq. (12)
 
 on field and margin. w is 1 on trusted pixels of the field, and 0 on masked pixels and in the margin. a(i) is the share
-of the light of pixel i that falls on observed pixels. Where it is below LEAST_SEEN, the data do not determine the
+of the light of pixel i that falls on observed pixels. Where it is below LEAST_OBSERVED, the data do not determine the
 scene, and x is 0; the paper uses a threshold for the same reason, to avoid a division by nearly 0. Unlike the step in
 `richardson_lucy`, this step converges to the most likely scene also near edges and masked pixels. Negative pixels
 count as 0.
@@ -15,7 +15,7 @@ The scene in the margin starts from the field's mirror image: from a constant, t
 | y | observed | image unit |
 | x | estimate, on field and margin | image unit |
 | w | trusted, 1 or 0 | - |
-| a | share_seen | - |
+| a | share_observed | - |
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from psfcore.psf import Psf
 METHOD = "richardson-lucy-extended"
 EDGES: Edges = "extended"
 MARGIN_SHARE = 0.005
-LEAST_SEEN = 1e-3
+LEAST_OBSERVED = 1e-3
 # The ratio of a masked pixel is 0 here: a already accounts for the pixel.
 _NO_RATIO = 1e-30
 
@@ -67,14 +67,14 @@ class _Extended(Iteration):
     def __init__(self, problem: Problem) -> None:
         engine = problem.engine
         estimate = light_above_floor(problem)
-        share_seen = engine.adjoint(problem.domain.trusted.astype(np.float32))
-        seen = share_seen > LEAST_SEEN
-        gain = np.where(seen, 1 / np.maximum(share_seen, np.float32(LEAST_SEEN)), np.float32(0))
+        share_observed = engine.adjoint(problem.domain.trusted.astype(np.float32))
+        known = share_observed > LEAST_OBSERVED
+        gain = np.where(known, 1 / np.maximum(share_observed, np.float32(LEAST_OBSERVED)), np.float32(0))
         self._engine = engine
         self._ratio = Ratio(problem, _NO_RATIO, float(estimate.max()))
         self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
         self._gain = engine.to_lanes(gain)
-        self.x = engine.to_lanes(np.where(seen, estimate, np.float32(0)))
+        self.x = engine.to_lanes(np.where(known, estimate, np.float32(0)))
         self._correction = np.zeros_like(self.x)
         self.change = 0.0
         engine.rows_forward(self.x)
