@@ -31,7 +31,7 @@ def with_negative(kernel: NDArray[np.float64]) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("kernel", "code", "words"),
     [
-        (delta(32) * 3, "psf-sum", "got 3:"),
+        (delta(32) * 3, "psf-sum", r"got 3\."),
         (delta(32) * 0.01, "psf-sum", "got 0.01"),
         (with_nan(delta(32)), "psf-nonfinite", "got 1"),
         (with_negative(delta(32)), "psf-negative", "-1e-06"),
