@@ -29,8 +29,9 @@ from astropy.io import fits
 from psfcore.build import build_psf
 from psfcore.deconvolve.assess.contact_sheet import treat
 from psfcore.deconvolve.conditions import Conditions, EngineCache
-from psfcore.fits.fits_io import read_image, read_psf, write_psf
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_image
+from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.model import load_instrument
 from psfcore.simulate.observe import demo_image
 from tests.whole import stack as stacks

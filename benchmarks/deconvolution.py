@@ -1,7 +1,7 @@
-"""`make bench`: times as ratios to a reference transform of the same run, called 1 F.
+"""Times of deconvolution and PSF builds, in units of a reference transform; part of `make bench`.
 
-1 F is one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers. The machine's other work slows both
-alike, so the ratio says more than the seconds.
+The unit 1 F is the time of one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers, measured in the same run.
+Other work on the machine slows both equally, so ratios are more reliable than seconds.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import scipy.fft
 
+from benchmarks import fft_libraries
 from benchmarks.peers import peak_gib
 from psfcore.build import build_psf
 from psfcore.deconvolve.conditions import Conditions, EngineCache
@@ -27,8 +28,8 @@ from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.diffraction.fraunhofer import FEWEST_SAMPLES, far_field
 from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.drawing.plots import preview_png
-from psfcore.fits.fits_io import read_image
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_image
 from psfcore.instruments.model import load_instrument
 from psfcore.psf import Psf
 from psfcore.simulate.observe import demo_image
@@ -38,7 +39,7 @@ THREADS = os.cpu_count() or 1
 
 
 def seconds(work: Callable[[], object], repeats: int = 1) -> float:
-    """The shortest of some runs."""
+    """Shortest time of several runs, in s."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -48,7 +49,7 @@ def seconds(work: Callable[[], object], repeats: int = 1) -> float:
 
 
 def reference() -> float:
-    """1 F in seconds."""
+    """1 F, in s."""
     field = np.random.default_rng(0).random((4096, 4096), dtype=np.float32)
 
     def pair() -> None:
@@ -62,18 +63,18 @@ def row(what: str, took_s: float, f_s: float, note: str = "") -> None:
 
 
 def round_trip_s(stack: stacks.Stack, image: Path, output: Path) -> tuple[float, float]:
-    """Upload, job and download in seconds, for a product that is new and for one that is there."""
+    """Time of upload, job and download in s: for a new product, and for one that exists already."""
     stack.client.build_psf("hri_euv")
-    # Another step count, so that the worker has its kernels loaded and the product is not there yet.
+    # With another number of steps, the worker loads its kernels but the product does not exist yet.
     stack.client.deconvolve(image, steps=1)
-    # Levels that no pixel reaches: the same work, but another product each time.
+    # No pixel reaches these saturation levels: the work is the same, but each level is another product.
     levels = iter((1e9, 2e9, 3e9))
     new = seconds(lambda: stack.client.deconvolve(image, output, saturation_dn=next(levels)), 3)
     return new, seconds(lambda: stack.client.deconvolve(image, output, saturation_dn=3e9), 3)
 
 
 def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, folder: Path) -> None:
-    """The same deconvolution over HTTP, embedded and with Redis and PostgreSQL; the PSF is built before."""
+    """The same deconvolution over HTTP: embedded, and with Redis and PostgreSQL. The PSF is built before."""
     for name, mode in (("embedded", stacks.embedded), ("Redis and PostgreSQL", stacks.served)):
         place = folder / name.split()[0]
         place.mkdir()
@@ -81,15 +82,20 @@ def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, fold
             try:
                 stack = resources.enter_context(mode(place))
             except stacks.Missing as missing:
-                print(f"left out: {missing}")
+                print(f"skipped: {missing}")
                 continue
             took, again = round_trip_s(stack, image, place / "out.fits")
-        row(f"HTTP round trip, {name}", took, f_s, f"over the psfcore call: {took - in_process_s:+.2f} s")
-        row(f"  an equal request again, {name}", again, f_s)
+        row(
+            f"HTTP round trip, {name}",
+            took,
+            f_s,
+            f"difference from the psfcore call: {took - in_process_s:+.2f} s",
+        )
+        row(f"  the same request again, {name}", again, f_s)
 
 
 def builds(f_s: float) -> None:
-    """PSF builds, and the far field beside one plain transform of its padded pupil, each in a process of its own."""
+    """PSF builds, and the far field compared with a plain transform of its padded pupil; one process each."""
     for what in ("build 2048", "build 4096", "far field 1024", "plain padded transform 1024"):
         answer = subprocess.run(
             [sys.executable, "-m", "benchmarks.deconvolution", what],
@@ -105,7 +111,7 @@ def builds(f_s: float) -> None:
 
 
 def one_build(what: str) -> None:
-    """One line of ``builds``, as JSON."""
+    """Print one line of `builds`, as JSON."""
     instrument = load_instrument("hri_euv")
     if what.startswith("build"):
         took = seconds(lambda: build_psf(instrument, size=int(what.split()[1]), threads=THREADS))
@@ -134,6 +140,7 @@ def main() -> None:
         path = folder / "image.fits"
         demo_image(path, psf, size=2048)
         image = read_image(path, FitsLimits(max_pixels=2**24))
+        fft_libraries.compare(image.pixels.astype(np.float32), psf.kernel.astype(np.float32), folder, f_s)
         richardson_lucy(image, psf, steps=1, threads=THREADS)
         results = []
         published_s = seconds(lambda: results.append(richardson_lucy(image, psf, threads=THREADS)))
@@ -142,7 +149,7 @@ def main() -> None:
         default = method_named("richardson-lucy")
         default(image, psf, conditions, steps=1)
         core_s = seconds(lambda: default(image, psf, conditions))
-        row("the same by default (edges mirrored, PSF prepared)", core_s, f_s)
+        row("the same by default (mirrored edges, PSF prepared)", core_s, f_s)
         picture_s = seconds(
             lambda: preview_png(image.pixels, results[0].pixels, folder / "p.png", title="bench")
         )

@@ -1,8 +1,9 @@
-"""`make bench-peers`: twenty Richardson-Lucy steps by heliopsf and by what people use today, in turn on the same data.
+"""`make bench-peers`: twenty Richardson-Lucy steps by heliopsf and by other packages, in turn on the same data.
 
-A 2048 x 2048 image, a 4096 x 4096 PSF. Each runs in a process of its own, so that its peak of memory is its own; the
-reference of the same run, 1 F, is one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers. Peers live in an
-environment of their own (`.venv-peers`), and one that is not installed is left out and named.
+The image has 2048 x 2048 px, the PSF 4096 x 4096 px. Each package runs in a process of its own, so that its peak memory
+can be measured. The unit 1 F is one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers, in the same run. The
+other packages are installed in a separate environment (`.venv-peers`); a missing package is skipped and reported.
+`benchmarks.fft_libraries` compares FFT libraries in the same loop; here each package runs as its users run it.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ def heliopsf(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
     from psfcore.image import Image
     from psfcore.psf import Psf
 
-    seen = Image(image.astype(float), np.zeros(image.shape, np.uint8), Header(), "DN/s", 1.0)
+    observed = Image(image.astype(float), np.zeros(image.shape, np.uint8), Header(), "DN/s", 1.0)
     kernel = Psf(psf.astype(float), "bench", "1", None, "draft", None, None)
-    return richardson_lucy(seen, kernel, steps=STEPS, threads=os.cpu_count() or 1).pixels
+    return richardson_lucy(observed, kernel, steps=STEPS, threads=os.cpu_count() or 1).pixels
 
 
 def scipy_fft(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
-    """The plain way, float32, two workers, image and PSF on the padded plane."""
+    """The simplest loop: float32, two workers, image and PSF on the plane of the PSF."""
     import scipy.fft
 
     image, psf = image.astype(np.float32), psf.astype(np.float32)
@@ -57,13 +58,13 @@ def scipy_fft(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
 def scikit_image(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
     from skimage.restoration import richardson_lucy
 
-    odd = psf[1:, 1:]  # its centre is the middle of an odd array
+    odd = psf[1:, 1:]  # the package expects the centre in the middle of an odd array
     start = image.astype(np.float32) / image.max()
     return richardson_lucy(start, odd.astype(np.float32), num_iter=STEPS, clip=False) * image.max()
 
 
 def aiapy(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
-    """Its own loop: double precision, circular, so image and PSF are padded first."""
+    """Its loop uses double precision and periodic convolution, so the image is padded first."""
     import astropy.units as u
     import sunpy.map
     from aiapy.psf import deconvolve
@@ -87,7 +88,7 @@ CONTENDERS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 
 
 def data() -> tuple[np.ndarray, np.ndarray]:
-    """A textured image and a PSF with the paper's softened power law and a sharp core."""
+    """A textured image, and a PSF with a sharp core and the softened power law of the paper."""
     rng = np.random.default_rng(0)
     y, x = np.indices((PSF_PX, PSF_PX), dtype=np.float32) - PSF_PX // 2
     psf = 0.1525 / (6.15 + np.hypot(x, y)) ** 2.53
@@ -110,7 +111,7 @@ def reference_s() -> float:
 
 
 def peak_gib() -> float:
-    """Largest resident size of this process. (getrusage would count what the parent held when it forked.)"""
+    """Largest resident size of this process, in GiB. (getrusage would include the parent's memory at the fork.)"""
     line = next(
         line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")
     )
@@ -118,10 +119,10 @@ def peak_gib() -> float:
 
 
 def run_one(name: str, folder: Path) -> None:
-    """In a process of its own: time one contender; a first short run loads what is loaded once."""
+    """Time one package in this process. heliopsf first runs on a small image, which loads its compiled kernels."""
     image, psf = np.load(folder / "image.npy"), np.load(folder / "psf.npy")
     if name == "heliopsf":
-        CONTENDERS[name](image[:64, :64], psf[2016:2080, 2016:2080])  # kernels from the compiler's cache
+        CONTENDERS[name](image[:64, :64], psf[2016:2080, 2016:2080])  # loads compiled kernels
     start = time.perf_counter()
     result = CONTENDERS[name](image, psf)
     seconds = time.perf_counter() - start
@@ -144,7 +145,7 @@ def main(interpreters: dict[str, str]) -> None:
             answer = subprocess.run(command, capture_output=True, text=True, env=environment)
             if answer.returncode:
                 last = (answer.stderr.strip().splitlines() or ["no message"])[-1]
-                print(f"{contender:<24} left out: {last}")
+                print(f"{contender:<24} skipped: {last}")
                 continue
             measured = json.loads(answer.stdout.splitlines()[-1])
             took[contender] = measured["seconds"]
@@ -155,7 +156,7 @@ def main(interpreters: dict[str, str]) -> None:
             print(
                 f"{contender:<24} {measured['seconds']:8.2f} s {measured['seconds'] / f_s:8.1f} F "
                 f"{took['heliopsf'] / measured['seconds']:6.3f} (ours / theirs)   peak {measured['peak_gib']:.2f} GiB   "
-                f"differs by {apart:.1e} of the maximum, edges apart"
+                f"difference {apart:.1e} of the maximum, without edges"
             )
 
 

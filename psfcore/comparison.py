@@ -1,4 +1,4 @@
-"""Two arrays that ought to be one: are they the same bit for bit, and if not, how far apart are they?"""
+"""Compares two arrays that should be equal: are they the same bit for bit, and how large is the difference?"""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Comparison:
-    """What two arrays have in common.
+    """The differences between two arrays.
 
-    largest_relative: the largest difference over the largest magnitude of the first; None where the shapes differ, or
-    one has a value where the other has none.
+    same: equal bit for bit. largest_relative: the largest difference divided by the largest absolute value of the
+    first array; None if the shapes differ, or if one array is finite where the other is not.
+    values_that_differ: their number; None if the shapes differ.
     """
 
     same: bool
     largest_relative: float | None
-    values_that_differ: int | None  # None where the shapes differ
-    sha256: tuple[str, str]  # of the values in C order, each array's own kind of number, little end first
+    values_that_differ: int | None
+    sha256: tuple[str, str]  # of the values in C order, in the array's own number type, little-endian
 
 
 def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
-    """Compare two arrays of numbers; NaN is the same as NaN."""
+    """Compare two arrays of numbers; NaN equals NaN."""
     hashes = (array_sha256(first), array_sha256(again))
     kinds = {array.dtype.newbyteorder("<") for array in (first, again)}
     same = first.shape == again.shape and len(kinds) == 1 and hashes[0] == hashes[1]
@@ -44,6 +45,6 @@ def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
 
 
 def array_sha256(array: NDArray[Any]) -> str:
-    """SHA-256 (hex) of an array's numbers, whatever their order of bytes and their place in memory."""
+    """SHA-256 (hex) of an array's values, independent of byte order and memory layout."""
     plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return hashlib.sha256(plain.tobytes()).hexdigest()

@@ -1,13 +1,13 @@
-"""Kernels compiled by numba, kept on disk so that processes that start at the same moment cannot mix them up.
+"""Kernels compiled by numba and kept on disk, safely for processes that compile at the same time.
 
-numba numbers the machine code of a function in an index that is read, changed and written without a lock, and names its
-symbols by a counter of the process. Two processes that compile two kernels of one name at once, as passes of two
-lengths are (``fft_kernels``), can both write number 1, and give two kernels one symbol. Either is then called for the
-other: transforms come out wrong, and nothing says so. Here a file is named after what was compiled, without an index,
-and functions that a function makes have names of their own.
+numba keeps the machine code of a function in numbered files. It reads, changes and writes their index without a lock,
+and it names symbols by a counter of the process. Two processes can compile two kernels of the same name at once, for
+example FFT passes of two lengths (`fft_kernels`). Both may then write file number 1 or use the same symbol, so that
+one kernel is called in place of the other: transforms are wrong, without any error. Here the name of a file is a hash
+of what was compiled, there is no index, and functions made inside another function get a name of their own.
 
-Nor does numba see that a function in another file, which a kernel calls and holds, has changed: here kernels go by all
-files that define any. A file that a loss of power has cut is none.
+numba also does not notice a change in another file whose function a kernel calls. Here every kernel depends on all
+source files that define kernels. A kernel file cut short by a power failure is ignored.
 """
 
 from __future__ import annotations
@@ -31,17 +31,20 @@ log = logging.getLogger(__name__)
 def compiled(
     *, name: str | None = None, **options: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: ``numba.njit`` with these options, without the interpreter's lock, and kept on disk.
+    """Decorator: `numba.njit` with these options; releases the interpreter's lock and keeps the kernel on disk.
 
-    name: for functions that hold constants of the function around them, another for each set of constants.
+    name: required for a function that uses constants of its enclosing function; different for each set of constants.
+    Raises TypeError if it is missing.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         if function.__closure__ is not None and name is None:
-            raise TypeError(f"expected a name of its own for {function.__qualname__}, which holds constants")
+            raise TypeError(
+                f"expected an argument name: {function.__qualname__} uses constants of its enclosing function"
+            )
         function.__qualname__ = name or function.__qualname__
         kernel: Any = njit(nogil=True, cache=True, **options)(function)
-        if isinstance(kernel, Dispatcher):  # a plain function where compiling is switched off
+        if isinstance(kernel, Dispatcher):  # a plain function if compiling is switched off
             cache = kernel._cache  # type: ignore[attr-defined]
             cache._cache_file = KernelFiles(
                 cache.cache_path, cache._impl.filename_base, cache._impl.locator.get_source_stamp()
@@ -52,27 +55,29 @@ def compiled(
 
 
 class KernelFiles(IndexDataCacheFile):
-    """The files of a function's kernels, each named after its key; inside, what it was compiled from and its hash.
+    """The kernel files of one function. A file is named by its key and ends with a hash of sources and content.
 
-    A key tells the types of the arguments, the processor, and the constants that a closure holds.
+    The key consists of the argument types, the processor and the constants of a closure.
     """
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep a kernel; whoever looks sees all of its file, or none. Where it cannot be kept, it is used all the same."""
+        """Write a kernel to disk in one step. If this fails, log a warning; the kernel can be used all the same."""
         payload = self._dump(data)
         try:
             with self._open_for_write(self._data_path(self._name(key))) as file:
                 file.write(payload + self._seal(payload))
         except OSError as error:
-            log.warning("a compiled kernel cannot be kept, and is compiled again by each process: %s", error)
+            log.warning(
+                "cannot write a compiled kernel to disk; each process will compile it again: %s", error
+            )
 
     def load(self, key: Any) -> Any:
-        """The kernel of this key and of the sources as they are now; None where it was not compiled yet."""
+        """The kernel for this key, compiled from the present sources; None if there is none yet."""
         name = self._name(key)
         if not self._is_good(name):
             return None
         data = self._load_data(name)
-        # A process of another version may have put its own there meanwhile.
+        # Meanwhile, a process of another version may have replaced the file.
         return data if self._is_good(name) else None
 
     def _is_good(self, name: str) -> bool:
@@ -93,6 +98,6 @@ class KernelFiles(IndexDataCacheFile):
 
 @cache
 def sources_sha256() -> str:
-    """The SHA-256 of all files of this package that define kernels."""
+    """SHA-256 of all source files of psfcore that define kernels."""
     sources = sorted(path.read_bytes() for path in Path(__file__).parent.rglob("*.py"))
     return hashlib.sha256(b"".join(source for source in sources if MARK in source)).hexdigest()

@@ -1,13 +1,13 @@
-"""What can be wrong with the data a user brings."""
+"""Errors in the user's data."""
 
 from __future__ import annotations
 
 
 class DataError(ValueError):
-    """The user's data cannot be used as it is.
+    """The user's data cannot be used.
 
-    `code` is stable kebab-case for programs ("all-nan"); `message` is for people and says what was
-    expected and what was found.
+    code: stable, in kebab-case, for programs ("all-nan"). message: for people; it says what was expected and what
+    was found.
     """
 
     def __init__(self, code: str, message: str) -> None:
@@ -20,4 +20,4 @@ class DataError(ValueError):
 
 
 class HeaderError(DataError):
-    """A file is refused for what its headers show; no pixel was read."""
+    """A file whose headers show that it cannot be used; no pixel was read."""

@@ -1,4 +1,4 @@
-"""An image with a mask that says why a pixel is not to be trusted."""
+"""An image with a mask that tells which pixels cannot be trusted, and why."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SMALLEST_SIDE_PX = 16
 
 
 class MaskBit(IntFlag):
-    """Bits of the mask plane. Negative values are data (noise about zero) and have no bit."""
+    """Bits of the mask plane. Negative pixels are valid data (noise about zero) and have no bit."""
 
     NONFINITE = 1
     SATURATED = 2
@@ -38,16 +38,19 @@ class Image:
         object.__setattr__(self, "pixels", np.ascontiguousarray(self.pixels, dtype=np.float64))
         object.__setattr__(self, "mask", np.ascontiguousarray(self.mask, dtype=np.uint8))
         if self.pixels.ndim != 2:
-            raise DataError("not-2d", f"expected an image of two axes; got {self.pixels.ndim}")
+            raise DataError("not-2d", f"expected an image with two axes; got {self.pixels.ndim}")
         if min(self.pixels.shape) < SMALLEST_SIDE_PX:
             ny, nx = self.pixels.shape
-            raise DataError("too-small", f"expected at least {SMALLEST_SIDE_PX} px a side; got {nx} x {ny}")
+            raise DataError("too-small", f"expected at least {SMALLEST_SIDE_PX} px per side; got {nx} x {ny}")
         if self.mask.shape != self.pixels.shape:
             raise DataError("mask-shape", f"expected a mask of {self.pixels.shape}; got {self.mask.shape}")
         if not np.isfinite(self.pixels[(self.mask & MaskBit.NONFINITE) == 0]).all():
-            raise DataError("unmasked-nonfinite", "expected every NaN or infinite pixel to be masked")
+            raise DataError(
+                "unmasked-nonfinite",
+                "expected every NaN or infinite pixel to be masked; got at least one that is not",
+            )
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """True where a pixel can be trusted, [y, x]."""
+        """True for pixels that can be trusted, [y, x]."""
         return self.mask == 0

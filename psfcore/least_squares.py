@@ -1,15 +1,15 @@
-"""The inverse of a normal matrix whose numbers have units: the covariance of a least-squares fit.
+"""The covariance of a least-squares fit: the inverse of a normal matrix whose parameters have different units.
 
     A = S B S,   S = diag(sqrt(A_kk))        Eq. (1)
     A^+ = S^-1 B^+ S^-1                      Eq. (2)
 
-B has a unit diagonal whatever the units of the fitted numbers are, so that which of its directions are open is a
-question of the data and not of px beside DN/s. B^+ is its pseudo-inverse (Moore and Penrose): a direction that is
-open stays where it is, and gets no variance.
+B has a unit diagonal for any units of the fitted parameters. The data alone, and not the ratio of units such as px and
+DN/s, then decide which directions are undetermined. B^+ is the pseudo-inverse of B (Moore and Penrose): it gives an
+undetermined direction no change and no variance.
 
 | symbol | name |
 |---|---|
-| A | normal: J^T W J, slopes J and weights W |
+| A | normal: J^T W J, with the Jacobian J and the weights W |
 | S | size |
 """
 
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
 
-WEAKEST_DIRECTION = 1e-15  # of B's strongest: weaker ones are open
+WEAKEST_DIRECTION = 1e-15  # relative to B's largest eigenvalue; weaker directions are undetermined
 
 
 def scaled_inverse(normal: Matrix, *, weakest: float = WEAKEST_DIRECTION) -> Matrix:
-    """Eq. (2) of a symmetric (n, n) matrix that is not negative; a number that nothing depends on has 0 there.
+    """Eq. (2) for a symmetric, non-negative matrix (n, n). Parameters without any influence get 0.
 
-    weakest: eigenvalue of B, as a share of its largest, up to which a direction is taken as open.
+    weakest: a direction is undetermined if its eigenvalue of B is at most this share of the largest.
     """
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scale = np.outer(size, size)

@@ -1,17 +1,17 @@
-"""Noise of an exposure: photons and readout.
+"""Noise of an exposure: photon noise and read noise.
 
     var(D) = g D + r^2            Eq. (1)    of D in DN
     var(R) = (g R t + r^2) / t^2  Eq. (2)    of a rate R = D / t in DN/s
 
-The variance is that of the expected value. Taken from the observed one it would be smallest where the noise
-happened to be negative, and of the wrong sign where a pixel is.
+The variance follows from the expected value of a pixel. From the observed value it would be too small where the noise
+happens to be negative, and negative where the pixel is negative.
 
 | symbol | name | unit |
 |---|---|---|
 | D | expected value of a pixel in one exposure | DN |
-| g | photon_gain_dn: DN a detected photon | DN |
-| r | read_noise_dn: rms of the readout | DN |
-| t | dn_per_unit: the exposure for DN/s, 1 for DN | s, 1 |
+| g | photon_gain_dn: DN per detected photon | DN |
+| r | read_noise_dn: rms | DN |
+| t | dn_per_unit: exposure time for DN/s, 1 for DN | s, 1 |
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Noise:
-    """What a photon and a readout do to a pixel.
+    """Photon gain and read noise of a camera.
 
-    Raises DataError "bad-noise": both finite, neither below zero, and one above it.
+    Raises DataError "bad-noise" unless both are finite and at least zero, and one of them is above zero.
     """
 
     photon_gain_dn: float
@@ -41,31 +41,36 @@ class Noise:
     def __post_init__(self) -> None:
         pair = (self.photon_gain_dn, self.read_noise_dn)
         if not all(math.isfinite(value) and value >= 0 for value in pair) or not any(pair):
-            raise DataError("bad-noise", f"expected DN a photon and DN rms, not both zero; got {pair}")
+            raise DataError(
+                "bad-noise",
+                f"expected photon gain (DN per photon) and read noise (DN rms), at least 0 and not both 0; got {pair}",
+            )
 
     def variance(self, expected: Plane, dn_per_unit: float) -> Plane:
-        """Variance [y, x] of pixels whose expected value is `expected`; below zero counts as zero."""
+        """Variance [y, x] of pixels with the expected value `expected`; negative values count as zero."""
         photons = self.photon_gain_dn * np.maximum(expected, 0.0) / dn_per_unit
         return np.asarray(photons + (self.read_noise_dn / dn_per_unit) ** 2)  # Eq. (1), Eq. (2)
 
     def observe(self, expected: Plane, dn_per_unit: float, rng: np.random.Generator) -> Plane:
-        """Pixels [y, x] as one more exposure of the same scene would have them."""
-        seen_dn: Plane = np.maximum(expected, 0.0) * dn_per_unit
+        """Simulate one exposure [y, x] of a scene whose noise-free image is `expected`."""
+        exposure_dn: Plane = np.maximum(expected, 0.0) * dn_per_unit
         if self.photon_gain_dn > 0:
-            seen_dn = np.asarray(rng.poisson(seen_dn / self.photon_gain_dn) * self.photon_gain_dn)
+            exposure_dn = np.asarray(rng.poisson(exposure_dn / self.photon_gain_dn) * self.photon_gain_dn)
         if self.read_noise_dn > 0:
-            seen_dn = np.asarray(seen_dn + rng.normal(0.0, self.read_noise_dn, expected.shape))
-        return np.asarray(seen_dn / dn_per_unit)
+            exposure_dn = np.asarray(exposure_dn + rng.normal(0.0, self.read_noise_dn, expected.shape))
+        return np.asarray(exposure_dn / dn_per_unit)
 
 
 def dn_per_unit(image: Image) -> float:
-    """DN in one exposure for one unit of the image: the exposure where the unit is DN/s, else 1.
+    """DN in one exposure per unit of the image: the exposure time (s) if the unit is DN/s, otherwise 1.
 
     Raises DataError "no-exposure".
     """
     if (image.unit or "").replace(" ", "").lower() != "dn/s":
         return 1.0
     if image.exposure_s is None:
-        message = "expected XPOSURE or EXPTIME, to know the noise of an image in DN/s; got neither"
+        message = (
+            "expected XPOSURE or EXPTIME in the header, to compute the noise of an image in DN/s; got neither"
+        )
         raise DataError("no-exposure", message)
     return image.exposure_s

@@ -1,17 +1,17 @@
-"""A PSF on the pixels that an image has: binned, cut out, or as it is.
+"""Adapts a PSF to the pixels of an image, which may be binned or a cut-out.
 
-A binned pixel is the mean of n x n pixels. A scene that is constant within binned pixels is seen by them through
+A binned pixel is the mean of n x n pixels. For a scene that is constant within binned pixels, the binned PSF is
 
     K[M] = sum over d of t(d) h[n M + d],   t(d) = (1 - |d| / n) for |d| < n       Eq. (1), on each axis
 
-t is the box of the pixel that is seen convolved with the box of the pixel that sees. Both have n pixels, so their
-shifts by half a pixel for even n cancel: K is centred at [n // 2, n // 2] for even and odd factors alike, and it
-is h, box-averaged, at the mean of all the phases that a source can have within a binned pixel. The t(n M + d)
-sum to 1 over M: no light is lost. A delta stays a delta.
+t is the convolution of two boxes of n pixels, one for the binned pixel in the scene and one for the binned pixel in the
+image. For even n, their shifts by half a pixel cancel, so K is centred at [size // 2, size // 2] for even and odd
+factors. K is the box-averaged h, averaged over all positions of a source within a binned pixel. The t(n M + d) sum to
+1 over M, so no light is lost. A delta function stays a delta function.
 
-A cut-out, or a window that starts elsewhere on the detector (PXBEG), is seen through the same PSF: with one PSF
-for the whole field only the difference of two positions counts. What a window changes is its edge, whose
-neighbourhood gets light from scenes that are not in the image; no choice of PSF makes up for that.
+A cut-out, or a window that starts elsewhere on the detector (PXBEG), has the same PSF: with one PSF for the whole
+field, only the difference of two positions matters. Near the edges of a window, light from outside the window enters
+the image; no choice of PSF corrects this.
 
 | symbol | name | unit |
 |---|---|---|
@@ -39,12 +39,12 @@ Kernel = NDArray[np.float64]
 
 
 def psf_for_image(psf: Psf, header: Header) -> Psf:
-    """The PSF on the pixels of an image with this header: `psf` itself, or rebinned by its `binning_factor`."""
+    """The PSF for the pixels of an image with this header: `psf` itself, or rebinned by `binning_factor`."""
     return rebinned(psf, binning_factor(psf, header))
 
 
 def check_compatible(image: Image, psf: Psf) -> None:
-    """Raise DataError "plate-scale-mismatch" when the scales are known and differ by over 1 %."""
+    """Raise DataError "plate-scale-mismatch" if both plate scales are known and differ by more than 1 %."""
     if psf.plate_scale_arcsec is None:
         return
     for axis in (1, 2):
@@ -52,18 +52,19 @@ def check_compatible(image: Image, psf: Psf) -> None:
         if scale is None:
             continue
         if abs(scale / psf.plate_scale_arcsec - 1) > PLATE_SCALE_TOLERANCE:
-            wanted = f"{psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it"
+            wanted = f"{psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}"
             raise DataError(
                 "plate-scale-mismatch", f"expected {wanted}; got CDELT{axis} = {scale:g} arcsec/px"
             )
 
 
 def binning_factor(psf: Psf, header: Header) -> int:
-    """How many of the PSF's pixels a pixel of an image with this header has, on each axis.
+    """Number of the PSF's pixels per image pixel, along each axis.
 
-    Same scale to 1 %, or a scale that is not known: 1. A whole multiple on both axes: that,
-    where the image is of the PSF's own instrument or the PSF names none: another telescope's pixels may be a
-    multiple by chance (an FSI pixel is nine of HRI_EUV's). Raises DataError "plate-scale-mismatch".
+    It is 1 if the plate scales agree to 1 % or one of them is not known. If the image's plate scale is the same whole
+    multiple on both axes, it is that multiple. This requires that the image is from the PSF's instrument, or that the
+    PSF names no instrument: pixels of another telescope may be a multiple by chance (an FSI pixel is nine HRI_EUV
+    pixels). Raises DataError "plate-scale-mismatch".
     """
     if psf.plate_scale_arcsec is None:
         return 1
@@ -73,7 +74,7 @@ def binning_factor(psf: Psf, header: Header) -> int:
         return 1
     if len(factors) > 1 or None in factors or not _same_instrument(psf, header):
         found = " x ".join("unknown" if scale is None else f"{scale:g}" for scale in scales)
-        wanted = f"{psf.plate_scale_arcsec:g} arcsec/px as PSF {psf.name} has it, or its own images binned"
+        wanted = f"{psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}, or binned images of its instrument"
         raise DataError("plate-scale-mismatch", f"expected {wanted}; got CDELT1 x CDELT2 = {found} arcsec/px")
     return factors.pop() or 1
 
@@ -84,15 +85,18 @@ def _same_instrument(psf: Psf, header: Header) -> bool:
 
 
 def rebinned(psf: Psf, factor: int) -> Psf:
-    """The PSF of pixels that are means of factor x factor pixels, with its components.
+    """The PSF, with its components, for pixels that are means of factor x factor pixels.
 
-    Raises DataError "bad-binning" for a factor out of range or larger than the kernel's half.
+    Raises DataError "bad-binning" if the factor is out of range or larger than half the kernel.
     """
     if factor == 1:
         return psf
     smallest = min(psf.kernel.shape)
     if not 1 <= factor <= min(LARGEST_FACTOR, max(1, smallest // 2)):
-        raise DataError("bad-binning", f"expected a factor of 1 to {LARGEST_FACTOR}; got {factor}")
+        raise DataError(
+            "bad-binning",
+            f"expected a binning factor of 1 to {min(LARGEST_FACTOR, max(1, smallest // 2))}; got {factor}",
+        )
     scale = psf.plate_scale_arcsec
     return replace(
         psf,
@@ -105,14 +109,14 @@ def rebinned(psf: Psf, factor: int) -> Psf:
 
 
 def rebinned_kernel(kernel: Kernel, factor: int) -> Kernel:
-    """Eq. (1), on both axes; keeps the sum within the full reach, which is measured in unbinned pixels."""
+    """Eq. (1) along both axes. Only weights within the full reach (in unbinned pixels) are used; their sum is kept."""
     inner = crop_centred(kernel, (min(kernel.shape[0], REACH_GRID_PX), min(kernel.shape[1], REACH_GRID_PX)))
     rows = _rebin_axis(inner, factor)
     return np.ascontiguousarray(_rebin_axis(rows.T, factor).T)
 
 
 def _rebin_axis(kernel: Kernel, factor: int) -> Kernel:
-    """Eq. (1) along the first axis: each weight is shared by the two binned offsets that it lies between."""
+    """Eq. (1) along the first axis: each weight is divided between the two nearest binned offsets."""
     offset = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
     low, past = np.divmod(offset, factor)
     half = int(max(-low.min(), low.max() + 1))
@@ -124,6 +128,6 @@ def _rebin_axis(kernel: Kernel, factor: int) -> Kernel:
 
 
 def _factor(ratio: float) -> int | None:
-    """The whole number that the ratio of two scales is to 1 %, or None."""
+    """The whole number that equals the ratio of two plate scales to 1 %, or None."""
     whole = round(ratio)
     return whole if whole >= 1 and abs(ratio / whole - 1) <= PLATE_SCALE_TOLERANCE else None

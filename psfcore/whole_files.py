@@ -1,4 +1,4 @@
-"""Files of which there is all or nothing, whatever is killed and whenever the power goes."""
+"""Writes files completely or not at all, even if the process is killed or the power fails."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ PARTIAL = ".part"
 
 @contextmanager
 def whole_file(target: Path) -> Iterator[BinaryIO]:
-    """A file to write to, beside its place; it takes that, over what is there, once all of it is on the disk.
+    """Open a temporary file beside `target`; it replaces `target` when all of it is on the disk.
 
-    A process that is killed leaves what ``partials`` finds. Raises OSError.
+    A killed process leaves its temporary file behind; `partials` finds it. Raises OSError.
     """
     partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
     try:
@@ -31,11 +31,11 @@ def whole_file(target: Path) -> Iterator[BinaryIO]:
 
 
 def write_whole(target: Path, text: str) -> None:
-    """Write a text so. Raises OSError."""
+    """Write a text file completely or not at all. Raises OSError."""
     with whole_file(target) as file:
         file.write(text.encode())
 
 
 def partials(target: Path) -> Iterator[Path]:
-    """What processes that were killed left of this file."""
+    """Temporary files of `target` that killed processes left behind."""
     return target.parent.glob(f".{glob.escape(target.name)}.*{PARTIAL}")

@@ -1,4 +1,4 @@
-"""Files that attack whoever reads them, for the tests of every layer. Each is small; what it unfolds to is not."""
+"""Small files that would inflate to very much data (bombs), for the tests of every layer."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ HEADER_BLOCK = 2880
 
 
 def padded(content: bytes, fill: bytes = b"\0") -> bytes:
-    """Up to a whole number of FITS blocks."""
+    """The content padded to a whole number of FITS blocks."""
     return content + fill * (-len(content) % HEADER_BLOCK)
 
 
 def lying_tiles(stream: bytes, *, edge: int = 64, column: str = "COMPRESSED_DATA") -> bytes:
-    """An image of edge x edge int16, whose every row is said to be compressed in the same stream of gzip."""
+    """An image of edge x edge int16 in which every row refers to the same gzip stream."""
     names = ["COMPRESSED_DATA"] if column == "COMPRESSED_DATA" else ["COMPRESSED_DATA", column]
     rows = np.zeros(edge, dtype=[(name, ">i4", (2,)) for name in names])
     rows[column][:, 0] = len(stream)
@@ -32,7 +32,7 @@ def lying_tiles(stream: bytes, *, edge: int = 64, column: str = "COMPRESSED_DATA
 
 
 def psf_with_a_tail(tail: str) -> bytes:
-    """A PSF that says it was written here, and something behind it that should not be read as it stands."""
+    """A PSF with the card PSFNAME, as heliopsf writes it, followed by HDUs that must not be read without a check."""
     y, x = np.indices((64, 64)) - 32
     kernel = np.exp(-0.5 * (x**2 + y**2) / 1.5**2)
     primary = fits.PrimaryHDU((kernel / kernel.sum()).astype("f4"))

@@ -10,7 +10,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
-from psfcore.fits.fits_io import write_psf
+from psfcore.fits.psfs import write_psf
 from psfcore.noise import Noise
 from psfcore.psf import Psf, crop_centred
 from psfcore.scatter.power_law import scatter_kernel

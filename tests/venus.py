@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
-from psfcore.fits.fits_io import read_image
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_image
 from psfcore.psf import Psf
 from psfcore.scatter.power_law import scatter_kernel
 

@@ -26,7 +26,7 @@ from psfcore.blind.chain import Chain, Sky
 from psfcore.blind.effects.effect import Effect
 from psfcore.blind.effects.fine_optics import boxed_glass, fine_optics
 from psfcore.blind.leftover import Left, LinearEstimator, refitted, rms_difference
-from psfcore.fits.fits_io import Cards, CardValue, write_plane
+from psfcore.fits.images import Cards, CardValue, write_plane
 from psfcore.simulate.plan import HIGH, Plan
 from psfcore.simulate.transit_files import instrument_values, shot_values
 from psfcore.transit.prepare import Exposure, prepare

@@ -1,0 +1,1 @@
+"""Convolution with a PSF and its adjoint, through Fourier transforms."""

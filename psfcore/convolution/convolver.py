@@ -1,13 +1,14 @@
-"""Linear convolution through Fourier transforms: the only transforms in the package.
+"""Linear convolution through SciPy's Fourier transforms. No other file of psfcore calls a library's transforms.
 
-The scene is taken as zero outside the field, and only what falls on the field is kept:
+The scene is zero outside the field, and the result is cut to the field:
 
     (H x)[j] = sum over o of h[o] x[j - o],      Eq. (1)    j and j - o on the field
     (H^T y)[i] = sum over o of h[o] y[i + o]     Eq. (2)
 
-The paper pads image and PSF by half an image edge on all sides. That is long enough that nothing wraps;
-what wraps into pixels that are cut off again does no harm, so a transform of field + largest offset
-gives the same numbers (tests compare the two) and is shorter: 3072 for a 2048 px field and PSF.
+The paper (Hofmeister et al. 2024) pads image and PSF by half an image edge on all sides, so that nothing wraps
+around. Light that wraps into pixels which are cut off afterwards does no harm. A transform of the length field +
+largest offset therefore gives the same numbers (the tests compare both) and is shorter: 3072 px for a field and a
+PSF of 2048 px.
 
 | symbol | name |
 |---|---|
@@ -30,9 +31,9 @@ Field = NDArray[np.floating]
 class Convolver:
     """Convolution with one PSF, cut to one field, and its adjoint.
 
-    psf_kernel: weights [y, x], centre at [n // 2, n // 2]. field_shape: (ny, nx) of what is convolved.
-    dtype: float32 or float64, of the transforms and of the results. threads: for the transforms.
-    Raises DataError "field-shape" when an array has another shape.
+    psf_kernel: weights [y, x], centre at [n // 2, n // 2]. field_shape: (ny, nx) of the arrays to convolve.
+    dtype: float32 or float64, for transforms and results. threads: number of threads for the transforms.
+    Raises DataError "field-shape" if an array has another shape.
     """
 
     def __init__(
@@ -57,22 +58,22 @@ class Convolver:
         self._transfer = scipy.fft.rfft2(corner, workers=threads)
 
     def apply(self, x: Field) -> Field:
-        """H x, Eq. (1): the field as seen through the PSF; shape (ny, nx)."""
+        """H x, Eq. (1): the field convolved with the PSF; shape (ny, nx)."""
         spectrum = self._forward(x)
         spectrum *= self._transfer
         return self._inverse(spectrum)
 
     def adjoint(self, y: Field) -> Field:
-        """H^T y, Eq. (2): where the light of each pixel may have come from; shape (ny, nx)."""
+        """H^T y, Eq. (2): the field correlated with the PSF; shape (ny, nx)."""
         spectrum = self._forward(y)
-        # spectrum * conj(transfer), without a temporary for the conjugate
+        # spectrum * conj(transfer), without a temporary array for the conjugate
         np.conjugate(spectrum, out=spectrum)
         spectrum *= self._transfer
         np.conjugate(spectrum, out=spectrum)
         return self._inverse(spectrum)
 
     def _forward(self, x: Field) -> NDArray[np.complexfloating]:
-        """Rows first and only those of the field: the padding rows are zero and need no transform."""
+        """Transform along x first, only the rows of the field: the padding rows are zero."""
         if x.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {x.shape}")
         rows = scipy.fft.rfft(np.asarray(x, dtype=self.dtype), n=self.length[1], axis=1, workers=self.threads)
@@ -90,19 +91,19 @@ class Convolver:
 def needed_kernel(
     psf_kernel: NDArray[np.floating], field_shape: tuple[int, int]
 ) -> tuple[NDArray[np.floating], tuple[int, int]]:
-    """The part of a kernel whose offsets can join two pixels of the field, and the offset of its first."""
+    """The part of a kernel whose offsets can connect two pixels of the field, and the offset of its first pixel."""
     (y0, y1), (x0, x1) = (_needed(n, size) for n, size in zip(psf_kernel.shape, field_shape, strict=True))
     return psf_kernel[y0:y1, x0:x1], (y0 - psf_kernel.shape[0] // 2, x0 - psf_kernel.shape[1] // 2)
 
 
 def _needed(kernel_size: int, field_size: int) -> tuple[int, int]:
-    """Index range of the kernel whose offsets can join two pixels of the field."""
+    """Index range of the offsets that can connect two pixels of the field, along one axis."""
     centre = kernel_size // 2
     return max(0, centre - (field_size - 1)), min(kernel_size, centre + field_size)
 
 
 def _length(field_size: int, lowest: int, highest: int) -> int:
-    """Shortest fast transform in which no wrapped light reaches the field."""
+    """Length of the shortest fast transform in which no wrapped light reaches the field."""
     return int(scipy.fft.next_fast_len(field_size + max(-lowest, highest, 0), real=True))
 
 
@@ -113,9 +114,9 @@ def linear_convolve(
     *,
     threads: int = 1,
 ) -> NDArray[np.float64]:
-    """Two kernels, each centred at [n // 2, n // 2], convolved linearly in float64 on `out_shape`.
+    """Convolve two kernels linearly in float64; both have their centre at [n // 2, n // 2].
 
-    The result is centred at [n // 2, n // 2] of `out_shape`; light that falls outside it is cut.
+    The result has the shape `out_shape` and its centre at [n // 2, n // 2]. Light outside it is cut off.
     """
     length = tuple(
         int(scipy.fft.next_fast_len(p + q - 1, real=True))
@@ -138,28 +139,28 @@ def linear_convolve(
 def correlations(
     planes: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int
 ) -> NDArray[np.floating]:
-    """Sums over pixels of plane(x) scene(x - d) for displacements d up to reach_px along each axis.
+    """Sums over pixels of plane(x) scene(x - d), for displacements d up to reach_px along each axis.
 
-    planes: (k, ny, nx). scene: (ny + 2 reach, nx + 2 reach), the same place in its middle. Returns (k, 2 reach + 1,
-    2 reach + 1), no displacement in the middle.
+    planes: (k, ny, nx). scene: (ny + 2 reach, nx + 2 reach); its middle covers the same pixels as the planes.
+    Returns (k, 2 reach + 1, 2 reach + 1), with displacement 0 in the middle.
     """
     length = tuple(int(scipy.fft.next_fast_len(n, real=True)) for n in scene.shape)
     wide = scipy.fft.rfft2(planes, s=length)
     wide *= scipy.fft.rfft2(scene, s=length).conj()
-    # What is at index i of a plane is at i + reach of the scene: the sums come reach_px further back.
+    # Index i of a plane is index i + reach of the scene, so the sums are shifted back by reach_px.
     back = scipy.fft.irfft2(wide, s=length)
     at = np.arange(-2 * reach_px, 1)
     return np.asarray(back[:, at[:, None], at[None, :]])
 
 
 class ChirpTransform:
-    """Fourier sum between two centred grids of any steps, as one convolution with a chirp (Bluestein 1970).
+    """Fourier sum between two centred grids of arbitrary steps, as one convolution with a chirp (Bluestein 1970).
 
         F[k] = sum over n of f[n] exp(-2 pi i r n' k'),  n' = n - (N - 1) / 2,  k' = k - (K - 1) / 2
         n' k' = (n'^2 + k'^2 - (k' - n')^2) / 2
 
-    r: ratio, step times step of the two grids over what their product is measured in (a FFT has 1 / N).
-    N, K: samples, out_samples. No grid wraps: the sum is evaluated as it is written.
+    r: ratio, the product of the two grid steps in units of one period (1 / N for an FFT).
+    N, K: samples, out_samples. The grids are not periodic: the sum is evaluated exactly as written.
     """
 
     def __init__(self, ratio: float, samples: int, out_samples: int) -> None:
@@ -175,7 +176,7 @@ class ChirpTransform:
         self._transfer = scipy.fft.fft(kernel, overwrite_x=True)
 
     def apply(self, f: NDArray[np.complexfloating]) -> NDArray[np.complex128]:
-        """F, shape (out_samples,), of f, shape (samples,)."""
+        """F, shape (out_samples,), from f, shape (samples,). Raises DataError "field-shape"."""
         if f.shape != (self.samples,):
             raise DataError("field-shape", f"expected a field of {(self.samples,)}; got {f.shape}")
         spectrum = scipy.fft.fft(f * self._before, n=self._length, overwrite_x=True)
@@ -189,5 +190,5 @@ def _chirp(ratio: float, n: NDArray[np.floating]) -> NDArray[np.complex128]:
 
 
 def transform_axis(a: NDArray[np.complex64], *, axis: int, threads: int = 1) -> NDArray[np.complex64]:
-    """Forward transform along one axis, in the place of `a`, which it may overwrite."""
+    """Forward transform along one axis. It may overwrite `a`."""
     return np.asarray(scipy.fft.fft(a, axis=axis, workers=threads, overwrite_x=True))

@@ -1,18 +1,19 @@
-"""A PSF prepared for one shape of field, applied and adjoint-applied in single precision, fused and pruned.
+"""Fast convolution with one PSF, and its adjoint, for fields of one shape, in single precision.
 
-The same operators as ``psfcore.convolution.convolver.Convolver`` (its Eq. (1) and (2)), several times faster:
+The operators are those of `psfcore.convolution.convolver.Convolver` (Eq. (1) and (2) there). The engine is several
+times faster (`python -m benchmarks.deconvolution` prints the ratio to SciPy and ducc0) for three reasons:
 
-- pruned: of the padded plane only the field's rows are transformed along x; along y, a block of sixteen columns
-  is padded, transformed, multiplied by the transfer function and transformed back while it is in cache, and only
-  the field's rows are written back;
-- fused: between two convolutions of an iteration a block of rows is transformed back, changed by what the method
-  does to pixels, and transformed again, in cache; H x is never written out;
-- the transfer function is kept real where the PSF is symmetric about its centre.
+- Pruned transforms: along x only the field's rows of the padded plane are transformed. Along y, a block of sixteen
+  columns is padded, transformed, multiplied by the transfer function and transformed back while it is in the cache.
+  Only the field's rows are written back.
+- Fused steps: between two convolutions of an iteration, a block of rows is transformed back, changed by the method
+  and transformed again while it is in the cache. H x is never written to memory.
+- A real transfer function, if the PSF is symmetric about its centre.
 
-Fields live in the engine as blocks of 32 rows, [block][x][half][lane]: row 32 block + 16 half + lane. The two halves
-are the real and the imaginary part of one complex transform, so that a real row costs half a transform. Spectra
-live as [block of 16 columns][row][re, im][lane]. Every block is worked on alone and in one order, so the result does
-not depend on the number of threads.
+Layout of a field: blocks of 32 rows, [block][x][half][lane], where the row is 32 block + 16 half + lane. The two
+halves are the real and imaginary part of one complex transform, so a real row costs half a transform. Layout of a
+spectrum: [block of 16 columns][row][re, im][lane]. Each block is processed on its own and in a fixed order, so the
+result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -33,19 +34,17 @@ from psfcore.convolution.fft_kernels import LANES, Plan, forward, good_length, i
 from psfcore.errors import DataError
 
 BLOCK_ROWS = 2 * LANES
-SYMMETRIC_TO = 1e-7  # of the sum: below float32's own rounding of the transfer function
-# Of small images and of large ones: handing out a chunk takes as long as a small block or two.
+SYMMETRIC_TO = 1e-7  # of the sum of weights: smaller than the float32 rounding of the transfer function
+# For small and for large images. Handing out a chunk takes about as long as one or two small blocks.
 _CHUNKS_A_THREAD = (2, 4)
 _BLOCKS_A_CHUNK = 8
 
 Single = NDArray[np.float32]
-# A method's own work on a block of rows between two transforms: (spectrum, first, last block, scratch).
-RowWork = Callable[[int, int, "Scratch"], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Scratch:
-    """What one thread needs while it works: a transform's buffer and a corner to turn blocks in."""
+    """Memory of one thread: the buffer of a transform, and a small array to transpose blocks in."""
 
     buffer: Single
     corner: Single
@@ -55,10 +54,10 @@ class Engine:
     """Convolution with one PSF, cut to one field, and its adjoint, in float32.
 
     psf_kernel: weights [y, x], centre at [n // 2, n // 2]; any shape, even or odd. field_shape: (ny, nx).
-    span: (ny, nx), pixels less than this apart are joined as the PSF says; none: all, the field's shape. Where the
-    field holds a margin, what is farther apart lies in opposite margins: there light may wrap, which keeps
-    the transforms short. threads: how many work at once; the result is the same for any number.
-    Raises DataError "field-shape" when an array has another shape.
+    span: (ny, nx); the convolution is exact between pixels closer than this. Default: the field's shape, so that it
+    is exact between all pixels. If the field includes a margin, pixels farther apart lie in opposite margins; light
+    may wrap between them, which keeps the transforms short. threads: number of threads; it does not change the
+    result. Raises DataError "field-shape" if an array has another shape.
     """
 
     def __init__(
@@ -92,23 +91,23 @@ class Engine:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it holds between two calls."""
+        """Memory that the engine holds between two calls, in bytes."""
         scratch = self.threads * max(self.row_plan.length, self.column_plan.length) * 2 * LANES * 4
         return self.transfer.nbytes + self._spectrum.nbytes + scratch
 
     @property
     def symmetric(self) -> bool:
-        """Whether the PSF is symmetric about its centre: its transfer function is real."""
+        """Whether the PSF is symmetric about its centre, so that its transfer function is real."""
         return self.transfer.shape[2] == 1
 
     # Whole operators -------------------------------------------------------------------------------
 
     def apply(self, x: NDArray[np.floating]) -> Single:
-        """H x: the field as seen through the PSF; shape (ny, nx)."""
+        """H x: the field convolved with the PSF; shape (ny, nx)."""
         return self._whole(x, adjoint=False)
 
     def adjoint(self, y: NDArray[np.floating]) -> Single:
-        """H^T y: where the light of each pixel may have come from; shape (ny, nx)."""
+        """H^T y: the field correlated with the PSF; shape (ny, nx)."""
         return self._whole(y, adjoint=True)
 
     def _whole(self, field: NDArray[np.floating], *, adjoint: bool) -> Single:
@@ -118,10 +117,10 @@ class Engine:
         self.rows_inverse(lanes)
         return self.from_lanes(lanes)
 
-    # The parts that methods put together ------------------------------------------------------------
+    # Steps that a method combines -------------------------------------------------------------------
 
     def to_lanes(self, field: NDArray[np.floating], *, padding: float = 0.0) -> Single:
-        """A field (ny, nx) in the engine's order; rows that fill the last block hold `padding`."""
+        """Convert a field (ny, nx) to the engine's layout. Rows that fill up the last block hold `padding`."""
         if field.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {field.shape}")
         ny, nx = self.field_shape
@@ -130,7 +129,7 @@ class Engine:
         return np.ascontiguousarray(padded.transpose(0, 3, 1, 2))
 
     def from_lanes(self, lanes: Single) -> Single:
-        """The inverse of ``to_lanes``: shape (ny, nx)."""
+        """The inverse of `to_lanes`; shape (ny, nx)."""
         ny, nx = self.field_shape
         return np.ascontiguousarray(lanes.transpose(0, 2, 3, 1).reshape(-1, nx)[:ny])
 
@@ -155,11 +154,11 @@ class Engine:
         self.run(work, self.row_blocks)
 
     def columns(self, *, adjoint: bool) -> None:
-        """Convolve the spectrum's columns: there, times the transfer function (conjugate: adjoint), and back."""
+        """Transform the columns, multiply by the transfer function (its conjugate for the adjoint), transform back."""
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
-        """The spectrum's columns there, times a filter laid out as the transfer function, and back."""
+        """Transform the columns, multiply by a filter in the layout of the transfer function, transform back."""
         kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
         sign = np.float32(-1.0 if conjugate else 1.0)
 
@@ -169,9 +168,10 @@ class Engine:
         self.run(work, self.column_blocks)
 
     def row_stage(self, work: Callable[..., Any], *fields: Any) -> list[Any]:
-        """Run a method's compiled row stage on all blocks; returns what it returned, a chunk at a time.
+        """Run a method's compiled row stage on all blocks; returns its results, one per chunk.
 
-        ``work`` is called with the spectrum, the fields, a buffer, a corner, the range of blocks and the plan.
+        `work` is called with the spectrum, the fields, buffer and corner of the scratch memory, the range of blocks
+        and the numbers of the row plan.
         """
 
         def part(start: int, stop: int, scratch: Scratch) -> Any:
@@ -183,11 +183,11 @@ class Engine:
 
     @property
     def row_numbers(self) -> tuple[Any, ...]:
-        """The row plan as kernels take it."""
+        """The row plan in the form of kernel arguments."""
         return (*_numbers(self.row_plan), self.row_plan.place)
 
     def run(self, work: Callable[[int, int, Scratch], Any], blocks: int) -> list[Any]:
-        """Call ``work(start, stop, scratch)`` on ranges that cover all blocks, in as many threads as set."""
+        """Call `work(start, stop, scratch)` on ranges that cover all blocks, using all threads."""
         few, many = _CHUNKS_A_THREAD
         a_thread = min(max(blocks // (_BLOCKS_A_CHUNK * self.threads), few), many)
         chunks = min(blocks, self.threads * a_thread) if self.threads > 1 else 1
@@ -200,12 +200,14 @@ class Engine:
             finally:
                 self._scratch.put(scratch)
 
-        # One chunk is not worth handing to another thread.
+        # A single chunk runs in this thread.
         return [one(0)] if chunks == 1 else self._shared_out(one, chunks)
 
     def _shared_out(self, one: Callable[[int], Any], chunks: int) -> list[Any]:
-        """Every chunk's result. This thread works too, and each takes the next chunk: where an image is small, waking
-        another for every chunk would take longer than the chunk."""
+        """Results of all chunks. This thread works too, and each thread takes the next free chunk.
+
+        For a small image, waking another thread for each chunk would take longer than the chunk itself.
+        """
         results: list[Any] = [None] * chunks
         taken = itertools.count()
 
@@ -217,19 +219,19 @@ class Engine:
         try:
             work()
         finally:
-            for other in others:  # they write to the same spectrum
+            for other in others:  # wait: they write to the same spectrum
                 other.result()
         return results
 
     @property
     def transfer_scale(self) -> int:
-        """What the transfer function is divided by, so that a transform there and back needs no scaling."""
+        """Divisor of the transfer function: with it, a forward and an inverse transform need no other scaling."""
         return self.row_plan.length * self.column_plan.length
 
     def _transfer_function(self, kernel: NDArray[np.floating], first: tuple[int, int]) -> Single:
-        """The PSF's transform over the transforms' lengths: [block of columns][row][re, im][lane].
+        """The PSF's transform divided by `transfer_scale`: [block of columns][row][re, im][lane].
 
-        Without the imaginary part where the PSF is symmetric.
+        The imaginary part is left out if the PSF is symmetric.
         """
         ly, lx = self.column_plan.length, self.row_plan.length
         blocks = -(-ly // BLOCK_ROWS)
@@ -259,7 +261,7 @@ class Engine:
 def _wrapped_rows(
     kernel: NDArray[np.floating], first: tuple[int, int], shape: tuple[int, int], rows: slice
 ) -> Single:
-    """Some rows of a plane of zeros that holds the kernel, its centre in the corner, wrapped round the ends."""
+    """Some rows of a periodic plane that holds the kernel with its centre at [0, 0], and zeros elsewhere."""
     (ky, kx), (fy, fx), (ly, lx) = kernel.shape, first, shape
     out = np.zeros((rows.stop - rows.start, lx), np.float32)
     split = min(kx, max(0, -fx))
@@ -275,14 +277,15 @@ def _numbers(plan: Plan) -> tuple[Any, ...]:
     return plan.length, plan.radices, plan.lengths, plan.twiddles, plan.offsets
 
 
-# Kernels: each works on the blocks [start, stop) ---------------------------------------------------------
+# Kernels; each processes the blocks [start, stop) --------------------------------------------------------
 
 
 @compiled()
 def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
-    """A block of rows, transformed two to a complex signal, taken apart into the spectra of its 32 rows.
+    """Separate a transformed block of rows into the spectra of its 32 rows.
 
-    With Z the transform of a + i b for real a, b: A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
+    Each complex signal of the block holds two real rows. With Z the transform of a + i b for real a and b:
+    A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
     """
     z = buffer.reshape((-1, 2, LANES))
     half = np.float32(0.5)
@@ -354,7 +357,7 @@ def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, radices,
 
 @compiled()
 def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
-    # Rows of padding that the transform is too short for are zero and stay so.
+    # The block may hold more padding rows than the transform is long. They are zero and stay zero.
     filled = min(spectrum.shape[1], length) * 2 * LANES
     z = buffer.reshape((-1, 2, LANES))
     for group in range(start, stop):
@@ -373,8 +376,8 @@ def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radice
 
 @compiled()
 def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
-    """As ``_columns_real`` for a PSF without symmetry; ``sign`` -1 takes the conjugate: the adjoint."""
-    # Rows of padding that the transform is too short for are zero and stay so.
+    """As `_columns_real` for an asymmetric PSF; `sign` -1 uses the conjugate, for the adjoint."""
+    # The block may hold more padding rows than the transform is long. They are zero and stay zero.
     filled = min(spectrum.shape[1], length) * 2 * LANES
     z = buffer.reshape((-1, 2, LANES))
     for group in range(start, stop):

@@ -1,20 +1,20 @@
-"""Fast Fourier transforms of sixteen signals at a time, in single precision and in cache.
+"""Fast Fourier transforms of sixteen signals at a time, in single precision and in the cache.
 
-Mixed-radix Cooley-Tukey transforms in place. Forward is decimation in frequency, from natural to digit-reversed
-order; inverse is decimation in time, back from digit-reversed to natural order. A convolution multiplies
-between the two, so nothing is ever put in order (``Plan.frequency`` says which frequency lies where).
+These are mixed-radix Cooley-Tukey transforms in place. The forward transform decimates in frequency, from natural to
+digit-reversed order. The inverse decimates in time, from digit-reversed back to natural order. A convolution
+multiplies between the two, so the frequencies are never sorted (`Plan.frequency` gives the frequency at each place).
 
-Sixteen signals ("lanes") lie side by side, so that each butterfly is the same operation on sixteen neighbours:
-a buffer is flat float32, [index][re, im][lane]. The compiler turns the innermost loop over lanes into vector
-instructions, which needs the distances between more than three legs of a butterfly as constants: hence one compiled
-function for each length of a pass of radix 8 or 4. The pass of radix 4 or 2 comes before those of 8, so that these
-lengths are few: compiling is what a first run waits for. Unsigned indices spare the check for negative ones, which
-would prevent it.
+Sixteen signals ("lanes") lie side by side, so each butterfly is one operation on sixteen neighbours. A buffer is flat
+float32, [index][re, im][lane]. The compiler turns the innermost loop over lanes into vector instructions. With more
+than three legs per butterfly this works only if the distances between legs are constants: there is therefore one
+compiled function for each length of a radix-8 or radix-4 pass. The radix-4 or radix-2 pass comes before the radix-8
+passes, which keeps the number of lengths, and the time to compile on the first run, small. Indices are unsigned,
+because the check for negative indices would prevent vector instructions.
 
     X[k] = sum_j x[j] exp(-2 pi i j k / L)                                                          Eq. (1)
 
 A pass of radix r on length n = r m takes legs x[p + q m], q = 0 .. r-1, to DFT_r(legs)[q] exp(-2 pi i p q / n).
-The inverse of Eq. (1) times L is the same with the real and imaginary parts exchanged on the way in and out.
+L times the inverse of Eq. (1) is the same transform with real and imaginary parts exchanged in input and output.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ODD_FACTORS = (1, 3, 9)
 _HALF_ROOT = np.float32(np.sqrt(0.5))
 _HALF_ROOT_3 = np.float32(np.sqrt(0.75))
 _W = np.uint64(LANES)
-# Contraction to fused multiply-add only: nothing that lets NaN or the order of sums be guessed at.
+# Allow fused multiply-add only: no option that assumes finite numbers or changes the order of sums.
 _FAST: Any = {"contract"}
 
 Flat = NDArray[np.float32]
@@ -44,9 +44,9 @@ Flat = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How a length is transformed: radices and lengths pass by pass, twiddles, and the order of the result.
+    """How to transform one length: radix and length of each pass, twiddle factors, and order of the result.
 
-    ``frequency[i]`` is the frequency at place i after a forward transform, ``place`` its inverse.
+    `frequency[i]` is the frequency at place i after a forward transform; `place` is the inverse permutation.
     """
 
     length: int
@@ -59,17 +59,17 @@ class Plan:
 
 
 def good_length(at_least: int) -> int:
-    """The smallest length >= ``at_least`` that can be transformed: 2^a, 3 2^a or 9 2^a, a >= 4."""
+    """The smallest supported length >= `at_least`: 2^a, 3 2^a or 9 2^a with a >= 4. Raises ValueError."""
     candidates = [odd << a for odd in _ODD_FACTORS for a in range(4, 15) if odd << a <= LARGEST_LENGTH]
     fitting = [length for length in candidates if length >= at_least]
     if not fitting:
-        raise ValueError(f"expected a length of at most {LARGEST_LENGTH}, got {at_least}")
+        raise ValueError(f"expected a length of at most {LARGEST_LENGTH}; got {at_least}")
     return min(fitting)
 
 
 @lru_cache(maxsize=16)
 def make_plan(length: int) -> Plan:
-    """The plan for a length that ``good_length`` returned."""
+    """The plan for a length that `good_length` returned."""
     radices = _radices(length)
     lengths, offsets, twiddles = [], [], []
     n, offset = length, 0
@@ -83,7 +83,7 @@ def make_plan(length: int) -> Plan:
         offsets.append(offset)
         twiddles.append(table.ravel())
         offset += table.size
-        # Block q of this pass holds the frequencies congruent to q: the first pass is the lowest digit.
+        # Block q of this pass holds the frequencies congruent to q, so the first pass gives the lowest digit.
         frequency = (frequency[:, None] + scale * np.arange(radix)[None, :]).ravel()
         scale *= radix
         n = m
@@ -101,7 +101,7 @@ def make_plan(length: int) -> Plan:
 
 
 def _radices(length: int) -> list[int]:
-    """Threes first, then the four or two that is left beside eights, so that passes of eight have few lengths."""
+    """Radices of the passes: threes, then the remaining four or two, then eights (few different lengths)."""
     radices, rest = [], length
     while rest % 3 == 0:
         radices.append(3)
@@ -113,11 +113,11 @@ def _radices(length: int) -> list[int]:
     if rest > 1:
         radices.append(rest)
     if rest not in (1, 2, 4):
-        raise ValueError(f"length {length} is not 2^a, 3 2^a or 9 2^a")
+        raise ValueError(f"expected a length 2^a, 3 2^a or 9 2^a; got {length}")
     return radices + [8] * eights
 
 
-# Butterflies on scalars, which the compiler sees as lanes --------------------------------------------
+# Butterflies on scalars; the compiler applies them to all lanes ---------------------------------------
 
 
 @njit(inline="always", fastmath=_FAST)
@@ -133,11 +133,11 @@ def _times(ar, ai, wr, wi):  # type: ignore[no-untyped-def]
 
 
 def _radix8(n: int, inverse: bool) -> Callable[..., None]:
-    """The radix-8 pass for blocks of length n, which is a constant for the compiler."""
+    """The radix-8 pass for blocks of length n, a constant for the compiler."""
     m = n // 8
     h = _HALF_ROOT
     M1, M2, M3, M4, M5, M6, M7 = (np.uint64(q * m * 2 * LANES) for q in range(1, 8))
-    # Real and imaginary parts change places for the inverse.
+    # The inverse exchanges real and imaginary parts.
     R, I = (np.uint64(LANES), np.uint64(0)) if inverse else (np.uint64(0), np.uint64(LANES))  # noqa: E741
 
     @compiled(name=f"forward_{n}", fastmath=_FAST)
@@ -160,7 +160,7 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
                     gr, gi = x[r + M3] + x[r + M7], x[i + M3] + x[i + M7]
                     hr, hi = x[r + M3] - x[r + M7], x[i + M3] - x[i + M7]
                     y0r, y0i, y2r, y2i, y4r, y4i, y6r, y6i = _dft4(ar, ai, cr, ci, er, ei, gr, gi)
-                    # The odd outputs: legs turned by exp(-2 pi i q / 8).
+                    # Odd outputs: legs multiplied by exp(-2 pi i q / 8).
                     y1r, y1i, y3r, y3i, y5r, y5i, y7r, y7i = _dft4(
                         br, bi, h * (dr + di), h * (di - dr), fi, -fr, h * (hi - hr), -h * (hr + hi)
                     )
@@ -250,7 +250,7 @@ def _backward3(x, tw, length, n):  # type: ignore[no-untyped-def]
 
 
 def _radix4(n: int, inverse: bool) -> Callable[..., None]:
-    """The radix-4 pass for blocks of length n, which is a constant for the compiler."""
+    """The radix-4 pass for blocks of length n, a constant for the compiler."""
     m = n // 4
     M1, M2, M3 = (np.uint64(q * m * 2 * LANES) for q in range(1, 4))
     R, I = (np.uint64(LANES), np.uint64(0)) if inverse else (np.uint64(0), np.uint64(LANES))  # noqa: E741
@@ -334,7 +334,7 @@ _forward_4096, _backward_4096 = _radix8(4096, False), _radix8(4096, True)
 
 @compiled()
 def forward(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
-    """Eq. (1) of sixteen lanes in place; the result is in the order ``Plan.frequency``."""
+    """Eq. (1) for sixteen lanes in place; the result is in the order of `Plan.frequency`."""
     for stage in range(len(radices)):
         tw, n = twiddles[offsets[stage] :], lengths[stage]
         if radices[stage] == 3:
@@ -361,7 +361,7 @@ def forward(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-
 
 @compiled()
 def inverse(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
-    """``length`` times the inverse of ``forward``, in place, from its order back to the natural one."""
+    """`length` times the inverse of `forward`, in place; the result is in natural order."""
     for stage in range(len(radices) - 1, -1, -1):
         tw, n = twiddles[offsets[stage] :], lengths[stage]
         if radices[stage] == 3:

@@ -1,6 +1,6 @@
-"""Deconvolution methods, one file each, all called as ``deconvolve(image, psf, conditions, ...) -> Deconvolved``.
+"""Deconvolution of images with a known PSF.
 
-A method's file says METHOD, its name, and EDGES, what it does at edges where nothing is asked for;
-`methods.method_named` finds it. A method that steps through the engine is an `Iteration` between
-`problem.pose` and `problem.solution`.
+Each method is one file in `methods`, with a function `deconvolve(image, psf, conditions, ...) -> Deconvolved`. The
+constant METHOD is its name, and EDGES is its default for what lies beyond the field; `methods.registry.method_named`
+finds it. A method that uses the engine is an `Iteration` between `problem.pose` and `problem.solution`.
 """

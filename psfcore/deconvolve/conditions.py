@@ -1,4 +1,4 @@
-"""Under which conditions an image is deconvolved: what all methods have in common."""
+"""Options that all deconvolution methods have in common, and a cache of prepared PSFs."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from psfcore.psf import Psf
 
 Progress = Callable[[int, int], None]
 Shape = tuple[int, int]
-# (psf, shape of the plane, how far apart pixels are joined exactly, threads)
+# (psf, shape of the plane, span within which the convolution is exact, threads)
 EngineFor = Callable[[Psf, Shape, Shape, int], Engine]
 
 
 def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
-    """An engine for this call alone."""
+    """Make a new engine."""
     return Engine(psf.kernel, shape, span=span, threads=threads)
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """edges: what is taken to lie beyond the field; none: what the method does best with, its EDGES.
+    """Options of a deconvolution. Raises DataError "bad-margin" for a negative margin.
 
-    margin_px: how far the scene is followed beyond the field (not with zero edges); none: as far as the PSF asks for.
-    noise: needed where a method stops by discrepancy. threads: the result is the same for any number.
-    progress(step, steps) is called after each step; what it raises passes through.
-    engine_for: where engines come from; an `EngineCache` keeps them between images.
+    edges: assumption about the scene beyond the field; None: the method's own default, EDGES.
+    margin_px: width of the margin beyond the field (unused with zero edges); None: chosen from the PSF.
+    noise: required if a method stops by discrepancy. threads: number of threads; it does not change the result.
+    progress(step, steps) is called after each step; its exceptions are not caught.
+    engine_for: makes the engine; an `EngineCache` keeps engines between images.
     """
 
     edges: Edges | None = None
@@ -45,9 +46,10 @@ class Conditions:
 
 
 class EngineCache:
-    """Engines by PSF, shape, span and threads, the least recently used forgotten first.
+    """A cache of engines by PSF, shape, span and threads; it drops the least recently used one first.
 
-    An engine works on one image at a time, and so does a cache. A PSF is known by identity: pass the same object.
+    An engine handles one image at a time, so threads must not share a cache. PSFs are compared by identity: pass the
+    same object again to reuse its engine.
     """
 
     def __init__(self, capacity: int = 2) -> None:

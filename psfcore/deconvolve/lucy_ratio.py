@@ -1,14 +1,14 @@
-"""What Richardson-Lucy methods share: the ratio of observation and model.
+"""The ratio of observation to model, which all Richardson-Lucy methods use.
 
     w y / (H x) + (1 - w) a        Eq. (1)
 
-a is the ratio at which a masked pixel counts as agreeing with the model. One plane holds both: the light of
-a trusted pixel, at least 0, or minus a. A negative pixel is noise about zero and counts as 0: these methods
-know no negative light.
+a is the ratio of a masked pixel, so chosen that the pixel agrees with the model. One plane stores both cases: the
+light (at least 0) of a trusted pixel, or -a of a masked pixel. A negative pixel is noise about zero and counts as 0,
+because these methods have no negative light.
 
 | symbol | name | unit |
 |---|---|---|
-| y | light, trusted pixels, over the domain's scale | - |
+| y | light of trusted pixels, divided by the domain's scale | - |
 | w | trusted, 1 or 0 | - |
 | a | agreed | - |
 """
@@ -26,30 +26,30 @@ from psfcore.convolution.fft_kernels import LANES, forward, inverse
 from psfcore.deconvolve.problem import Problem, first_estimate
 from psfcore.errors import DataError
 
-# float32's resolution of the brightest pixel: below it the transform's rounding decides, and a floor
-# there keeps denormal numbers, which are slow, out of the loop.
+# Resolution of float32 relative to the brightest pixel. Smaller values are dominated by the rounding of the
+# transform. A floor at this level also avoids denormal numbers, which are slow.
 FLOOR_OF_MAXIMUM = 2.0**-23
-# An estimate below this part of the floor is dark.
+# An estimate below this fraction of the floor is set to 0.
 DARK_OF_FLOOR = 1e-6
-# The order of a sum is the compiler's and fixed; rows are summed block by block, whatever the threads.
+# The compiler may reorder a sum within a block, but the order is then fixed and independent of the threads.
 _SUMS: Any = {"contract", "reassoc"}
 
 Single = NDArray[np.float32]
 
 
 def light_above_floor(problem: Problem) -> Single:
-    """The first estimate [y, x], above the floor. Raises DataError "no-signal" without light."""
+    """The first estimate [y, x], raised to the floor. Raises DataError "no-signal" if there is no light."""
     domain = problem.domain
     if not (domain.pixels[domain.trusted] > 0).any():
-        raise DataError("no-signal", "expected a trusted pixel above zero; got none")
+        raise DataError("no-signal", "expected at least one trusted pixel above zero; got none")
     estimate = first_estimate(problem)
     return np.maximum(estimate, np.float32(FLOOR_OF_MAXIMUM * float(estimate.max())))
 
 
 class Ratio:
-    """Brings Eq. (1) into the engine's spectrum, where the spectrum held the rows of x.
+    """Replaces the rows of x in the engine's spectrum by the rows of Eq. (1).
 
-    agreed [y, x]: a of Eq. (1), above 0. brightest: of the first estimate; the model's floor follows from it.
+    agreed [y, x]: a of Eq. (1), above 0. brightest: largest value of the first estimate; it sets the model's floor.
     """
 
     def __init__(self, problem: Problem, agreed: Single | float, brightest: float) -> None:
@@ -60,14 +60,14 @@ class Ratio:
         self._light_or_agreed = self.engine.to_lanes(light_or_agreed)
 
     def measure(self) -> None:
-        """H x, how it fits, and the ratio."""
+        """Compute H x, its chi2, and the ratio of Eq. (1)."""
         self.engine.columns(adjoint=False)
         self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, *self.judgement.numbers)
 
 
 @compiled(fastmath=_SUMS)
 def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """H x <- Eq. (1), H x not below the floor; sums of (y - H x)^2 / variance over judged pixels."""
+    """Replace H x by Eq. (1), with H x at least `floor`; sum (y - H x)^2 / variance over judged pixels."""
     nx = light.shape[1]
     zero = np.float32(0.0)
     least = np.float32(1e-30)
@@ -81,11 +81,11 @@ def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums
             for side in range(2):
                 for w in range(LANES):
                     y = light[block, i, side, w]
-                    seen = max(z[i, side, w], floor)
-                    misfit = y - seen
-                    part = judged[block, side, w] * misfit * misfit / max(slope * seen + ground, least)
+                    model = max(z[i, side, w], floor)
+                    misfit = y - model
+                    part = judged[block, side, w] * misfit * misfit / max(slope * model + ground, least)
                     sum_row += part if y >= zero else zero
-                    z[i, side, w] = y / seen if y >= zero else -y
+                    z[i, side, w] = y / model if y >= zero else -y
             if first <= i < last:
                 sum_here += sum_row
         sums[block] = sum_here

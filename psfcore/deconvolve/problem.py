@@ -1,4 +1,4 @@
-"""An image made ready for a method, and a method's estimate made a result: what stands around every method."""
+"""The frame of every method: prepare an image for a method, and turn its estimate into a result."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from psfcore.image import Image, MaskBit
 from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible
 
-# A starting value is taken from trusted neighbours where the PSF gathers at least this share of its light there.
+# A missing pixel starts from its trusted neighbours if they hold at least this share of its PSF.
 _ENOUGH_NEIGHBOURS = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """An image and a PSF, checked, laid out on the plane on which the scene is sought, with its engine."""
+    """A checked image and PSF, the plane on which the scene is estimated, and the engine for it."""
 
     image: Image
     psf: Psf
@@ -41,7 +41,7 @@ class Problem:
     edge_band_px: int
 
     def solve(self, iteration: Iteration, *, steps: int, stop: Stop) -> Ended:
-        """Let a method step until it is to end."""
+        """Run a method's iteration until it stops."""
         return run(
             iteration,
             self.judgement,
@@ -62,10 +62,10 @@ def pose(
     steps: int,
     stop: Stop,
 ) -> Problem:
-    """Check a request and lay it out.
+    """Check the input and prepare a problem.
 
-    edges: the method's own choice, where the conditions make none. margin_share: how much of its light a pixel
-    at the edge may have from beyond the margin. Raises DataError: "bad-steps", "bad-stop", "bad-edges",
+    edges: the method's default, used if the conditions name none. margin_share: the largest share of an edge
+    pixel's light that may come from beyond the margin. Raises DataError: "bad-steps", "bad-stop", "bad-edges",
     "all-masked", "no-signal", "plate-scale-mismatch", "no-exposure".
     """
     check_steps(steps, stop)
@@ -82,17 +82,20 @@ def pose(
 
 
 def first_estimate(problem: Problem) -> NDArray[np.float32]:
-    """The observation; at pixels that are not finite the PSF-weighted mean of trusted ones. Shape of the domain."""
+    """The observation [y, x] on the domain, as the starting value.
+
+    Pixels that are not finite hold the PSF-weighted mean of trusted pixels.
+    """
     domain, engine = problem.domain, problem.engine
     estimate = domain.pixels.copy()
     missing = ~domain.finite
     if missing.any():
         observed = np.where(domain.trusted, domain.pixels, np.float32(0))
         near = engine.apply(domain.trusted.astype(np.float32))[missing]
-        seen = engine.apply(observed)[missing]
+        gathered = engine.apply(observed)[missing]
         everywhere = np.float32(domain.pixels[domain.trusted].mean())
         estimate[missing] = np.where(
-            near > _ENOUGH_NEIGHBOURS, seen / np.maximum(near, _ENOUGH_NEIGHBOURS), everywhere
+            near > _ENOUGH_NEIGHBOURS, gathered / np.maximum(near, _ENOUGH_NEIGHBOURS), everywhere
         )
     return estimate
 
@@ -107,9 +110,9 @@ def solution(
     negatives_count: bool,
     noise_amplification: float | None = None,
 ) -> Deconvolved:
-    """An estimate on the domain as the result for the image.
+    """Turn an estimate on the domain into the result for the image.
 
-    negatives_count: whether the method takes pixels below 0 as they are, or as 0.
+    negatives_count: True if the method uses negative pixels as they are; False if it counts them as 0.
     """
     image, domain = problem.image, problem.domain
     pixels = domain.cut(estimate)

@@ -1,4 +1,4 @@
-"""What a deconvolution gives back."""
+"""The result of a deconvolution."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from psfcore.deconvolve.edges import Edges
 
 @dataclass(frozen=True)
 class Deconvolved:
-    """An estimate of the scene and how it was reached.
+    """An estimate of the scene, and how the method reached it.
 
-    pixels: estimate [y, x] in the image's unit, NaN where the image has no finite value.
-    flux_in: sum of the image over its valid pixels, negatives as 0 where the method counts them so.
-    flux_out: sum of the estimate over the same pixels. negative_pixels: how many of them were below 0.
-    last_change: rms change of the last step over the rms of the estimate.
-    edges, margin_px: what was taken to lie beyond the field, and how far it was followed.
-    edge_band_px: width of the band along the edges in which the result leans on light from beyond the field.
-    noise_amplification: rms noise of the estimate over that of the image, for noise without correlation;
-    none where the method is not linear. chi2_per_pixel: how well the estimate fits, where the noise is known.
+    pixels: estimate [y, x] in the image's unit; NaN where the image has no finite value.
+    stopped_because: reason why the iteration ended.
+    flux_in: sum of the image over its valid pixels; negative pixels count as 0 if the method treats them so.
+    flux_out: sum of the estimate over the same pixels. negative_pixels: number of valid pixels below 0 in the image.
+    last_change: rms change of the last step, divided by the rms of the estimate.
+    edges, margin_px: assumption about the scene beyond the field, and width of the margin.
+    edge_band_px: width of the band along the edges in which the result depends on light from beyond the field.
+    noise_amplification: rms noise of the estimate divided by that of the image, for uncorrelated noise; None if the
+    method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of pixels; None if the noise is not
+    known.
     """
 
     pixels: NDArray[np.float64]

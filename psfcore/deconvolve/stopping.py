@@ -1,16 +1,16 @@
-"""When an iteration ends: after a number of steps, or when the fit is as good as the noise allows.
+"""Stopping rules: a fixed number of steps, or the discrepancy principle.
 
-The discrepancy principle (Morozov 1966) with the noise expected of the estimate's own image, so that faint
-pixels are not judged by their luck:
+The discrepancy principle (Morozov 1966) stops when the model fits the image as well as the noise allows. The variance
+is that of the model image, so the noise of a faint pixel does not influence its own weight:
 
     chi2 = 1/n sum over judged pixels of (y - H x)^2 / (g H x + r^2)        Eq. (1)
 
-The first estimate with chi2 <= 1 is the result: steps beyond it fit the noise. Judged are the n trusted
-pixels outside the band along the edges in which light from beyond the field decides.
+The first estimate with chi2 <= 1 is the result: further steps would fit the noise. The n judged pixels are the
+trusted pixels outside the band along the edges in which light from beyond the field dominates.
 
 | symbol | name | unit |
 |---|---|---|
-| g, r^2 | slope, ground of the variance | (image unit), (image unit)^2 |
+| g, r^2 | slope and ground (constant term) of the variance | (image unit), (image unit)^2 |
 | n | judged pixels | - |
 """
 
@@ -35,9 +35,9 @@ MOST_STEPS = 10_000
 
 @dataclass(frozen=True)
 class Ended:
-    """After how many steps an iteration ended, why, and chi2 of Eq. (1) where the noise is known.
+    """Number of steps done, the reason for the end, and chi2 of Eq. (1), or None if the noise is not known.
 
-    With a fixed number of steps chi2 is that of the estimate before the last step.
+    With a fixed number of steps, chi2 belongs to the estimate before the last step.
     """
 
     steps_done: int
@@ -47,10 +47,10 @@ class Ended:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """Which pixels Eq. (1) counts, and their variance, as row stages take it.
+    """The judged pixels of Eq. (1) and their variance, in the form that row stages need.
 
-    rows [block][half][lane]: 1 where a row is judged; first, last: range of columns; count: pixels, n.
-    slope, ground: the variance's terms in the domain's scaled unit; sums: chi2 * n, one for each block.
+    rows [block][half][lane]: 1 for a judged row, else 0. first, last: range of judged columns. count: n.
+    slope, ground: terms of the variance in the domain's scaled unit. sums: chi2 * n for each block.
     """
 
     rows: NDArray[np.float32]
@@ -63,7 +63,7 @@ class Judgement:
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        """As a row stage takes them."""
+        """The arguments of a row stage."""
         return self.rows, self.first, self.last, self.slope, self.ground, self.sums
 
     @property
@@ -75,9 +75,10 @@ class Judgement:
 def judgement(
     image: Image, band_px: int, domain: Domain, engine: Engine, conditions: Conditions
 ) -> Judgement:
-    """Lay out what Eq. (1) needs, leaving out a band along the edges, of a quarter of the field at most.
+    """Prepare Eq. (1). A band of `band_px` along the edges (at most a quarter of the field) is not judged.
 
-    Without noise, variance 1: chi2 is then the mean square in scaled units.
+    If the noise is not known the variance is 1, and chi2 is the mean square difference in scaled units.
+    Raises DataError "no-exposure".
     """
     ny, nx = image.pixels.shape
     band = min(band_px, ny // 4, nx // 4)
@@ -85,34 +86,34 @@ def judgement(
     top, left = (part.start for part in domain.field)
     rows[top + band : top + ny - band] = 1
     judged = (slice(band, ny - band), slice(band, nx - band))
-    slope, readout = 0.0, domain.scale
+    slope, read_noise = 0.0, domain.scale
     if conditions.noise is not None:
         dn = dn_per_unit(image)
-        slope, readout = conditions.noise.photon_gain_dn / dn, conditions.noise.read_noise_dn / dn
+        slope, read_noise = conditions.noise.photon_gain_dn / dn, conditions.noise.read_noise_dn / dn
     return Judgement(
         rows=rows.reshape(engine.row_blocks, *engine.lanes_shape[2:]),
         first=left + band,
         last=left + nx - band,
         count=int(np.count_nonzero(image.valid[judged])),
         slope=np.float32(slope / domain.scale),
-        ground=np.float32((readout / domain.scale) ** 2),
+        ground=np.float32((read_noise / domain.scale) ** 2),
         sums=np.zeros(engine.row_blocks),
     )
 
 
 class Iteration:
-    """A method's steps, put between the parts that every method shares.
+    """One step of a method, in two parts.
 
-    A method gives `measure`, which brings what H x says of the estimate x into the engine's spectrum and
-    fills the judgement, and `update`, which makes the next estimate of it.
+    `measure` computes H x from the estimate x, fills the judgement, and leaves in the engine's spectrum what the
+    method needs next. `update` makes the next estimate from it.
     """
 
     def measure(self) -> None:
-        """H x and how it fits."""
+        """Compute H x and chi2."""
         raise NotImplementedError
 
     def update(self, *, last: bool) -> None:
-        """The next estimate. After the last one, nothing more will be measured."""
+        """Make the next estimate. last: no call of `measure` follows."""
         raise NotImplementedError
 
 
@@ -125,13 +126,14 @@ def run(
     noise_known: bool,
     progress: Progress | None,
 ) -> Ended:
-    """Step until `stop` is met, at most `steps` times.
+    """Run an iteration until the rule `stop` ends it, for at most `steps` steps.
 
-    Raises DataError "no-noise-model" for a discrepancy without noise.
+    Raises DataError "no-noise-model" if the rule is discrepancy and the noise is not known.
     """
     if stop == "discrepancy" and not (noise_known and found.count):
         raise DataError(
-            "no-noise-model", "expected photon gain and read noise to stop by discrepancy; got none"
+            "no-noise-model",
+            "expected photon gain and read noise, which stopping by discrepancy needs; got neither",
         )
     for step in range(1, steps + 1):
         iteration.measure()
@@ -150,6 +152,6 @@ def run(
 def check_steps(steps: int, stop: str) -> None:
     """Raise DataError "bad-steps" or "bad-stop"."""
     if not 1 <= steps <= MOST_STEPS:
-        raise DataError("bad-steps", f"expected at least one step and at most {MOST_STEPS}; got {steps}")
+        raise DataError("bad-steps", f"expected 1 to {MOST_STEPS} steps; got {steps}")
     if stop not in ("fixed", "discrepancy"):
         raise DataError("bad-stop", f"expected stop to be fixed or discrepancy; got {stop}")

@@ -1,0 +1,1 @@
+"""FITS files: headers, images, PSFs and cut-outs."""

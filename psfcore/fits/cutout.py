@@ -1,7 +1,7 @@
-"""The middle of a stored PSF as a FITS file, cut out of the stored file's bytes: no array is made of them.
+"""The central part of a stored PSF as a FITS file, copied from the stored bytes without making an array.
 
-A FITS image is its rows, one after the other, so a cut-out is a stretch of bytes of each of its rows (FITS standard
-4.0, section 3.3.2). That holds for a plain image in the first HDU, as every PSF is that is built or fitted here.
+A FITS image stores its rows one after the other (FITS standard 4.0, section 3.3.2), so a cut-out consists of a range
+of bytes from each row. This needs an uncompressed image in the first HDU, as in every PSF that heliopsf writes.
 """
 
 from __future__ import annotations
@@ -15,19 +15,18 @@ from typing import BinaryIO
 from astropy.io.fits import Header
 
 from psfcore.errors import DataError
-from psfcore.fits.header import BLOCK_BYTES, FitsLimits, read_summary
+from psfcore.fits.blocks import BLOCK_BYTES, CARD_BYTES, END_CARD
+from psfcore.fits.header import FitsLimits, read_summary
 
-_CARD_BYTES = 80
-_END = b"END" + b" " * 77
 _FLOATS = {-32: "f", -64: "d"}
-# Cards of the whole that a part makes wrong; what a part needs is written anew.
+# Cards of the whole image that are wrong for a cut-out. The cards that it needs are written again.
 _DROPPED = ("EXTEND", "CHECKSUM", "DATASUM", "DATAMIN", "DATAMAX", "DATAMEAN", "PCOUNT", "GCOUNT")
 
 
 def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
-    """The central (size, size) px of a PSF's file as a FITS file, the centre at [size // 2, size // 2].
+    """Bytes of a FITS file with the central (size, size) px of a PSF; its centre is at [size // 2, size // 2].
 
-    Raises DataError "cutout-too-large", "cutout-not-plain" where the file is compressed or holds no plain floats.
+    Raises DataError "cutout-too-large"; "cutout-not-plain" if the file is compressed or does not hold plain floats.
     """
     summary = read_summary(path, limits)
     ny, nx = summary.shape
@@ -37,13 +36,16 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
     if not plain or summary.bitpix not in _FLOATS:
         raise DataError(
             "cutout-not-plain",
-            "expected a PSF whose file is a plain image of floats in its first HDU; this one is compressed, of whole "
-            "numbers, or further back: download its file, and `heliopsf psf cutout` cuts it",
+            "expected a PSF stored as uncompressed floats in the first HDU; this PSF is compressed, stored as integers, or "
+            "in a later HDU. Download the file and run `heliopsf psf cutout` on it",
         )
     with path.open("rb") as file:
         header = _header(file)
         if "BSCALE" in header or "BZERO" in header:
-            raise DataError("cutout-not-plain", "expected a PSF without BSCALE and BZERO; download its file")
+            raise DataError(
+                "cutout-not-plain",
+                "expected a PSF without BSCALE and BZERO. Download the file and run `heliopsf psf cutout` on it",
+            )
         pixels = _middle(file, file.tell(), (ny, nx), size, abs(summary.bitpix) // 8)
     weights = array(_FLOATS[summary.bitpix], pixels)
     if sys.byteorder == "little":
@@ -53,11 +55,11 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
 
 
 def _header(file: BinaryIO) -> Header:
-    """The first header; the file is left at the first byte of its data."""
+    """Read the first header; the file is then at the first byte of its data."""
     raw = bytearray()
     block = b""
-    while not any(block[at : at + _CARD_BYTES] == _END for at in range(0, len(block), _CARD_BYTES)):
-        block = file.read(BLOCK_BYTES)  # read_summary has seen the END
+    while not any(block[at : at + CARD_BYTES] == END_CARD for at in range(0, len(block), CARD_BYTES)):
+        block = file.read(BLOCK_BYTES)  # ends: read_summary found END
         raw += block
     return Header.fromstring(bytes(raw))
 

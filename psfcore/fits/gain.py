@@ -1,7 +1,8 @@
-"""What the readout mode of an image means for its pixels.
+"""Saturation level and noise of an image's gain mode.
 
-A detector that is read with a high and a low gain saturates, and turns photons into DN, by mode: GAINCOMB
-says which (`combined`, `high-only`, `low-only`). The figures are those of the instrument's [detector.gain_modes].
+Some detectors are read with a high and a low gain. Saturation level, photon gain and read noise then depend on the
+mode, which the card GAINCOMB names (`combined`, `high-only`, `low-only`). The values come from the table
+[detector.gain_modes] of the instrument description.
 """
 
 from __future__ import annotations
@@ -14,20 +15,20 @@ from psfcore.noise import Noise
 
 
 def gain_mode(instrument: Instrument, header: Header) -> GainMode | None:
-    """The mode that GAINCOMB names, in any case; None where it names none or the instrument lacks it."""
+    """The mode that GAINCOMB names, upper or lower case; None if missing or unknown to the instrument."""
     named = (optional_text(header, "GAINCOMB") or "").lower()
     modes = {name.lower(): mode for name, mode in instrument.detector.gain_modes.items()}
     return modes.get(named)
 
 
 def saturation_for(instrument: Instrument, header: Header) -> float | None:
-    """Level in DN of one exposure from which a pixel counts as saturated, or None where it is not known."""
+    """Level (DN in one exposure) from which a pixel is saturated; None if it is not known."""
     mode = gain_mode(instrument, header)
     return None if mode is None else mode.saturation_dn
 
 
 def noise_for(instrument: Instrument, header: Header) -> Noise | None:
-    """Photon gain and read noise of the image's mode, or None where one of the two is not known."""
+    """Photon gain and read noise of the image's mode; None if one of the two is not known."""
     mode = gain_mode(instrument, header)
     if mode is None or mode.photon_gain_dn is None or mode.read_noise_dn is None:
         return None

@@ -1,9 +1,9 @@
-"""What the tiles of a compressed image unfold to, bounded before they are decoded.
+"""Size check for the tiles of a compressed image, before they are decoded.
 
-FITS standard 4.0, section 10.1: a tile is a stretch of the table's heap, found by a descriptor (length, offset) in
-the table's row. A stream of gzip says nowhere how long it is inflated: half a megabyte of them makes half a gigabyte,
-whatever ZNAXISn declare. So each is inflated here in a bounded way first, and refused where it holds more than its
-tile has pixels. RICE_1 needs no such look: its decoder makes as many pixels as it was asked for.
+FITS standard 4.0, section 10.1: each row of the table holds a descriptor (length, offset) of one tile in the table's
+heap. A gzip stream does not state its inflated size: half a megabyte can become half a gigabyte, whatever ZNAXISn
+declare. Each stream is therefore first inflated up to a limit, and the file is refused if a stream holds more bytes
+than the pixels of its tile. RICE_1 needs no check, because its decoder returns exactly the requested number of pixels.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 
-# Streams of gzip stand in GZIP tiles, and beside RICE_1 for tiles that could not be quantised.
+# Gzip streams occur in GZIP tiles, and with RICE_1 for tiles that could not be quantised.
 _GZIP_COLUMNS = {
     "GZIP_1": ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"),
     "GZIP_2": ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"),
@@ -25,23 +25,23 @@ _GZIP_COLUMNS = {
 }
 _LARGEST_PIXEL_BYTES = 8
 _ITEM_BYTES = {"B": 1, "I": 2, "J": 4}
-_OVERHEAD_BYTES = 1024  # of gzip over what it holds, generously
+_OVERHEAD_BYTES = 1024  # of a gzip stream over its content, with ample margin
 
 
 class Heap(Protocol):
-    """The bytes that descriptors point into."""
+    """The bytes that the descriptors refer to."""
 
     def read(self, offset: int, count: int) -> bytes:
-        """``count`` bytes from ``offset`` on; fewer where the file ends."""
+        """`count` bytes from `offset` on; fewer at the end of the file."""
 
 
 def check_tiles(
     rows: NDArray[np.void], formats: dict[str, str], heap: Heap, codec: str, tile_pixels: int
 ) -> None:
-    """Raise DataError "tile-too-large" where a tile holds more than ``tile_pixels`` pixels of 8 bytes.
+    """Raise DataError "tile-too-large" if a tile inflates to more than `tile_pixels` pixels of 8 bytes.
 
-    rows: the table's rows as they are stored. formats: TFORMn by column. Passes on what a broken gzip stream raises:
-    OSError, EOFError, zlib.error.
+    rows: the rows of the table as stored. formats: TFORMn by column name. A broken gzip stream raises OSError,
+    EOFError or zlib.error.
     """
     most = tile_pixels * _LARGEST_PIXEL_BYTES
     for name in _GZIP_COLUMNS.get(codec, ()):
@@ -54,13 +54,13 @@ def check_tiles(
 
 
 def _check_stream(heap: Heap, offset: int, count: int, most: int) -> None:
-    # An honest stream is hardly longer than what it holds. One that is would only cost time, over and over where
-    # many descriptors point at it.
+    # A correct stream is hardly longer than its content. A longer one only costs time, many times if many
+    # descriptors point at it.
     if offset < 0 or not 0 < count <= 2 * most + _OVERHEAD_BYTES:
         raise _too_large(f"a compressed tile of {count} bytes", most)
     with gzip.GzipFile(fileobj=io.BytesIO(heap.read(offset, count))) as stream:
         if len(stream.read(most + 1)) > most:
-            raise _too_large("a compressed tile that unfolds to more", most)
+            raise _too_large("a compressed tile that inflates to more", most)
 
 
 def _too_large(got: str, most: int) -> DataError:

@@ -15,7 +15,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.fits.fits_io import write_image
+from psfcore.fits.images import write_image
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.simulate.scene import solar_scene

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import Cards, CardValue, read_plane, write_plane
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import Cards, CardValue, read_plane, write_plane
 from psfcore.simulate.plan import HIGH, Shot, plan_from_json
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import TrueSky, true_sky

@@ -17,9 +17,9 @@ import numpy as np
 from astropy.io.fits import Header
 
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image, read_plane
 from psfcore.fits.gain import saturation_for
 from psfcore.fits.header import FitsLimits, HeaderSummary, plate_scale_arcsec, read_summary
+from psfcore.fits.images import read_image, read_plane
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import Instrument, load_instrument
 from psfcore.noise import Noise

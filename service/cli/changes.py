@@ -108,7 +108,7 @@ def _treat(
 ) -> Treated:
     from psfcore.deconvolve.assess.contact_sheet import treat
     from psfcore.deconvolve.conditions import Conditions
-    from psfcore.fits.fits_io import read_image
+    from psfcore.fits.images import read_image
     from psfcore.noise import Noise
 
     psf = psf_for(path)
@@ -125,7 +125,7 @@ def _psf_chooser(psf_name: str, threads: int) -> Callable[[Path], Psf]:
     """The PSF of an image: the file that was named, read once, or that of its instrument, built once."""
     from psfcore.build import build_psf
     from psfcore.errors import DataError
-    from psfcore.fits.fits_io import read_psf
+    from psfcore.fits.psfs import read_psf
     from psfcore.instruments.model import load_instrument
 
     @cache

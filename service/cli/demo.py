@@ -67,8 +67,8 @@ def _address(server: subprocess.Popen[str], output: Path) -> str:
 def _simulated(service: Heliopsf, output: Path, progress: Progress) -> Path:
     """An image seen through the very PSF that the service then takes away again."""
     # Imported here, so that a demo of an image of your own does not load it.
-    from psfcore.fits.fits_io import read_psf
     from psfcore.fits.header import FitsLimits
+    from psfcore.fits.psfs import read_psf
     from psfcore.simulate.observe import demo_image
 
     psf_file, image = output / "psf.fits", output / "simulated.fits"

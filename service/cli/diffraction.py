@@ -29,7 +29,7 @@ def show(file: Path, plot: Path | None) -> list[str]:
     import numpy as np
 
     from psfcore.drawing.plots import psf_png
-    from psfcore.fits.fits_io import read_psf
+    from psfcore.fits.psfs import read_psf
     from psfcore.psf import cumulative_curve
 
     psf = read_psf(file, limits())
@@ -135,7 +135,7 @@ def arms(
     plot: Path | None,
 ) -> None:
     """Measure the diffraction arms round a flare in IMAGE: their angles and the spacing of their peaks."""
-    from psfcore.fits.fits_io import read_image
+    from psfcore.fits.images import read_image
     from psfcore.flare.arms import measure_arms
     from psfcore.flare.arms_plot import arms_png
 

@@ -163,7 +163,7 @@ def _with(transit: Transit, psf: Psf, file: Path, say: Report) -> tuple[Evaluati
 
 
 def _psf(file: Path) -> Psf:
-    from psfcore.fits.fits_io import read_psf
+    from psfcore.fits.psfs import read_psf
 
     if not file.is_file():
         raise click.BadParameter(

@@ -53,7 +53,8 @@ def flare(
     plot: Path | None,
 ) -> None:
     """Simulate the stray light of the flare in IMAGE with a PSF, and compare it along a diffraction arm."""
-    from psfcore.fits.fits_io import read_image, read_psf
+    from psfcore.fits.images import read_image
+    from psfcore.fits.psfs import read_psf
     from psfcore.flare.arm_profile import compare_on_flare, flare_centre
     from psfcore.psf_sampling import check_compatible
 

@@ -121,7 +121,7 @@ def _score(made: BlindSet, numbers: list[int], not_made: dict[int, str]) -> str:
 
 def _planes(files: tuple[Path, ...]) -> list[NDArray[np.float64]]:
     """Pixels of images in DN/s, where their unit and exposure say how."""
-    from psfcore.fits.fits_io import read_image
+    from psfcore.fits.images import read_image
 
     limits = FitsLimits(max_pixels=Settings.model_fields["max_pixels"].default)
     planes = []

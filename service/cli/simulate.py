@@ -157,7 +157,7 @@ def _lines(found: PhotonBound) -> list[str]:
 def _diffraction(file: Path | None, instrument: str, size: int) -> NDArray[np.float64]:
     """Weights that sum to 1 on their grid: read, or built for an instrument."""
     from psfcore.build import build_psf
-    from psfcore.fits.fits_io import read_plane
+    from psfcore.fits.images import read_plane
     from psfcore.instruments.model import load_instrument
 
     if file is not None:
@@ -168,7 +168,7 @@ def _diffraction(file: Path | None, instrument: str, size: int) -> NDArray[np.fl
 
 def _scenes(files: tuple[Path, ...], plan: Plan) -> dict[int, NDArray[np.float64]] | None:
     """A scene a pointing from images: one for all, mirrored for the west limb, or one each; None for none."""
-    from psfcore.fits.fits_io import read_image
+    from psfcore.fits.images import read_image
     from psfcore.simulate.plan import WEST
     from psfcore.simulate.pointings import scene_from_image
 

@@ -1,4 +1,4 @@
-"""Two arrays that ought to be one: the same, close, far, and of other shapes."""
+"""Comparison of two arrays: equal, close, far apart, and of different shapes."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from psfcore.comparison import compare
 IMAGE = np.array([[1.0, -4.0], [np.nan, 0.0]])
 
 
-def test_an_array_is_the_same_as_its_copy_whatever_its_order_in_memory() -> None:
+def test_an_array_equals_its_copy_for_any_memory_layout() -> None:
     for again in (IMAGE.copy(), np.asfortranarray(IMAGE), IMAGE.astype(">f8")):
         found = compare(IMAGE, again)
         assert found.same and (found.largest_relative, found.values_that_differ) == (0.0, 0)
         assert found.sha256[0] == found.sha256[1]
 
 
-def test_a_difference_is_told_as_a_part_of_the_largest_value() -> None:
+def test_a_difference_is_relative_to_the_largest_value() -> None:
     again = IMAGE.copy()
     again[0, 0] += 0.02
     found = compare(IMAGE, again)
@@ -26,14 +26,14 @@ def test_a_difference_is_told_as_a_part_of_the_largest_value() -> None:
     assert found.sha256[0] != found.sha256[1]
 
 
-def test_zero_of_the_other_sign_differs_in_its_bits_alone() -> None:
+def test_zero_of_the_other_sign_differs_only_in_its_bits() -> None:
     again = IMAGE.copy()
     again[1, 1] = -0.0
     found = compare(IMAGE, again)
     assert not found.same and (found.largest_relative, found.values_that_differ) == (0.0, 0)
 
 
-def test_what_has_no_measure_says_none() -> None:
+def test_a_difference_that_is_not_defined_is_none() -> None:
     assert compare(IMAGE, IMAGE[:1]).largest_relative is None
     assert compare(IMAGE, IMAGE[:1]).values_that_differ is None
     filled = np.nan_to_num(IMAGE)
@@ -42,6 +42,6 @@ def test_what_has_no_measure_says_none() -> None:
     assert compare(np.zeros(3), np.ones(3)).largest_relative is None
 
 
-def test_other_kinds_of_numbers_with_equal_values_are_not_the_same_bits() -> None:
+def test_equal_values_of_another_number_type_are_not_the_same_bits() -> None:
     found = compare(np.ones(3, "f4"), np.ones(3, "f8"))
     assert not found.same and found.largest_relative == 0.0

@@ -1,4 +1,4 @@
-"""Machine code on disk: no process may be given another kernel's, whatever starts or dies at the same moment."""
+"""Compiled kernels on disk: no process may load the wrong one, even if others start or die at the same time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_two_processes_that_compile_at_once_keep_both_kernels(tmp_path: Path) -> None:
-    """The second writes its kernel while the first, which found nothing there before, is about to write its own."""
+    """The second process writes its kernel after the first found no file and before the first writes its own."""
     first, second = (KernelFiles(str(tmp_path), "f.py311", "source") for _ in range(2))
     write = first._open_for_write
 
@@ -33,7 +33,7 @@ def test_two_processes_that_compile_at_once_keep_both_kernels(tmp_path: Path) ->
     assert third.load(("length 8",)) is None
 
 
-def test_code_of_a_source_that_has_changed_is_not_loaded(tmp_path: Path) -> None:
+def test_a_kernel_of_a_changed_source_is_not_loaded(tmp_path: Path) -> None:
     KernelFiles(str(tmp_path), "f.py311", "before").save(("float32",), "old code")
     now = KernelFiles(str(tmp_path), "f.py311", "now")
     assert now.load(("float32",)) is None
@@ -42,7 +42,7 @@ def test_code_of_a_source_that_has_changed_is_not_loaded(tmp_path: Path) -> None
     assert len(list(tmp_path.iterdir())) == 1, "and the old code's file is gone"
 
 
-def test_code_that_holds_a_changed_function_of_another_file_is_not_loaded(
+def test_a_kernel_that_calls_a_changed_function_of_another_file_is_not_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = KernelFiles(str(tmp_path), "f.py311", "the same")
@@ -53,7 +53,7 @@ def test_code_that_holds_a_changed_function_of_another_file_is_not_loaded(
 
 
 @pytest.mark.parametrize("left", [0, 10, 64, -1])
-def test_a_file_that_was_cut_when_the_power_went_is_compiled_again(tmp_path: Path, left: int) -> None:
+def test_a_kernel_file_cut_short_by_a_power_failure_is_compiled_again(tmp_path: Path, left: int) -> None:
     files = KernelFiles(str(tmp_path), "f.py311", "source")
     files.save(("float32",), "code")
     (kept,) = tmp_path.iterdir()
@@ -63,13 +63,13 @@ def test_a_file_that_was_cut_when_the_power_went_is_compiled_again(tmp_path: Pat
     assert files.load(("float32",)) == "code"
 
 
-def test_a_kernel_that_cannot_be_kept_is_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_kernel_that_cannot_be_written_is_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     KernelFiles(str(tmp_path / "gone"), "f.py311", "source").save(("float32",), "code")
-    assert "cannot be kept" in caplog.text
+    assert "cannot write a compiled kernel" in caplog.text
 
 
 def kernel_names(source: ast.Module) -> set[str]:
-    """What the bodies of a file's kernels name."""
+    """Names used in the bodies of a file's kernels."""
     kernels = [
         node
         for node in ast.walk(source)
@@ -79,8 +79,8 @@ def kernel_names(source: ast.Module) -> set[str]:
     return {one.id for kernel in kernels for one in ast.walk(kernel) if isinstance(one, ast.Name)}
 
 
-def test_kernels_hold_nothing_of_files_that_define_none() -> None:
-    """What they hold of others must change the hash that they go by."""
+def test_kernels_use_names_only_from_files_that_define_kernels() -> None:
+    """A change in a name that a kernel uses must change the hash of the sources."""
     sources = {path: path.read_bytes() for path in (ROOT / "psfcore").rglob("*.py")}
     looked_at = 0
     for path, content in sources.items():
@@ -101,7 +101,7 @@ def test_kernels_hold_nothing_of_files_that_define_none() -> None:
 MODULE = """
 import sys
 import numpy as np
-from psfcore import fft_kernels
+from psfcore.convolution import fft_kernels
 from psfcore.compiled import compiled
 
 def adding(amount):
@@ -125,8 +125,8 @@ def run(kernel):
 """
 
 
-def test_kernels_that_two_processes_compiled_each_as_its_first_are_not_mixed_up(tmp_path: Path) -> None:
-    """A symbol has a number that counts what its process compiled: both are first, and a third process links both."""
+def test_first_kernels_of_two_processes_are_not_mixed_up(tmp_path: Path) -> None:
+    """numba numbers symbols per process: both kernels are number 1, and a third process links both."""
     (tmp_path / "kernels.py").write_text(MODULE)
     said = [
         subprocess.run(
@@ -144,25 +144,25 @@ def test_kernels_that_two_processes_compiled_each_as_its_first_are_not_mixed_up(
         ["20.0", "20.0", "20.0", "0"],
         ["21.0", "21.0", "21.0", "0"],
         ["1.0", "1.0", "1.0", "1"],
-    ], "the last is not compiled again"
+    ], "the last kernel must not be compiled again"
 
 
-def test_every_pass_of_the_transforms_has_a_name_of_its_own() -> None:
+def test_every_pass_of_the_transforms_has_its_own_name() -> None:
     passes = [
         kernel for name, kernel in vars(fft_kernels).items() if re.match(r"_(for|back)ward4?_\d+$", name)
     ]
     assert len({kernel.__qualname__ for kernel in passes}) == len(passes) == 16
 
 
-def test_a_function_that_holds_constants_needs_a_name_for_them() -> None:
+def test_a_function_that_uses_constants_needs_a_name() -> None:
     amount = 3
-    with pytest.raises(TypeError, match=r"a name of its own for .*add, which holds constants"):
+    with pytest.raises(TypeError, match=r"expected an argument name: .*add uses constants"):
 
         @compiled()
         def add(x):  # type: ignore[no-untyped-def]
             return x + amount
 
 
-def test_no_kernel_is_kept_in_another_way() -> None:
+def test_every_cached_kernel_uses_compiled() -> None:
     sources = [path for path in (ROOT / "psfcore").rglob("*.py") if path.name != "compiled.py"]
     assert sources and not [path for path in sources if re.search(r"cache\s*=\s*True", path.read_text())]

@@ -20,7 +20,7 @@ from psfcore.image import Image, MaskBit
         (np.full((20, 20), np.nan), (20, 20), "unmasked-nonfinite"),
     ],
 )
-def test_what_is_no_image_is_refused(
+def test_a_wrong_image_is_refused(
     pixels: NDArray[np.float64], mask_shape: tuple[int, ...], code: str
 ) -> None:
     with pytest.raises(DataError) as caught:
@@ -37,7 +37,7 @@ def test_any_bit_makes_a_pixel_invalid() -> None:
     assert image.valid.sum() == 254
 
 
-def test_errors_survive_the_way_between_processes() -> None:
+def test_errors_can_be_pickled() -> None:
     error = pickle.loads(pickle.dumps(HeaderError("not-fits", "expected FITS; got soup")))
     assert isinstance(error, HeaderError)
     assert (error.code, error.message) == ("not-fits", "expected FITS; got soup")

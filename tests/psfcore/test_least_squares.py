@@ -1,4 +1,4 @@
-"""The inverse of a normal matrix is the inverse, whatever the units, and leaves alone what is open."""
+"""The scaled inverse is the inverse for any units; undetermined directions get no variance."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def test_it_is_the_inverse() -> None:
     np.testing.assert_allclose(scaled_inverse(normal) @ normal, np.eye(4), atol=1e-12)
 
 
-def test_units_make_no_difference() -> None:
-    """Units 1e12 apart: an inverse cut by the eigenvalues of the matrix as it stands would lose two numbers."""
+def test_units_do_not_matter() -> None:
+    """Units differ by 1e12: a pseudo-inverse of the unscaled matrix would lose two parameters."""
     normal, units = normal_matrix(), np.diag([1e-6, 1.0, 1e3, 1e6])
     expected = np.linalg.inv(units) @ np.linalg.inv(normal) @ np.linalg.inv(units)
     np.testing.assert_allclose(scaled_inverse(units @ normal @ units, weakest=1e-9), expected, rtol=1e-9)
@@ -27,8 +27,8 @@ def test_units_make_no_difference() -> None:
     assert cut[0, 0] < 1e-3 * expected[0, 0]
 
 
-def test_an_open_direction_has_no_variance_and_others_have_theirs() -> None:
-    """Of two numbers of which the data know the sum alone, the sum has its variance and the difference none."""
+def test_an_undetermined_direction_has_no_variance_and_others_keep_theirs() -> None:
+    """The data determine only the sum of two parameters: the sum has a variance, the difference has none."""
     normal = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 25.0]])
     inverse = scaled_inverse(normal, weakest=1e-9)
     total, difference = np.array([1.0, 1.0, 0.0]), np.array([1.0, -1.0, 0.0])
@@ -37,5 +37,5 @@ def test_an_open_direction_has_no_variance_and_others_have_theirs() -> None:
     assert inverse[2, 2] == pytest.approx(1 / 25)
 
 
-def test_a_number_that_nothing_depends_on_has_no_variance() -> None:
+def test_a_parameter_without_influence_has_no_variance() -> None:
     np.testing.assert_allclose(scaled_inverse(np.diag([4.0, 0.0])), np.diag([0.25, 0.0]))

@@ -31,7 +31,7 @@ def with_negative(kernel: NDArray[np.float64]) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("kernel", "code", "words"),
     [
-        (delta(32) * 3, "psf-sum", "got 3:"),
+        (delta(32) * 3, "psf-sum", r"got 3\."),
         (delta(32) * 0.01, "psf-sum", "got 0.01"),
         (with_nan(delta(32)), "psf-nonfinite", "got 1"),
         (with_negative(delta(32)), "psf-negative", "-1e-06"),
@@ -40,7 +40,7 @@ def with_negative(kernel: NDArray[np.float64]) -> NDArray[np.float64]:
         (np.ones(9) / 9, "psf-not-2d", "two axes"),
     ],
 )
-def test_what_is_no_psf_is_refused(kernel: NDArray[np.float64], code: str, words: str) -> None:
+def test_a_wrong_psf_is_refused(kernel: NDArray[np.float64], code: str, words: str) -> None:
     with pytest.raises(DataError, match=words) as caught:
         make_psf(kernel)
     assert caught.value.code == code
@@ -55,7 +55,7 @@ def test_encircled_energy_counts_by_brute_force() -> None:
     np.testing.assert_allclose(encircled_energy(kernel, radii), expected, rtol=1e-12)
 
 
-def test_cumulative_curve_of_a_delta_is_zero_and_light_off_the_array_counts() -> None:
+def test_cumulative_curve_of_a_delta_is_zero_and_includes_light_outside_the_array() -> None:
     np.testing.assert_allclose(cumulative_curve(delta(16), [0.0, 0.5, 5.0]), 0.0, atol=1e-12)
     np.testing.assert_allclose(cumulative_curve(0.8 * delta(16), [0.5, 99.0]), 20.0)
 

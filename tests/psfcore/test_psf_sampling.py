@@ -20,7 +20,7 @@ FACTORS = [2, 3, 4, 5]
 
 
 def lopsided(shape: tuple[int, int]) -> Plane:
-    """A kernel without any symmetry, its peak at the centre."""
+    """An asymmetric kernel with its peak at the centre."""
     kernel = np.random.default_rng(shape[0]).random(shape) ** 4
     y, x = (np.arange(n) - n // 2 for n in shape)
     kernel *= np.exp(-0.2 * np.abs(y[:, None] + 0.5) - 0.3 * np.abs(x[None, :] - 0.3))
@@ -48,7 +48,7 @@ def see(scene: Plane, kernel: Plane) -> Plane:
 def test_rebinning_is_exact_where_the_scene_is_constant_within_binned_pixels(
     factor: int, shape: tuple[int, int]
 ) -> None:
-    """By brute force: seen at full resolution and then binned. Even, odd and oblong kernels and fields."""
+    """Compare with a convolution at full resolution that is then binned; even, odd and oblong kernels and fields."""
     scene = np.random.default_rng(factor).random((13, 18))
     fine = np.kron(scene, np.ones((factor, factor)))
     kernel = lopsided(shape)
@@ -58,7 +58,7 @@ def test_rebinning_is_exact_where_the_scene_is_constant_within_binned_pixels(
 
 @pytest.mark.parametrize("factor", FACTORS)
 def test_rebinning_holds_on_a_smooth_scene(factor: int) -> None:
-    """Structures of 6 binned pixels (sigma) on a sky: the two ways agree to half a percent."""
+    """For structures of 6 binned pixels (sigma) on a sky, both ways agree to half a percent."""
     y, x = np.mgrid[: 48 * factor, : 60 * factor] / factor
     scene = 20 + 300 * np.exp(-((y - 20.3) ** 2 + (x - 31.6) ** 2) / (2 * 6.0**2))
     kernel = wings(256).kernel
@@ -68,7 +68,7 @@ def test_rebinning_holds_on_a_smooth_scene(factor: int) -> None:
 
 
 @pytest.mark.parametrize("factor", FACTORS)
-def test_energy_and_centre_are_kept_and_a_delta_stays_one(factor: int) -> None:
+def test_energy_and_centre_are_kept_and_a_delta_stays_a_delta(factor: int) -> None:
     psf = wings(256)
     coarse = rebinned(psf, factor)
     assert coarse.total == pytest.approx(psf.total, rel=1e-12)
@@ -93,7 +93,7 @@ def test_light_beyond_the_full_reach_is_left_out_before_binning() -> None:
 
 
 @pytest.mark.parametrize("factor", [-1, 0, 17, 100])
-def test_a_factor_that_is_none_is_refused(factor: int) -> None:
+def test_a_wrong_factor_is_refused(factor: int) -> None:
     with pytest.raises(DataError) as caught:
         rebinned(make_psf(delta(32)), factor)
     assert caught.value.code == "bad-binning"
@@ -126,7 +126,7 @@ def header(step_1: float | None, step_2: float | None = None, unit: str | None =
         (header(7.0, unit="furlong"), 1),
     ],
 )
-def test_the_psf_is_taken_to_the_pixels_of_the_image(made: Header, factor: int) -> None:
+def test_the_psf_is_rebinned_to_the_pixels_of_the_image(made: Header, factor: int) -> None:
     psf = wings(128)
     found = psf_for_image(psf, made)
     assert found.provenance.get("binning", 1) == factor
@@ -136,30 +136,30 @@ def test_the_psf_is_taken_to_the_pixels_of_the_image(made: Header, factor: int) 
 @pytest.mark.parametrize(
     "made", [header(0.7), header(0.984, 0.492), header(0.246), header(2.3), header(0.492 * 2.05)]
 )
-def test_a_scale_that_no_binning_gives_is_a_mismatch(made: Header) -> None:
+def test_a_plate_scale_that_is_no_multiple_is_a_mismatch(made: Header) -> None:
     with pytest.raises(DataError, match=r"0\.492") as caught:
         psf_for_image(wings(128), made)
     assert caught.value.code == "plate-scale-mismatch"
 
 
-def test_another_telescopes_pixels_are_no_binned_ones() -> None:
-    """The pixels of FSI are nine of HRI_EUV's to 0.3 %."""
+def test_pixels_of_another_telescope_are_not_binned_pixels() -> None:
+    """An FSI pixel equals nine HRI_EUV pixels to 0.3 %."""
     psf = replace(wings(128), instrument="hri_euv")
     own, other = header(0.984), header(4.44012445)
     own["DETECTOR"], other["DETECTOR"] = "HRI_EUV", "FSI"
     assert psf_for_image(psf, own).provenance["binning"] == 2
-    with pytest.raises(DataError, match="its own images binned") as caught:
+    with pytest.raises(DataError, match="or binned images of its instrument") as caught:
         psf_for_image(psf, other)
     assert caught.value.code == "plate-scale-mismatch"
 
 
-def test_a_psf_of_unknown_scale_fits_any_image() -> None:
+def test_a_psf_without_plate_scale_fits_any_image() -> None:
     psf = make_psf(delta(32))
     assert psf_for_image(psf, header(3.3)) is psf
 
 
-def test_a_window_is_seen_through_the_same_psf_up_to_its_edge() -> None:
-    """Only differences of positions count: where a window starts on the detector is of no matter."""
+def test_a_window_has_the_same_psf_except_near_its_edge() -> None:
+    """Only differences of positions matter, not where the window starts on the detector."""
     scene = np.random.default_rng(5).random((120, 150))
     kernel = lopsided((21, 27))
     whole, window = see(scene, kernel), see(scene[30:95, 41:140], kernel)

@@ -15,17 +15,18 @@ import numpy as np
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.changes import Effects, effects
+from psfcore.deconvolve.assess.changes import Changes, measure_changes
 from psfcore.deconvolve.assess.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
-from psfcore.deconvolve.assess.plots import effects_png
+from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.assess.quality import QualityBit, quality_plane
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image, read_psf, write_image
 from psfcore.fits.gain import noise_for, saturation_for
+from psfcore.fits.images import read_image, write_image
+from psfcore.fits.psfs import read_psf
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
@@ -184,7 +185,7 @@ class Made:
     work: _Work
     result: Deconvolved
     errors: ErrorPlanes | None
-    found: Effects
+    found: Changes
     quality: NDArray[np.uint8]
     details: dict[str, Any]
     preview_sha256: str | None
@@ -209,7 +210,7 @@ def make(
     with ThreadPoolExecutor(1) as beside:
         # A worker of one thread draws in turn: another thread would take the time of the worker next to it.
         picture = beside.submit(draw).result if preview and context.settings.threads > 1 else draw
-        found = effects(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
+        found = measure_changes(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
         quality = quality_plane(
             image,
             result.pixels,
@@ -270,9 +271,9 @@ def _preview(work: _Work, result: Deconvolved) -> str:
         return work.context.store.keep(picture)
 
 
-def _effects_picture(work: _Work, result: Deconvolved, found: Effects) -> str:
+def _effects_picture(work: _Work, result: Deconvolved, found: Changes) -> str:
     with work.context.store.temporary() as picture:
-        effects_png(work.image.pixels, result.pixels, found, picture, title=_title(work))
+        changes_png(work.image.pixels, result.pixels, found, picture, title=_title(work))
         return work.context.store.keep(picture)
 
 
@@ -315,7 +316,7 @@ def _title(work: _Work) -> str:
     return f"{' '.join(map(str, parts))}   PSF {work.psf_row.name} {work.psf_row.version}"
 
 
-def _details(work: _Work, result: Deconvolved, errors: ErrorPlanes | None, found: Effects) -> dict[str, Any]:
+def _details(work: _Work, result: Deconvolved, errors: ErrorPlanes | None, found: Changes) -> dict[str, Any]:
     """What the catalogue keeps: how it was made, and what changed.
 
     Bright and dark are the pixels at and above the 99th percentile of the input, and at and below the first.

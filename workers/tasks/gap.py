@@ -8,7 +8,7 @@ from typing import Any
 
 from psfcore.drawing.plots import psf_png
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import write_psf
+from psfcore.fits.psfs import write_psf
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
 from psfcore.gap.library.added import Added, added_effects, library_with

@@ -14,8 +14,8 @@ from astropy.io.fits import Header
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Shape, new_engine
-from psfcore.fits.fits_io import read_psf
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf
 from psfcore.psf_sampling import binning_factor, rebinned
 

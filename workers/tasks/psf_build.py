@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from psfcore.build import build_psf
 from psfcore.drawing import plots
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image, read_psf, write_psf
+from psfcore.fits.images import read_image
+from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.psf import Psf, cumulative_curve
 from psfcore.tables.make import tables_of

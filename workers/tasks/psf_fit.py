@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_psf, write_psf
+from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.noise import Noise
 from psfcore.scatter.fit import TransitFit, fit_transit, psf_of, report
 from psfcore.scatter.fit_plot import fit_png

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from psfcore.comparison import Comparison, compare
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_plane, read_planes, read_psf
+from psfcore.fits.images import read_plane, read_planes
+from psfcore.fits.psfs import read_psf
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.contract.contract import ResolvedRerun, rerun_identity

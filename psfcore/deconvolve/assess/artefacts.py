@@ -1,20 +1,22 @@
-"""What a deconvolution may have put into an image that the Sun did not.
+"""Signs of artefacts: structures that a deconvolution made and that are not on the Sun.
 
-Four signs are looked for, each where the image before says that it cannot be real:
+There are four signs. Each is something that cannot be real, given the image before deconvolution:
 
     hole        x <= 0, or x < 0.02 y, where y > 5 sigma                                       Eq. (1)
-    overshoot   x > (y + 5 sigma) / h0:  light >= 0 seen through the PSF gives y >= h0 x       Eq. (2)
-    new extreme |x - med x| > 8 sigma_x at an extreme of 3 x 3 px, with |y - med y| < sigma
-                or of the other sign: a point where the image before is smooth                 Eq. (3)
-    ringing     rise after the first dip of the mean profile round bright sources, in percent
-                of the peak, beyond that of the image before                                   Eq. (4)
+    overshoot   x > (y + 5 sigma) / h0:  positive light convolved with the PSF has y >= h0 x   Eq. (2)
+    new extreme |x - med x| > 8 sigma_x at an extreme of 3 x 3 px, where |y - med y| < sigma
+                or has the other sign: a point where the image before is smooth                Eq. (3)
+    ringing     rise after the first dip of the mean profile around bright sources, in percent
+                of the peak, minus the same rise in the image before                           Eq. (4)
 
-med is the median of 5 x 5 px. The score is the sum of the four, each over the value from which a person should
-look: below 1 nothing was found. It ranks a catalogue; it is no probability.
+med is the median of 5 x 5 px. The score is the sum of the four signs, each divided by the value from which a person
+should inspect the image. Below 1, nothing was found. The score ranks the images of a catalogue; it is not a
+probability.
 
-sigma comes from the camera's noise where it is known. Else, and for the image after always, from the pixels
-(Immerkaer 1996): the second difference in both directions of white noise has 6 sigma; its median absolute value
-within classes of brightness. Structure enters as if it were noise, so that this is an upper limit.
+sigma comes from the noise of the camera if it is known. Otherwise, and always for the image after deconvolution, it is
+estimated from the pixels (Immerkaer 1996): for white noise, the second difference in both directions has a standard
+deviation of 6 sigma. Its median absolute value is taken in classes of brightness. Structure adds to this estimate, so
+it is an upper limit.
 
 | symbol | name | unit |
 |---|---|---|
@@ -33,9 +35,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve, maximum_filter, minimum_filter
 
 HOLE_SHARE = 0.02
-SEEN_SIGMA = 5.0
+DETECTION_SIGMA = 5.0
 EXTREME_SIGMA = 8.0
-# Values from which a person should look: per million pixels, and percent of a source's peak.
+# Values from which a person should inspect the image: per million pixels, and percent of a source's peak.
 ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 2.0}
 RING_RADIUS_PX = 8
 _SOURCES = 100
@@ -49,9 +51,10 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Artefacts:
-    """suspected: pixels [y, x] with a sign of Eq. (1) to (3). signs: figures by the names of ALARMS.
+    """Signs of artefacts in one image.
 
-    ringing_pct is None where fewer than three sources stand out. score: 0 is clean, above 1 is to be looked at.
+    suspected: pixels [y, x] with a sign of Eq. (1) to (3). signs: value of each sign in ALARMS; ringing_pct is None
+    with fewer than three bright sources. sources: number of bright sources. score: 0 is clean; inspect from 1.
     """
 
     suspected: Flags
@@ -60,27 +63,27 @@ class Artefacts:
     score: float
 
     def as_json(self) -> dict[str, Any]:
-        """All but the plane."""
+        """Values for JSON, without the plane of suspected pixels."""
         return {"score": self.score, "sources": self.sources, "signs": self.signs, "alarms": ALARMS}
 
 
 def find_artefacts(
     before: Plane, after: Plane, counted: Flags, peak_weight: float, *, sigma: Plane | None = None
 ) -> Artefacts:
-    """Signs of artefacts in `after` [y, x]; pixels that are not counted are passed over.
+    """Find signs of artefacts in the counted pixels of `after` [y, x].
 
-    sigma: noise of `before` [y, x], in its unit; estimated from the pixels where it is not given.
+    sigma: noise of `before` [y, x], in its unit; None: estimated from the pixels.
     """
-    # Single precision is enough for what is looked for, and filters twice as fast.
+    # Single precision is accurate enough here, and makes the filters twice as fast.
     filled_before, filled_after = (_filled(plane).astype(np.float32) for plane in (before, after))
     classes = classes_of(filled_before[counted])
     noise_after = noise_from_pixels(filled_after, filled_before, counted, classes)
     noise_before = (
         noise_from_pixels(filled_before, filled_before, counted, classes) if sigma is None else sigma
     )
-    seen = filled_before > SEEN_SIGMA * noise_before
-    holes = counted & seen & (filled_after < HOLE_SHARE * filled_before)  # Eq. (1)
-    limit = (filled_before + SEEN_SIGMA * noise_before) / peak_weight
+    detected = filled_before > DETECTION_SIGMA * noise_before
+    holes = counted & detected & (filled_after < HOLE_SHARE * filled_before)  # Eq. (1)
+    limit = (filled_before + DETECTION_SIGMA * noise_before) / peak_weight
     overshoots = counted & (filled_after > limit)  # Eq. (2)
     extremes = counted & _new_extremes(filled_before, filled_after, noise_before, noise_after)
     ringing, sources = ringing_pct(filled_before, filled_after, counted)
@@ -99,14 +102,14 @@ def find_artefacts(
 
 @dataclass(frozen=True, eq=False)
 class BrightnessClasses:
-    """Pixels in classes of equal number by brightness: the class of each, and each class's median."""
+    """Classes of equal size by brightness: indices of the pixels and median brightness of each class."""
 
     members: list[NDArray[np.intp]]
     centres: Plane
 
 
 def classes_of(brightness: Plane) -> BrightnessClasses:
-    """Classes of the pixels (n,), none where there are too few."""
+    """Brightness classes of pixels (n,); no classes if there are too few pixels."""
     if brightness.size < _BRIGHTNESS_CLASSES:
         return BrightnessClasses([], np.empty(0))
     ordered = np.argsort(brightness)
@@ -115,20 +118,20 @@ def classes_of(brightness: Plane) -> BrightnessClasses:
 
 
 def noise_from_pixels(pixels: Plane, brightness: Plane, counted: Flags, classes: BrightnessClasses) -> Plane:
-    """Upper limit of the noise of `pixels` [y, x] as it goes with `brightness`; both finite everywhere."""
+    """Upper limit of the noise of `pixels` [y, x] as a function of `brightness`; both must be finite."""
     second = np.abs(convolve(pixels, _SECOND_DIFFERENCE, mode="reflect"))[counted] / 6
     smallest = 1e-6 * float(np.abs(pixels).max()) + np.finfo(float).tiny
     if not classes.members:
         return np.full(pixels.shape, smallest)
     centres = classes.centres
     levels = np.array([1.4826 * np.median(second[part]) for part in classes.members])
-    # Within the brightest class, whose pixels differ by much, as photon noise grows.
+    # The brightest class spans a wide range. Within it, let the noise grow like photon noise.
     beyond = np.sqrt(np.maximum(brightness, centres[-1]) / centres[-1]) if centres[-1] > 0 else 1.0
     return np.asarray(np.maximum(np.interp(brightness, centres, levels) * beyond, smallest))
 
 
 def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
-    """Eq. (4), and the number of sources it was averaged over; None for fewer than three."""
+    """Eq. (4), or None with fewer than three sources, and the number of sources."""
     sources = _bright_sources(before, counted)
     if len(sources) < _FEWEST_SOURCES:
         return None, len(sources)
@@ -139,15 +142,15 @@ def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | No
 def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after: Plane) -> Flags:
     """Eq. (3)."""
     limit = EXTREME_SIGMA * noise_after
-    # A median lies between the least and the most of its pixels: what is not that far from them cannot be
-    # an extreme, and medians are taken of the few that are left.
+    # A median lies between the minimum and the maximum of its pixels. A pixel closer to them than the limit cannot
+    # be an extreme, so medians are needed only for the few remaining pixels.
     peak = (after == maximum_filter(after, 3)) & (after - minimum_filter(after, 5) > limit)
     pit = (after == minimum_filter(after, 3)) & (maximum_filter(after, 5) - after > limit)
     places = np.nonzero(peak | pit)
     away_after = after[places] - _medians(after, places)
     away_before = before[places] - _medians(before, places)
     limits, noise = limit[places], noise_before[places]
-    # A peak has to show before, as far as noise lets it; so has a pit.
+    # A real peak or pit must show in the image before, within its noise.
     new_peak = peak[places] & (away_after > limits) & (away_before < noise)
     new_pit = pit[places] & (away_after < -limits) & (away_before > -noise)
     found = np.zeros(after.shape, dtype=np.bool_)
@@ -156,14 +159,14 @@ def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after:
 
 
 def _medians(plane: Plane, places: tuple[NDArray[np.intp], ...]) -> Plane:
-    """Median of the 5 x 5 px round each place; the plane is mirrored at its edges."""
+    """Median of the 5 x 5 px around each place; the plane is mirrored at its edges."""
     mirrored = np.pad(plane, 2, mode="symmetric")
     windows = np.lib.stride_tricks.sliding_window_view(mirrored, (5, 5))
     return np.asarray(np.median(windows[places].reshape(len(places[0]), 25), axis=1))
 
 
 def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
-    """[y, x] of the brightest compact peaks, each alone within the ring's radius; shape (n, 2)."""
+    """[y, x] of the brightest compact peaks, no two closer than RING_RADIUS_PX along both axes; shape (n, 2)."""
     size = 2 * RING_RADIUS_PX + 1
     whole = minimum_filter(counted.astype(np.uint8), size, mode="constant", cval=0) > 0
     found = np.argwhere(whole & (before == maximum_filter(before, size)))
@@ -174,7 +177,7 @@ def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
 
 
 def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:
-    """Median of sixteen pixels on a circle round each place [y, x]."""
+    """Median of sixteen pixels on a circle around each place [y, x]."""
     angle = np.arange(16) * np.pi / 8
     rows = places[:, :1] + np.rint(RING_RADIUS_PX * np.sin(angle)).astype(int)
     columns = places[:, 1:] + np.rint(RING_RADIUS_PX * np.cos(angle)).astype(int)
@@ -182,7 +185,7 @@ def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:
 
 
 def _mean_profile(plane: Plane, sources: NDArray[np.int64]) -> Plane:
-    """Median over sources of the ring means by radius, over the peak, less the outermost ring."""
+    """Median over sources of the mean by radius, minus the outermost ring and scaled to a peak of 1."""
     offset = np.arange(-RING_RADIUS_PX, RING_RADIUS_PX + 1)
     ring = np.rint(np.hypot(*np.meshgrid(offset, offset))).astype(int).ravel()
     inside = ring <= RING_RADIUS_PX
@@ -198,7 +201,7 @@ def _mean_profile(plane: Plane, sources: NDArray[np.int64]) -> Plane:
 
 
 def _rise(profile: Plane) -> float:
-    """How far a profile climbs again behind its first dip, in units of the peak."""
+    """Rise of a profile after its first dip, in units of the peak."""
     falls = np.flatnonzero(np.diff(profile) > 0)
     if falls.size == 0:
         return 0.0
@@ -207,6 +210,6 @@ def _rise(profile: Plane) -> float:
 
 
 def _filled(plane: Plane) -> Plane:
-    """Pixels without a value as the median of the others."""
+    """The plane with pixels that are not finite replaced by the median of the others."""
     good = np.isfinite(plane)
     return np.where(good, plane, float(np.median(plane[good])) if good.any() else 0.0)

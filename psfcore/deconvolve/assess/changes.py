@@ -1,17 +1,17 @@
-"""What a deconvolution did to an image, in figures that can be set beside the paper's.
+"""What a deconvolution changed in an image, in numbers that can be compared with the paper.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images": "bright features
-intensify by up to 40 %, while dark regions decrease by up to 85 %". The paper does not say what a feature is,
-over how many pixels it is averaged, nor which of them "up to" takes. So it is all given: structures are blocks
-of n x n pixels, bright or dark by percentiles of the image before, for every n and percentile of the tables
-below, each with the change of their summed light, the median change, and the largest after leaving out
-one block in a hundred.
+intensify by up to 40 %, while dark regions decrease by up to 85 %". The paper does not define a feature, the number
+of pixels it is averaged over, or the meaning of "up to". This module therefore tabulates several definitions.
+Structures are blocks of n x n pixels. They are bright or dark by percentiles of the image before deconvolution, for
+every n and percentile below. Each row gives the change of their summed light, the median change, and the largest
+change without the most extreme 1 % of the blocks.
 
     change = 100 (after / before - 1)                       Eq. (1)
     dynamic range = percentile 100 - p over percentile p    Eq. (2)    of block means
 
-Blocks are chosen on the image before, noise and all: the brightest single pixels are bright partly by
-noise. Blocks of 4 px and more are hardly touched by that.
+Blocks are selected in the image before deconvolution, which is noisy: some of the brightest single pixels are bright
+only by noise. This hardly matters for blocks of 4 px and more.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Structure:
-    """Change of the brightest or darkest `tail_pct` percent of blocks of block_px x block_px, Eq. (1).
+    """Change, Eq. (1), of the brightest or darkest `tail_pct` percent of blocks of block_px x block_px.
 
-    sum_pct: of their summed light. median_pct: of the middle one. up_to_pct: the largest rise of bright ones, or
-    fall of dark ones, that one block in a hundred exceeds. before: their mean, in the image's unit.
+    kind: bright or dark. sum_pct: change of their summed light. median_pct: median change. up_to_pct: the rise of
+    bright blocks, or fall of dark blocks, that 1 % of the blocks exceed. before: mean before, in the image's unit.
     """
 
     kind: str
@@ -58,9 +58,9 @@ class Structure:
 
 @dataclass(frozen=True)
 class Range:
-    """Dynamic range, Eq. (2), and contrast (rms over mean) of block means, before and after.
+    """Dynamic range, Eq. (2), and contrast (rms divided by mean) of block means, before and after.
 
-    A dynamic range is None where the lower percentile is not above zero.
+    A dynamic range is None if the lower percentile is not above zero.
     """
 
     block_px: int
@@ -72,10 +72,12 @@ class Range:
 
 
 @dataclass(frozen=True, eq=False)
-class Effects:
-    """Figures of one image before and after. change_pct: percentiles of the change of pixels, Eq. (1).
+class Changes:
+    """What a deconvolution changed in one image.
 
-    not_positive: pixels that were not above zero before, and are not after; those of before have no change.
+    pixels: number of pixels compared. edge_px: width of the excluded band at the edges. change_pct: percentiles of the
+    change of single pixels, Eq. (1). difference: percentiles of after - before, in the image's unit.
+    not_positive_before, not_positive_after: number of pixels not above zero; for the former Eq. (1) is not defined.
     """
 
     pixels: int
@@ -90,7 +92,7 @@ class Effects:
     artefacts: Artefacts
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-able, without the plane of suspected pixels."""
+        """Values for JSON, without the plane of suspected pixels."""
         plain = {name: value for name, value in vars(self).items() if name not in ("structures", "ranges")}
         return plain | {
             "structures": [asdict(row) for row in self.structures],
@@ -99,20 +101,20 @@ class Effects:
         }
 
 
-def effects(
+def measure_changes(
     image: Image, result: Plane, psf: Psf, *, noise: Noise | None = None, edge_px: int = 0
-) -> Effects:
-    """Figures of `result` [y, x], the deconvolution of `image` with `psf`, over trusted pixels.
+) -> Changes:
+    """Compare `result` [y, x], the deconvolution of `image` with `psf`, with the image, over trusted pixels.
 
-    edge_px: band at the edges left out. noise: the camera's; where it is not known the artefact check takes
-    it from the pixels. Raises DataError "field-shape", "no-signal", "no-exposure".
+    edge_px: width of a band at the edges to exclude. noise: noise of the camera; if it is None, the artefact check
+    estimates the noise from the pixels. Raises DataError "field-shape", "no-signal", "no-exposure".
     """
     if result.shape != image.pixels.shape:
         raise DataError("field-shape", f"expected a result of {image.pixels.shape}; got {result.shape}")
     counted = counted_pixels(image, result, edge_px)
     before, after = image.pixels[counted], result[counted]
     if before.size == 0 or before.sum() <= 0:
-        raise DataError("no-signal", "expected trusted pixels with light away from the edges; got none")
+        raise DataError("no-signal", "expected trusted pixels with light outside the edge band; got none")
     positive = before > 0
     change = _change_pct(before[positive], after[positive])
     sigma = None
@@ -120,13 +122,13 @@ def effects(
         sigma = np.sqrt(noise.variance(np.where(counted, image.pixels, 0.0), dn_per_unit(image)))
     centre = (psf.kernel.shape[0] // 2, psf.kernel.shape[1] // 2)
     peak_weight = float(psf.kernel[centre])
-    with ThreadPoolExecutor(1) as beside:  # filters and percentiles let each other run
+    with ThreadPoolExecutor(1) as beside:  # filters and percentiles run at the same time
         artefacts = beside.submit(find_artefacts, image.pixels, result, counted, peak_weight, sigma=sigma)
         blocks = [_blocks(image.pixels, result, counted, block_px) for block_px in BLOCKS_PX]
         structures = tuple(row for part in blocks for row in _structures(part))
         ranges = tuple(row for part in blocks for row in _ranges(part))
         change_pct, difference = _percentiles(change), _percentiles(after - before)
-    return Effects(
+    return Changes(
         pixels=int(before.size),
         edge_px=edge_px,
         flux_change_pct=float(_change_pct(before.sum(), after.sum())),
@@ -141,7 +143,7 @@ def effects(
 
 
 def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
-    """Trusted and finite pixels [y, x] that are not in the band at the edges."""
+    """Pixels [y, x] that are trusted, finite and outside the band at the edges."""
     counted = image.valid & np.isfinite(result)
     inner = np.zeros_like(counted)
     inner[edge_px : counted.shape[0] - edge_px, edge_px : counted.shape[1] - edge_px] = True
@@ -149,7 +151,7 @@ def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
 
 
 def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
-    """Means of whole blocks of n x n pixels, all of them counted; shape (n_blocks,)."""
+    """Means of the blocks of block_px x block_px pixels whose pixels all count; shape (n_blocks,)."""
     if block_px == 1:
         return np.asarray(plane[counted])
     ny, nx = plane.shape[0] // block_px, plane.shape[1] // block_px
@@ -162,7 +164,7 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Block means (n,) before and after, and their percentiles at both ends by the tail's percent."""
+    """Block means (n,) before and after, and their lower and upper percentile for each tail."""
 
     block_px: int
     old: Plane
@@ -172,7 +174,7 @@ class _Blocks:
 
     @property
     def tails(self) -> list[float]:
-        """Tails that hold at least one block."""
+        """Tails with at least one block."""
         return [tail for tail in TAILS_PCT if self.old.size * tail >= 100]
 
 
@@ -182,7 +184,7 @@ def _blocks(before: Plane, after: Plane, counted: Flags, block_px: int) -> _Bloc
 
 
 def _levels(means: Plane) -> dict[float, tuple[float, float]]:
-    """(low, high) for each tail, all in one pass."""
+    """(lower, upper) percentile of each tail."""
     if means.size == 0:
         return {}
     wanted = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
@@ -196,7 +198,7 @@ def _structures(blocks: _Blocks) -> list[Structure]:
 
 
 def _structure(blocks: _Blocks, kind: str, tail: float) -> Structure | None:
-    """One row, or None where the tail holds no light."""
+    """One row, or None if the tail has no light."""
     old, new, block_px = blocks.old, blocks.new, blocks.block_px
     bright = kind == "bright"
     level = blocks.old_levels[tail][bright]

@@ -1,8 +1,8 @@
-"""What a deconvolution does to many images: figures of each, the doubtful ones first, and one sheet of thumbnails.
+"""What deconvolution changes in many images: numbers for each, the most doubtful first, and a sheet of thumbnails.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images": a catalogue at a daily
-cadence was deconvolved "to visually inspect for artifacts". Here the artefact check ranks the images, so that an eye
-goes first to where there may be something to see. No image is kept in memory: of each only its thumbnails are.
+Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images", deconvolved a catalogue
+at a daily cadence "to visually inspect for artifacts". Here the artefact score ranks the images, so that a person
+inspects the most doubtful ones first. Only thumbnails of the images are kept in memory.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.changes import Effects, effects
+from psfcore.deconvolve.assess.changes import Changes, measure_changes
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.drawing.plots import CHANGE, CHANGE_LIMIT_PCT, GOLD, INK, binned, change_pct, square_root_stretch
@@ -29,7 +29,7 @@ from psfcore.psf_sampling import psf_for_image
 
 THUMBNAIL_PX = 256
 MOST_ON_SHEET = 60
-# The rows of psfcore.deconvolve.assess.changes that stand for an image: blocks of 4 px, tails of 1 %.
+# The rows of psfcore.deconvolve.assess.changes that represent an image: blocks of 4 px, tails of 1 %.
 BLOCK_PX, TAIL_PCT = 4, 1.0
 LOOK_FROM = 1.0
 _MARKS = 300
@@ -43,12 +43,16 @@ Deconvolve = Callable[[Image, Psf], "Treated"]
 
 @dataclass(frozen=True, eq=False)
 class Treated:
-    """One image: its figures, thumbnails [y, x] of before and after, and where in them artefacts are suspected, (n, [y, x])."""
+    """One deconvolved image.
+
+    taken: date of the observation. found: what changed. before, after: thumbnails [y, x]. suspected: thumbnail pixels
+    with suspected artefacts, (n, [y, x]).
+    """
 
     name: str
     taken: str | None
     psf: str
-    found: Effects
+    found: Changes
     steps_done: int
     stopped_because: str
     before: Plane
@@ -57,18 +61,18 @@ class Treated:
 
     @property
     def score(self) -> float:
-        """Of the artefact check: below 1 nothing was found."""
+        """Artefact score; below 1, nothing was found."""
         return self.found.artefacts.score
 
     def structure(self, kind: str) -> dict[str, float] | None:
-        """Change of bright or dark blocks: of their summed light, and up to; none where there are none."""
+        """Change of the bright or dark blocks: sum_pct and up_to_pct of `Structure`; None without such blocks."""
         for row in self.found.structures:
             if (row.kind, row.block_px, row.tail_pct) == (kind, BLOCK_PX, TAIL_PCT):
                 return {"sum_pct": row.sum_pct, "up_to_pct": row.up_to_pct}
         return None
 
     def as_json(self) -> dict[str, Any]:
-        """A row of the table."""
+        """One row of the table, as JSON values."""
         return {
             "file": self.name,
             "taken": self.taken,
@@ -85,7 +89,7 @@ class Treated:
 
 @dataclass(frozen=True)
 class Failure:
-    """An image that could not be treated, and why."""
+    """An image that could not be deconvolved, and the reason."""
 
     name: str
     code: str
@@ -101,12 +105,15 @@ def treat(
     conditions: Conditions | None = None,
     **parameters: Any,
 ) -> Treated:
-    """Deconvolve one image and take its figures. Raises DataError as the method does, "plate-scale-mismatch"."""
+    """Deconvolve one image and measure what changed.
+
+    Raises DataError "plate-scale-mismatch" and the errors of the method.
+    """
     conditions = conditions or Conditions()
     fitting = psf_for_image(psf, image.header)
     result = method_named(method)(image, fitting, conditions, **parameters)
     edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
-    found = effects(image, result.pixels, fitting, noise=conditions.noise, edge_px=edge_px)
+    found = measure_changes(image, result.pixels, fitting, noise=conditions.noise, edge_px=edge_px)
     step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
     return Treated(
         name=name,
@@ -127,9 +134,10 @@ def treat_many(
     *,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[list[Treated], list[Failure]]:
-    """Every image, worst first, and those that failed, in the order given. What an image lacks never stops the run.
+    """Deconvolve many images. Returns the results, highest score first, and the failures, in the order of `names`.
 
-    one(name) reads and treats an image; where it raises DataError or OSError, the image is a failure.
+    one(name) reads and deconvolves an image. If it raises DataError or OSError, the image becomes a failure and the
+    run continues.
     """
     treated: list[Treated] = []
     failures: list[Failure] = []
@@ -146,7 +154,7 @@ def treat_many(
 
 
 def table(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
-    """The run as JSON: a summary, one row an image in the order given, and the failures."""
+    """The run as JSON values: a summary, one row per image in the order given, and the failures."""
     return {
         "schema": "effects/1",
         "summary": _summary(treated, failures),
@@ -159,7 +167,7 @@ def table(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, 
 def contact_sheet_png(
     treated: Sequence[Treated], failures: Sequence[Failure], path: str | Path, *, most: int = MOST_ON_SHEET
 ) -> None:
-    """Thumbnails of before, after and change of the first `most` images, in the order given; failures at the foot."""
+    """Draw before, after and change of the first `most` images, and a list of the failures, to a PNG file."""
     shown = list(treated[:most])
     across = 1 if len(shown) < 4 else 2
     down = max(1, -(-len(shown) // across))
@@ -176,7 +184,10 @@ def contact_sheet_png(
         weight="bold",
         va="center",
     )
-    legend = f"each: before, after (one stretch), change in percent of before, blue -{CHANGE_LIMIT_PCT:g} to red +{CHANGE_LIMIT_PCT:g}, circles: suspected artefacts"
+    legend = (
+        f"each image: before, after (same scale), change from -{CHANGE_LIMIT_PCT:g} % (blue) to "
+        f"+{CHANGE_LIMIT_PCT:g} % (red); circles: suspected artefacts"
+    )
     figure.text(0.3 / width, 1 - 0.55 / height, legend, fontsize=9, color=INK, va="center")
     for index, row in enumerate(shown):
         down_at, across_at = divmod(index, across)
@@ -221,8 +232,8 @@ def _draw_row(
 def _heading(treated: Sequence[Treated], shown: Sequence[Treated]) -> str:
     doubtful = sum(row.score >= LOOK_FROM for row in treated)
     images = f"{len(treated)} image{'' if len(treated) == 1 else 's'}"
-    part = "" if len(shown) == len(treated) else f", the worst {len(shown)} shown"
-    return f"{images} deconvolved{part}, by artefact score; {doubtful} to look at (score of {LOOK_FROM:g} or more)"
+    part = "" if len(shown) == len(treated) else f" (shown: the {len(shown)} with the highest scores)"
+    return f"{images} deconvolved{part}, sorted by artefact score; {doubtful} to inspect (score {LOOK_FROM:g} or more)"
 
 
 def _changes(row: Treated) -> str:
@@ -239,17 +250,17 @@ def _failure_lines(failures: Sequence[Failure]) -> list[str]:
         return []
     lines = [f"not deconvolved: {len(failures)}"]
     lines += [f"   {_short(failure.name)}: {failure.reason}"[:200] for failure in failures[:10]]
-    return lines + ([f"   and {len(failures) - 10} more, in the table"] if len(failures) > 10 else [])
+    return lines + ([f"   and {len(failures) - 10} more, listed in the table"] if len(failures) > 10 else [])
 
 
 def _short(name: str) -> str:
-    """A file's name without its folder, its middle left out where it is long."""
+    """A file's name without its folder; the middle of a long name is replaced by dots."""
     file = Path(name).name
     return file if len(file) <= _LETTERS else f"{file[: _LETTERS // 2 - 2]}...{file[-_LETTERS // 2 :]}"
 
 
 def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
-    """Over all images: how many are doubtful, and medians and extremes of the changes."""
+    """Summary of all images: how many a person should inspect, and medians and extremes of the changes."""
     out: dict[str, Any] = {
         "images": len(treated),
         "failures": len(failures),

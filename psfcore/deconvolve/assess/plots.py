@@ -1,4 +1,4 @@
-"""One page about what a deconvolution did to an image: six panels and the figures beside them."""
+"""A page with six panels that show what a deconvolution changed in an image, and its main numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.colors import Colormap, LogNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.changes import Effects, block_means
+from psfcore.deconvolve.assess.changes import Changes, block_means
 from psfcore.drawing.plots import (
     CHANGE,
     CHANGE_LIMIT_PCT,
@@ -31,10 +31,13 @@ _BEFORE, _AFTER = "#1f6fb4", "#d5642f"
 Plane = NDArray[np.float64]
 
 
-def effects_png(
-    before: Plane, after: Plane, found: Effects, path: str | Path, *, title: str, unit: str = "DN/s"
+def changes_png(
+    before: Plane, after: Plane, found: Changes, path: str | Path, *, title: str, unit: str = "DN/s"
 ) -> None:
-    """Before, after, change in percent; difference, ratio, histogram [y, x], first row at the bottom."""
+    """Draw before, after, change in percent, difference, ratio and histogram to a PNG file; row 0 is at the bottom.
+
+    before, after: [y, x], in `unit`. found: the numbers below the panels.
+    """
     step = max(1, -(-max(before.shape) // PANEL_PX))
     old, new = binned(before, step), binned(after, step)
     stretch = square_root_stretch(old, new)
@@ -81,7 +84,7 @@ def _place(index: int) -> tuple[float, float, float, float]:
 
 
 def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
-    """Distribution of block means before and after, over equal steps of the logarithm."""
+    """Histogram of block means before and after, with logarithmic bins."""
     counted = np.isfinite(before) & np.isfinite(after)
     means = [block_means(plane, counted, _HISTOGRAM_BLOCK_PX) for plane in (before, after)]
     positive = [values[values > 0] for values in means]
@@ -99,34 +102,36 @@ def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
         yscale="log",
         xlabel=f"Mean of {_HISTOGRAM_BLOCK_PX} x {_HISTOGRAM_BLOCK_PX} px ({unit})",
     )
-    axes.set_title("Blocks by brightness; dashed: percentiles 1 and 99", fontsize=11, color=INK, loc="left")
+    axes.set_title(
+        "Number of blocks by brightness; dashed: percentiles 1 and 99", fontsize=11, color=INK, loc="left"
+    )
     axes.tick_params(labelsize=8.5)
     axes.legend(frameon=False, loc="upper left")
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
 
 
-def _figures(found: Effects) -> str:
-    """The line at the foot of the page: blocks of 4 px, tails of 1 %."""
+def _figures(found: Changes) -> str:
+    """The line below the panels: blocks of 4 px, brightest and darkest 1 %."""
     parts = [
         f"{row.kind} {row.tail_pct:g} % of {row.block_px} px blocks: {row.sum_pct:+.0f} %, up to {row.up_to_pct:+.0f} %"
         for row in found.structures
         if (row.block_px, row.tail_pct) == (4, 1.0)
     ]
     parts += [
-        f"percentile 99 over 1: {_number(row.dynamic_before)} to {_number(row.dynamic_after)}"
+        f"dynamic range (percentile 99 / percentile 1): {_number(row.dynamic_before)} -> {_number(row.dynamic_after)}"
         for row in found.ranges
         if (row.block_px, row.tail_pct) == (4, 1.0)
     ]
-    parts.append(f"artefact score {found.artefacts.score:.2f} (look from 1)")
+    parts.append(f"artefact score {found.artefacts.score:.2f} (inspect from 1)")
     return "     ".join(parts)
 
 
 def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.1f}"
+    return "undefined" if value is None else f"{value:.1f}"
 
 
 def _largest(plane: Plane) -> float:
-    """99.5th percentile of the absolute values that are finite, or 0."""
+    """99.5th percentile of the finite absolute values, or 0."""
     finite = np.abs(plane[np.isfinite(plane)])
     return float(np.percentile(finite, 99.5)) if finite.size else 0.0

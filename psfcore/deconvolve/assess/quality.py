@@ -1,4 +1,4 @@
-"""Why a pixel of a deconvolved image is to be used with care: one bit a reason."""
+"""The quality plane: one bit for each reason to use a pixel of a deconvolved image with care."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Plane = NDArray[np.float64]
 
 
 class QualityBit(IntFlag):
-    """Bits of the quality plane; the first two are those of the mask."""
+    """Bits of the quality plane. The first two equal those of the mask."""
 
-    NONFINITE = 1  # the input had no value: neither has the result
-    SATURATED = 2  # the input was saturated: the result is an estimate from the pixels around
-    NEAR_MASKED = 4  # within 3 px of such a pixel
-    EDGE = 8  # in the band where the result leans on light from beyond the field
+    NONFINITE = 1  # the input has no finite value, so the result has none
+    SATURATED = 2  # the input is saturated; the result is an estimate from the surrounding pixels
+    NEAR_MASKED = 4  # within 3 px of a nonfinite or saturated pixel
+    EDGE = 8  # in the band at the edges where the result depends on light from beyond the field
     NEGATIVE = 16  # the result is below zero
-    ARTEFACT = 32  # a sign of an artefact of the deconvolution
-    NO_ERROR = 64  # no estimate of the noise
+    ARTEFACT = 32  # the pixel shows a sign of an artefact
+    NO_ERROR = 64  # there is no estimate of the noise
 
 
 def quality_plane(
@@ -35,10 +35,10 @@ def quality_plane(
     suspected: NDArray[np.bool_] | None = None,
     error: Plane | None = None,
 ) -> NDArray[np.uint8]:
-    """Bits of QualityBit [y, x] of `result`, the deconvolution of `image`.
+    """Bits of QualityBit [y, x] for `result`, the deconvolution of `image`.
 
-    edge_px: width of the band at the edges, as `Deconvolved.edge_band_px` has it. suspected: pixels with a sign of an
-    artefact. error: the noise plane, where there is one; without it every pixel has NO_ERROR.
+    edge_px: width of the band at the edges, see `Deconvolved.edge_band_px`. suspected: pixels with a sign of an
+    artefact. error: noise plane; if it is None, every pixel has NO_ERROR.
     """
     plane = np.zeros(result.shape, dtype=np.uint8)
     for mask_bit, bit in (

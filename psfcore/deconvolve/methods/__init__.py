@@ -1,0 +1,1 @@
+"""Deconvolution methods, one per file; `registry` finds them by name."""

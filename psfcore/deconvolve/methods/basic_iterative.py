@@ -2,15 +2,15 @@
 
     x <- x + w (y - H x),   x_0 = y      Eq. (1)
 
-The paper recommends it for a bright source near an edge: what a pixel loses beyond the field is given back,
-since Eq. (1) settles where H x = y, whatever share of the light H keeps. The light that comes in has to be
-accounted for likewise: with a scene that ends at the field, the pixels along the edge come out a third too bright
-(`python -m studies.edges`), so that the field is continued by its mirror image. A field may be much smaller
-than its PSF: then the whole PSF still counts, over the margin.
+The paper recommends this method for a bright source near an edge. Eq. (1) converges to H x = y, whatever share of
+the light H keeps, so it restores the light that a pixel loses beyond the field. Light that comes in from beyond the
+field needs the same care: with a scene that is zero beyond the field, the pixels along the edge become a third too
+bright (`python -m studies.edges`). By default the field is therefore continued by its mirror image. If the field is
+much smaller than the PSF, the margin still makes use of the whole PSF.
 
-Linear: negative pixels are data and stay, and so may be results. A masked pixel (w = 0) keeps its first
-estimate. On frequencies, with T the PSF's transform, the noise of the estimate after n steps is that of the
-image times sum over j = 0 .. n of (1 - T)^j; where abs(1 - T) > 1 that grows without end.
+The method is linear: negative pixels are used as they are, and the result may be negative. A masked pixel (w = 0)
+keeps its first estimate. At a frequency with the PSF's transform T, the noise of the estimate after n steps is the
+noise of the image times the sum over j = 0 .. n of (1 - T)^j. This grows without limit if abs(1 - T) > 1.
 
 | symbol | name | unit |
 |---|---|---|
@@ -43,10 +43,10 @@ MARGIN_SHARE = 0.015
 def deconvolve(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 20, stop: Stop = "fixed"
 ) -> Deconvolved:
-    """Estimate the scene behind `image` [y, x] seen through `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
 
-    The result is NaN where the image is not finite, the first estimate where it is saturated, and may be negative.
-    Raises DataError as `problem.pose`, and "method-diverges" for a PSF that blurs too much.
+    The result may be negative. It is NaN where the image is not finite, and the first estimate where the image is
+    saturated. Raises DataError as `problem.pose` does, and "method-diverges" if the PSF is too broad.
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     sample = transfer_sample(problem.engine)
@@ -65,7 +65,7 @@ def deconvolve(
 
 
 class _BasicIterative(Iteration):
-    """Eq. (1), one row stage a step: the next estimate is made while H x is in cache, and taken by ``update``."""
+    """Eq. (1) with one row stage per step: `measure` makes the next estimate, and `update` adopts it."""
 
     def __init__(self, problem: Problem) -> None:
         domain, engine = problem.domain, problem.engine
@@ -88,14 +88,14 @@ class _BasicIterative(Iteration):
 
     @property
     def change(self) -> float:
-        """Rms of the last step over the rms of x."""
+        """Rms of the last step, divided by the rms of x."""
         total = float(self._total.sum())
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
 @compiled(fastmath={"contract", "reassoc"})
 def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """new <- Eq. (1), and its rows; sums of (change)^2, x^2, and (y - H x)^2 / variance over judged pixels."""
+    """new <- Eq. (1), and transform its rows; sum (change)^2, x^2, and (y - H x)^2 / variance of judged pixels."""
     nx = x.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)
     z = buffer.reshape((-1, 2, LANES))
@@ -107,9 +107,9 @@ def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, sl
             sum_row, moved_row, total_row = zero, zero, zero
             for side in range(2):
                 for w in range(LANES):
-                    y, seen = observed[block, i, side, w], z[i, side, w]
-                    misfit = y - seen if y == y else zero
-                    variance = max(slope * max(seen, zero) + ground, least)
+                    y, model = observed[block, i, side, w], z[i, side, w]
+                    misfit = y - model if y == y else zero
+                    variance = max(slope * max(model, zero) + ground, least)
                     sum_row += judged[block, side, w] * misfit * misfit / variance
                     value = x[block, i, side, w] + misfit  # Eq. (1)
                     new[block, i, side, w] = value

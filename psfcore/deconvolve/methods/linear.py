@@ -2,13 +2,14 @@
 
     x <- x + G w (y - H x),   x_0 = y,   G = T* / max(abs(T)^2, t^2)      Eq. (1)
 
-H is the convolution cut to the field, T the PSF's transform on the padded, periodic plane: G undoes H but for
-what crosses the field's edge, and a few steps settle the rest. Where T is below LEAST_TRANSFER, t, the step is that
-of Landweber: a PSF without power at some frequency has it restored slowly, and its noise with it.
+H is the convolution cut to the field, and T is the PSF's transform on the padded, periodic plane. G therefore inverts
+H except for light that crosses the field's edge; a few steps account for that light. Where abs(T) is below t
+(LEAST_TRANSFER) the step is a Landweber step: frequencies at which the PSF has little power are restored slowly, and
+so is their noise.
 
-No positivity: no bias on faint pixels, and the same PSF takes the noise of every image alike, by
-`noise_amplification` (2 to 2.4 for HRI_EUV). Negative pixels are data and stay, and so may be results.
-A masked pixel (w = 0) does not pull; its own estimate follows its neighbours'.
+The method does not force the scene to be positive, so faint pixels have no bias. One PSF amplifies the noise of every
+image by the same factor, `noise_amplification` (2 to 2.4 for HRI_EUV). Negative pixels are used as they are, and the
+result may be negative. A masked pixel (w = 0) does not influence the fit; its estimate follows from its neighbours.
 
 | symbol | name | unit |
 |---|---|---|
@@ -44,9 +45,9 @@ LEAST_TRANSFER = 0.1
 def deconvolve(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 5, stop: Stop = "fixed"
 ) -> Deconvolved:
-    """Estimate the scene behind `image` [y, x] seen through `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
 
-    The result is NaN where the image is not finite, and may be negative. Raises DataError as `problem.pose`.
+    The result may be negative, and is NaN where the image is not finite. Raises DataError as `problem.pose` does.
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     iteration = _Linear(problem)
@@ -87,13 +88,13 @@ class _Linear(Iteration):
 
     @property
     def change(self) -> float:
-        """Rms of the last step over the rms of x."""
+        """Rms of the last step, divided by the rms of x."""
         total = float(self._total.sum())
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
 def inverse_filter(engine: Engine) -> NDArray[np.float32]:
-    """G of Eq. (1), laid out as the engine's transfer function."""
+    """G of Eq. (1), in the layout of the engine's transfer function."""
     scale = np.float32(engine.transfer_scale)
     power = np.square(engine.transfer).sum(axis=2, keepdims=True) * scale**2
     g = engine.transfer / np.maximum(power, np.float32(LEAST_TRANSFER**2))
@@ -104,7 +105,7 @@ def inverse_filter(engine: Engine) -> NDArray[np.float32]:
 
 @compiled(fastmath={"contract", "reassoc"})
 def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """H x <- w (y - H x); sums of (y - H x)^2 / variance over judged pixels. y is NaN where w is 0."""
+    """Replace H x by w (y - H x); sum (y - H x)^2 / variance over judged pixels. y is NaN where w is 0."""
     nx = observed.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)
     z = buffer.reshape((-1, 2, LANES))
@@ -116,9 +117,9 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
             sum_row = zero
             for side in range(2):
                 for w in range(LANES):
-                    y, seen = observed[block, i, side, w], z[i, side, w]
-                    misfit = y - seen if y == y else zero
-                    variance = max(slope * max(seen, zero) + ground, least)
+                    y, model = observed[block, i, side, w], z[i, side, w]
+                    misfit = y - model if y == y else zero
+                    variance = max(slope * max(model, zero) + ground, least)
                     sum_row += judged[block, side, w] * misfit * misfit / variance
                     z[i, side, w] = misfit
             if first <= i < last:
@@ -131,7 +132,7 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
 
 @compiled(fastmath={"contract", "reassoc"})
 def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """x <- x + G w (y - H x), Eq. (1); sums of (change)^2 and x^2 for each block."""
+    """x <- x + G w (y - H x), Eq. (1); sum (change)^2 and x^2 for each block."""
     nx = x.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))

@@ -1,4 +1,4 @@
-"""Methods by their names: the module ``richardson_lucy`` is the method "richardson-lucy"."""
+"""Finds methods by name: the file `richardson_lucy.py` holds the method "richardson-lucy"."""
 
 from __future__ import annotations
 
@@ -16,19 +16,21 @@ Method = Callable[..., Deconvolved]
 
 
 def method_named(name: str) -> Method:
-    """The function ``deconvolve(image, psf, conditions, **parameters)`` of a method.
+    """The function `deconvolve(image, psf, conditions, **parameters)` of a method.
 
-    Raises DataError "unknown-method", which lists the known ones.
+    Raises DataError "unknown-method", whose message lists the known methods.
     """
     file = name.replace("-", "_")
     if not re.fullmatch(r"[a-z_]+", file) or file not in _files() or _name_of(file) != name:
-        raise DataError("unknown-method", f"expected one of {', '.join(method_names())}; got {name!r}")
+        raise DataError(
+            "unknown-method", f"expected one of the methods {', '.join(method_names())}; got {name!r}"
+        )
     method: Method = _module(file).deconvolve
     return method
 
 
 def method_names() -> list[str]:
-    """Names of all methods: modules of this package that say which METHOD they are."""
+    """Names of all methods: the constants METHOD of the files in this package."""
     return sorted(name for name in map(_name_of, _files()) if name is not None)
 
 

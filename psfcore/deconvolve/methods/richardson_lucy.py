@@ -2,23 +2,24 @@
 
     x <- x * H^T( w y / (H x) + (1 - w) / s ),   s = H^T 1      Eq. (1)
 
-Without masked pixels (w = 1) this is the published step and keeps the flux, sum x = sum y over the plane it
-works on, because H^T meets the very H x it divides by. A pixel that is not trusted (w = 0) counts as agreeing
-with the model: it neither pulls nor pushes. Agreeing is 1 / s and not 1, because light that leaves the plane
-is not given back by the published step: its ratios settle at 1 / s, and pixels held at 1 would fade by s
-at each step. A negative pixel is noise about zero and counts as 0 in the ratio: the method knows no negative light.
+Without masked pixels (w = 1) this is the published step. It conserves the flux: sum x = sum y over the plane, because
+H^T is applied to a ratio with H x itself in the denominator. A masked pixel (w = 0) gets the ratio at which it agrees
+with the model, so it does not change the fit. That ratio is 1 / s and not 1: the published step does not restore
+light that leaves the plane, so its ratios converge to 1 / s, and pixels with the ratio 1 would fade by the factor s
+at each step. A negative pixel is noise about zero and counts as 0 in the ratio, because the method has no negative
+light.
 
-The paper ends the scene at the field: edges "zero". Then what comes in from beyond makes up for what went
-out only on average, and the outermost rows come out 4 to 6 % too dark; continued by its mirror image, the same
-field is within 1.3 % (`python -m studies.edges`). A margin of some 64 px does, because the published step
-makes up for the rest: "symmetric" is what is done where nothing is asked for.
+In the paper the scene is zero beyond the field (edges "zero"). Light from beyond the field then makes up for the light
+lost only on average, and the outermost rows become 4 to 6 % too dark. If the field is continued by its mirror image,
+the error is at most 1.3 % (`python -m studies.edges`). The default is therefore "symmetric". A margin of about 64 px
+is enough, because the published step compensates the rest.
 
 | symbol | name | unit |
 |---|---|---|
 | y | observed | image unit |
 | x | estimate | image unit |
 | w | trusted, 1 or 0 | - |
-| s | what of a pixel's light the plane and the PSF's array hold; (1 - w) / s is agreed | - |
+| s | share of a pixel's light that falls on the plane and on the PSF's array; 1 / s is `agreed` | - |
 | H, H^T | Engine.apply, Engine.adjoint | - |
 """
 
@@ -52,10 +53,10 @@ Single = NDArray[np.float32]
 def deconvolve(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 20, stop: Stop = "fixed"
 ) -> Deconvolved:
-    """Estimate the scene behind `image` [y, x] seen through `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
 
-    The result is NaN where the image is not finite and the estimate where it is saturated; it is not negative.
-    Raises DataError as `problem.pose`, and "no-signal".
+    The result is not negative. It is NaN where the image is not finite; where the image is saturated, it is an
+    estimate from the surrounding pixels. Raises DataError as `problem.pose` does, and "no-signal".
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     iteration = _RichardsonLucy(problem)
@@ -73,13 +74,13 @@ def deconvolve(
 def richardson_lucy(
     image: Image, psf: Psf, *, steps: int = 20, threads: int = 1, progress: Progress | None = None
 ) -> Deconvolved:
-    """As published: a fixed number of steps, the scene ending with the field."""
+    """The published method: a fixed number of steps, and a scene that is zero beyond the field."""
     conditions = Conditions(edges="zero", threads=threads, progress=progress)
     return deconvolve(image, psf, conditions, steps=steps)
 
 
 class _RichardsonLucy(Iteration):
-    """Eq. (1). Between the two convolutions of a step, and between two steps, a block of rows stays in cache."""
+    """Eq. (1). Between two convolutions, a block of rows stays in the cache."""
 
     def __init__(self, problem: Problem) -> None:
         estimate = light_above_floor(problem)
@@ -101,13 +102,13 @@ class _RichardsonLucy(Iteration):
 
     @property
     def change(self) -> float:
-        """Rms of the last step over the rms of x."""
+        """Rms of the last step, divided by the rms of x."""
         total = float(self._total.sum())
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
 def agreed(problem: Problem) -> Single:
-    """1 / s of Eq. (1); 1 where all pixels are trusted and it does not matter. Shape of the domain."""
+    """1 / s of Eq. (1) on the domain; 1 if all pixels are trusted, because then it is not used."""
     ones = np.ones(problem.domain.shape, dtype=np.float32)
     if problem.domain.trusted.all():
         return ones
@@ -116,7 +117,7 @@ def agreed(problem: Problem) -> Single:
 
 @compiled(fastmath=_SUMS)
 def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """x <- x * correction, Eq. (1), zero below `dark`; sums of (change)^2 and x^2 for each block."""
+    """x <- x * correction, Eq. (1), zero below `dark`; sum (change)^2 and x^2 for each block."""
     nx = estimate.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))
@@ -131,7 +132,7 @@ def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, 
             for side in range(2):
                 for w in range(LANES):
                     old = estimate[block, i, side, w]
-                    # Rounding may take a correction of 0 below 0.
+                    # A correction of 0 may be negative by rounding.
                     new = old * max(z[i, side, w], zero)
                     new = zero if new < dark else new
                     estimate[block, i, side, w] = new

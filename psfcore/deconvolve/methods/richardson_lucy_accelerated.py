@@ -4,9 +4,9 @@
     x_(k+1) = R(p_k)                                                                                    Eq. (2)
     a_k = sum(g_(k-1) g_(k-2)) / sum(g_(k-2)^2),  0 <= a_k < 1,   g_k = x_(k+1) - p_k                   Eq. (3)
 
-R is one Richardson-Lucy step, with its masks and edges. The second order (q) is left out where not asked for.
-Predictions are kept above 0. A few such steps go as far as many plain ones; with noise they overshoot the best
-estimate as fast, so that stopping by discrepancy is worth its while.
+R is one Richardson-Lucy step, with its masks and edges. With order 1 the term in q is left out. Predictions are kept
+above 0. A few accelerated steps reach as far as many plain steps. With noise, they also pass the best estimate as
+quickly: stop by discrepancy.
 
 | symbol | name |
 |---|---|
@@ -33,7 +33,7 @@ from psfcore.psf import Psf
 METHOD = "richardson-lucy-accelerated"
 EDGES: Edges = "symmetric"
 MARGIN_SHARE = 0.05
-# The acceleration stays below 1, as Biggs & Andrews ask for.
+# Biggs & Andrews require an acceleration below 1.
 _MOST_ACCELERATION = 0.999
 
 
@@ -46,10 +46,10 @@ def deconvolve(
     order: int = 1,
     stop: Stop = "fixed",
 ) -> Deconvolved:
-    """Estimate the scene behind `image` [y, x] seen through `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
 
-    order: 1 or 2, of the extrapolation. The result is NaN where the image is not finite, and not negative.
-    Raises DataError as `problem.pose`, "bad-order", "no-signal".
+    order: order of the extrapolation, 1 or 2. The result is not negative, and NaN where the image is not finite.
+    Raises DataError as `problem.pose` does, "bad-order", "no-signal".
     """
     if order not in (1, 2):
         raise DataError("bad-order", f"expected an order of 1 or 2; got {order}")
@@ -67,7 +67,7 @@ def deconvolve(
 
 
 class _Accelerated(Iteration):
-    """Eq. (1) to (3). ``prediction`` is what is measured, and x itself after the last step."""
+    """Eq. (1) to (3). `measure` uses `prediction`; after the last step, `prediction` is x."""
 
     def __init__(self, problem: Problem, order: int) -> None:
         estimate = light_above_floor(problem)
@@ -77,7 +77,7 @@ class _Accelerated(Iteration):
         self._order = order
         self.prediction = problem.engine.to_lanes(estimate)
         self._x, self._before = self.prediction.copy(), self.prediction.copy()
-        # The first order needs no third estimate: x_(k-1) itself gives its place.
+        # Order 1 needs no third estimate: the array of x_(k-1) is used again.
         self._earlier = self.prediction.copy() if order == 2 else self._before
         self._gradient = np.zeros_like(self._x)
         self._corrected = np.zeros_like(self._x)
@@ -98,7 +98,7 @@ class _Accelerated(Iteration):
             self._engine.rows_forward(self.prediction)
 
     def _correct(self) -> float:
-        """Eq. (2), the oldest estimate giving its place to the new one; returns Eq. (3)."""
+        """Eq. (2), writing the new estimate over the oldest one; returns Eq. (3)."""
         new, before = self._earlier, self._before
         sums = np.zeros((self._engine.row_blocks, 4))
 
@@ -129,7 +129,7 @@ class _Accelerated(Iteration):
 
 @compiled(fastmath={"contract", "reassoc"})
 def _correct(new, prediction, correction, x, gradient, dark, sums, start, stop):  # type: ignore[no-untyped-def]
-    """new <- prediction * correction, gradient <- new - prediction; sums for Eq. (3) and of the change."""
+    """new <- prediction * correction, gradient <- new - prediction; sums for Eq. (3) and for the change."""
     zero = np.float32(0.0)
     for block in range(start, stop):
         n, p, c = new[block].reshape(-1), prediction[block].reshape(-1), correction[block].reshape(-1)
@@ -149,7 +149,7 @@ def _correct(new, prediction, correction, x, gradient, dark, sums, start, stop):
 
 @compiled(fastmath={"contract"})
 def _predict(prediction, x, before, earlier, a, curvature, dark, start, stop):  # type: ignore[no-untyped-def]
-    """Eq. (1), above 0 where x is."""
+    """Eq. (1), kept above 0 where x is above 0."""
     two = np.float32(2.0)
     for block in range(start, stop):
         p, new = prediction[block].reshape(-1), x[block].reshape(-1)

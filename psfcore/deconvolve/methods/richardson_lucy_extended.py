@@ -1,20 +1,21 @@
-"""Richardson-Lucy on a scene that goes on beyond the field: Bertero & Boccacci 2005, A&A 437, 369.
+"""Richardson-Lucy for a scene that extends beyond the field: Bertero & Boccacci 2005, A&A 437, 369.
 
     x <- (x / a) * H^T( w y / (H x) ),   a = H^T w      Eq. (1), their Eq. (12)
 
-on field and margin; w is 1 on trusted pixels of the field, 0 on the others and beyond the field. a(i) is the
-share of the light of i that falls on observed pixels. Where it is below LEAST_SEEN the scene cannot be told, and
-is 0; their threshold likewise keeps the division from running away. Unlike the published step it converges to
-the most likely scene, edges and masks included; negative pixels count as 0.
+on field and margin. w is 1 on trusted pixels of the field, and 0 on masked pixels and in the margin. a(i) is the share
+of the light of pixel i that falls on observed pixels. Where it is below LEAST_OBSERVED, the data do not determine the
+scene, and x is 0; the paper uses a threshold for the same reason, to avoid a division by nearly 0. Unlike the step in
+`richardson_lucy`, this step converges to the most likely scene also near edges and masked pixels. Negative pixels
+count as 0.
 
-The scene beyond the field starts from the field's mirror image: twenty steps from a level start are too few.
+The scene in the margin starts from the field's mirror image: from a constant, twenty steps would not be enough.
 
 | symbol | name | unit |
 |---|---|---|
 | y | observed | image unit |
 | x | estimate, on field and margin | image unit |
 | w | trusted, 1 or 0 | - |
-| a | share_seen | - |
+| a | share_observed | - |
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ from psfcore.psf import Psf
 METHOD = "richardson-lucy-extended"
 EDGES: Edges = "extended"
 MARGIN_SHARE = 0.005
-LEAST_SEEN = 1e-3
-# A masked pixel's ratio is 0: it counts in a instead.
+LEAST_OBSERVED = 1e-3
+# The ratio of a masked pixel is 0 here: a already accounts for the pixel.
 _NO_RATIO = 1e-30
 
 
 def deconvolve(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 20, stop: Stop = "fixed"
 ) -> Deconvolved:
-    """Estimate the scene behind `image` [y, x] seen through `psf`, and what lies beyond its edges.
+    """Estimate the scene from `image` [y, x], observed with `psf`, in the field and in a margin around it.
 
-    The result is NaN where the image is not finite, the field alone, and not negative.
-    Raises DataError as `problem.pose`, and "no-signal".
+    The result covers the field only. It is not negative, and NaN where the image is not finite.
+    Raises DataError as `problem.pose` does, and "no-signal".
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     iteration = _Extended(problem)
@@ -66,14 +67,14 @@ class _Extended(Iteration):
     def __init__(self, problem: Problem) -> None:
         engine = problem.engine
         estimate = light_above_floor(problem)
-        share_seen = engine.adjoint(problem.domain.trusted.astype(np.float32))
-        seen = share_seen > LEAST_SEEN
-        gain = np.where(seen, 1 / np.maximum(share_seen, np.float32(LEAST_SEEN)), np.float32(0))
+        share_observed = engine.adjoint(problem.domain.trusted.astype(np.float32))
+        known = share_observed > LEAST_OBSERVED
+        gain = np.where(known, 1 / np.maximum(share_observed, np.float32(LEAST_OBSERVED)), np.float32(0))
         self._engine = engine
         self._ratio = Ratio(problem, _NO_RATIO, float(estimate.max()))
         self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
         self._gain = engine.to_lanes(gain)
-        self.x = engine.to_lanes(np.where(seen, estimate, np.float32(0)))
+        self.x = engine.to_lanes(np.where(known, estimate, np.float32(0)))
         self._correction = np.zeros_like(self.x)
         self.change = 0.0
         engine.rows_forward(self.x)
@@ -93,7 +94,7 @@ class _Extended(Iteration):
             self._engine.rows_forward(self.x)
 
     def _step(self, blocks: slice, last: bool) -> tuple[float, float]:
-        """Eq. (1) on some blocks; after the last step the sums of (change)^2 and x^2."""
+        """Eq. (1) on some blocks; returns the sums of (change)^2 and x^2, computed in the last step only."""
         x, correction = self.x[blocks], self._correction[blocks]
         np.maximum(correction, np.float32(0), out=correction)
         correction *= self._gain[blocks]

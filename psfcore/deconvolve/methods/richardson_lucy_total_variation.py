@@ -2,16 +2,17 @@
 
     x <- x / (1 - k div(grad x / |grad x|)) * H^T( w y / (H x) + (1 - w) / s )      Eq. (1), their Eq. (14)
 
-The step of ``richardson_lucy`` with its masks and edges, and a price k on every rise and fall of the scene, in
-counts: noise costs more than it explains, and further steps do not bring it up. In simulated HRI_EUV images
-(100 photons in a quiet pixel) the rms error after 20 steps is 157 instead of 169 DN/s at 512 px, 92 instead of
-130 at 1024 px, where the best number of plain steps, which nobody knows, reaches 166 and 112. What is as
-faint as the noise goes with it: for pictures and feature finding, not for the photometry of small spots, which
-stay smoothed even where there is no noise, and move by up to 0.002 px, for forward differences lean to one side.
+This is the step of `richardson_lucy`, with its masks and edges, and a penalty k (in counts) on differences between
+neighbouring pixels. Noise then costs more than it improves the fit, so further steps do not amplify it. In simulated
+HRI_EUV images (100 photons in a quiet pixel) the rms error after 20 steps is 157 DN/s instead of 169 at 512 px, and 92
+instead of 130 at 1024 px. Plain Richardson-Lucy reaches 166 and 112 with the best number of steps, which is not known
+for real images. Structures as faint as the noise are lost too. Use this method for pictures and for finding features,
+not for the photometry of small spots: they stay smoothed even without noise, and forward differences shift them by up
+to 0.002 px.
 
-|grad x| is the root of the sum of squares of forward differences and of SOFTENING x: differences below a tenth of
-the light are evened out gently. That is the departure from the paper, which has no softening: there flat light breaks
-up into a pattern of k times 4, for the step overshoots where differences are small.
+|grad x| is the root of the sum of squares of the forward differences and of SOFTENING x, so that differences below a
+tenth of the light are smoothed only weakly. This departs from the paper, which has no softening. Without it the step
+overshoots where differences are small, and flat light breaks up into a pattern with an amplitude of 4 k.
 
 | symbol | name | unit |
 |---|---|---|
@@ -39,7 +40,7 @@ METHOD = "richardson-lucy-total-variation"
 EDGES: Edges = "symmetric"
 MARGIN_SHARE = 0.05
 SOFTENING = 0.1
-# A small difference changes by 8 k / SOFTENING of itself in a step: below 2 it settles.
+# In one step, a small difference changes by 8 k / SOFTENING of itself. It converges if this is below 2.
 MOST_SMOOTHING = 0.02
 
 
@@ -52,10 +53,10 @@ def deconvolve(
     smoothing: float = 0.01,
     stop: Stop = "fixed",
 ) -> Deconvolved:
-    """Estimate the scene behind `image` [y, x] seen through `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
 
-    smoothing: k of Eq. (1). The result is NaN where the image is not finite, and not negative.
-    Raises DataError as `problem.pose`, "bad-smoothing", "no-signal".
+    smoothing: k of Eq. (1). The result is not negative, and NaN where the image is not finite.
+    Raises DataError as `problem.pose` does, "bad-smoothing", "no-signal".
     """
     if not 0 <= smoothing <= MOST_SMOOTHING:
         raise DataError("bad-smoothing", f"expected smoothing of 0 to {MOST_SMOOTHING}; got {smoothing}")
@@ -73,7 +74,7 @@ def deconvolve(
 
 
 class _TotalVariation(Iteration):
-    """Eq. (1). x is kept as a plane [y, x], for its differences reach across the engine's blocks."""
+    """Eq. (1). x is a plane [y, x], because its differences cross the engine's blocks."""
 
     def __init__(self, problem: Problem, smoothing: float) -> None:
         self.x = light_above_floor(problem)
@@ -112,7 +113,7 @@ class _TotalVariation(Iteration):
 
 @compiled()
 def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
-    """grad x / |grad x| at a pixel, (along y, along x); differences across the far edges are 0."""
+    """grad x / |grad x| at a pixel, (along y, along x); differences across the last row and column are 0."""
     zero = np.float32(0.0)
     here = x[row, column]
     dy = x[row + 1, column] - here if row + 1 < x.shape[0] else zero
@@ -126,7 +127,7 @@ def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _smooth_rows(x, correction, new, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
-    """new <- Eq. (1) on rows [start, stop), zero below `dark`; sums of (change)^2 and x^2 for each row."""
+    """new <- Eq. (1) on rows [start, stop), zero below `dark`; sum (change)^2 and x^2 for each row."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for row in range(start, stop):
         moved, total = 0.0, 0.0

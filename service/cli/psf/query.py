@@ -145,7 +145,7 @@ def _tables(file: str) -> dict[str, Any]:
 
 
 def _read(file: str) -> Psf:
-    from psfcore.fits.fits_io import read_psf
+    from psfcore.fits.psfs import read_psf
 
     return read_psf(file, limits())
 
@@ -168,7 +168,7 @@ def _cut(psf: Psf, size: int) -> Psf:
 
 
 def _write(output: Path, psf: Psf) -> None:
-    from psfcore.fits.fits_io import write_psf
+    from psfcore.fits.psfs import write_psf
 
     text = psf.provenance.get("instrument_toml")
     write_psf(output, psf, instrument_file=None if text is None else text.encode())

@@ -27,7 +27,7 @@ def direct(x: NDArray[np.float64], kernel: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def padded_by_half_on_all_sides(x: NDArray[np.float64], kernel: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The paper's prescription, word for word: image and PSF of one size, both padded to twice the edge."""
+    """The method of the paper: image and PSF of one size, both padded to twice the edge."""
     ny, nx = x.shape
     py, px = ny - ny // 2, nx - nx // 2
     pad = ((py, ny - py), (px, nx - px))
@@ -84,7 +84,7 @@ def test_gaussian_widths_add_in_quadrature() -> None:
     np.testing.assert_allclose(blurred, gaussian(101, 5.0), atol=1e-9)
 
 
-def test_kernels_convolved_keep_their_light_and_their_centre() -> None:
+def test_convolving_kernels_keeps_their_sum_and_centre() -> None:
     both = linear_convolve(gaussian(60, 3.0), gaussian(51, 4.0), (101, 90))
     np.testing.assert_allclose(both.sum(), 1.0, atol=1e-12)
     assert np.unravel_index(both.argmax(), both.shape) == (50, 45)

@@ -1,4 +1,4 @@
-"""The fused engine against the plain one: same operators, any shape, any thread count."""
+"""The engine has the same operators as the convolver, for any shape and any number of threads."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def plan_numbers(length: int) -> tuple[object, ...]:
 
 
 @pytest.mark.parametrize("length", [*LENGTHS, 8192, 16384])
-def test_transforms_agree_with_numpy_and_come_back(length: int) -> None:
+def test_transforms_agree_with_numpy_and_are_inverted(length: int) -> None:
     rng = np.random.default_rng(length)
     signals = rng.standard_normal((length, 2, LANES)).astype(np.float32)
     expected = np.fft.fft(signals[:, 0] + 1j * signals[:, 1], axis=0)
@@ -65,7 +65,7 @@ def test_the_operators_are_those_of_the_plain_convolver(
     assert np.abs(engine.adjoint(field) - plain.adjoint(field)).max() < 2e-6
 
 
-def test_symmetry_is_seen_where_it_is_and_only_there() -> None:
+def test_only_a_symmetric_psf_is_symmetric() -> None:
     y, x = np.indices((65, 65)) - 32
     round_psf = 1 / (3 + np.hypot(x, y)) ** 2.5
     assert Engine(round_psf / round_psf.sum(), (64, 64)).symmetric
@@ -82,7 +82,7 @@ def test_the_result_does_not_depend_on_the_threads() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_every_block_is_worked_on_once_and_results_come_in_their_order(threads: int) -> None:
+def test_every_block_is_processed_once_and_results_keep_their_order(threads: int) -> None:
     engine = Engine(np.ones((3, 3)) / 9, (40 * BLOCK_ROWS, 8), threads=threads)
     blocks = 40
     parts = engine.run(lambda start, stop, scratch: list(range(start, stop)), blocks)
@@ -90,7 +90,7 @@ def test_every_block_is_worked_on_once_and_results_come_in_their_order(threads: 
 
 
 @pytest.mark.parametrize("wrong", [0, 7])
-def test_what_fails_in_any_thread_is_raised_and_the_engine_goes_on(wrong: int) -> None:
+def test_an_error_in_any_thread_is_raised_and_the_engine_still_works(wrong: int) -> None:
     engine = Engine(np.ones((3, 3)) / 9, (8 * BLOCK_ROWS, 8), threads=2)
 
     def work(start: int, stop: int, scratch: Scratch) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image
+from psfcore.fits.images import read_image
 from psfcore.image import MaskBit
 from psfcore.psf import Psf, crop_centred
 from psfcore.simulate.observe import observe
@@ -20,7 +20,7 @@ from tests.psfcore.conftest import LIMITS, delta, gaussian, make_image, make_psf
 def plain_richardson_lucy(
     observed: NDArray[np.float64], weight: NDArray[np.float64], psf: Psf, steps: int
 ) -> NDArray[np.float64]:
-    """Eq. (1) in float64, one line a step: the reference for the fast one."""
+    """Eq. (1) in float64, one line per step: the reference for the fast version."""
     convolver = Convolver(psf.kernel, observed.shape, dtype=np.float64)
     y = np.maximum(observed, 0)
     x = np.maximum(y, 2.0**-23 * y.max())
@@ -57,7 +57,7 @@ def test_single_precision_follows_the_plain_version(scene: NDArray[np.float64], 
     assert np.abs(fast - plain).max() < 2e-5 * plain.max()
 
 
-def test_masked_pixels_follow_the_plain_version_too(scene: NDArray[np.float64], psf_256: Psf) -> None:
+def test_masked_pixels_follow_the_plain_version(scene: NDArray[np.float64], psf_256: Psf) -> None:
     observed = look(scene, psf_256)
     mask = np.zeros(observed.shape, np.uint8)
     mask[50:55, 60:70] = MaskBit.SATURATED
@@ -75,7 +75,7 @@ def test_flux_is_kept(scene: NDArray[np.float64], psf_256: Psf) -> None:
     assert "20 steps" in result.stopped_because
 
 
-def test_a_scene_comes_back_better_than_it_was_seen(scene: NDArray[np.float64], psf_256: Psf) -> None:
+def test_the_estimate_is_closer_to_the_scene_than_the_image(scene: NDArray[np.float64], psf_256: Psf) -> None:
     observed = look(scene, psf_256)
     result = richardson_lucy(make_image(observed), psf_256, steps=20)
     inside = (slice(16, -16), slice(16, -16))
@@ -84,7 +84,7 @@ def test_a_scene_comes_back_better_than_it_was_seen(scene: NDArray[np.float64], 
     assert after < 0.5 * before
 
 
-def test_without_noise_more_steps_come_closer(scene: NDArray[np.float64], psf_256: Psf) -> None:
+def test_without_noise_more_steps_reduce_the_error(scene: NDArray[np.float64], psf_256: Psf) -> None:
     observed = look(scene, psf_256, noisy=False)
     inside = (slice(16, -16), slice(16, -16))
     errors = [
@@ -94,7 +94,7 @@ def test_without_noise_more_steps_come_closer(scene: NDArray[np.float64], psf_25
     assert errors == sorted(errors, reverse=True)
 
 
-def test_nan_stays_where_it_was(scene: NDArray[np.float64], psf_256: Psf) -> None:
+def test_nan_stays_in_place(scene: NDArray[np.float64], psf_256: Psf) -> None:
     observed = look(scene, psf_256)
     holed = observed.copy()
     holed[80:83, 70:72] = np.nan
@@ -115,7 +115,7 @@ def test_a_saturated_core_is_estimated_from_its_surroundings(psf_256: Psf) -> No
     mask = np.where(observed >= level, int(MaskBit.SATURATED), 0).astype(np.uint8)
     assert mask.any()
     clipped = make_image(np.minimum(observed, level), mask)
-    # A masked core must not fade while the rest settles, and in the end its diffracted light tells its size.
+    # A masked core must not fade while the rest converges. In the end its diffracted light determines its size.
     early, late = (richardson_lucy(clipped, psf_256, steps=n).pixels[63:66, 63:66].sum() for n in (5, 300))
     assert early > 0.95 * 9 * level
     assert late == pytest.approx(9 * 40000.0, rel=0.1)
@@ -130,7 +130,7 @@ def test_negative_pixels_count_as_dark_and_are_counted(psf_256: Psf) -> None:
     assert result.flux_in == pytest.approx(10.0 * (64 * 64 - 4))
 
 
-def test_what_progress_raises_passes_through_and_steps_are_told() -> None:
+def test_progress_reports_steps_and_its_exceptions_pass_through() -> None:
     class Cancelled(Exception):
         pass
 
@@ -184,8 +184,8 @@ def test_any_shape_mask_and_scale_gives_finite_light(
 
 
 def test_on_a_real_image_bright_rises_and_dark_falls(real, hri_psf: Psf) -> None:  # type: ignore[no-untyped-def]
-    """The paper: bright up by up to 40 %, dark down by up to 85 %. Judged on means of 8 x 8 px, so that
-    pixel noise is not counted as structure."""
+    """The paper: bright features rise by up to 40 %, dark regions fall by up to 85 %. The test uses means of 8 x 8 px,
+    so that pixel noise does not count as structure."""
     image = read_image(real("eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"), LIMITS)
     result = richardson_lucy(image, hri_psf, steps=20, threads=2)
     assert result.flux_out == pytest.approx(result.flux_in, rel=1e-5)

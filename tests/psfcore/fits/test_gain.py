@@ -30,15 +30,15 @@ def instrument() -> Instrument:
         (3, None),
     ],
 )
-def test_saturation_goes_by_gain_mode(instrument: Instrument, mode: object, level: float | None) -> None:
+def test_saturation_depends_on_gain_mode(instrument: Instrument, mode: object, level: float | None) -> None:
     assert saturation_for(instrument, Header({"GAINCOMB": mode})) == level
 
 
-def test_an_image_without_a_mode_has_no_level(instrument: Instrument) -> None:
+def test_an_image_without_a_gain_mode_has_no_saturation_level(instrument: Instrument) -> None:
     assert saturation_for(instrument, Header()) is None
 
 
-def test_noise_needs_both_of_its_figures(instrument: Instrument) -> None:
+def test_noise_needs_photon_gain_and_read_noise(instrument: Instrument) -> None:
     assert noise_for(instrument, Header({"GAINCOMB": "combined"})) == Noise(6.0, 2.0)
     assert noise_for(instrument, Header({"GAINCOMB": "high-only"})) is None
     assert noise_for(instrument, Header()) is None

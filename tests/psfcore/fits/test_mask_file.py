@@ -12,7 +12,7 @@ from psfcore.fits.mask_file import read_mask_image
 
 
 def test_png_and_fits_of_one_mask_agree(tmp_path: Path) -> None:
-    """Upright as people see it: a PNG's top row is the one of the highest y."""
+    """The top row of a PNG is the row with the highest y."""
     mask = np.zeros((8, 8))
     mask[6, 1] = 1  # upper left
     fits.PrimaryHDU(mask).writeto(tmp_path / "mask.fits")
@@ -22,10 +22,12 @@ def test_png_and_fits_of_one_mask_agree(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"])
-def test_a_broken_png_is_the_users(tmp_path: Path, content: bytes) -> None:
+def test_a_broken_png_is_a_data_error(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "mask.png"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"mount\.mask_image\.file: expected a PNG") as caught:
+    with pytest.raises(
+        DataError, match=r"mount\.mask_image\.file: expected a PNG that can be read"
+    ) as caught:
         read_mask_image(path)
     assert caught.value.code == "bad-mount"
 

@@ -1,4 +1,4 @@
-"""Compressed tiles that hold more than they say are refused before they take the room; honest ones pass."""
+"""Tiles that inflate to more than they declare are refused before they use memory; correct tiles pass."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image, read_psf
 from psfcore.fits.header import FitsLimits, check_all_headers
+from psfcore.fits.images import read_image
+from psfcore.fits.psfs import read_psf
 from tests.fits_bombs import lying_tiles, psf_with_a_tail
 
 MIB = 2**20
@@ -34,7 +35,9 @@ def peak_mib_of_refusal(path: Path, code: str, *, psf: bool = False) -> float:
 
 @pytest.mark.parametrize("column", ["COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"])
 @pytest.mark.parametrize("packed", [False, True])
-def test_half_a_megabyte_that_unfolds_to_537_takes_no_room(tmp_path: Path, column: str, packed: bool) -> None:
+def test_half_a_megabyte_that_inflates_to_537_uses_no_memory(
+    tmp_path: Path, column: str, packed: bool
+) -> None:
     content = lying_tiles(gzip.compress(bytes(537_000_000)), column=column)
     assert len(content) < 540_000
     path = tmp_path / "bomb.fits"
@@ -42,13 +45,13 @@ def test_half_a_megabyte_that_unfolds_to_537_takes_no_room(tmp_path: Path, colum
     assert peak_mib_of_refusal(path, "tile-too-large") < 30
 
 
-def test_a_little_more_than_a_tile_holds_is_refused_too(tmp_path: Path) -> None:
+def test_a_stream_slightly_too_long_for_its_tile_is_refused(tmp_path: Path) -> None:
     (tmp_path / "bomb.fits").write_bytes(lying_tiles(gzip.compress(bytes(64 * 8 + 1))))
     assert peak_mib_of_refusal(tmp_path / "bomb.fits", "tile-too-large") < 10
 
 
-def test_long_streams_of_nothing_that_many_tiles_share_take_no_time(tmp_path: Path) -> None:
-    """Empty blocks of deflate: they hold nothing, and each of 64 descriptors would have all of them read."""
+def test_a_long_empty_stream_shared_by_many_tiles_takes_no_time(tmp_path: Path) -> None:
+    """The stream consists of empty deflate blocks; each of 64 descriptors would read all of it."""
     nothing = gzip.compress(b"")[:10] + bytes.fromhex("000000ffff") * 2_000_000 + gzip.compress(b"")[10:]
     (tmp_path / "bomb.fits").write_bytes(lying_tiles(nothing))
     started = time.monotonic()
@@ -62,7 +65,7 @@ EXACT = [(codec, dtype) for codec in ("GZIP_1", "GZIP_2", "NOCOMPRESS") for dtyp
 
 @pytest.mark.parametrize(("codec", "dtype"), [*EXACT, *(("RICE_1", dtype) for dtype in WHOLE)])
 @pytest.mark.parametrize("tile", [(7, 9), (1, 50), (40, 50)])
-def test_honest_tiles_pass(tmp_path: Path, codec: str, dtype: str, tile: tuple[int, int]) -> None:
+def test_correct_tiles_pass(tmp_path: Path, codec: str, dtype: str, tile: tuple[int, int]) -> None:
     pixels = np.random.default_rng(0).integers(1, 200, (40, 50)).astype(dtype)
     hdu = fits.CompImageHDU(pixels, compression_type=codec, tile_shape=tile, quantize_level=0)
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "tiles.fits")
@@ -70,11 +73,9 @@ def test_honest_tiles_pass(tmp_path: Path, codec: str, dtype: str, tile: tuple[i
 
 
 @pytest.mark.parametrize("codec", ["RICE_1", "GZIP_1", "GZIP_2"])
-def test_honest_quantised_floats_pass_with_tiles_that_could_not_be_quantised(
-    tmp_path: Path, codec: str
-) -> None:
+def test_quantised_floats_pass_with_tiles_that_could_not_be_quantised(tmp_path: Path, codec: str) -> None:
     pixels = np.random.default_rng(0).normal(100, 1, (40, 50)).astype("f4")
-    pixels[3] *= 1e30  # goes to GZIP_COMPRESSED_DATA
+    pixels[3] *= 1e30  # stored in GZIP_COMPRESSED_DATA
     hdu = fits.CompImageHDU(pixels, compression_type=codec)
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "tiles.fits")
     assert np.allclose(read_image(tmp_path / "tiles.fits", LIMITS).pixels, pixels, rtol=0.01)
@@ -84,20 +85,20 @@ def test_honest_quantised_floats_pass_with_tiles_that_could_not_be_quantised(
     ("tail", "code"),
     [("many HDUs", "too-many-hdus"), ("long header", "header-too-long"), ("inflated data", "too-many-bytes")],
 )
-def test_what_stands_behind_a_psf_is_bounded_too(tmp_path: Path, tail: str, code: str) -> None:
+def test_hdus_after_the_kernel_of_a_psf_obey_the_limits(tmp_path: Path, tail: str, code: str) -> None:
     path = tmp_path / "psf.fits"
     path.write_bytes(psf_with_a_tail(tail))
-    read_psf(path, LIMITS, parts=False)  # a convolution does not look there
+    read_psf(path, LIMITS, parts=False)  # a convolution does not read them
     assert peak_mib_of_refusal(path, code, psf=True) < 60
 
 
-def test_a_compressed_component_is_not_unfolded(tmp_path: Path) -> None:
+def test_a_compressed_component_is_not_inflated(tmp_path: Path) -> None:
     path = tmp_path / "psf.fits"
     path.write_bytes(psf_with_a_tail("component of tiles"))
     assert read_psf(path, LIMITS).components == {}
 
 
-def test_headers_share_one_allowance(tmp_path: Path) -> None:
+def test_all_headers_together_obey_one_limit(tmp_path: Path) -> None:
     long = fits.PrimaryHDU()
     for number in range(400):
         long.header.add_history(f"{number}")

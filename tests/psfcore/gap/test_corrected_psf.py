@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_psf, write_psf
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, start_of
 from psfcore.gap.effect import Effect

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_psf, write_psf
+from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter import fit as fit_module
 from psfcore.scatter.as_published.published import AS_PUBLISHED, MENDED_ALONE, Choices, Published

@@ -14,7 +14,7 @@ from scipy.signal import fftconvolve
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image
+from psfcore.fits.images import read_image
 from psfcore.psf import cumulative_curve
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.simulate.disc import Behind, covered_share, fully_dark

@@ -13,7 +13,7 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
-from psfcore.fits.fits_io import write_psf as write_whole_psf
+from psfcore.fits.psfs import write_psf as write_whole_psf
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.simulate.transit import INSTRUMENT, PLATE_SCALE_ARCSEC
 from psfcore.simulate.transit_files import write

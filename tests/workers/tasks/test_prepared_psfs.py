@@ -9,8 +9,8 @@ import pytest
 from astropy.io.fits import Header
 
 from psfcore.deconvolve.conditions import new_engine
-from psfcore.fits.fits_io import read_psf
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.psfs import read_psf
 from psfcore.psf_sampling import psf_for_image
 from service.local import LocalService
 from tests.conftest import write_image, write_psf

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.fits.fits_io import read_planes, read_psf
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_planes
+from psfcore.fits.psfs import read_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter.samples import possible_psfs
 from psfcore.simulate.scatter_truth import total_kernel

@@ -11,8 +11,8 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_plane
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_plane
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
 from tests.workers.psf_examples import OWNER, identity, product, psf

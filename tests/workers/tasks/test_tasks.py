@@ -11,7 +11,7 @@ import pytest
 from astropy.io import fits
 
 from psfcore.deconvolve.methods.registry import method_names
-from psfcore.fits.fits_io import read_planes
+from psfcore.fits.images import read_planes
 from psfcore.instruments.model import parse_instrument
 from service.cli.main import METHODS
 from service.client.http import ServiceError

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.deconvolve.assess.artefacts import classes_of, find_artefacts, noise_from_pixels, ringing_pct
-from psfcore.deconvolve.assess.changes import BLOCKS_PX, TAILS_PCT, Effects, block_means, effects
-from psfcore.deconvolve.assess.plots import effects_png
+from psfcore.deconvolve.assess.changes import BLOCKS_PX, TAILS_PCT, Changes, block_means, measure_changes
+from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image
+from psfcore.fits.images import read_image
 from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf, crop_centred
@@ -47,16 +47,16 @@ def seen(psf: Psf) -> Image:
     return Image(pixels, image.mask, image.header, "DN/s", 1.4)
 
 
-def found(image: Image, psf: Psf, steps: int) -> Effects:
+def found(image: Image, psf: Psf, steps: int) -> Changes:
     result = richardson_lucy(image, psf, steps=steps, threads=2).pixels
-    return effects(image, result, psf, edge_px=EDGE_PX)
+    return measure_changes(image, result, psf, edge_px=EDGE_PX)
 
 
 # --- figures ---
 
 
-def test_a_result_that_is_the_input_has_no_effect(seen: Image) -> None:
-    report = effects(seen, seen.pixels, make_psf(delta(32)))
+def test_a_result_equal_to_the_image_has_no_changes(seen: Image) -> None:
+    report = measure_changes(seen, seen.pixels, make_psf(delta(32)))
     assert report.flux_change_pct == 0
     assert set(report.change_pct.values()) == {0.0}
     assert all(row.sum_pct == row.median_pct == row.up_to_pct == 0 for row in report.structures)
@@ -65,11 +65,11 @@ def test_a_result_that_is_the_input_has_no_effect(seen: Image) -> None:
 
 
 def test_known_changes_of_known_structures_are_found() -> None:
-    """A quarter of the pixels bright and raised by 40 %, a quarter dark and lowered by 85 %, in blocks of 32."""
+    """A quarter of the pixels is bright and rises by 40 %, a quarter is dark and falls by 85 %, in blocks of 32."""
     before = np.full((256, 256), 100.0)
     before[:64], before[-64:] = 1000.0, 10.0
     after = before * np.where(before == 1000, 1.4, np.where(before == 10, 0.15, 1.0))
-    report = effects(make_image(before), after, make_psf(delta(32)))
+    report = measure_changes(make_image(before), after, make_psf(delta(32)))
     assert {row.block_px for row in report.structures} == set(BLOCKS_PX)
     for row in report.structures:
         wanted = 40.0 if row.kind == "bright" else -85.0
@@ -99,7 +99,7 @@ def test_deconvolution_raises_the_bright_and_lowers_the_dark(seen: Image, psf: P
 
 def test_a_dark_sky_at_zero_has_no_dynamic_range(seen: Image, psf: Psf) -> None:
     pixels = seen.pixels - np.percentile(seen.pixels, 10)
-    report = effects(make_image(pixels), pixels, psf)
+    report = measure_changes(make_image(pixels), pixels, psf)
     assert report.ranges[0].dynamic_before is None
     assert report.not_positive_before == report.not_positive_after > 0
     json.dumps(report.as_json(), allow_nan=False)
@@ -109,18 +109,18 @@ def test_masked_pixels_are_left_out(seen: Image, psf: Psf) -> None:
     pixels = seen.pixels.copy()
     pixels[100:110, 100:110] = np.nan
     image = make_image(pixels)
-    report = effects(image, richardson_lucy(image, psf, steps=3).pixels, psf, edge_px=EDGE_PX)
+    report = measure_changes(image, richardson_lucy(image, psf, steps=3).pixels, psf, edge_px=EDGE_PX)
     assert report.pixels == (SIZE_PX - 2 * EDGE_PX) ** 2 - 100
     assert not report.artefacts.suspected[100:110, 100:110].any()
     json.dumps(report.as_json(), allow_nan=False)
 
 
-def test_what_cannot_be_compared_is_refused(seen: Image, psf: Psf) -> None:
+def test_images_that_cannot_be_compared_are_refused(seen: Image, psf: Psf) -> None:
     with pytest.raises(DataError) as caught:
-        effects(seen, seen.pixels[:-1], psf)
+        measure_changes(seen, seen.pixels[:-1], psf)
     assert caught.value.code == "field-shape"
     with pytest.raises(DataError) as caught:
-        effects(seen, seen.pixels, psf, edge_px=SIZE_PX)
+        measure_changes(seen, seen.pixels, psf, edge_px=SIZE_PX)
     assert caught.value.code == "no-signal"
 
 
@@ -130,11 +130,11 @@ def test_what_cannot_be_compared_is_refused(seen: Image, psf: Psf) -> None:
 @pytest.mark.parametrize("noise", [None, Noise(6.0, 2.0)])
 def test_twenty_steps_with_the_true_psf_are_clean(seen: Image, psf: Psf, noise: Noise | None) -> None:
     result = richardson_lucy(seen, psf, steps=20, threads=2).pixels
-    assert effects(seen, result, psf, noise=noise, edge_px=EDGE_PX).artefacts.score < 0.2
+    assert measure_changes(seen, result, psf, noise=noise, edge_px=EDGE_PX).artefacts.score < 0.2
 
 
 def test_worse_deconvolutions_rank_above_better_ones(seen: Image, psf: Psf) -> None:
-    """Noise fitted by 200 steps; a core twice too wide, driven to its rings; light divided out where none is."""
+    """Noise fitted by 200 steps; a core twice too wide, which causes rings; an inverse without regularisation."""
     clean = found(seen, psf, 20).artefacts.score
     assert clean < 1 < found(seen, psf, 200).artefacts.score
     rings = found(seen, blurred(1.6), 100).artefacts
@@ -142,10 +142,10 @@ def test_worse_deconvolutions_rank_above_better_ones(seen: Image, psf: Psf) -> N
     transfer = np.fft.rfft2(np.fft.ifftshift(crop_centred(psf.kernel, (SIZE_PX, SIZE_PX))))
     bound = np.where(np.abs(transfer) > 0.02, transfer, 0.02)
     inverse = np.fft.irfft2(np.fft.rfft2(seen.pixels) / bound, s=seen.pixels.shape)
-    assert effects(seen, inverse, psf, edge_px=EDGE_PX).artefacts.score > 100
+    assert measure_changes(seen, inverse, psf, edge_px=EDGE_PX).artefacts.score > 100
 
 
-def test_each_sign_is_seen_where_it_is(seen: Image, psf: Psf) -> None:
+def test_each_sign_is_found_at_its_place(seen: Image, psf: Psf) -> None:
     result = richardson_lucy(seen, psf, steps=20, threads=2).pixels
     quiet = seen.pixels > 300
     (y1, x1), (y2, x2), (y3, x3) = np.argwhere(quiet)[[20_000, 30_000, 40_000]]
@@ -171,7 +171,7 @@ def test_rings_are_measured_in_percent_of_the_peak() -> None:
     assert ringing_pct(np.ones((64, 64)), np.ones((64, 64)), np.ones((64, 64), bool))[0] is None
 
 
-def test_noise_is_found_from_the_pixels() -> None:
+def test_noise_is_estimated_from_the_pixels() -> None:
     expected = np.full((256, 256), 300.0) + np.linspace(0, 600, 256)
     noise = Noise(6.0, 2.0)
     pixels = noise.observe(expected, 1.4, np.random.default_rng(1))
@@ -188,9 +188,9 @@ def test_noise_is_found_from_the_pixels() -> None:
 def test_the_page_is_drawn(seen: Image, psf: Psf, tmp_path: Path) -> None:
     result = richardson_lucy(seen, psf, steps=5, threads=2).pixels
     result[5, 5] = np.nan
-    report = effects(seen, result, psf, edge_px=EDGE_PX)
+    report = measure_changes(seen, result, psf, edge_px=EDGE_PX)
     for name in ("a.png", "b.png"):
-        effects_png(seen.pixels, result, report, tmp_path / name, title="Simulated")
+        changes_png(seen.pixels, result, report, tmp_path / name, title="Simulated")
     content = (tmp_path / "a.png").read_bytes()
     assert content.startswith(b"\x89PNG") and len(content) > 100_000
     assert content == (tmp_path / "b.png").read_bytes()
@@ -199,8 +199,8 @@ def test_the_page_is_drawn(seen: Image, psf: Psf, tmp_path: Path) -> None:
 def test_a_page_of_an_image_without_light_is_drawn(tmp_path: Path) -> None:
     pixels = np.full((64, 64), -1.0)
     pixels[3, 3] = 200.0
-    report = effects(make_image(pixels + 1), pixels + 1, make_psf(delta(16)))
-    effects_png(pixels, pixels, report, tmp_path / "p.png", title="Dark")
+    report = measure_changes(make_image(pixels + 1), pixels + 1, make_psf(delta(16)))
+    changes_png(pixels, pixels, report, tmp_path / "p.png", title="Dark")
 
 
 @pytest.mark.slow
@@ -209,7 +209,7 @@ def test_the_real_image(real: Callable[[str], Path]) -> None:
     image = read_image(real(HRI), LIMITS)
     scatter = make_psf(scatter_kernel(6.15, 2.53, 0.411, 2048))
     result = richardson_lucy(image, scatter, steps=20, threads=2).pixels
-    report = effects(image, result, scatter, edge_px=EDGE_PX)
+    report = measure_changes(image, result, scatter, edge_px=EDGE_PX)
     assert report.artefacts.score < 1
     assert len(report.structures) == 2 * len(BLOCKS_PX) * len(TAILS_PCT)
     bright = [row.up_to_pct for row in report.structures if row.kind == "bright" and row.block_px > 1]

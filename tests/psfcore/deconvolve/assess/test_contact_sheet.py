@@ -1,4 +1,4 @@
-"""Many images in one run: the doubtful first, the failed apart, and a sheet to look at."""
+"""Many images in one run: the most doubtful first, the failures apart, and a contact sheet."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from psfcore.simulate.scene import solar_scene
 from tests.psfcore.conftest import make_image, make_psf
 
 SIZE = 288
-DEAD = (slice(40, 80, 4), slice(40, 280, 8))  # [y, x] of pits that the Sun does not have
+DEAD = (slice(40, 80, 4), slice(40, 280, 8))  # [y, x] of dead pixels, which are not on the Sun
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def run(images: dict[str, Image], psf: Psf) -> tuple[list[Treated], list[Failure
     return treat_many(["gone", "clean", "dead", "empty", "other"], reader(images, psf))
 
 
-def test_the_doubtful_come_first_and_failures_stop_nothing(
+def test_the_most_doubtful_come_first_and_failures_do_not_stop_the_run(
     run: tuple[list[Treated], list[Failure]],
 ) -> None:
     treated, failures = run
@@ -83,7 +83,7 @@ def test_the_doubtful_come_first_and_failures_stop_nothing(
     ]
 
 
-def test_what_is_ours_is_not_taken_for_a_failure_of_the_image() -> None:
+def test_an_internal_error_is_not_a_failure_of_the_image() -> None:
     def broken(name: str) -> Treated:
         raise RuntimeError(name)
 
@@ -91,7 +91,7 @@ def test_what_is_ours_is_not_taken_for_a_failure_of_the_image() -> None:
         treat_many(["a"], broken)
 
 
-def test_figures_are_those_of_the_deconvolution(
+def test_numbers_belong_to_the_deconvolution(
     run: tuple[list[Treated], list[Failure]], images: dict[str, Image], psf: Psf
 ) -> None:
     row = next(row for row in run[0] if row.name == "clean")
@@ -146,14 +146,14 @@ def test_the_sheet_shows_every_image_and_every_failure(
     contact_sheet_png(run[0], [], tmp_path / "well.png")
     whole, one, well = (drawn(tmp_path / f"{name}.png") for name in ("all", "one", "well"))
     assert whole.shape[0] > one.shape[0] + 400  # two more rows of thumbnails
-    # The failures' lines stand in red at the foot; without failures there are none.
+    # The failures are listed in red at the foot of the sheet, if there are any.
     red = [np.mean((image[-70:] * [1, -1, -1]).sum(axis=-1) > 0.3) for image in (whole, well)]
     assert red[0] > 0.002 > red[1]
     dark = (whole < 0.3).all(axis=-1).mean()
-    assert 0.05 < dark < 0.9  # thumbnails are dark, the page is not
+    assert 0.05 < dark < 0.9  # thumbnails are dark, the page is white
 
 
-def test_a_run_in_which_all_failed_has_a_sheet_too(tmp_path: Path) -> None:
+def test_a_run_in_which_all_images_failed_has_a_sheet(tmp_path: Path) -> None:
     failures = [Failure(f"{n}.fits", "all-nan", "expected finite pixels") for n in range(30)]
     contact_sheet_png([], failures, tmp_path / "none.png")
     assert drawn(tmp_path / "none.png").std() > 0.02

@@ -40,7 +40,7 @@ def psf() -> Psf:
 
 
 def cut(light: float) -> Plane:
-    """A corner of a simulated scene: disc, a hole and the corona, at `light` times the usual brightness."""
+    """A corner of a simulated scene: disc, coronal hole and corona, at `light` times the usual brightness."""
     return light * solar_scene((1024, 1024), 3)[200 : 200 + SIZE_PX, 560 : 560 + SIZE_PX]
 
 
@@ -57,7 +57,7 @@ def twenty_steps(psf: Psf) -> Callable[[Image], Plane]:
 
 
 def pulls(scene: Plane, psf: Psf, images: int, draws: int) -> tuple[Plane, Plane]:
-    """(found - noise-free deconvolved the same way) / error, [image, y, x] away from edges; and the latter."""
+    """(result - result without noise) / error, [image, y, x] away from edges; and the error."""
     run = twenty_steps(psf)
     truth = run(see(scene, psf, None))
     inner = np.s_[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX]
@@ -86,7 +86,7 @@ def check_widths(scene: Plane, psf: Psf, images: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("light", [0.5, 0.05])
 def test_pulls_of_forty_images_have_width_one(psf: Psf, light: float) -> None:
-    """At 50 to 650 photons a pixel, and at a dozen or so."""
+    """At 50 to 650 photons per pixel, and at about a dozen."""
     check_widths(cut(light), psf, 40)
 
 
@@ -107,7 +107,7 @@ def test_a_delta_gives_back_the_noise_of_the_camera() -> None:
     assert planes.degrees_of_freedom == pytest.approx(12 * 50, rel=0.2)
 
 
-def test_the_plane_is_the_same_for_the_same_seed_and_empty_where_nothing_is_known(psf: Psf) -> None:
+def test_the_same_seed_gives_the_same_plane_and_masked_pixels_have_none(psf: Psf) -> None:
     image = see(cut(0.5), psf, 1)
     pixels, mask = image.pixels.copy(), image.mask.copy()
     pixels[40, 50], mask[40, 50] = np.nan, MaskBit.NONFINITE
@@ -122,7 +122,7 @@ def test_the_plane_is_the_same_for_the_same_seed_and_empty_where_nothing_is_know
     assert np.median(first.error[far] / whole.error[far]) == pytest.approx(1.0, abs=0.01)
 
 
-def test_the_model_is_as_bright_as_the_observation_though_light_leaves_the_field(psf: Psf) -> None:
+def test_the_model_is_as_bright_as_the_observation_near_the_edges(psf: Psf) -> None:
     image = see(cut(0.5), psf, None)
     model = expected_image(image, twenty_steps(psf)(image), psf)
     off = np.abs(model / image.pixels - 1)
@@ -130,7 +130,7 @@ def test_the_model_is_as_bright_as_the_observation_though_light_leaves_the_field
     assert off[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX].max() < 0.02
 
 
-def test_progress_is_told_and_may_end_the_work(psf: Psf) -> None:
+def test_progress_is_reported_and_may_stop_the_work(psf: Psf) -> None:
     image = see(cut(0.5), psf, 1)
     told: list[tuple[int, int]] = []
     error_planes(image, psf, lambda seen: seen.pixels, NOISE, draws=2, progress=lambda *at: told.append(at))
@@ -143,7 +143,7 @@ def test_progress_is_told_and_may_end_the_work(psf: Psf) -> None:
         error_planes(image, psf, lambda seen: seen.pixels, NOISE, progress=stop)
 
 
-def test_one_draw_says_nothing(psf: Psf) -> None:
+def test_one_noise_realisation_is_refused(psf: Psf) -> None:
     with pytest.raises(DataError) as caught:
         error_planes(see(cut(0.5), psf, 1), psf, lambda seen: seen.pixels, NOISE, draws=1)
     assert caught.value.code == "bad-draws"
@@ -159,13 +159,13 @@ def test_noise_in_dn_per_second_needs_the_exposure() -> None:
 
 
 @pytest.mark.parametrize("pair", [(0.0, 0.0), (-1.0, 2.0), (np.nan, 1.0), (1.0, np.inf)])
-def test_noise_that_is_none_is_refused(pair: tuple[float, float]) -> None:
+def test_wrong_noise_is_refused(pair: tuple[float, float]) -> None:
     with pytest.raises(DataError) as caught:
         Noise(*pair)
     assert caught.value.code == "bad-noise"
 
 
-def test_drawn_noise_has_the_variance_that_the_formula_says() -> None:
+def test_simulated_noise_has_the_variance_of_the_formula() -> None:
     expected = np.full((300, 300), 12 * 6 / 1.4)  # a dozen photons
     drawn = NOISE.observe(expected, 1.4, np.random.default_rng(2))
     assert drawn.mean() == pytest.approx(expected[0, 0], rel=0.01)
@@ -176,7 +176,7 @@ def test_drawn_noise_has_the_variance_that_the_formula_says() -> None:
 # --- the PSF's own uncertainty ---
 
 
-def test_sigma_points_have_the_mean_and_covariance_asked_for() -> None:
+def test_sigma_points_have_the_given_mean_and_covariance() -> None:
     root = np.array([[1.0, 0, 0], [0.4, 0.3, 0], [-2.0, 0.1, 0.7]])
     mean, covariance = np.array([6.15, 2.53, 0.41]), root @ root.T
     points = sigma_points(mean, covariance)
@@ -186,7 +186,7 @@ def test_sigma_points_have_the_mean_and_covariance_asked_for() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.array([[1.0, 0.5], [0.2, 1.0]]), np.diag([1.0, -1.0]), np.eye(3)])
-def test_what_is_no_covariance_is_refused(wrong: Plane) -> None:
+def test_a_wrong_covariance_is_refused(wrong: Plane) -> None:
     with pytest.raises(DataError) as caught:
         sigma_points(np.zeros(2), wrong)
     assert caught.value.code == "bad-covariance"
@@ -194,7 +194,7 @@ def test_what_is_no_covariance_is_refused(wrong: Plane) -> None:
 
 @pytest.mark.slow
 def test_sigma_points_agree_with_many_random_samples(psf: Psf) -> None:
-    """The scattered total known to 0.01: what that does to the image, by two points and by 60 draws."""
+    """The scattered total is known to 0.01: its effect on the image by two sigma points and by 60 random samples."""
     image = see(cut(0.5), psf, None)
 
     def build(total: float) -> Psf:
@@ -207,12 +207,12 @@ def test_sigma_points_agree_with_many_random_samples(psf: Psf) -> None:
     by_points = psf_error_plane([build(float(t)) for (t,) in points], run, chance=False)
     totals = np.random.default_rng(1).normal(0.411, 0.01, 60)
     by_chance = psf_error_plane([build(float(t)) for t in totals], run)
-    assert np.median(by_points / by_chance) == pytest.approx(1.0, abs=0.15)  # 60 samples: 9 % by themselves
+    assert np.median(by_points / by_chance) == pytest.approx(1.0, abs=0.15)  # 60 samples scatter by 9 %
     planes = error_planes(image, psf, run=lambda seen: seen.pixels, noise=NOISE, draws=2)
     assert with_psf_error(planes, by_points).psf_error is not None
 
 
-def test_the_root_of_an_average_is_put_right() -> None:
+def test_the_bias_of_the_root_of_a_mean_is_corrected() -> None:
     drawn = np.random.default_rng(3).chisquare(3, 400_000)
     assert mean_of_root(3) == pytest.approx(np.sqrt(drawn / 3).mean(), rel=2e-3)
     assert mean_of_root(1e6) == pytest.approx(1.0, abs=1e-6)

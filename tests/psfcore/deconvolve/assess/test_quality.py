@@ -42,7 +42,7 @@ def points_scene() -> Plane:
 def neighbours_off(
     scene: Plane, psf: Psf, bad: NDArray[np.bool_], bit: MaskBit
 ) -> tuple[Plane, Plane, Plane]:
-    """Change by losing `bad` pixels, the image without loss, and the distance from them (px)."""
+    """Change caused by losing the pixels `bad`, the image without loss, and the distance from them (px)."""
     seen = observe(scene, psf, exposure_s=1.0, photon_gain_dn=0, read_noise_dn=0, seed=1)
     whole = richardson_lucy(make_image(seen), psf, steps=20).pixels
     lost = seen.copy()
@@ -64,7 +64,7 @@ def lost_pixels(kind: str, y: int = 64, x: int = 64) -> NDArray[np.bool_]:
 
 @pytest.mark.parametrize("bit", list(MaskBit))
 @pytest.mark.parametrize("kind", ["pixel", "block"])
-def test_a_lost_pixel_moves_others_by_less_than_a_percent_beyond_3_px(
+def test_a_lost_pixel_changes_others_by_less_than_a_percent_beyond_3_px(
     psf: Psf, kind: str, bit: MaskBit
 ) -> None:
     """A smooth bright scene, and a pixel between the points of a scene of points."""
@@ -79,7 +79,7 @@ def test_a_lost_pixel_moves_others_by_less_than_a_percent_beyond_3_px(
 def test_a_lost_point_source_leaves_less_than_a_percent_of_its_light_beyond_3_px(
     psf: Psf, kind: str, bit: MaskBit
 ) -> None:
-    """What was lost is 400 times brighter than the sky round it: the sky's own percent is not to be had."""
+    """The lost source is 400 times brighter than the sky around it, so the change is relative to its light."""
     change, whole, distance = neighbours_off(points_scene(), psf, lost_pixels(kind), bit)
     far = np.abs(change)[distance > 3].max()
     assert far < 0.01 * whole[64, 64]
@@ -115,7 +115,7 @@ def test_the_first_bits_are_those_of_the_mask() -> None:
 
 
 def test_the_edge_band_ends_where_little_of_the_light_is_from_outside(psf: Psf) -> None:
-    """By brute force: the share of a uniform Sun's light in each row that came from beyond the first row."""
+    """By brute force: in each row, the share of a uniform Sun's light that comes from beyond the first row."""
     edge_px = edge_band_px(psf, 0.10)
     outside = np.zeros((256, 257))
     outside[:128] = 1.0

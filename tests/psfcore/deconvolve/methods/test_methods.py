@@ -1,4 +1,4 @@
-"""What holds for every method: one signature, masks, scales, edges, stopping, threads, no drift."""
+"""Properties of every method: signature, masks, scales, edges, stopping, threads, no drift."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ZERO = Conditions(edges="zero")
 
 
 def lopsided(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """A sharp PSF with a round halo and a ghost beside it: asymmetric, its centroid off its centre."""
+    """A sharp PSF with a round halo and a ghost: asymmetric, with its centroid off the centre."""
     y, x = np.indices(shape) - np.array(shape)[:, None, None] // 2
     kernel = np.exp(-(x**2 + y**2) / 18.0)
     kernel *= 0.2 / kernel.sum()
@@ -55,12 +55,12 @@ def scene() -> NDArray[np.float64]:
 
 @pytest.fixture(scope="module")
 def seen(scene: NDArray[np.float64], psf_256: Psf) -> NDArray[np.float64]:
-    """A field whose scene goes on beyond it."""
+    """A field whose scene extends beyond it."""
     whole = observe(scene, psf_256, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
     return whole[128:320, 144:304]
 
 
-def test_the_methods_are_those_of_their_files() -> None:
+def test_method_names_follow_the_files() -> None:
     assert METHODS == [
         "basic-iterative",
         "linear",
@@ -87,7 +87,7 @@ def test_a_delta_changes_nothing(name: str, scene: NDArray[np.float64]) -> None:
 
 
 @pytest.mark.parametrize("name", FAITHFUL)
-def test_without_noise_the_scene_comes_back(name: str, psf_256: Psf) -> None:
+def test_without_noise_the_scene_is_recovered(name: str, psf_256: Psf) -> None:
     scene = solar_scene((448, 448), 2)
     field = (slice(32, -32),) * 2
     observed = observe(scene, psf_256, exposure_s=1.0, photon_gain_dn=0, read_noise_dn=0, seed=0)[field]
@@ -102,7 +102,7 @@ def test_without_noise_the_scene_comes_back(name: str, psf_256: Psf) -> None:
 def test_single_precision_follows_the_plain_version(
     name: str, seen: NDArray[np.float64], psf_256: Psf
 ) -> None:
-    """Each method's equation in float64, on the field and a margin, with transforms that nothing wraps in."""
+    """Each method's equation in float64, on field and margin, with transforms without wrap-around."""
     margin = 40
     field = (slice(margin, -margin),) * 2
     mask = np.zeros(seen.shape, np.uint8)
@@ -116,8 +116,8 @@ def test_single_precision_follows_the_plain_version(
     assert np.abs(found - x[field]).max() < 2e-5 * x[field].max()
 
 
-def test_linear_settles_where_the_model_is_the_image(seen: NDArray[np.float64], psf_256: Psf) -> None:
-    """Whatever its inverse, x is the solution of H x = y: five steps, float64's own convolution as the judge."""
+def test_linear_converges_to_a_model_equal_to_the_image(seen: NDArray[np.float64], psf_256: Psf) -> None:
+    """After five steps x solves H x = y, checked with a convolution in float64."""
     found = method_named("linear")(make_image(seen), psf_256, ZERO).pixels
     model = Convolver(psf_256.kernel, seen.shape, dtype=np.float64).apply(found)
     assert np.abs(model - seen).max() < 1e-4 * seen.max()
@@ -126,7 +126,7 @@ def test_linear_settles_where_the_model_is_the_image(seen: NDArray[np.float64], 
 def plain(
     name: str, y: NDArray[np.float64], weight: NDArray[np.float64], convolver: Convolver, steps: int
 ) -> NDArray[np.float64]:
-    """The equation of a method in float64, a line each."""
+    """The equation of a method in float64, one line per method."""
     if name == "richardson-lucy-extended":
         y = np.maximum(y, 0)
         x = np.maximum(y, 2.0**-23 * y.max())
@@ -143,7 +143,7 @@ def plain(
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_nan_stays_where_it_was_and_never_spreads(name: str, seen: NDArray[np.float64], psf_256: Psf) -> None:
+def test_nan_stays_in_place_and_does_not_spread(name: str, seen: NDArray[np.float64], psf_256: Psf) -> None:
     holed = seen.copy()
     holed[80:83, 70:72] = np.nan
     holed[0, :5] = -np.inf
@@ -156,8 +156,10 @@ def test_nan_stays_where_it_was_and_never_spreads(name: str, seen: NDArray[np.fl
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_what_a_masked_pixel_holds_pulls_nothing(name: str, seen: NDArray[np.float64], psf_256: Psf) -> None:
-    """The result is the same, pixel by pixel, whatever stands where there is no finite value."""
+def test_the_value_of_a_masked_pixel_has_no_influence(
+    name: str, seen: NDArray[np.float64], psf_256: Psf
+) -> None:
+    """The result is the same, pixel by pixel, for any value in the masked pixels."""
     holes = np.zeros(seen.shape, np.uint8)
     holes[80:82, 70:72] = MaskBit.NONFINITE
     changed = np.where(holes > 0, 1e9, seen)
@@ -169,7 +171,9 @@ def test_what_a_masked_pixel_holds_pulls_nothing(name: str, seen: NDArray[np.flo
 
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e37, 1e300])
-def test_any_scale_gives_the_same(name: str, scale: float, seen: NDArray[np.float64], psf_256: Psf) -> None:
+def test_the_result_does_not_depend_on_the_scale(
+    name: str, scale: float, seen: NDArray[np.float64], psf_256: Psf
+) -> None:
     of_one, scaled = (
         method_named(name)(make_image(p), psf_256, ZERO, steps=5).pixels for p in (seen, seen * scale)
     )
@@ -191,13 +195,13 @@ def test_the_result_does_not_depend_on_the_threads(
 @pytest.mark.parametrize("psf_shape", [(64, 64), (65, 65), (64, 41)])
 @pytest.mark.parametrize("shape", [(96, 96), (97, 75)])
 def test_nothing_drifts(name: str, psf_shape: tuple[int, int], shape: tuple[int, int]) -> None:
-    """A blurred star comes back where it was: PSFs even, odd, oblong and lopsided, fields even and odd."""
+    """A blurred star keeps its position, for even, odd, oblong and asymmetric PSFs and even and odd fields."""
     y, x = np.indices(shape)
     truth = 5.0 + 500 * np.exp(-((y - 46.3) ** 2 + (x - 31.2) ** 2) / 3)
     psf = make_psf(lopsided(psf_shape))
     observed = Convolver(psf.kernel, shape, dtype=np.float64).apply(truth)
     found = method_named(name)(make_image(observed), psf, Conditions(), steps=100).pixels
-    # Forward differences lean a little to one side.
+    # Forward differences cause a small shift to one side.
     allowed_px = 1e-3 if name in FAITHFUL else 3e-3
     for found_px, true_px in zip(centroid(found), centroid(truth), strict=True):
         assert found_px == pytest.approx(true_px, abs=allowed_px)
@@ -223,7 +227,7 @@ def test_linear_methods_are_linear_and_keep_negative_light(
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_translation_moves_the_result_along(name: str) -> None:
+def test_translation_shifts_the_result(name: str) -> None:
     psf = make_psf(gaussian(21, 0.8))
     plane = np.full((120, 120), 5.0)
     plane[50:60, 50:53] = 90.0
@@ -236,7 +240,7 @@ def test_translation_moves_the_result_along(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LINEAR)
-def test_noise_grows_as_is_said(name: str, hri_psf: Psf) -> None:
+def test_noise_grows_by_the_stated_amplification(name: str, hri_psf: Psf) -> None:
     noise = np.random.default_rng(1).normal(0, 1, (512, 512))
     result = method_named(name)(make_image(noise), hri_psf, Conditions(threads=2))
     assert result.noise_amplification == pytest.approx(result.pixels[64:-64, 64:-64].std(), rel=0.02)
@@ -255,11 +259,11 @@ def test_discrepancy_stops_near_the_noise(name: str, psf_256: Psf, seen: NDArray
     before = method_named(name)(image, psf_256, conditions, steps=result.steps_done)
     assert before.chi2_per_pixel is not None
     assert before.chi2_per_pixel > 1
-    if name != "richardson-lucy-accelerated":  # which stops at a prediction, not at a step's own result
+    if name != "richardson-lucy-accelerated":  # it stops at a prediction, not at the result of a step
         np.testing.assert_allclose(before.pixels, result.pixels, atol=1e-4 * seen.max())
 
 
-def test_twenty_steps_are_past_the_noise_optimum_and_discrepancy_is_not(hri_psf: Psf) -> None:
+def test_twenty_steps_fit_noise_and_discrepancy_does_not(hri_psf: Psf) -> None:
     scene = solar_scene((512, 512), 1)
     observed = observe(scene, hri_psf, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
     image = dataclasses.replace(make_image(observed), exposure_s=1.4)
@@ -269,7 +273,7 @@ def test_twenty_steps_are_past_the_noise_optimum_and_discrepancy_is_not(hri_psf:
 
     def error(**asked: object) -> float:
         result = method_named("richardson-lucy")(image, hri_psf, conditions, **asked)
-        # In units of each pixel's own photon noise, so that faint pixels count as bright ones do.
+        # In units of each pixel's photon noise, so that faint and bright pixels have equal weight.
         return float(np.sqrt(np.mean(((result.pixels - scene) ** 2 / scene)[inside])))
 
     errors = {steps: error(steps=steps) for steps in (2, 3, 5, 8, 20)}
@@ -278,8 +282,8 @@ def test_twenty_steps_are_past_the_noise_optimum_and_discrepancy_is_not(hri_psf:
     assert error(steps=20, stop="discrepancy") < errors[20]
 
 
-def test_total_variation_earns_its_place(hri_psf: Psf) -> None:
-    """On a noisy scene it comes nearer than any number of plain steps, and further steps do no harm."""
+def test_total_variation_is_better_on_a_noisy_scene(hri_psf: Psf) -> None:
+    """Its error is smaller than with any number of plain steps, and further steps do not increase it."""
     scene = solar_scene((512, 512), 1)
     observed = observe(scene, hri_psf, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
     conditions = Conditions(edges="zero", threads=2, engine_for=EngineCache())
@@ -296,7 +300,9 @@ def test_total_variation_earns_its_place(hri_psf: Psf) -> None:
     assert max(smooth) < 1.1 * min(smooth)
 
 
-def test_discrepancy_that_is_not_met_ends_at_the_most_steps(psf_256: Psf, seen: NDArray[np.float64]) -> None:
+def test_discrepancy_that_is_not_reached_ends_after_all_steps(
+    psf_256: Psf, seen: NDArray[np.float64]
+) -> None:
     conditions = Conditions(noise=Noise(1e-3, 1e-3))
     result = method_named("richardson-lucy")(
         make_image(seen), psf_256, conditions, steps=3, stop="discrepancy"
@@ -305,7 +311,7 @@ def test_discrepancy_that_is_not_met_ends_at_the_most_steps(psf_256: Psf, seen: 
     assert "still above 1" in result.stopped_because
 
 
-def test_engines_are_kept_and_the_least_used_forgotten(psf_256: Psf) -> None:
+def test_the_cache_drops_the_least_recently_used_engine(psf_256: Psf) -> None:
     cache = EngineCache(2)
     first = cache(psf_256, (32, 32), (32, 32), 1)
     second = cache(psf_256, (48, 32), (48, 32), 1)
@@ -316,7 +322,7 @@ def test_engines_are_kept_and_the_least_used_forgotten(psf_256: Psf) -> None:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_kept_engine_gives_the_same(name: str, seen: NDArray[np.float64], psf_256: Psf) -> None:
+def test_a_cached_engine_gives_the_same_result(name: str, seen: NDArray[np.float64], psf_256: Psf) -> None:
     kept = Conditions(engine_for=EngineCache())
     deconvolve = method_named(name)
     deconvolve(make_image(seen[::-1]), psf_256, kept, steps=3)
@@ -324,19 +330,19 @@ def test_a_kept_engine_gives_the_same(name: str, seen: NDArray[np.float64], psf_
     np.testing.assert_array_equal(again, new)
 
 
-def test_the_band_along_the_edge_is_read_off_the_psf() -> None:
+def test_the_edge_band_follows_from_the_psf() -> None:
     kernel = np.zeros((9, 9))
     kernel[4, 4], kernel[4, 8], kernel[1, 4] = 0.6, 0.2, 0.2
     psf = make_psf(kernel)
-    # Over the four directions, light from 4 px and from 3 px beyond, 0.2 / 4 each.
+    # Mean over the four directions: light from 4 px and from 3 px beyond, 0.2 / 4 each.
     np.testing.assert_allclose(share_from_beyond(psf), [0.1, 0.1, 0.1, 0.05, 0.0])
     assert (edge_band_px(psf, 0.07), edge_band_px(psf, 0.04), edge_band_px(psf, 0.2)) == (3, 4, 0)
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_field_smaller_than_its_psf_agrees_with_the_whole(name: str, hri_psf: Psf) -> None:
-    """A sub-region of 128 px with the whole PSF: away from its edges within 8 % of the whole image, where
-    half of the light within reach was cut off."""
+def test_a_field_smaller_than_its_psf_agrees_with_the_whole_image(name: str, hri_psf: Psf) -> None:
+    """A sub-region of 128 px with the whole PSF agrees with the whole image to 8 % away from its edges, although
+    half of the light within reach is cut off."""
     scene = solar_scene((512, 512), 5)
     observed = observe(scene, hri_psf, exposure_s=1.0, photon_gain_dn=0, read_noise_dn=0, seed=0)
     whole = method_named(name)(make_image(observed), hri_psf, Conditions(threads=2)).pixels
@@ -366,7 +372,7 @@ def test_refusals(
     assert caught.value.code == code
 
 
-def test_a_psf_that_additive_steps_diverge_with_is_refused() -> None:
+def test_a_psf_with_which_additive_steps_diverge_is_refused() -> None:
     box = np.zeros((21, 21))
     box[8:13, 8:13] = 1 / 25
     image = make_image(np.random.default_rng(0).random((64, 64)))
@@ -377,7 +383,7 @@ def test_a_psf_that_additive_steps_diverge_with_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("photon", "read"), [(0, 0), (-1, 2), (float("nan"), 1)])
-def test_noise_that_is_none_is_refused(photon: float, read: float) -> None:
+def test_wrong_noise_is_refused(photon: float, read: float) -> None:
     with pytest.raises(DataError, match="noise"):
         Noise(photon, read)
 
@@ -424,7 +430,9 @@ def test_any_shape_mask_and_type_gives_finite_light(
     kernel=st.tuples(st.integers(1, 60), st.integers(1, 60)),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_the_plain_adjoint_is_one(shape: tuple[int, int], kernel: tuple[int, int], seed: int) -> None:
+def test_the_reference_adjoint_is_the_adjoint(
+    shape: tuple[int, int], kernel: tuple[int, int], seed: int
+) -> None:
     """<H x, y> = <x, H^T y>, in float64 to 1e-12."""
     rng = np.random.default_rng(seed)
     weights = rng.random(kernel)
@@ -435,8 +443,8 @@ def test_the_plain_adjoint_is_one(shape: tuple[int, int], kernel: tuple[int, int
 
 
 @pytest.mark.slow
-def test_the_default_is_near_the_run_without_an_edge() -> None:
-    """What README and method say of edges: the default within 2.5, 2 and 1 % in the bands of the edge study."""
+def test_the_default_is_close_to_a_run_without_edges() -> None:
+    """The errors near edges that README and methods state: 2.5, 2 and 1 % in the bands of the edge study."""
     psf, cache = edge_study.study_psf(), EngineCache(8)
     for seed in edge_study.SEEDS:
         (row,) = edge_study.rows(seed, psf, cache, methods=("richardson-lucy",), ways=(None,))

@@ -1,3 +1,5 @@
+"""Images and products: what is read, what is masked, and what is written."""
+
 from __future__ import annotations
 
 import gzip
@@ -15,13 +17,11 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.errors import DataError
-from psfcore.fits.fits_io import read_image, read_mask, read_planes, read_psf, write_image, write_psf
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_image, read_mask, read_planes, write_image
 from psfcore.image import Image, MaskBit
-from psfcore.instruments.files import instrument_path
-from psfcore.psf import Psf
 from psfcore.simulate.observe import demo_image
-from tests.psfcore.conftest import delta, gaussian, make_psf
+from tests.psfcore.conftest import gaussian, make_psf
 
 Find = Callable[[str], Path]
 CARDS: dict[str, tuple[str | int | float | bool, str]] = {"PSFNAME": ("hri_euv", "point-spread function")}
@@ -129,7 +129,7 @@ def test_saturation(
         (np.ones((10, 40)), {}, None, "too-small"),
     ],
 )
-def test_what_only_pixels_show(
+def test_unusable_pixels_are_data_errors(
     tmp_path: Path,
     limits: FitsLimits,
     data: NDArray[np.generic],
@@ -144,7 +144,7 @@ def test_what_only_pixels_show(
     assert "expected" in caught.value.message
 
 
-def test_damaged_tiles_are_the_users_error(tmp_path: Path, limits: FitsLimits) -> None:
+def test_damaged_tiles_are_data_errors(tmp_path: Path, limits: FitsLimits) -> None:
     path = tmp_path / "d.fits"
     hdu = fits.CompImageHDU(ramp(64, 64).astype(np.int32), compression_type="GZIP_1")
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path)
@@ -300,85 +300,13 @@ def test_the_demo_opens_in_sunpy_and_says_it_is_simulated(tmp_path: Path, limits
     assert seen.scale.axis1.value == pytest.approx(0.492)
 
 
-# --- point-spread functions ---
-
-
-def full_psf() -> Psf:
-    return make_psf(
-        0.9 * gaussian(64, 2.0),
-        name="mine",
-        version="3",
-        status="draft",
-        instrument="hri_euv",
-        plate_scale_arcsec=0.492,
-        wavelength_angstrom=174.0,
-        components={"DIFFRACTION": gaussian(64, 1.0), "SCATTER": delta(64)},
-        provenance={"why": "test"},
-    )
-
-
-def test_a_psf_comes_back_whole(tmp_path: Path, limits: FitsLimits) -> None:
-    toml = instrument_path("hri_euv").read_bytes()
-    psf = full_psf()
-    for name in ("a.fits", "b.fits"):
-        write_psf(tmp_path / name, psf, instrument_file=toml)
-    assert (tmp_path / "a.fits").read_bytes() == (tmp_path / "b.fits").read_bytes()
-    back = read_psf(tmp_path / "a.fits", limits)
-    assert (back.name, back.version, back.status, back.instrument) == ("mine", "3", "draft", "hri_euv")
-    assert (back.plate_scale_arcsec, back.wavelength_angstrom) == (0.492, 174.0)
-    np.testing.assert_array_equal(back.kernel, psf.kernel.astype(np.float32))
-    assert list(back.components) == ["DIFFRACTION", "SCATTER"]
-    assert back.provenance["instrument_toml"].encode() == toml
-    assert "why: test" in back.provenance["history"]
-    assert read_summary(tmp_path / "a.fits", limits).shape == (64, 64)
-    with fits.open(tmp_path / "a.fits", checksum=True) as hdus:
-        assert all(hdu.verify_checksum() == 1 for hdu in hdus)
-        assert hdus["PROFILE"].data["cumulative_pct"][-1] == pytest.approx(10.0, abs=1e-3)
-        assert hdus["PROFILE"].data["encircled"][-1] == pytest.approx(0.9)
-        assert hdus["PROFILE"].data["scatter_encircled"][0] == pytest.approx(1.0)
-        weight = hdus["PROFILE"].data["diffraction_mean_weight"]
-        assert weight[0] == pytest.approx(gaussian(64, 1.0)[32, 32])
-        assert hdus[0].header["PSFSUM"] == pytest.approx(0.9)
-
-
-def test_single_precision_keeps_the_sum_of_the_full_psf(
-    tmp_path: Path, limits: FitsLimits, hri_psf: Psf
-) -> None:
-    write_psf(tmp_path / "p.fits", hri_psf)
-    assert read_psf(tmp_path / "p.fits", limits).total == pytest.approx(1.0, abs=1e-7)
-
-
-@pytest.mark.parametrize("shape", [(31, 31), (32, 32), (33, 48)])
-def test_a_foreign_psf_takes_its_files_name(
-    tmp_path: Path, limits: FitsLimits, shape: tuple[int, int]
-) -> None:
-    kernel = np.full(shape, 1e-6)
-    kernel[shape[0] // 2, shape[1] // 2] = 0.9
-    psf = read_psf(save(tmp_path / "other_psf.v2.fits", kernel), limits)
-    assert (psf.name, psf.status, psf.instrument, psf.plate_scale_arcsec) == ("other_psf", "user", None, None)
-
-
-def test_a_psf_with_its_peak_in_the_corner_says_so(tmp_path: Path, limits: FitsLimits) -> None:
-    path = save(tmp_path / "corner.fits", np.fft.ifftshift(gaussian(32, 1.0)))
-    with pytest.raises(DataError, match="corner origin") as caught:
-        read_psf(path, limits)
-    assert caught.value.code == "psf-not-centred"
-
-
-def test_a_real_foreign_psf(real: Find, limits: FitsLimits) -> None:
-    psf = read_psf(real("psf/derived_aia171_psf_aiapy0.10.2.fits"), limits)
-    assert psf.kernel.shape == (4096, 4096)
-    assert psf.total == pytest.approx(1, abs=1e-6)
-    assert psf.wavelength_angstrom == 171
-
-
 def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path) -> None:
     stored = np.arange(32 * 32, dtype=np.int16).reshape(32, 32)
     stored[3, 4] = -32768
     hdu = fits.PrimaryHDU(stored)
     hdu.header["BZERO"], hdu.header["BSCALE"], hdu.header["BLANK"] = 32768, 1, -32768
     path = tmp_path / "unsigned.fits"
-    with path.open("wb") as file:  # as stored: astropy would scale it on the way out
+    with path.open("wb") as file:  # written by hand, because astropy would scale the values
         file.write(hdu.header.tostring().encode())
         data = stored.astype(">i2").tobytes()
         file.write(data + bytes(-len(data) % 2880))
@@ -390,7 +318,7 @@ def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path) -> None:
 # --- planes of a product ---
 
 
-def test_planes_come_back_and_the_product_is_still_one_map(
+def test_planes_are_read_back_and_the_product_opens_as_one_map(
     tmp_path: Path, limits: FitsLimits, real: Find
 ) -> None:
     image = read_image(real(AIA), limits)
@@ -442,7 +370,7 @@ def test_a_product_without_planes_has_none(tmp_path: Path, limits: FitsLimits) -
         ("QUALITY", np.zeros((20, 24), np.uint32)),
     ],
 )
-def test_what_is_no_plane_is_refused(
+def test_a_wrong_plane_is_refused(
     tmp_path: Path, limits: FitsLimits, name: str, plane: NDArray[np.generic]
 ) -> None:
     image = read_image(save(tmp_path / "in.fits", ramp()), limits)

@@ -1,0 +1,356 @@
+"""The HDUs of a FITS file, one after the other, without reading a pixel.
+
+Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 3.3, 4.4 and 10.1.
+`walk` reads headers in blocks of 2880 bytes. It skips the data by the size that NAXISn, BITPIX, PCOUNT and
+GCOUNT declare. heliopsf uses the first two-dimensional image of a file: a plain image HDU, or a
+tile-compressed image in a binary table with ZIMAGE = T. `first_image` ignores everything after that image.
+
+To skip data in a file that is compressed as a whole (.fits.gz), the reader must inflate it. It therefore
+checks every declared size first and limits the number of inflated bytes.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import math
+import os
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+from astropy.io.fits import Header
+from astropy.io.fits.verify import VerifyError
+
+from psfcore.errors import HeaderError
+
+BLOCK_BYTES = 2880
+CARD_BYTES = 80
+ALLOWED_CODECS = ("RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS")
+_BITPIX = (8, 16, 32, 64, -32, -64)
+_LARGEST_COUNT = 2**63 - 1
+_SKIP_BYTES = 1 << 20
+END_CARD = b"END" + b" " * 77
+# Exceptions that astropy raises for a damaged card. Which one depends on the damage.
+CARD_TROUBLE = (VerifyError, ValueError, TypeError, IndexError, OverflowError)
+_KNOWN_STARTS = (
+    (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),
+    (b"\xff\x4f\xff\x51", "a JPEG 2000 codestream"),
+    (b"\x89PNG", "a PNG file"),
+    (b"\xff\xd8\xff", "a JPEG file"),
+    (b"PK\x03\x04", "a zip archive"),
+    (b"BZh", "a bzip2 file"),
+    (b"\xfd7zXZ", "an xz file"),
+    (b"%PDF", "a PDF file"),
+    (b"\x89HDF", "an HDF5 file"),
+    (b"<", "a text file (markup)"),
+    (b"{", "a text file (JSON)"),
+)
+
+
+@dataclass(frozen=True)
+class FitsLimits:
+    """Upper limits for reading a FITS file.
+
+    max_pixels: pixels of an image, and of a tile of a compressed image. max_header_bytes: bytes of all headers
+    together. max_hdus: number of HDUs.
+    """
+
+    max_pixels: int
+    max_header_bytes: int = 4 * 1024 * 1024
+    max_hdus: int = 64
+
+
+class Source(Protocol):
+    """A stream of bytes that can be read or skipped, forwards only."""
+
+    gzipped: bool
+
+    def read(self, count: int) -> bytes: ...
+
+    def skip(self, count: int) -> int: ...
+
+
+class _PlainSource:
+    gzipped = False
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._size = os.fstat(file.fileno()).st_size
+
+    def read(self, count: int) -> bytes:
+        return self._file.read(count)
+
+    def skip(self, count: int) -> int:
+        """Skip up to `count` bytes; returns how many of them the file holds."""
+        there = max(0, min(count, self._size - self._file.tell()))
+        self._file.seek(there, io.SEEK_CUR)
+        return there
+
+
+class _GzipSource:
+    gzipped = True
+
+    def __init__(self, file: BinaryIO, budget_bytes: int) -> None:
+        self._stream = gzip.GzipFile(fileobj=file, mode="rb")
+        self._left = budget_bytes
+
+    def read(self, count: int) -> bytes:
+        self._left -= count
+        if self._left < 0:
+            raise HeaderError("too-many-bytes", "expected inflated data within the size limit; got more")
+        try:
+            return self._stream.read(count)
+        except EOFError:
+            raise HeaderError(
+                "truncated-gzip", "expected a complete gzip stream; it ends too early"
+            ) from None
+        except (OSError, zlib.error) as error:
+            raise HeaderError("bad-gzip", f"expected a readable gzip stream; got: {error}") from None
+
+    def skip(self, count: int) -> int:
+        there = 0
+        while there < count:
+            chunk = self.read(min(_SKIP_BYTES, count - there))
+            if not chunk:
+                break
+            there += len(chunk)
+        return there
+
+
+@contextmanager
+def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
+    """Open a FITS file, plain or gzipped. Raises HeaderError "empty-file"."""
+    with path.open("rb") as file:
+        start = file.read(2)
+        file.seek(0)
+        if not start:
+            raise HeaderError("empty-file", "expected a FITS file; got an empty file")
+        if start == b"\x1f\x8b":
+            yield _GzipSource(file, limits.max_pixels * 16 + limits.max_hdus * limits.max_header_bytes)
+        else:
+            yield _PlainSource(file)
+
+
+def first_image(source: Source, limits: FitsLimits) -> tuple[Header, int]:
+    """Header and HDU number of the first 2-D image. Raises HeaderError if there is none."""
+    kinds: list[str] = []
+    for header, hdu, kind in walk(source, limits, to_the_end=False):
+        if kind == "image":
+            return header, hdu
+        kinds.append(kind)
+    raise _no_image(kinds)
+
+
+def walk(source: Source, limits: FitsLimits, *, to_the_end: bool) -> Iterator[tuple[Header, int, str]]:
+    """Yield header, number and kind (see `_kind`) of each HDU.
+
+    to_the_end: continue to the end of the file instead of stopping at the first image. Raises HeaderError.
+    """
+    header_bytes = 0
+    for hdu in range(limits.max_hdus):
+        raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=hdu == 0)
+        if raw is None:
+            return
+        header_bytes += len(raw)
+        header = _parse(raw, hdu)
+        kind = _kind(header, hdu)
+        last = kind == "image" and not to_the_end
+        if last:
+            _check_image(header, limits)
+        _pass_data(source, header, hdu, limits, last=last)
+        yield header, hdu, kind
+        if last:
+            return
+    if not to_the_end or source.read(1):
+        message = f"expected at most {limits.max_hdus} HDUs, one of them an image; got more HDUs"
+        raise HeaderError("too-many-hdus", message)
+
+
+def _no_image(kinds: list[str]) -> HeaderError:
+    wanted = "expected a two-dimensional image"
+    if any(kind.startswith("cube") for kind in kinds):
+        axes = next(kind for kind in kinds if kind.startswith("cube")).split()[1]
+        code = "three-axes" if axes == "3" else "not-2d"
+        return HeaderError(code, f"{wanted}; got an image of {axes} axes")
+    if "line" in kinds:
+        return HeaderError("not-2d", f"{wanted}; got an image of one axis")
+    if "table" in kinds:
+        return HeaderError("table-only", f"{wanted}; got only tables ({len(kinds)} HDUs)")
+    return HeaderError("no-image", f"{wanted}; got {len(kinds)} HDUs without data of two axes")
+
+
+def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
+    """The cards before END, in at most `most` bytes; None if the file ends before another header starts."""
+    raw = bytearray()
+    while len(raw) < most:
+        block = source.read(BLOCK_BYTES)
+        if not raw and first:
+            _check_start(block)
+        elif not raw and (len(block) < 8 or not block.startswith(b"XTENSION")):
+            return None  # end of file, or special records or padding after the last HDU
+        end = _find_end(block)
+        raw += block if end is None else block[:end]
+        if end is not None:
+            return bytes(raw)
+        if len(block) < BLOCK_BYTES:
+            message = f"expected an END card; the file stops after {len(raw)} bytes of this header"
+            raise HeaderError("truncated-header", message)
+    message = f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more"
+    raise HeaderError("header-too-long", message)
+
+
+def _find_end(block: bytes) -> int | None:
+    for at in range(0, len(block) - CARD_BYTES + 1, CARD_BYTES):
+        if block[at : at + CARD_BYTES] == END_CARD:
+            return at
+    return None
+
+
+def _check_start(block: bytes) -> None:
+    if block.startswith(b"SIMPLE  ="):
+        return
+    if not block:
+        raise HeaderError("empty-file", "expected a FITS file; got a gzip file with no content")
+    if block.startswith(b"SIMPLE"[: len(block)]) and len(block) < 9:
+        raise HeaderError(
+            "truncated-header", f"expected a FITS header; the file stops after {len(block)} bytes"
+        )
+    got = next((name for start, name in _KNOWN_STARTS if block.startswith(start)), None)
+    if got is None:
+        text = all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in block[:256])
+        got = "a text file" if text else f"bytes {block[:8]!r}"
+    raise HeaderError("not-fits", f"expected a FITS file, which starts with 'SIMPLE  ='; got {got}")
+
+
+def _parse(raw: bytes, hdu: int) -> Header:
+    try:
+        return Header.fromstring(raw)
+    except CARD_TROUBLE as error:
+        raise HeaderError("bad-card", f"expected readable cards in HDU {hdu}; got: {error!s:.100}") from None
+
+
+def _kind(header: Header, hdu: int) -> str:
+    """Kind of an HDU: image, empty, line (one axis), "cube n" (n axes), table or other."""
+    extension = "IMAGE" if hdu == 0 else card_text(header, "XTENSION")
+    if extension == "BINTABLE" and card_flag(header, "ZIMAGE"):
+        return _axes_kind(card_count(header, "ZNAXIS", largest=999))
+    if extension in ("BINTABLE", "TABLE", "A3DTABLE"):
+        return "table"
+    if extension not in ("IMAGE", "IUEIMAGE"):
+        return "other"
+    return _axes_kind(card_count(header, "NAXIS", largest=999))
+
+
+def _axes_kind(axes: int) -> str:
+    return {0: "empty", 1: "line", 2: "image"}.get(axes, f"cube {axes}")
+
+
+def _check_image(header: Header, limits: FitsLimits) -> None:
+    """Raise HeaderError if size, codec or tiles of an image are not allowed."""
+    z = "Z" if card_flag(header, "ZIMAGE") else ""
+    bitpix = card_count(header, f"{z}BITPIX", smallest=-64, largest=64)
+    if bitpix not in _BITPIX:
+        raise HeaderError("bad-card", f"expected {z}BITPIX of {_BITPIX}; got {bitpix}")
+    nx, ny = (card_count(header, f"{z}NAXIS{axis}") for axis in (1, 2))
+    if nx == 0 or ny == 0:
+        raise HeaderError("zero-size", f"expected at least one pixel on each axis; got {nx} x {ny}")
+    if nx * ny > limits.max_pixels:
+        message = f"expected at most {limits.max_pixels} pixels; got {nx} x {ny} = {nx * ny}"
+        raise HeaderError("too-many-pixels", message)
+    if z:
+        _check_tiles(header, nx, ny, limits)
+
+
+def _check_tiles(header: Header, nx: int, ny: int, limits: FitsLimits) -> None:
+    codec = card_text(header, "ZCMPTYPE")
+    if codec not in ALLOWED_CODECS:
+        wanted = ", ".join(ALLOWED_CODECS)
+        raise HeaderError("codec-not-allowed", f"expected compression by one of {wanted}; got {codec}")
+    tile_x = card_count(header, "ZTILE1", default=nx)
+    tile_y = card_count(header, "ZTILE2", default=1)
+    if not 1 <= tile_x * tile_y <= limits.max_pixels:
+        message = f"expected tiles of 1 to {limits.max_pixels} pixels; got {tile_x} x {tile_y}"
+        raise HeaderError("bad-tiles", message)
+    tiles = math.prod(-(-n // tile) for n, tile in ((nx, tile_x), (ny, tile_y)))
+    rows = card_count(header, "NAXIS2")
+    if rows != tiles:
+        message = f"expected one table row per tile, {tiles} rows for {nx} x {ny} pixels; got {rows}"
+        raise HeaderError("bad-tiles", message)
+
+
+def _pass_data(source: Source, header: Header, hdu: int, limits: FitsLimits, *, last: bool) -> None:
+    size = _data_bytes(header, hdu)
+    if source.gzipped and size > limits.max_pixels * 16:
+        message = (
+            f"expected at most {limits.max_pixels * 16} bytes of data in an HDU; HDU {hdu} declares {size}"
+        )
+        raise HeaderError("too-many-bytes", message)
+    there = source.skip(size)
+    if there < size:
+        message = f"expected {size} bytes of data in HDU {hdu}, as its header declares; got {there}"
+        raise HeaderError("truncated-data", message)
+    if not last:
+        source.skip(-size % BLOCK_BYTES)
+
+
+def _data_bytes(header: Header, hdu: int) -> int:
+    """Declared size of the data, FITS standard Eq. (2): |BITPIX| / 8 * GCOUNT * (PCOUNT + prod NAXISn)."""
+    bitpix = card_count(header, "BITPIX", smallest=-64, largest=64)
+    if bitpix not in _BITPIX:
+        raise HeaderError("bad-card", f"expected BITPIX of {_BITPIX} in HDU {hdu}; got {bitpix}")
+    axes = card_count(header, "NAXIS", largest=999)
+    if axes == 0:
+        return 0
+    if hdu == 0 and card_flag(header, "GROUPS"):
+        raise HeaderError("random-groups", "expected an image; got random groups (GROUPS = T)")
+    elements = math.prod(card_count(header, f"NAXIS{axis}") for axis in range(1, axes + 1))
+    groups, extra = card_count(header, "GCOUNT", default=1), card_count(header, "PCOUNT", default=0)
+    size = abs(bitpix) // 8 * groups * (extra + elements)
+    if size > _LARGEST_COUNT:
+        raise HeaderError(
+            "bad-card", f"expected a possible data size in HDU {hdu}; its header declares {size:.3g} bytes"
+        )
+    return size
+
+
+def _value(header: Header, key: str) -> object:
+    """Value of a structural card, or None; HeaderError if the card is unreadable or occurs twice."""
+    try:
+        if header.count(key) > 1:
+            raise HeaderError("bad-card", f"expected card {key} once; got it {header.count(key)} times")
+        return header[key]
+    except KeyError:
+        return None
+    except HeaderError:
+        raise
+    except CARD_TROUBLE:
+        raise HeaderError("bad-card", f"expected a readable card {key}; its value cannot be read") from None
+
+
+def card_count(
+    header: Header, key: str, *, smallest: int = 0, largest: int = _LARGEST_COUNT, default: int | None = None
+) -> int:
+    """Whole number of a structural card. Raises HeaderError "bad-card" if it is missing or out of range."""
+    value = _value(header, key)
+    if value is None and default is not None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, int) or not smallest <= value <= largest:
+        raise HeaderError(
+            "bad-card", f"expected {key} = integer from {smallest} to {largest}; got {value!r:.40}"
+        )
+    return value
+
+
+def card_flag(header: Header, key: str) -> bool:
+    """Whether a structural card is T."""
+    return _value(header, key) is True
+
+
+def card_text(header: Header, key: str) -> str | None:
+    """Text of a structural card, stripped; None if it is missing or no text."""
+    value = _value(header, key)
+    return value.strip() if isinstance(value, str) else None

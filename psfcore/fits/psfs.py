@@ -1,0 +1,171 @@
+"""Reading and writing point-spread functions (PSFs) as FITS files.
+
+In memory, weights are float64 [y, x]. Files written here hold float32; equal content gives equal bytes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.fits.hdus import PIXEL_TROUBLE, ascii_text, read_pixels, write_hdus
+from psfcore.fits.header import FitsLimits, check_all_headers, optional_text, plate_scale_arcsec, read_summary
+from psfcore.psf import (
+    FittedShape,
+    Psf,
+    cumulative_curve,
+    encircled_energy,
+    radial_profile,
+)
+
+
+def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = None) -> None:
+    """Write a PSF: the kernel in the primary HDU, one image HDU per component, and tables.
+
+    Tables: PROFILE (weight by radius), FIT (the fitted shape, if any) and INSTRUMENT. Weights are float32; this
+    rounds each by 6e-8 at most and changes the sum by less than 1e-7.
+    instrument_file: the TOML text that the PSF was built from, stored unchanged.
+    """
+    hdus: list[Any] = [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))]
+    for name, kernel in psf.components.items():
+        component = fits.ImageHDU(kernel.astype(np.float32), name=ascii_text(name).upper())
+        component.header["PSFSUM"] = (float(kernel.sum()), "sum of weights on this array")
+        hdus.append(component)
+    hdus.append(_profile_hdu(psf))
+    if psf.fitted is not None:
+        hdus.append(_fitted_hdu(psf.fitted))
+    if instrument_file is not None:
+        hdus.append(_instrument_hdu(instrument_file))
+    write_hdus(path, hdus)
+
+
+def _psf_header(psf: Psf) -> fits.Header:
+    header = fits.Header()
+    header["PSFNAME"] = (ascii_text(psf.name), "name of this point-spread function")
+    header["PSFVERS"] = (ascii_text(psf.version), "its version")
+    header["PSFSTAT"] = (ascii_text(psf.status), "draft or released")
+    header["PSFSUM"] = (psf.total, "sum of weights on this array")
+    header["REACH"] = (psf.reach_px, "[pixel] farthest pixel from the centre")
+    if psf.instrument is not None:
+        header["INSTRUME"] = (ascii_text(psf.instrument), "instrument description")
+    if psf.wavelength_angstrom is not None:
+        header["WAVELNTH"] = (psf.wavelength_angstrom, "[Angstrom] wavelength")
+    for axis, size in ((1, psf.kernel.shape[1]), (2, psf.kernel.shape[0])):
+        header[f"CRPIX{axis}"] = (size // 2 + 1.0, "[pixel] centre, counted from 1")
+        if psf.plate_scale_arcsec is not None:
+            header[f"CDELT{axis}"] = (psf.plate_scale_arcsec, "[arcsec] pixel scale")
+            header[f"CUNIT{axis}"] = "arcsec"
+    for key, value in psf.provenance.items():
+        if key != "instrument_toml":
+            header.add_history(ascii_text(f"{key}: {value}"))
+    return header
+
+
+def _profile_hdu(psf: Psf) -> fits.BinTableHDU:
+    """Mean weight and encircled energy by radius, of the total PSF and of each component."""
+    radius, weight = radial_profile(psf.kernel)
+    columns = [
+        fits.Column(name="radius_px", format="D", unit="pixel", array=radius),
+        fits.Column(name="mean_weight", format="D", array=weight),
+        fits.Column(name="encircled", format="D", array=encircled_energy(psf.kernel, radius)),
+        fits.Column(name="cumulative_pct", format="D", unit="%", array=cumulative_curve(psf.kernel, radius)),
+    ]
+    for name, kernel in psf.components.items():
+        if kernel.shape == psf.kernel.shape:
+            label = ascii_text(name).lower()
+            profile, within = radial_profile(kernel)[1], encircled_energy(kernel, radius)
+            columns.append(fits.Column(name=f"{label}_mean_weight", format="D", array=profile))
+            columns.append(fits.Column(name=f"{label}_encircled", format="D", array=within))
+    return fits.BinTableHDU.from_columns(columns, name="PROFILE")
+
+
+def _fitted_hdu(fitted: FittedShape) -> fits.BinTableHDU:
+    """One row per parameter: name, fitted coordinate, and its row of the covariance matrix."""
+    count = len(fitted.parameters)
+    columns = [
+        fits.Column(name="parameter", format="16A", array=np.array(fitted.parameters)),
+        fits.Column(name="coordinate", format="D", array=np.array(fitted.coordinates)),
+        fits.Column(name="covariance", format=f"{count}D", array=np.array(fitted.covariance)),
+    ]
+    hdu = fits.BinTableHDU.from_columns(columns, name="FIT")
+    hdu.header["SHAPE"] = (ascii_text(fitted.shape), "formula that SCATTER was fitted with")
+    return hdu
+
+
+def _read_fitted(hdu: fits.BinTableHDU) -> FittedShape:
+    table = hdu.data
+    return FittedShape(
+        shape=str(hdu.header["SHAPE"]),
+        parameters=tuple(str(name) for name in table["parameter"]),
+        coordinates=tuple(float(value) for value in table["coordinate"]),
+        covariance=tuple(
+            tuple(float(value) for value in row)
+            for row in np.atleast_2d(table["covariance"]).reshape(len(table), -1)
+        ),
+    )
+
+
+def _instrument_hdu(text: bytes) -> fits.BinTableHDU:
+    values = np.frombuffer(text, dtype=np.uint8)[None]
+    column = fits.Column(name="TOML", format=f"{values.size}B", array=values)
+    return fits.BinTableHDU.from_columns([column], name="INSTRUMENT")
+
+
+def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf:
+    """Read a PSF from the first 2-D image of a file, and its metadata from the header.
+
+    Weights are not changed; the centre is at [n // 2, n // 2]. Without a card PSFNAME, the PSF is named after the
+    file. parts: also read the components, the instrument description and the fitted shape of a file that
+    `write_psf` wrote; a convolution does not need them. Raises HeaderError; DataError "unreadable-pixels" and the
+    errors of `Psf` ("psf-not-centred", "psf-sum", ...).
+    """
+    summary = read_summary(path, limits)
+    kernel, header = read_pixels(path, summary)
+    own = "PSFNAME" in header
+    components, provenance, fitted = (
+        _read_extras(path, limits, kernel.shape) if own and parts else ({}, {}, None)
+    )
+    return Psf(
+        kernel=kernel,
+        name=optional_text(header, "PSFNAME") or Path(path).name.split(".")[0],
+        version=optional_text(header, "PSFVERS") or "unversioned",
+        instrument=optional_text(header, "INSTRUME") if own else summary.instrument,
+        status=optional_text(header, "PSFSTAT") or "user",
+        plate_scale_arcsec=plate_scale_arcsec(header),
+        wavelength_angstrom=summary.wavelnth,
+        components=components,
+        provenance={"file": Path(path).name, **provenance},
+        fitted=fitted,
+    )
+
+
+def _read_extras(
+    path: str | Path, limits: FitsLimits, shape: tuple[int, ...]
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any], FittedShape | None]:
+    """Components, provenance and fitted shape of a file that `write_psf` wrote."""
+    fitted: FittedShape | None = None
+    components: dict[str, NDArray[np.float64]] = {}
+    provenance: dict[str, Any] = {}
+    # Any file can carry a card PSFNAME. The size limits therefore hold for its other HDUs too, and HDUs that
+    # write_psf never writes (compressed components, other shapes) are ignored.
+    check_all_headers(path, limits)
+    try:
+        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+            provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
+            for hdu in hdus[1:]:
+                if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
+                    components[hdu.name] = np.array(hdu.data, dtype=np.float64)
+                elif hdu.name == "INSTRUMENT":
+                    text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
+                    provenance["instrument_toml"] = text.decode("utf-8")
+                elif hdu.name == "FIT":
+                    fitted = _read_fitted(hdu)
+    except PIXEL_TROUBLE as error:
+        message = f"expected readable extensions in {Path(path).name}; got: {error!s:.120}"
+        raise DataError("unreadable-pixels", message) from None
+    return components, provenance, fitted

@@ -1,0 +1,94 @@
+"""PSF files: a written PSF is read back unchanged, and files of other programs are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.instruments.files import instrument_path
+from psfcore.psf import Psf
+from tests.psfcore.conftest import delta, gaussian, make_psf
+
+Find = Callable[[str], Path]
+
+
+def save(path: Path, data: NDArray[np.generic]) -> Path:
+    fits.PrimaryHDU(data).writeto(path)
+    return path
+
+
+def full_psf() -> Psf:
+    return make_psf(
+        0.9 * gaussian(64, 2.0),
+        name="mine",
+        version="3",
+        status="draft",
+        instrument="hri_euv",
+        plate_scale_arcsec=0.492,
+        wavelength_angstrom=174.0,
+        components={"DIFFRACTION": gaussian(64, 1.0), "SCATTER": delta(64)},
+        provenance={"why": "test"},
+    )
+
+
+def test_a_psf_is_read_back_complete(tmp_path: Path, limits: FitsLimits) -> None:
+    toml = instrument_path("hri_euv").read_bytes()
+    psf = full_psf()
+    for name in ("a.fits", "b.fits"):
+        write_psf(tmp_path / name, psf, instrument_file=toml)
+    assert (tmp_path / "a.fits").read_bytes() == (tmp_path / "b.fits").read_bytes()
+    back = read_psf(tmp_path / "a.fits", limits)
+    assert (back.name, back.version, back.status, back.instrument) == ("mine", "3", "draft", "hri_euv")
+    assert (back.plate_scale_arcsec, back.wavelength_angstrom) == (0.492, 174.0)
+    np.testing.assert_array_equal(back.kernel, psf.kernel.astype(np.float32))
+    assert list(back.components) == ["DIFFRACTION", "SCATTER"]
+    assert back.provenance["instrument_toml"].encode() == toml
+    assert "why: test" in back.provenance["history"]
+    assert read_summary(tmp_path / "a.fits", limits).shape == (64, 64)
+    with fits.open(tmp_path / "a.fits", checksum=True) as hdus:
+        assert all(hdu.verify_checksum() == 1 for hdu in hdus)
+        assert hdus["PROFILE"].data["cumulative_pct"][-1] == pytest.approx(10.0, abs=1e-3)
+        assert hdus["PROFILE"].data["encircled"][-1] == pytest.approx(0.9)
+        assert hdus["PROFILE"].data["scatter_encircled"][0] == pytest.approx(1.0)
+        weight = hdus["PROFILE"].data["diffraction_mean_weight"]
+        assert weight[0] == pytest.approx(gaussian(64, 1.0)[32, 32])
+        assert hdus[0].header["PSFSUM"] == pytest.approx(0.9)
+
+
+def test_single_precision_keeps_the_sum_of_the_full_psf(
+    tmp_path: Path, limits: FitsLimits, hri_psf: Psf
+) -> None:
+    write_psf(tmp_path / "p.fits", hri_psf)
+    assert read_psf(tmp_path / "p.fits", limits).total == pytest.approx(1.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("shape", [(31, 31), (32, 32), (33, 48)])
+def test_a_psf_of_another_program_is_named_after_its_file(
+    tmp_path: Path, limits: FitsLimits, shape: tuple[int, int]
+) -> None:
+    kernel = np.full(shape, 1e-6)
+    kernel[shape[0] // 2, shape[1] // 2] = 0.9
+    psf = read_psf(save(tmp_path / "other_psf.v2.fits", kernel), limits)
+    assert (psf.name, psf.status, psf.instrument, psf.plate_scale_arcsec) == ("other_psf", "user", None, None)
+
+
+def test_a_psf_with_its_peak_in_the_corner_says_so(tmp_path: Path, limits: FitsLimits) -> None:
+    path = save(tmp_path / "corner.fits", np.fft.ifftshift(gaussian(32, 1.0)))
+    with pytest.raises(DataError, match="corner origin") as caught:
+        read_psf(path, limits)
+    assert caught.value.code == "psf-not-centred"
+
+
+def test_a_real_psf_of_another_program(real: Find, limits: FitsLimits) -> None:
+    psf = read_psf(real("psf/derived_aia171_psf_aiapy0.10.2.fits"), limits)
+    assert psf.kernel.shape == (4096, 4096)
+    assert psf.total == pytest.approx(1, abs=1e-6)
+    assert psf.wavelength_angstrom == 171
