@@ -31,7 +31,7 @@ from psfcore.diffraction.airy import airy_kernel
 from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, rotated_mesh_kernel
 from psfcore.diffraction.pupil import Pupil, entrance_pupil
-from psfcore.instruments.model import Instrument, Line, Mesh
+from psfcore.instruments.model import Instrument, Mesh, SpectralLine
 
 MOST_SAMPLES = 32
 PERIOD_PX = 4096  # of the transform: light wraps round it, not round the 2048 px that are kept
@@ -78,7 +78,7 @@ def route_of(instrument: Instrument) -> Route:
             focal_length_mm=instrument.focal_length_mm,
             pixel_pitch_um=instrument.detector.pixel_pitch_um,
         )
-        for line in instrument.lines
+        for line in instrument.spectral_lines
     )
     mask = samples <= MOST_SAMPLES
     plain = all(mesh.share == 1 and mesh.angle_deg % 90 == 0 for mesh in _meshes(instrument, "entrance"))
@@ -127,7 +127,7 @@ def diffraction_patterns(
     """The wanted parts on (size, size), lines of the bandpass added by weight, not normalised."""
     needed = needed_parts(instrument, wanted)
     made = Patterns(notes={"entrance_route": str(route_of(instrument))})
-    lines = instrument.lines
+    lines = instrument.spectral_lines
     steps = len(needed) * STEPS_A_PUPIL
     for index, line in enumerate(lines):
         work = _OneLine(instrument, line, size, mount_image, threads, made.notes)
@@ -157,7 +157,7 @@ class _OneLine:
     def __init__(
         self,
         instrument: Instrument,
-        line: Line,
+        line: SpectralLine,
         size: int,
         mount_image: NDArray[np.floating] | None,
         threads: int,
