@@ -60,7 +60,9 @@ class Aperture(_Frozen):
     @model_validator(mode="after")
     def _ring(self) -> Aperture:
         if self.obscuration_diameter_mm >= self.diameter_mm:
-            raise ValueError(f"obscuration_diameter_mm must be less than diameter_mm, {self.diameter_mm}")
+            raise ValueError(
+                f"obscuration_diameter_mm ({self.obscuration_diameter_mm}) must be less than diameter_mm ({self.diameter_mm})"
+            )
         return self
 
 
@@ -108,7 +110,7 @@ class Mesh(_Frozen):
     @model_validator(mode="after")
     def _wire_fits(self) -> Mesh:
         if self.wire_um >= self.pitch_um:
-            raise ValueError(f"wire_um must be less than pitch_um, {self.pitch_um}")
+            raise ValueError(f"wire_um ({self.wire_um}) must be less than pitch_um ({self.pitch_um})")
         return self
 
 
