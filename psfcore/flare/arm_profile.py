@@ -242,7 +242,7 @@ def fit_flare(
     if not level > 0:
         raise DataError(
             "flare-no-light",
-            f"expected an image brighter than the one before at {matched_px[0]:g} to {matched_px[1]:g} px along the arm; "
+            f"expected light of the flare at {matched_px[0]:g} to {matched_px[1]:g} px along the arm; "
             f"got a mean difference of {level:.3g} over {int(matched.sum())} distances",
         )
     error = profile.sigma if profile.sigma is not None else _percent_error(observed, level)
