@@ -1,13 +1,14 @@
-"""A PSF from an instrument description.
+"""Computes a PSF from an instrument description.
 
 Hofmeister et al., The point-spread function of HRI_EUV, sections "Implementation" and "The combined PSF":
-the pupil's and the meshes' patterns are convolved with each other, the result with the diffuse scatter.
+the diffraction patterns of the pupil and of the meshes are convolved with each other, and the result with the
+diffuse scatter.
 
-Light is counted over the full reach, a grid of 2048 px, on which every kernel sums to 1. Each is computed on
-that grid and cut to the size asked for. Where more is asked for, to 4096 px, it is computed on 4096 px and
-scaled so that its inner 2048 px sum to 1: further pixels hold what falls beyond, and the whole sums to more.
-The inner 2048 px then equal those of the smaller PSF but for light that comes back into them, in a convolution,
-from beyond: 1e-5 of the light in all for HRI_EUV's diffraction.
+Light is counted over the full reach, a grid of 2048 px, on which every kernel sums to 1. Each kernel is computed on
+that grid and cut to the requested size. For a larger size, up to 4096 px, it is computed on 4096 px and scaled so
+that its inner 2048 px sum to 1: the outer pixels hold the light beyond the full reach, and the sum exceeds 1.
+The inner 2048 px then equal those of the smaller PSF except for light that a convolution brings back from
+beyond: 1e-5 of all light for the diffraction of HRI_EUV.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ def build_psf(
     progress: Progress | None = None,
     threads: int = 1,
 ) -> Psf:
-    """PSF of `instrument` on (size, size), an even size of 64 to 4096 px: the total, with its components.
+    """The PSF of `instrument` on (size, size), an even size of 64 to 4096 px: the total PSF with its components.
 
-    component: one of component_names() alone, as the kernel of a PSF without components.
-    mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see instruments.mask_file).
-    progress is told (step, steps), and ends the work by raising.
+    component: build only this one of component_names(); the result is a PSF without components.
+    mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see fits.mask_file).
+    progress: called with (step, steps); it may raise to stop the work.
     Raises DataError "bad-size", "unknown-component", "bad-mount".
     """
     _check_size(size)
@@ -58,7 +59,7 @@ def build_psf(
         wanted=names,
         mount_image=mount_image,
         threads=threads,
-        progress=_with_last_step(progress),
+        progress=_nine_tenths_of(progress),
     )
     provenance = _provenance(instrument, patterns.notes)
     kernels: dict[str, Kernel] = {}
@@ -93,12 +94,12 @@ def build_psf(
 
 
 def component_names(instrument: Instrument) -> tuple[str, ...]:
-    """The components that a PSF of this instrument has."""
+    """The components of a PSF of this instrument."""
     return available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
 
 
-def _with_last_step(progress: Progress | None) -> Progress:
-    """Diffraction's steps as nine tenths of the whole."""
+def _nine_tenths_of(progress: Progress | None) -> Progress:
+    """Report the steps of diffraction as the first nine tenths of the work."""
 
     def report(done: int, of: int) -> None:
         if progress is not None:
@@ -108,8 +109,8 @@ def _with_last_step(progress: Progress | None) -> Progress:
 
 
 def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
-    """Weights >= 0 that sum to 1 on the full reach, and the share of the light that had fallen past it."""
-    positive = np.maximum(kernel, 0.0)  # transforms leave +-1e-17 where there is no light
+    """Weights >= 0 that sum to 1 on the full reach, and the share of the light that was beyond it."""
+    positive = np.maximum(kernel, 0.0)  # Fourier transforms leave +-1e-17 where there is no light
     inner = float(crop_centred(positive, (REACH_GRID_PX, REACH_GRID_PX)).sum())
     return positive / inner, 1 - inner
 
@@ -120,7 +121,7 @@ def _provenance(instrument: Instrument, notes: dict[str, Any]) -> dict[str, Any]
     about: dict[str, Any] = {
         "model": model if law is None else f"{model}, and with a softened power law",
         "mount_basis": "none" if mount is None else mount.basis,
-        "lines": [[line.wavelength_angstrom, line.weight] for line in instrument.lines],
+        "lines": [[line.wavelength_angstrom, line.weight] for line in instrument.spectral_lines],
         "past_reach": {},
         **notes,
     }

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from psfcore.errors import DataError
+from psfcore.plate_scale import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
 
 REACH_GRID_PX = 2048
 LARGEST_SUM = 1 + 1e-3
 SMALLEST_SUM = 0.05
-PLATE_SCALE_TOLERANCE = 0.01
-CENTRE_TOLERANCE = 1e-3  # of the largest weight: pixels that share the peak differ by rounding
+CENTRE_TOLERANCE = 1e-3  # of the largest weight: pixels that share the peak may differ by rounding
 
 Kernel = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""A page of HTML as a test sees it: its tags, its text, and whether it stands by itself."""
+"""Reads an HTML page for tests: its tags and texts, and whether it needs anything from elsewhere."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from html.parser import HTMLParser
 
 VOID = {"meta", "link", "img", "br", "hr", "input"}
-ASKING = ("src", "href", "srcset", "action", "data", "poster")  # attributes that may name something elsewhere
+LOADING = ("src", "href", "srcset", "action", "data", "poster")  # attributes that can load another file
 
 
 @dataclass(eq=False)
 class Tag:
-    """A tag, the tags that it stands in, and the text below it."""
+    """A tag, the tags around it, and the text inside it."""
 
     name: str
     attributes: dict[str, str]
@@ -20,7 +20,7 @@ class Tag:
 
     @property
     def text(self) -> str:
-        """All text below it."""
+        """All text inside it."""
         return "".join(self.words).strip()
 
 
@@ -46,7 +46,7 @@ class _Reader(HTMLParser):
 
 
 def read_page(html: str) -> list[Tag]:
-    """The tags of a page in their order; tags that are not closed, or in the wrong order, fail."""
+    """The tags of a page in order; fails if a tag is not closed, or closed in the wrong order."""
     reader = _Reader()
     reader.feed(html)
     reader.close()
@@ -55,7 +55,7 @@ def read_page(html: str) -> list[Tag]:
 
 
 def check_stands_alone(html: str) -> None:
-    """Nothing is asked for from elsewhere, nothing runs, and every picture has words."""
+    """Check that the page loads nothing, runs no script, and describes every figure in words."""
     tags = read_page(html)
     assert html.lstrip().lower().startswith("<!doctype html>")
     assert next(t for t in tags if t.name == "html").attributes["lang"] == "en"
@@ -64,7 +64,7 @@ def check_stands_alone(html: str) -> None:
     assert any(t.attributes.get("rel") == "icon" for t in tags if t.name == "link")
     for tag in tags:
         assert not [name for name in tag.attributes if name.startswith("on")], tag.name
-        for name in ASKING:
+        for name in LOADING:
             assert tag.attributes.get(name, "#").startswith(("data:image/", "#")), tag.attributes[name][:80]
     assert "@import" not in html and "url(" not in html
     for image in (t for t in tags if t.name == "img"):

@@ -1,4 +1,4 @@
-"""A small PSF with diffraction arms and scatter, and a flare seen through it whose core is saturated."""
+"""A small PSF with diffraction arms and scatter, and images of a flare with a saturated core made with it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Plane = NDArray[np.float64]
 
 @cache
 def flare_psf(c: float = 2.53) -> Psf:
-    """Orders 6 px apart on both axes, and a power law of exponent c."""
+    """A PSF with orders 6 px apart on both axes, and a power law of exponent c."""
     orders = np.zeros((KERNEL, KERNEL))
     middle = KERNEL // 2
     for k in range(1, 20):
@@ -52,7 +52,7 @@ def flare_psf(c: float = 2.53) -> Psf:
 
 
 def flare_light(seed: int, light: float = LIGHT) -> Plane:
-    """A flare of uneven light on 5 x 5 px, before the PSF."""
+    """The scene of a flare: uneven light on 5 x 5 px."""
     out = np.zeros((SIZE, SIZE))
     uneven = np.random.default_rng(seed).gamma(0.7, 1.0, (5, 5))
     uneven[2, 2] += 8
@@ -66,20 +66,20 @@ def quiet_sun() -> Plane:
     return np.asarray(QUIET * (1 + 0.3 * np.sin(x / 17) * np.cos(y / 23)))
 
 
-def seen(scene: Plane, seed: int | None) -> Plane:
-    """Through the PSF; with noise unless seed is none."""
+def observed(scene: Plane, seed: int | None) -> Plane:
+    """The scene convolved with the PSF; with noise unless seed is None."""
     clean = np.maximum(Convolver(flare_psf().kernel, (SIZE, SIZE), dtype=np.float64).apply(scene), 0)
     return clean if seed is None else NOISE.observe(clean, 1.0, np.random.default_rng(seed))
 
 
 def pair(seed: int) -> tuple[Plane, Plane]:
-    """The flaring image, clipped where it saturates, and the one before."""
-    flaring = seen(quiet_sun() + flare_light(seed), 100 + seed)
-    return np.minimum(flaring, SATURATION), seen(quiet_sun(), 200 + seed)
+    """The image of the flare, clipped at saturation, and the image before."""
+    flaring = observed(quiet_sun() + flare_light(seed), 100 + seed)
+    return np.minimum(flaring, SATURATION), observed(quiet_sun(), 200 + seed)
 
 
 def write_flare(folder: Path, seed: int = 0) -> dict[str, Path]:
-    """Files flare, before and psf."""
+    """Write the files flare, before and psf into the folder; return their paths."""
     paths = {name: folder / f"{name}.fits" for name in ("flare", "before", "psf")}
     header = fits.Header({"BUNIT": "DN", "XPOSURE": 1.0})
     for name, pixels in zip(("flare", "before"), pair(seed), strict=True):

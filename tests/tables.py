@@ -1,4 +1,7 @@
-"""A database with this version's tables, made once and copied: the revisions themselves have tests of their own."""
+"""A database with the tables of this version, made once and copied.
+
+This saves time: the database revisions have their own tests.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ RUN_REVISIONS = Schema.upgrade
 
 @contextmanager
 def copied_tables(folder: Path) -> Iterator[None]:
-    """While it lasts, a SQLite database that this process is to make starts as a copy of one in ``folder``."""
+    """While this context is active, a new SQLite database of this process starts as a copy of one in ``folder``."""
     made, one_at_a_time = folder / "made.sqlite", threading.Lock()
 
     def upgrade(schema: Schema) -> None:
@@ -28,7 +31,7 @@ def copied_tables(folder: Path) -> Iterator[None]:
                 if not made.exists():
                     first = Catalogue(f"sqlite:///{made}")
                     RUN_REVISIONS(first.schema)
-                    first.close()  # with it goes the write-ahead log: the file is all there is
+                    first.close()  # this merges the write-ahead log into the file, so the file is complete
                 target = Path(str(database))
                 if not target.exists() and target.parent.is_dir():
                     partial = target.with_suffix(".partial")

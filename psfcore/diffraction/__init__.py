@@ -1,1 +1,1 @@
-"""Diffraction by what stands in the beam."""
+"""Diffraction by the entrance pupil, its mount and the filter meshes."""

@@ -1,14 +1,14 @@
 """Diffraction by an open disc or ring, integrated over detector pixels.
 
 The Airy pattern (Goodman, Introduction to Fourier Optics, section "Fresnel and Fraunhofer diffraction"), with
-e the obscured share of the diameter and v = pi D r / (lambda f):
+e the obscured fraction of the diameter and v = pi D r / (lambda f):
 
     U(v) = (2 J1(v) / v - e^2 2 J1(e v) / (e v)) / (1 - e^2)                                     Eq. (1)
     dB/dv = -(1 - e^2) v U(v)^2 / 2;   for a disc B = J0(v)^2 + J1(v)^2                          Eq. (2)
 
-B(r) is the share of the light beyond r. The pattern is the divergence of the field -B / (2 pi r) in the
-direction of r, so that the light in a pixel is a flux through its four edges, of a function that is smooth
-where the pattern itself goes through hundreds of rings:
+B(r) is the share of the light beyond r (1 - encircled energy). The pattern is the divergence of the radial field
+-B / (2 pi r), so the light in a pixel is a flux through its four edges. The integrand of this flux is smooth, while
+the pattern itself has hundreds of rings:
 
     light in a pixel = [1 in the central one] - outward flux of B / (2 pi r)                      Eq. (3)
 
@@ -18,7 +18,7 @@ where the pattern itself goes through hundreds of rings:
 | lambda | wavelength_angstrom | Angstrom |
 | f | focal_length_mm | mm |
 | v | v, pi times radius over lambda f / D | - |
-| B | light_beyond | - |
+| B | airy_light_beyond | - |
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from psfcore.compiled import compiled
 
 _MM_PER_ANGSTROM = 1e-7
 _UM_PER_MM = 1e3
-_TABLE_STEP = 0.02  # of v: B changes over about 1
+_TABLE_STEP = 0.02  # in v; B changes on a scale of about 1
 NEAR_PX = 24
-NEAR_POINTS, FAR_POINTS = 48, 16  # of the edge integral, within NEAR_PX of an axis and beyond
+NEAR_POINTS, FAR_POINTS = 48, 16  # of the integral along an edge, within NEAR_PX of an axis and farther out
 
 
-def light_beyond(v: NDArray[np.float64], obscured: float = 0.0) -> NDArray[np.float64]:
-    """B of Eq. (2) at ascending, evenly spaced v from 0; `obscured` is e."""
+def airy_light_beyond(v: NDArray[np.float64], obscured: float = 0.0) -> NDArray[np.float64]:
+    """B of Eq. (2) at v, which must ascend from 0 in equal steps; `obscured` is e."""
     if obscured == 0:
         return np.asarray(j0(v) ** 2 + j1(v) ** 2)
     amplitude = (_jinc(v) - obscured**2 * _jinc(obscured * v)) / (1 - obscured**2)  # Eq. (1)
@@ -63,7 +63,7 @@ def airy_kernel(
 ) -> NDArray[np.float64]:
     """Share of all light in each of (size, size) pixels, size even, centre at [size // 2, size // 2].
 
-    Not normalised: the sum lacks the light beyond the grid.
+    It is not normalised: the light beyond the grid is missing from the sum.
     """
     resolved_px = (
         wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / diameter_mm * _UM_PER_MM / pixel_pitch_um
@@ -71,7 +71,7 @@ def airy_kernel(
     half = size // 2
     v_per_px = math.pi / resolved_px
     v = np.arange(0, v_per_px * (half + 1) * math.sqrt(2) + 2 * _TABLE_STEP, _TABLE_STEP)
-    table = light_beyond(v, obscuration_diameter_mm / diameter_mm)
+    table = airy_light_beyond(v, obscuration_diameter_mm / diameter_mm)
     near, far = (np.polynomial.legendre.leggauss(points) for points in (NEAR_POINTS, FAR_POINTS))
     flux = _edge_fluxes(table, v_per_px / _TABLE_STEP, half, near, far)
     out_x = np.diff(flux, axis=0, prepend=-flux[:1])[: half + 1]  # right edge less left edge
@@ -93,7 +93,7 @@ def _edge_fluxes(table, steps_per_px, half, near, far):  # type: ignore[no-untyp
     for i in range(half + 1):
         x = i + 0.5
         for k in range(half + 1):
-            # Steep near the axes, where the rings run along the edges.
+            # Near the axes the rings are almost parallel to the edges, so the integrand varies fast.
             places, weights = near if min(i, k) < NEAR_PX else far
             total = 0.0
             for g in range(len(places)):

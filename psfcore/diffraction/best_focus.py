@@ -1,15 +1,15 @@
-"""The mirror separation that focuses a telescope on its detector.
+"""The separation of the mirrors that focuses a telescope on its detector.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The instrument", prints radii and distances
-that do not close: with them the detector is far out of focus. The separation of the mirrors is solved for,
-since the secondary magnifies its error most; everything else stays as printed, and the shift is reported.
+Hofmeister et al., The point-spread function of HRI_EUV, section "The instrument", prints radii and distances that
+are not consistent: with them the detector is far out of focus. This module solves for the separation of the mirrors,
+because the secondary magnifies its error most. All other values stay as printed, and the result states the shift.
 
 Rays near the axis meet on the detector where y(L) = 0 in Eq. (1) of light_path:
 
     s = f1 - L / (1 - L / f2)                                                                      Eq. (1)
 
-The search starts there. Best focus is where the wave through the open aperture, without meshes, is most
-intense on the axis; the detector's pixels are too coarse to tell it as sharply.
+The search starts there. Best focus is the separation at which the wave through the open aperture, without meshes,
+has the largest intensity on the axis; the pixels of the detector are too coarse to show it as precisely.
 
 | symbol | name | unit |
 |---|---|---|
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from psfcore.diffraction.fresnel import FresnelStep, Grid, Line, Wave, binned_light
+from psfcore.diffraction.fresnel import FresnelStep, Grid, Vector, Wave, binned_light
 from psfcore.diffraction.light_path import MM_PER_UM, REACH_PX, SAMPLES_PER_PIXEL, LightPath, focal_mm
 from psfcore.errors import DataError
 
@@ -36,10 +36,10 @@ HIGHEST_ORDER = 15
 
 @dataclass(frozen=True)
 class BestFocus:
-    """What was done to focus a telescope, and what it gave.
+    """The separation of best focus, and what follows from it.
 
-    printed_blur_px: width of a point's geometric image with the printed separation.
-    beyond_central_pixel_*: share of the open aperture's light, without meshes, in one dimension.
+    printed_blur_px: width of the geometric image of a point with the printed separation.
+    beyond_central_pixel_*: share of the open aperture's light outside the central pixel, without meshes, in one dimension.
     order_spacing_px: measured in the focused image through the entrance mesh, over 2 x `orders` orders.
     """
 
@@ -59,7 +59,7 @@ class BestFocus:
 
 
 class _WithoutWheel:
-    """Waves from aperture to detector that meet no mesh in the filter wheel."""
+    """Waves from the aperture to the detector without the mesh of the filter wheel."""
 
     def __init__(self, path: LightPath) -> None:
         self.path = path
@@ -70,10 +70,10 @@ class _WithoutWheel:
         self._step = FresnelStep(
             self._secondary, self.detector, wavelength_mm=path.wavelength_mm, distance_mm=length_mm
         )
-        # Eq. (1) of fresnel for x2 = 0 is a plain sum
+        # for x2 = 0, Eq. (1) of fresnel is a plain sum
         self._to_axis = np.exp(1j * np.pi / path.wavelength_mm / length_mm * self._secondary.x_mm**2)
 
-    def at_primary(self, openings_mm: Line) -> Wave:
+    def at_primary(self, openings_mm: Vector) -> Wave:
         return self.path.field_at_primary(openings_mm, self._aperture, self._primary)
 
     def on_axis(self, at_primary: Wave, separation_mm: float) -> float:
@@ -90,20 +90,24 @@ class _WithoutWheel:
 def paraxial_separation_mm(path: LightPath) -> float:
     """The separation at which rays near the axis meet on the detector, Eq. (1).
 
-    Raises DataError "no-focus" where the mirrors have none.
+    Raises DataError "no-focus" if there is no such separation.
     """
     f1, f2, length = focal_mm(path.primary), focal_mm(path.secondary), path.secondary_to_detector_mm
     separation_mm = f1 - length * f2 / (f2 - length) if f2 != length else 0.0  # Eq. (1)
     if separation_mm <= 0:
         found = f"{separation_mm:g} mm" if f2 != length else "none"
-        raise DataError("no-focus", f"expected a separation that focuses the mirrors; got {found}")
+        raise DataError(
+            "no-focus",
+            f"expected mirrors that can focus on the detector at a positive separation; got {found}",
+        )
     return separation_mm
 
 
 def best_focus(path: LightPath, *, nominal_focal_length_mm: float) -> BestFocus:
-    """Solve for the separation; `nominal_focal_length_mm` is the instrument's, for comparison.
+    """Solve for the separation of best focus.
 
-    Raises DataError "no-focus" where no maximum lies within SEARCH_MM of the paraxial separation.
+    nominal_focal_length_mm: of the instrument, for comparison. Raises DataError "no-focus" if there is no maximum
+    within SEARCH_MM of the paraxial separation.
     """
     waves = _WithoutWheel(path)
     at_primary = waves.at_primary(path.aperture_mm)
@@ -142,13 +146,14 @@ def _sharpest(waves: _WithoutWheel, at_primary: Wave, paraxial_mm: float) -> flo
     separation_mm = float(found.x)
     if abs(separation_mm - paraxial_mm) > 0.95 * SEARCH_MM:
         raise DataError(
-            "no-focus", f"expected best focus within {SEARCH_MM} mm of {paraxial_mm:.3f} mm; got none"
+            "no-focus",
+            f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no maximum there",
         )
     return separation_mm
 
 
 def _order_spacing_px(waves: _WithoutWheel, separation_mm: float) -> tuple[float, int]:
-    """Mean distance of the entrance mesh's orders, from the outermost pair used; and its order."""
+    """Mean spacing of the entrance mesh's orders, from the outermost pair used, and the order of that pair."""
     path = waves.path
     field = waves.at_detector(waves.at_primary(path.entrance_mm), separation_mm)
     pitch_mm = path.entrance_mesh.pitch_um * MM_PER_UM
@@ -161,8 +166,8 @@ def _order_spacing_px(waves: _WithoutWheel, separation_mm: float) -> tuple[float
     return (high - low) / (2 * orders), orders
 
 
-def _peak_px(intensity: Line, grid: Grid, pixel_mm: float, near_px: float) -> float:
-    """Place of the highest sample within a pixel of `near_px`, refined by a parabola."""
+def _peak_px(intensity: Vector, grid: Grid, pixel_mm: float, near_px: float) -> float:
+    """Position of the highest sample within a pixel of `near_px`, refined by a parabola."""
     x_px = grid.x_mm / pixel_mm
     window = np.flatnonzero(np.abs(x_px - near_px) <= 1.0)
     top = int(window[np.argmax(intensity[window])])

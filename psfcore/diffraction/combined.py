@@ -1,20 +1,21 @@
-"""The diffraction of a whole telescope: entrance pupil and filter-wheel meshes, part by part.
+"""The diffraction of a whole telescope: entrance pupil and filter-wheel meshes, component by component.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation", the simplified-combined
-solution: Fraunhofer for the entrance pupil (aperture, mount and entrance mesh in one mask), the analytic
-series for the filter-wheel mesh, and their patterns convolved. Lines of the bandpass add by their weight.
+solution: a Fraunhofer transform of the entrance pupil (aperture, mount and entrance mesh in one mask), an analytic
+series for the filter-wheel mesh, and the convolution of both patterns. Spectral lines of the bandpass are added by
+weight.
 
-Which way an entrance part goes is decided by one rule, and written into the provenance:
+One rule decides how each component of the entrance is computed, and the provenance records the decision:
 
-- the mask is transformed where a pixel needs at most 32 samples (fraunhofer, Eq. (3)); beyond that the
-  aperture is an analytic Airy pattern, and a mount is left out;
-- entrance meshes stand in that mask where all of them cover the whole pupil and lie along the pixels;
-  else each has its series, turned by its angle, and their sum by share is convolved with the aperture's.
+- The mask is transformed if at most 32 samples per pixel are needed (fraunhofer, Eq. (3)). Otherwise the aperture
+  is an analytic Airy pattern, and a mount is left out.
+- Entrance meshes are in that mask if all of them cover the whole pupil and are parallel to the pixels. Otherwise
+  each has its series, rotated by its angle; their sum by share is convolved with the pattern of the aperture.
 
 | symbol | name |
 |---|---|
 | S | samples, per pixel and axis |
-| P | patterns, shares of a point's light per pixel [y, x], centre at [n // 2, n // 2] |
+| P | patterns, shares of the light of a point per pixel [y, x], centre at [n // 2, n // 2] |
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ from psfcore.diffraction.airy import airy_kernel
 from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, rotated_mesh_kernel
 from psfcore.diffraction.pupil import Pupil, entrance_pupil
-from psfcore.instruments.model import Instrument, Line, Mesh
+from psfcore.instruments.model import Instrument, Mesh, SpectralLine
 
 MOST_SAMPLES = 32
-PERIOD_PX = 4096  # of the transform: light wraps round it, not round the 2048 px that are kept
-NARROW_WINDOWS = 400
-STEPS_A_PUPIL = 20
+PERIOD_PX = 4096  # of the transform: light wraps around this grid, not around the 2048 px that are kept
+NARROW_WINDOWS = 400  # so many windows make the orders of a series narrow
+STEPS_A_PUPIL = 20  # of progress, for each part
 AIRY, ENTRANCE_MESH, MOUNT, ENTRANCE = "AIRY", "ENTRANCE_MESH", "MOUNT", "ENTRANCE"
 FILTER_WHEEL, DIFFRACTION = "FILTER_WHEEL", "DIFFRACTION"
 
@@ -46,7 +47,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Route:
-    """Which parts of the entrance are in the transformed mask, and why."""
+    """Which components of the entrance are in the transformed mask; as a text, why."""
 
     samples: int
     mask: bool
@@ -63,14 +64,14 @@ class Route:
 
 @dataclass
 class Patterns:
-    """Patterns by part, each the share of all light that falls on the grid, and notes on how they came."""
+    """Patterns by component, each the share of all light on the grid, and notes on how they were computed."""
 
     kernels: dict[str, Kernel] = field(default_factory=dict)
     notes: dict[str, Any] = field(default_factory=dict)
 
 
 def route_of(instrument: Instrument) -> Route:
-    """The rule above, for the shortest wavelength of the bandpass."""
+    """The rule above, applied to the shortest wavelength of the bandpass."""
     samples = max(
         samples_per_pixel(
             instrument.aperture.diameter_mm,
@@ -78,7 +79,7 @@ def route_of(instrument: Instrument) -> Route:
             focal_length_mm=instrument.focal_length_mm,
             pixel_pitch_um=instrument.detector.pixel_pitch_um,
         )
-        for line in instrument.lines
+        for line in instrument.spectral_lines
     )
     mask = samples <= MOST_SAMPLES
     plain = all(mesh.share == 1 and mesh.angle_deg % 90 == 0 for mesh in _meshes(instrument, "entrance"))
@@ -91,7 +92,7 @@ def route_of(instrument: Instrument) -> Route:
 
 
 def available_parts(instrument: Instrument) -> tuple[str, ...]:
-    """Names of the parts that this instrument has, in the order in which they are made."""
+    """Names of the components of this instrument, in the order in which they are computed."""
     route = route_of(instrument)
     has = {
         ENTRANCE_MESH: bool(_meshes(instrument, "entrance")),
@@ -103,7 +104,7 @@ def available_parts(instrument: Instrument) -> tuple[str, ...]:
 
 
 def needed_parts(instrument: Instrument, wanted: Iterable[str]) -> set[str]:
-    """The parts that have to be computed for those that are wanted."""
+    """The components that must be computed to obtain the wanted ones."""
     route, available = route_of(instrument), set(available_parts(instrument))
     needed = set(wanted)
     if DIFFRACTION in needed:
@@ -124,13 +125,13 @@ def diffraction_patterns(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> Patterns:
-    """The wanted parts on (size, size), lines of the bandpass added by weight, not normalised."""
+    """The wanted components on (size, size), not normalised; spectral lines are added by weight."""
     needed = needed_parts(instrument, wanted)
     made = Patterns(notes={"entrance_route": str(route_of(instrument))})
-    lines = instrument.lines
+    lines = instrument.spectral_lines
     steps = len(needed) * STEPS_A_PUPIL
     for index, line in enumerate(lines):
-        work = _OneLine(instrument, line, size, mount_image, threads, made.notes)
+        work = _OneWavelength(instrument, line, size, mount_image, threads, made.notes)
         for place, name in enumerate(part for part in available_parts(instrument) if part in needed):
             before = (index * len(needed) + place) * STEPS_A_PUPIL
             work.make(name, _scaled(progress, before, steps * len(lines)))
@@ -142,7 +143,7 @@ def diffraction_patterns(
 
 
 def _scaled(progress: Progress | None, before: int, steps: int) -> Progress:
-    """A part's own progress as steps of the whole."""
+    """Report the progress of one component as steps of the whole."""
 
     def report(done: int, of: int) -> None:
         if progress is not None:
@@ -151,13 +152,13 @@ def _scaled(progress: Progress | None, before: int, steps: int) -> Progress:
     return report
 
 
-class _OneLine:
-    """All parts at one wavelength; each is made from the aperture or from parts made before it."""
+class _OneWavelength:
+    """All components at one wavelength, each computed from the aperture or from earlier components."""
 
     def __init__(
         self,
         instrument: Instrument,
-        line: Line,
+        line: SpectralLine,
         size: int,
         mount_image: NDArray[np.floating] | None,
         threads: int,
@@ -173,6 +174,7 @@ class _OneLine:
         self.kernels: dict[str, Kernel] = {}
 
     def make(self, name: str, progress: Progress) -> None:
+        """Compute one component; those that it depends on must exist."""
         progress(0, 1)
         makers: dict[str, Callable[[Progress], Kernel]] = {
             AIRY: self._airy,
@@ -208,7 +210,7 @@ class _OneLine:
         return self._far_field(MOUNT, self._mounted(()), progress)
 
     def _entrance(self, progress: Progress) -> Kernel:
-        """All of the pupil together; where only one part stands in it, that part's own pattern."""
+        """The whole entrance pupil; if only one component is in it, the pattern of that component."""
         has_mesh, has_mount = bool(_meshes(self.instrument, "entrance")), self.route.mount
         if has_mesh and has_mount and self.route.meshes_in_mask:
             pupil = self._mounted(_meshes(self.instrument, "entrance"))
@@ -247,7 +249,10 @@ class _OneLine:
         return found.pattern
 
     def _series(self, place: str) -> Kernel:
-        """The meshes of one place: those that all light passes convolved, the others added by their share."""
+        """The pattern of the meshes of one place.
+
+        Meshes that all light crosses are convolved; meshes side by side are added by their share.
+        """
         whole = [mesh for mesh in _meshes(self.instrument, place) if mesh.share == 1]
         shared = [mesh for mesh in _meshes(self.instrument, place) if mesh.share < 1]
         kernels = [self._mesh(mesh) for mesh in whole]
@@ -268,7 +273,7 @@ class _OneLine:
             "distance_mm": self.instrument.mesh_distance_mm(mesh),
             "pitch_um": mesh.pitch_um,
             "wire_um": mesh.wire_um,
-            # At the entrance the aperture's own diffraction is in its pattern: the series' orders are narrow.
+            # The pattern of the aperture already holds the width of the orders, so those of the series must be narrow.
             "windows": max(mesh.windows, NARROW_WINDOWS) if mesh.place == "entrance" else mesh.windows,
             "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
             "size": self.size,

@@ -1,14 +1,15 @@
-"""What the pitch and the wire of an entrance mesh do to a point-spread function.
+"""How the pitch and the wire width of an entrance mesh change the PSF.
 
-Hofmeister et al., The point-spread function of HRI_EUV, sections "Analytical solution for mesh diffraction"
-and "Mesh geometry": a larger pitch brings the orders closer together, so that light blurs rather than veils;
-a smaller one spreads them, which veils but lets flares' orders be told apart. With f = 1 - wire / pitch:
+Hofmeister et al., The point-spread function of HRI_EUV, sections "Analytical solution for mesh diffraction" and
+"Mesh geometry": a larger pitch brings the orders closer together, so that the diffracted light blurs the image
+instead of veiling it. A smaller pitch spreads the orders: they veil the image, but the orders of a flare can be
+distinguished. With f = 1 - wire / pitch:
 
     share of the light in the order (k, 0) = f^2 sinc^2(pi k f)                                      Eq. (1)
     share outside the order (0, 0) = 1 - f^2                                                         Eq. (2)
 
-What lies beyond a radius is counted on the pattern of mesh_series (a square pupil as wide as the aperture,
-light normalised to the full reach), without mount, filter wheel or scatter.
+The light beyond a radius (1 - encircled energy) is that of the pattern of mesh_series: a square pupil as wide as the
+aperture, normalised to the light on the full reach, without mount, filter wheel or scatter.
 
 | symbol | name | unit |
 |---|---|---|
@@ -37,17 +38,17 @@ NEAR_PX = 10.0
 FAR_PX = 100.0
 FLARE_PX = 5
 MOST_MESHES = 400
-_SEEN_PX = (50.0, 150.0)
+_COMPARED_PX = (50.0, 150.0)  # the orders compared with the scatter
 
 
 @dataclass(frozen=True)
 class MeshDesign:
-    """One mesh: its geometry and what follows; percents are of all light that passes.
+    """One mesh: its geometry, and its effect in percent of all transmitted light.
 
-    peak_visibility: (high - low) / (high + low) along the axis at the order nearest to 100 px, for a flare
-    of `flare_px` px a side: 1 where orders stand apart, 0 where they run together.
-    peak_over_scatter: of the orders on the axis from 50 to 150 px, the most that one adds to the diffuse
-    scatter of such a flare that it lies on, as a multiple of it; None where the instrument has no scatter.
+    peak_visibility: the contrast (high - low) / (high + low) of the orders along the axis, for a flare of `flare_px` px
+    per side: 1 where the orders are separate, 0 where they merge.
+    peak_over_scatter: the largest ratio, among the orders on the axis from 50 to 150 px, of an order to the diffuse
+    scatter of the same flare at its position; None if the instrument has no scatter.
     """
 
     pitch_um: float
@@ -64,7 +65,7 @@ class MeshDesign:
 
 @dataclass(frozen=True)
 class DesignStudy:
-    """All meshes looked at, in order of wire and pitch, and the one that flies (None where there is none)."""
+    """All meshes, in order of wire and pitch, and the mesh that is flown (None if there is none)."""
 
     instrument: str
     flare_px: int
@@ -72,7 +73,7 @@ class DesignStudy:
     flown: MeshDesign | None
 
     def as_json(self) -> str:
-        """The study as JSON, keys as the fields are named."""
+        """The study as JSON; the keys are the names of the fields."""
         return json.dumps(asdict(self), indent=1)
 
 
@@ -83,9 +84,9 @@ def design_study(
     *,
     flare_px: int = FLARE_PX,
 ) -> DesignStudy:
-    """Every pitch with every wire at the entrance of `instrument`, and its own first entrance mesh.
+    """Compute every pitch with every wire at the entrance of `instrument`, and its own first entrance mesh.
 
-    Raises DataError "bad-design": no mesh, over 400 of them, or a wire not less than its pitch.
+    Raises DataError "bad-design": no mesh, over 400 meshes, or a wire not narrower than its pitch.
     """
     pitches, wires = sorted(set(pitches_um)), sorted(set(wires_um))
     _check(pitches, wires, flare_px)
@@ -103,12 +104,14 @@ def design_study(
 def _check(pitches: Sequence[float], wires: Sequence[float], flare_px: int) -> None:
     number = len(pitches) * len(wires)
     if not 1 <= number <= MOST_MESHES:
-        raise DataError("bad-design", f"expected 1 to {MOST_MESHES} meshes; got {number}")
+        raise DataError(
+            "bad-design", f"expected 1 to {MOST_MESHES} meshes (pitches times wires); got {number}"
+        )
     if not (wires[0] > 0 and np.isfinite(pitches).all() and wires[-1] < pitches[0]):
-        wanted = "finite pitches and wires, 0 < wire < pitch, um"
+        wanted = "finite pitches and wires with 0 < wire < pitch (um)"
         raise DataError("bad-design", f"expected {wanted}; got wires {wires} and pitches {pitches}")
     if flare_px < 1:
-        raise DataError("bad-design", f"expected a flare of 1 px or more; got {flare_px}")
+        raise DataError("bad-design", f"expected a flare of at least 1 px; got {flare_px}")
 
 
 def _mesh(
@@ -146,28 +149,28 @@ def _mesh(
         diffracted_pct=100 * (1 - open_share**2),  # Eq. (2)
         beyond_10_px_pct=float(beyond[0]),
         beyond_100_px_pct=float(beyond[1]),
-        peak_visibility=_visibility(spacing, flare_px),
+        peak_visibility=_contrast(spacing, flare_px),
         peak_over_scatter=None if halo is None else _over_scatter(open_share, spacing, flare_px, halo),
     )
 
 
-def _visibility(spacing_px: float, flare_px: int) -> float:
-    """Contrast along the axis of equal orders of a flare seen by pixels; see MeshDesign.
+def _contrast(spacing_px: float, flare_px: int) -> float:
+    """Contrast along the axis of equally bright orders of a flare, as pixels record them; see MeshDesign.
 
-    Each order is a flare's box seen by a pixel, a trapezium; near one order its neighbours are as bright.
+    Each order is the flare's box convolved with a pixel, a trapezium. Neighbouring orders are taken as equally bright.
     """
     x = np.linspace(0.0, spacing_px, 401)
     neighbours = int(np.ceil((flare_px + 1) / spacing_px)) + 1
     orders = spacing_px * np.arange(-neighbours, neighbours + 2)
     apart = np.abs(x[:, None] - orders)
-    seen = np.clip((flare_px + 1) / 2 - apart, 0.0, min(1.0, float(flare_px))).sum(axis=1)
-    return float((seen.max() - seen.min()) / (seen.max() + seen.min()))
+    light = np.clip((flare_px + 1) / 2 - apart, 0.0, min(1.0, float(flare_px))).sum(axis=1)
+    return float((light.max() - light.min()) / (light.max() + light.min()))
 
 
 def _over_scatter(open_share: float, spacing_px: float, flare_px: int, halo: NDArray[np.float64]) -> float:
-    """The order that stands highest over the scatter from 50 to 150 px; 0 where there is none."""
-    k = np.arange(np.ceil(_SEEN_PX[0] / spacing_px), np.floor(_SEEN_PX[1] / spacing_px) + 1)
+    """The largest ratio of an order to the scatter from 50 to 150 px; 0 if no order lies there."""
+    k = np.arange(np.ceil(_COMPARED_PX[0] / spacing_px), np.floor(_COMPARED_PX[1] / spacing_px) + 1)
     share = open_share**2 * np.sinc(k * open_share) ** 2  # Eq. (1)
     under = halo[np.rint(k * spacing_px).astype(int)]
-    # The order's light lies on the flare's pixels; scatter of all of the flare is nearly even under it.
+    # The light of the order spreads over as many pixels as the flare; under it the flare's scatter is nearly constant.
     return float((share / flare_px**2 / under).max(initial=0.0))

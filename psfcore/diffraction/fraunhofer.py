@@ -1,28 +1,28 @@
 """Far-field diffraction by the entrance pupil, summed over detector pixels.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Fraunhofer propagation", without the phase
-factors that |E|^2 drops, and with the wave's focal length f for the distance z:
+factors that cancel in |E|^2, and with the focal length f instead of the distance z:
 
     E(q) = sum over cells i of c_i exp(-2 pi i q . i / n),   dx = lambda f / (n p)                  Eq. (1)
     P_j = 1/S^2 sum over s, t = 0 .. S-1 of |E(j + (o_s, o_t))|^2,   o_s = (s + 1/2) / S - 1/2      Eq. (2)
     S >= 2 D p / (lambda f), and at least 14                                                       Eq. (3)
 
-The paper transforms the padded mask at once. Here each pair (s, t) of places within the pixel is one n x n
-transform: exp(-2 pi i j . i / n) has the period n in i, so the cells, times exp(-2 pi i o . i / n), are added
-modulo n first ("folded"), along x for all rows, then along y. Of each transform only the pixels asked for are
-kept. With Eq. (3) the sum over all n x n pixels is that of the mask's squares exactly (Parseval).
+The paper transforms the whole padded mask at once. Here each pair (s, t) of positions within the pixel is one
+n x n transform: exp(-2 pi i j . i / n) has the period n in i, so the cells, times exp(-2 pi i o . i / n), are first
+added modulo n ("folded"), along x for all rows, then along y. Of each transform only the requested pixels are kept.
+With Eq. (3) the sum over all n x n pixels is exactly that of the mask's squares (Parseval).
 
-Departure: a cell's open share is a mean over the cell, which weakens E far out by sinc(x / n) sinc(y / n);
-the pattern is divided by the square of that. What falls beyond the n x n pixels wraps round to the other
-side, with an amplitude of (x / (n - x))^2 of that which belongs there: 11 % at n / 4, 1 % at n / 11. With
-n = 4096, where HRI_EUV's pupil puts 0.13 % of its light beyond the inner 2048 px, this is 1e-5 of all light.
+Departure from the paper: the open share of a cell is a mean over the cell, which weakens E by sinc(x / n) sinc(y / n)
+far from the centre; the pattern is divided by the square of that. Light beyond the n x n pixels wraps around to the
+opposite side. Its amplitude is (x / (n - x))^2 of the correct one there: 11 % at n / 4, 1 % at n / 11. With n = 4096,
+where the pupil of HRI_EUV puts 0.13 % of its light beyond the inner 2048 px, this is 1e-5 of all light.
 
-Summing Eq. (2) instead of integrating keeps the energy but not each weight: for HRI_EUV's open disc the
-central pixel holds 3e-4 too little.
+The sum of Eq. (2), in place of an integral, conserves the energy but not each weight: for the open disc of HRI_EUV
+the central pixel is 3e-4 too low.
 
-A real mask has P(-q) = P(q); with a mirror axis x or y it has both; one that equals its transpose too needs
-an eighth of the transforms. Symmetry is found on the mask itself: for random vectors r, M r must agree with
-r M and with M's mirror images (Freivalds).
+A real mask has P(-q) = P(q). With one mirror axis, x or y, P has both mirror axes. A mask that also equals its
+transpose needs an eighth of the transforms. The symmetry is tested on the mask itself: for random vectors r, M r must
+equal r M and the products of the mirrored M (Freivalds).
 
 | symbol | name | unit |
 |---|---|---|
@@ -30,8 +30,8 @@ r M and with M's mirror images (Freivalds).
 | f | focal_length_mm | mm |
 | p | pixel_pitch_um | um |
 | D | pupil.width_mm | mm |
-| S | samples a pixel and axis, even | - |
-| n | period, pixels of the transform, of which the inner `size` are kept | px |
+| S | samples per pixel and axis, even | - |
+| n | period: pixels of the transform, of which the inner `size` are kept | px |
 | c | mask.rows, open share of the cells | - |
 | dx | mask.cell_mm | mm |
 """
@@ -51,9 +51,9 @@ from psfcore.convolution.convolver import transform_axis
 from psfcore.diffraction.pupil import MaskGrid, Pupil
 
 STRIP_ROWS = 16
-SURVEY_CELLS = 4096  # across the pupil
+SURVEY_CELLS = 4096  # across the pupil, for its area and symmetry
 FEWEST_SAMPLES = 14
-SPECTRA_BYTES = 700 * 2**20  # for the transforms along x that are kept at a time
+SPECTRA_BYTES = 700 * 2**20  # memory for the transforms along x that are kept at a time
 _SYMMETRY_TOLERANCE_CELLS = 1e-2
 _SYMMETRY_SEED = 174
 _MM_PER_ANGSTROM = 1e-7
@@ -66,10 +66,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class FarField:
-    """Share of the pupil's light in each pixel [y, x], centre at [n // 2, n // 2], and how it was found.
+    """Share of the pupil's light in each pixel [y, x], centre at [n // 2, n // 2], and how it was computed.
 
     open_area_mm2: of the pupil. samples: S of Eq. (3). symmetry: "none", "mirror" or "mirror and transpose".
-    The pattern sums to less than 1: the rest falls beyond the grid.
+    The pattern sums to less than 1: the remaining light is beyond the grid.
     """
 
     pattern: NDArray[np.float64]
@@ -97,9 +97,9 @@ def far_field(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> FarField:
-    """Eq. (2) for a pupil, on (size, size); `progress` is told after each transform.
+    """Eq. (2) for a pupil, on (size, size).
 
-    period: n, not less than size and even like it; the same as size where it is not given.
+    period: n, at least `size` and of the same parity; default: size. progress: called with (done, of) after each transform.
     """
     n = period or size
     optics = {
@@ -111,55 +111,55 @@ def far_field(
     cell_mm = wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / (n * pixel_pitch_um * _MM_PER_UM)
     mask = MaskGrid(pupil, cell_mm)
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        seen = _survey(MaskGrid(pupil, pupil.width_mm / SURVEY_CELLS), pool)
-        places = _Places(mask, seen, samples, n, size, pool, threads)
-        pattern = places.summed(progress or _silent)
-    pattern /= float(n) ** 2 * samples**2 * seen.open_area_mm2 / cell_mm**2
+        survey = _survey(MaskGrid(pupil, pupil.width_mm / SURVEY_CELLS), pool)
+        transforms = _Transforms(mask, survey, samples, n, size, pool, threads)
+        pattern = transforms.summed(progress or _silent)
+    pattern /= float(n) ** 2 * samples**2 * survey.open_area_mm2 / cell_mm**2
     sinc = np.sinc((np.arange(size) - size // 2) / n)
     pattern /= sinc[:, None] ** 2
     pattern /= sinc[None, :] ** 2
-    return FarField(pattern, seen.open_area_mm2, samples, seen.symmetry)
+    return FarField(pattern, survey.open_area_mm2, samples, survey.symmetry)
 
 
 def _silent(done: int, of: int) -> None:
-    """No one listens."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
 class _Survey:
-    """What one pass over the mask tells: its area, its symmetry, and whether turning y changes nothing."""
+    """Area and symmetry of the mask; mirror_y: whether the mask equals its mirror image in y."""
 
     open_area_mm2: float
     symmetry: str
-    upside_down: bool
+    mirror_y: bool
 
 
 def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
-    """Open area, and the symmetry that random vectors do not tell from the mask's.
+    """Open area, and the symmetry of the mask as tested with random vectors.
 
-    Its cells need not be those of the transform: shares of area miss nothing.
+    Its cells may differ from those of the transform: shares of area miss no part of the mask.
     """
     r = np.random.default_rng(_SYMMETRY_SEED).random(mask.cells)
     right = np.stack([r, r[::-1]], axis=1)
 
-    def look(first: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    def multiply(first: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         strip = mask.rows(first, min(first + STRIP_ROWS, mask.cells)).astype(np.float64)
         return strip @ right, r[first : first + len(strip)] @ strip, float(strip.sum())
 
     after, before, open_cells = [], np.zeros(mask.cells), 0.0
-    for strip_after, strip_before, strip_sum in pool.map(look, _strips(mask.cells)):
+    for strip_after, strip_before, strip_sum in pool.map(multiply, _strips(mask.cells)):
         after.append(strip_after)
         before += strip_before
         open_cells += strip_sum
     by_row, by_mirrored_row = np.concatenate(after).T  # M r, M r[::-1]
     area_mm2 = open_cells * mask.cell_mm**2
     mirror_x = _agree(by_row, by_mirrored_row)
-    # (M turned over in y) r = (M r)[::-1], and r^T (M turned over in y) = r[::-1]^T M
+    # M mirrored in y: its product with r is (M r)[::-1], and r^T times it is r[::-1]^T M
     mirror_y = _agree(by_row, by_row[::-1])
     if not (mirror_x or mirror_y):
-        return _Survey(area_mm2, NO_SYMMETRY, upside_down=False)
+        return _Survey(area_mm2, NO_SYMMETRY, mirror_y=False)
     symmetry = MIRROR_AND_TRANSPOSE if _agree(by_row, before) else MIRROR
-    return _Survey(area_mm2, symmetry, upside_down=mirror_y)
+    return _Survey(area_mm2, symmetry, mirror_y=mirror_y)
 
 
 def _agree(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
@@ -170,25 +170,25 @@ def _strips(cells: int) -> range:
     return range(0, cells, STRIP_ROWS)
 
 
-class _Places:
-    """The transforms of Eq. (2), one for each place in the pixel that the mask's symmetry leaves to compute."""
+class _Transforms:
+    """The transforms of Eq. (2) that the symmetry of the mask leaves to compute, one per position in the pixel."""
 
     def __init__(
         self,
         mask: MaskGrid,
-        seen: _Survey,
+        survey: _Survey,
         samples: int,
         period: int,
         size: int,
         pool: ThreadPoolExecutor,
         threads: int,
     ) -> None:
-        self.mask, self.symmetry, self.samples, self.period = mask, seen.symmetry, samples, period
+        self.mask, self.symmetry, self.samples, self.period = mask, survey.symmetry, samples, period
         self.kept = slice(period // 2 - size // 2, period // 2 - size // 2 + size)
         self.pool, self.threads = pool, threads
-        # Rows that are the same upside down are computed once.
-        rows = mask.cells // 2 if seen.upside_down else mask.cells
-        # A few s share one pass over the mask, as many as fit the memory set aside.
+        # If the mask is symmetric in y, half of its rows are enough.
+        rows = mask.cells // 2 if survey.mirror_y else mask.cells
+        # Several s share one pass over the mask, as many as fit in the memory.
         together = max(1, min(samples // 2, SPECTRA_BYTES // (8 * rows * size)))
         self.spectra = np.empty((together, rows, size), dtype=np.complex64)
         self.field = np.empty((period, size), dtype=np.complex64)
@@ -202,18 +202,18 @@ class _Places:
             if t == 0 and s % together == 0:
                 self._transform_along_x(range(s, min(s + together, half)))
             self._transform_along_y(self.spectra[s % together], t)
-            # With the transpose added in the end, s = t would count twice.
+            # The transpose is added at the end, which would count s = t twice.
             self._add(0.5 if s == t and self.symmetry == MIRROR_AND_TRANSPOSE else 1.0)
             progress(done + 1, len(places))
         return _completed(self.total, self.symmetry)
 
     def _along_y(self, s: int) -> range:
-        """The t that have to be computed for one s: all, a half, or those up to s."""
+        """The t that must be computed for one s: all, one half, or those up to s."""
         half = self.samples // 2
         return range({NO_SYMMETRY: self.samples, MIRROR: half, MIRROR_AND_TRANSPOSE: s + 1}[self.symmetry])
 
     def _transform_along_x(self, columns: range) -> None:
-        """spectra[y, j] of all rows, for a few s: the same for all t."""
+        """spectra[y, j] of all rows, for several s; they are the same for all t."""
         phases = [
             _phases(_turns(s, self.samples, self.period), self.mask.cells, self.period) for s in columns
         ]
@@ -247,7 +247,7 @@ class _Places:
 
 
 def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]:
-    """Add the places that were left out: they are mirror images of those that were computed."""
+    """Add the positions that were left out: they are mirror images of the computed ones."""
     n = len(total)
     mirror = (2 * (n // 2) - np.arange(n)) % n
     if symmetry == MIRROR_AND_TRANSPOSE:
@@ -259,7 +259,7 @@ def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]
 
 
 def _turns(place: int, samples: int, size: int) -> float:
-    """o_s - n // 2: the origin of j moves to [n // 2] without a shift of the result."""
+    """o_s - n // 2: so the origin of j is at [n // 2], and the result needs no shift."""
     return (place + 0.5) / samples - 0.5 - size // 2
 
 

@@ -9,17 +9,17 @@ propagation"; in one dimension, without the constant phase exp(2 pi i z / lambda
     sag(x) = x^2 / (R (1 + sqrt(1 - (1 + K) x^2 / R^2)))                                               Eq. (3)
     N1 = X1 / dx1,  dx1 = lambda z / X2,  hence N1 = X1 X2 / (lambda z)                                Eq. (4)
 
-Departures, each with its reason:
+Departures from the paper, with reasons:
 
-- Eq. (3): the text prints sqrt(x^2 + y^2) over R (...); the sag of a conic has x^2 + y^2 there.
-- Eq. (4): the text prints 1 / (lambda z)^2 for the product of two axes' counts; one axis has 1 / (lambda z).
-  dx1 is taken finer by SAMPLING_MARGIN, because light that would land beyond X2 folds back into it otherwise.
-- Each plane has the step that Eq. (4) asks of it. A plain FFT would tie the steps of successive planes to
-  each other and leave too small a field on short distances; a chirp transform does the same sum without that.
-- Wires and rims cover samples in part, by length, so that their places are not rounded to the grid.
+- Eq. (3): the paper prints sqrt(x^2 + y^2) over R (...); the sag of a conic has x^2 + y^2 there.
+- Eq. (4): the paper prints 1 / (lambda z)^2 for the product of the counts of two axes; one axis has 1 / (lambda z).
+  dx1 is finer by SAMPLING_MARGIN, because otherwise light that would land outside X2 folds back into it.
+- Each plane has the step that Eq. (4) requires. A plain FFT would couple the steps of successive planes, and leave
+  too small a field over short distances. A chirp transform computes the same sum without this coupling.
+- Wires and rims cover samples partly, by length, so that their positions are not rounded to the grid.
 
-Eq. (1) is paraxial: with it a pair of parabolas (K = -1) focuses perfectly, and the secondary's own conic
-constant leaves about 0.1 wave of spherical aberration at the rim of the beam, most of which focus takes up.
+Eq. (1) is paraxial: a pair of parabolas (K = -1) then focuses perfectly. The secondary's own conic constant leaves
+about 0.1 wave of spherical aberration at the rim of the beam; refocusing compensates most of it.
 
 | symbol | name | unit |
 |---|---|---|
@@ -46,12 +46,12 @@ SAMPLING_MARGIN = 1.5
 MOST_SAMPLES = 8_000_000
 
 Wave = NDArray[np.complex128]
-Line = NDArray[np.float64]
+Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Samples of one plane, at equal steps and symmetric about the axis."""
+    """Samples of one plane at equal steps, symmetric about the axis."""
 
     plane: str
     samples: int
@@ -62,13 +62,13 @@ class Grid:
         return self.samples * self.step_mm
 
     @property
-    def x_mm(self) -> Line:
+    def x_mm(self) -> Vector:
         """Positions of the samples, shape (samples,)."""
         return np.asarray((np.arange(self.samples) - (self.samples - 1) / 2) * self.step_mm)
 
     @property
-    def edges_mm(self) -> Line:
-        """Where the samples begin and end, shape (samples + 1,)."""
+    def edges_mm(self) -> Vector:
+        """Edges of the samples, shape (samples + 1,)."""
         return np.asarray((np.arange(self.samples + 1) - self.samples / 2) * self.step_mm)
 
     def light(self, field: Wave) -> float:
@@ -79,22 +79,23 @@ class Grid:
 def grid_for(
     plane: str, *, width_mm: float, next_width_mm: float, wavelength_mm: float, distance_mm: float
 ) -> Grid:
-    """The grid of a plane from which light must reach all of `next_width_mm`, `distance_mm` on.
+    """The grid of a plane from which light must reach all of `next_width_mm` at `distance_mm`.
 
-    Raises DataError "too-many-samples" where the distance is too short for it.
+    Raises DataError "too-many-samples" if the distance is too short.
     """
     step_mm = wavelength_mm * distance_mm / (SAMPLING_MARGIN * next_width_mm)  # Eq. (4), with the margin
     samples = math.ceil(width_mm / step_mm)
     if samples > MOST_SAMPLES:
         raise DataError(
             "too-many-samples",
-            f"{plane}: expected at most {MOST_SAMPLES} samples; {distance_mm:g} mm to the next plane need {samples}",
+            f"{plane}: expected a distance to the next plane that needs at most {MOST_SAMPLES} samples; "
+            f"got {distance_mm:g} mm, which needs {samples}",
         )
     return Grid(plane, samples, step_mm)
 
 
 class FresnelStep:
-    """Free space between two grids, Eq. (1); made once, applied to any number of fields."""
+    """Free space between two grids, Eq. (1); prepared once, then applied to any number of fields."""
 
     def __init__(self, source: Grid, target: Grid, *, wavelength_mm: float, distance_mm: float) -> None:
         reach_mm2 = wavelength_mm * distance_mm
@@ -106,17 +107,17 @@ class FresnelStep:
         self._after *= source.step_mm / np.sqrt(1j * reach_mm2)
 
     def apply(self, field: Wave) -> Wave:
-        """The field at the target, shape (target.samples,), from that at the source."""
+        """The field at the target, shape (target.samples,), from the field at the source."""
         return np.asarray(self._after * self._transform.apply(field * self._before))  # Eq. (1)
 
 
 def propagate(field: Wave, source: Grid, target: Grid, *, wavelength_mm: float, distance_mm: float) -> Wave:
-    """One field through free space, Eq. (1)."""
+    """Propagate one field through free space, Eq. (1)."""
     return FresnelStep(source, target, wavelength_mm=wavelength_mm, distance_mm=distance_mm).apply(field)
 
 
-def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Line:
-    """Depth of a conic mirror at x from its vertex, Eq. (3); NaN where the conic does not reach."""
+def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Vector:
+    """Depth of a conic mirror at x from its vertex, Eq. (3); NaN outside the conic."""
     square = np.square(np.asarray(x_mm, dtype=np.float64))
     root = 1 - (1 + conic) * square / radius_mm**2
     depth = np.sqrt(root, where=root >= 0, out=np.full_like(square, np.nan))
@@ -124,7 +125,7 @@ def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Line:
 
 
 def mirror_transmission(mirror: Mirror, grid: Grid, wavelength_mm: float) -> Wave:
-    """What a mirror does to a field: its phase, and no light beyond its rim; shape (samples,)."""
+    """The factor that a mirror applies to a field: its phase, and 0 outside its rim; shape (samples,)."""
     sign = 1.0 if mirror.figure == "convex" else -1.0
     radius_mm = mirror.diameter_mm / 2
     inside = open_share(grid, np.array([[-radius_mm, radius_mm]]))
@@ -133,10 +134,10 @@ def mirror_transmission(mirror: Mirror, grid: Grid, wavelength_mm: float) -> Wav
     return np.asarray(inside * np.exp(1j * sign * 4 * np.pi / wavelength_mm * sag_mm))  # Eq. (2)
 
 
-def mesh_openings_mm(*, pitch_mm: float, wire_mm: float, phase: float, width_mm: float) -> Line:
+def mesh_openings_mm(*, pitch_mm: float, wire_mm: float, phase: float, width_mm: float) -> Vector:
     """Windows of a mesh over at least `width_mm`, rows of (begin, end).
 
-    phase: how far the mesh is moved, in pitches; at 0 a window is centred on the axis, at 0.5 a wire.
+    phase: shift of the mesh in pitches; at 0 a window is centred on the axis, at 0.5 a wire.
     """
     reach = math.ceil(width_mm / pitch_mm / 2) + 1
     centres_mm = (np.arange(-reach, reach + 1) + phase) * pitch_mm
@@ -144,21 +145,21 @@ def mesh_openings_mm(*, pitch_mm: float, wire_mm: float, phase: float, width_mm:
     return np.stack([centres_mm - half_mm, centres_mm + half_mm], axis=1)
 
 
-def aperture_openings_mm(aperture: Aperture) -> Line:
+def aperture_openings_mm(aperture: Aperture) -> Vector:
     """A cut through the middle of the entrance pupil, rows of (begin, end)."""
     rim, hub = aperture.diameter_mm / 2, aperture.obscuration_diameter_mm / 2
     return np.array([[-rim, -hub], [hub, rim]]) if hub else np.array([[-rim, rim]])
 
 
-def common_openings_mm(first: Line, second: Line) -> Line:
-    """What is open in both lists, rows of (begin, end) in order."""
+def common_openings_mm(first: Vector, second: Vector) -> Vector:
+    """The openings that both lists share, rows of (begin, end) in order."""
     begin = np.maximum(first[:, None, 0], second[None, :, 0]).ravel()
     end = np.minimum(first[:, None, 1], second[None, :, 1]).ravel()
     both = np.stack([begin, end], axis=1)[end > begin]
     return np.asarray(both[np.argsort(both[:, 0])])
 
 
-def open_share(grid: Grid, openings_mm: Line) -> Line:
+def open_share(grid: Grid, openings_mm: Vector) -> Vector:
     """Share of each sample's length that is open, 0 to 1, shape (samples,)."""
     lengths_mm = np.diff(openings_mm, axis=1).ravel()
     open_before_mm = np.stack([np.cumsum(lengths_mm) - lengths_mm, np.cumsum(lengths_mm)], axis=1)
@@ -166,28 +167,33 @@ def open_share(grid: Grid, openings_mm: Line) -> Line:
     return np.diff(open_mm) / grid.step_mm
 
 
-def fraunhofer_field(openings_mm: Line, grid: Grid, *, wavelength_mm: float, focal_length_mm: float) -> Wave:
-    """The field in focus of a lit, open pupil: each opening's transform in closed form, shape (samples,).
+def fraunhofer_field(
+    openings_mm: Vector, grid: Grid, *, wavelength_mm: float, focal_length_mm: float
+) -> Wave:
+    """The field in focus of an evenly illuminated pupil: the sum of the openings' transforms, shape (samples,).
 
-    An opening of width w about c gives w sinc(pi w u) exp(-2 pi i c u), with u = x / (lambda f).
+    An opening of width w around c gives w sinc(pi w u) exp(-2 pi i c u), with u = x / (lambda f).
     """
     reach_mm2 = wavelength_mm * focal_length_mm
     u = grid.x_mm / reach_mm2
     field = np.zeros(grid.samples, dtype=np.complex128)
     for begin_mm, end_mm in openings_mm:
         width_mm, centre_mm = end_mm - begin_mm, (begin_mm + end_mm) / 2
-        # numpy's sinc has the pi in it
+        # np.sinc(t) is sin(pi t) / (pi t)
         field += width_mm * np.sinc(width_mm * u) * np.exp(-2j * np.pi * centre_mm * u)
     return np.asarray(field / np.sqrt(1j * reach_mm2))
 
 
-def binned_light(field: Wave, grid: Grid, samples_per_pixel: int) -> Line:
+def binned_light(field: Wave, grid: Grid, samples_per_pixel: int) -> Vector:
     """Light in each pixel: abs(E)^2 summed over its samples, times their step."""
     return (np.abs(field) ** 2).reshape(-1, samples_per_pixel).sum(axis=1) * grid.step_mm
 
 
-def light_beyond(line: Line, radii_px: Sequence[int] | NDArray[np.integer]) -> Line:
-    """Light of a line, centre at [n // 2], in pixels farther than each radius (px), as a share of all."""
+def line_light_beyond(line: Vector, radii_px: Sequence[int] | NDArray[np.integer]) -> Vector:
+    """1 - encircled energy in one dimension: the share of a line's light farther than each radius (px).
+
+    The centre of the line is at [n // 2]; only pixels farther than the radius count.
+    """
     offset = np.abs(np.arange(line.size) - line.size // 2)
     at = np.bincount(offset, weights=line)
     beyond = np.append(np.cumsum(at[::-1])[::-1][1:], 0.0)

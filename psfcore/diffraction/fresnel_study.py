@@ -1,23 +1,23 @@
-"""How well the simplified-combined method stands in for Fresnel propagation, in one dimension.
+"""How well the simplified-combined method approximates Fresnel propagation, in one dimension.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation" and the discussion of where
 diffracting components may stand. Two images of a point, both binned to pixels, are compared by the light
-that lands farther than a distance from the centre:
+beyond a distance from the centre (1 - encircled energy):
 
 - Fresnel: entrance aperture and mesh -> primary -> secondary -> filter-wheel mesh -> detector;
 - simplified-combined: Fraunhofer image of the entrance aperture and mesh, convolved with the analytic series
   of the filter-wheel mesh.
 
-Choices the text leaves open, each told in the result:
+The paper leaves some choices open; the result states each of them:
 
-- The mirror separation is the one of best focus. Both methods use the focal length it gives.
-- Where the filter-wheel wires lie across the beam is unknown. Results are means over equally spaced phases of
-  the mesh, with the spread of the single phases beside them.
-- The series has as many windows as the instrument gives (all that the field lights) or the caller asks for;
-  the wave meets the few wires that the beam of one field point covers. It is not that number that the series
-  wants: the image of the entrance holds the diffraction at the beam's edges already, and a series of few
-  windows adds it again. The more windows, the closer the methods come.
-- Other distances move the wheel between secondary and detector; the total stays.
+- The mirror separation is that of best focus. Both methods use the focal length that follows from it.
+- The position of the filter-wheel wires across the beam is unknown. Results are means over equally spaced phases of
+  the mesh, together with the range of the single phases.
+- The series has the instrument's number of windows (all that the field illuminates), or the caller's. The wave meets
+  only the few wires within the beam of one field point. Their number is not the right one for the series: the image
+  of the entrance already holds the diffraction at the edges of the beam, and a series of few windows adds it a second
+  time. The more windows, the closer the two methods agree.
+- For other distances the filter wheel moves between secondary and detector; the total distance stays.
 - Each line is normalised to the light within REACH_PX of the axis.
 """
 
@@ -36,11 +36,11 @@ from psfcore.diffraction.fresnel import (
     SAMPLING_MARGIN,
     FresnelStep,
     Grid,
-    Line,
+    Vector,
     Wave,
     binned_light,
     fraunhofer_field,
-    light_beyond,
+    line_light_beyond,
     open_share,
     propagate,
 )
@@ -66,23 +66,23 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a plane was sampled: width X, step dx, and count N = X / dx; least_samples is X1 X2 / (lambda z)."""
+    """The sampling of a plane: width X, step dx and count N = X / dx; least_samples is X1 X2 / (lambda z)."""
 
     plane: str
     width_mm: float
     step_um: float
     samples: int
     least_samples: int | None
-    light: float  # share of what passed the entrance, behind this plane's mask; mean over phases
+    light: float  # share of the entering light behind this plane's mask; mean over phases
 
 
 @dataclass(frozen=True)
 class DistanceResult:
     """Both methods with the filter wheel at one distance from the detector.
 
-    Lines, shape (2 REACH_PX + 1,), sum 1, centre at [REACH_PX]. Curves run over FresnelStudy.radii_px:
-    light beyond a radius in percent, differences (Fresnel less combined) in percentage points, of the mean
-    over phases and, with a phase's name, the lowest and the highest of the single phases.
+    Lines have shape (2 REACH_PX + 1,), sum 1 and their centre at [REACH_PX]. Curves are given at FresnelStudy.radii_px:
+    1 - encircled energy in percent, and differences (Fresnel less combined) in percentage points. Differences are those of
+    the mean over phases; phase_lowest_points and phase_highest_points are the range of the single phases.
     """
 
     distance_mm: float
@@ -90,14 +90,14 @@ class DistanceResult:
     beam_pitches: float
     wheel_order_spacing_px: float
     sampling: tuple[Sampling, ...]
-    fresnel_line: Line
-    combined_line: Line
-    fresnel_beyond_pct: Line
-    combined_beyond_pct: Line
-    difference_points: Line
-    phase_lowest_points: Line
-    phase_highest_points: Line
-    phase_largest_points: Line  # for each phase, its largest absolute difference; shape (phases,)
+    fresnel_line: Vector
+    combined_line: Vector
+    fresnel_beyond_pct: Vector
+    combined_beyond_pct: Vector
+    difference_points: Vector
+    phase_lowest_points: Vector
+    phase_highest_points: Vector
+    phase_largest_points: Vector  # largest absolute difference of each phase, shape (phases,)
 
     @property
     def largest_points(self) -> float:
@@ -112,7 +112,7 @@ class DistanceResult:
 
 @dataclass(frozen=True)
 class FresnelStudy:
-    """What was compared, how, and what came out."""
+    """The settings of a comparison, and its results."""
 
     instrument: str
     version: str
@@ -124,7 +124,7 @@ class FresnelStudy:
     reach_px: int
     samples_per_pixel: int
     sampling_margin: float
-    radii_px: Line
+    radii_px: Vector
     distances: tuple[DistanceResult, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -160,8 +160,8 @@ def fresnel_study(
 ) -> FresnelStudy:
     """Compare the methods with the filter wheel at each distance (mm) from the detector.
 
-    phases: how many places of the wheel's mesh, at equal parts of its pitch. windows: of the analytic series;
-    by default the instrument's. progress: called with (done, of).
+    phases: number of positions of the filter-wheel mesh, equally spaced over its pitch. windows: of the analytic series;
+    default: the instrument's. progress: called with (done, of).
     Raises DataError "bad-instrument-file", "no-focus", "bad-distance", "bad-phases", "bad-windows" or
     "too-many-samples".
     """
@@ -202,14 +202,14 @@ def fresnel_study(
 
 
 def _grids(path: LightPath, distance_mm: float) -> tuple[Grid, Grid]:
-    """Grids of secondary and filter wheel for a wheel at this distance from the detector."""
+    """Grids of secondary and filter wheel, for a filter wheel at this distance from the detector."""
     wheel = path.wheel_grid(distance_mm)
     behind_mm = path.secondary_to_detector_mm - distance_mm
     return path.secondary_grid(next_width_mm=wheel.width_mm, distance_mm=behind_mm), wheel
 
 
 class _AtWheel:
-    """The focused wave in front of a filter wheel, and its way on through the wheel's mesh."""
+    """The focused wave in front of a filter wheel, and its propagation through the mesh there."""
 
     def __init__(self, path: LightPath, at_primary: Wave, separation_mm: float, distance_mm: float) -> None:
         self.path, self.distance_mm = path, distance_mm
@@ -224,15 +224,15 @@ class _AtWheel:
             self._grid, self._detector, wavelength_mm=path.wavelength_mm, distance_mm=distance_mm
         )
 
-    def line(self, phase: float) -> Line:
-        """Light in each pixel, for the mesh moved by `phase` of its pitch."""
+    def line(self, phase: float) -> Vector:
+        """Light in each pixel, for the mesh shifted by `phase` of its pitch."""
         openings_mm = mesh_windows_mm(self.path.wheel_mesh, phase, self._grid.width_mm)
         field = self._field * open_share(self._grid, openings_mm)
         self._lights.append(self._grid.light(field))
         return binned_light(self._step.apply(field), self._detector, SAMPLES_PER_PIXEL)
 
     def sampling(self, detector_light: float) -> tuple[Sampling, ...]:
-        """All planes from the aperture to the detector, with what light is behind them."""
+        """All planes from the aperture to the detector, with the light behind each."""
         wheel_light = float(np.mean(self._lights))
         planes = [*self._upstream, (self._grid, wheel_light), (self._detector, detector_light)]
         lengths_mm = [
@@ -268,7 +268,7 @@ class _AtWheel:
         )
 
 
-def _entrance_line(path: LightPath, focal_length_mm: float) -> Line:
+def _entrance_line(path: LightPath, focal_length_mm: float) -> Vector:
     """Fraunhofer image of entrance aperture and mesh in pixels, sum 1."""
     grid = path.detector_grid
     field = fraunhofer_field(
@@ -278,7 +278,7 @@ def _entrance_line(path: LightPath, focal_length_mm: float) -> Line:
     return np.asarray(line / line.sum())
 
 
-def _combined_line(path: LightPath, entrance_line: Line, distance_mm: float, windows: int) -> Line:
+def _combined_line(path: LightPath, entrance_line: Vector, distance_mm: float, windows: int) -> Vector:
     """The entrance's image convolved with the wheel mesh's series, sum 1."""
     series = mesh_line(
         wavelength_angstrom=path.wavelength_mm * _ANGSTROM_PER_MM,
@@ -293,16 +293,16 @@ def _combined_line(path: LightPath, entrance_line: Line, distance_mm: float, win
     return np.asarray(line / line.sum())
 
 
-def _compared(wheel: _AtWheel, lines: Line, combined: Line) -> DistanceResult:
+def _compared(wheel: _AtWheel, lines: Vector, combined: Vector) -> DistanceResult:
     """Curves and differences from the lines of all phases, shape (phases, 2 REACH_PX + 1)."""
     path = wheel.path
     radii_px = np.arange(REACH_PX)
-    combined_beyond = 100 * light_beyond(combined, radii_px)
-    # A phase's line counts by its own light, so that a mean of curves is the curve of a mean.
+    combined_beyond = 100 * line_light_beyond(combined, radii_px)
+    # Each phase's line is normalised by its own light, so that the mean of the curves is the curve of the mean.
     shares = lines / lines.sum(axis=1, keepdims=True)
-    single = np.array([100 * light_beyond(line, radii_px) for line in shares]) - combined_beyond
+    single = np.array([100 * line_light_beyond(line, radii_px) for line in shares]) - combined_beyond
     mean_line = shares.mean(axis=0)
-    fresnel_beyond = 100 * light_beyond(mean_line, radii_px)
+    fresnel_beyond = 100 * line_light_beyond(mean_line, radii_px)
     pitch_mm = path.wheel_mesh.pitch_um * MM_PER_UM
     return DistanceResult(
         distance_mm=wheel.distance_mm,
@@ -330,17 +330,19 @@ def _check(path: LightPath, distances_mm: Sequence[float], phases: int, windows:
     longest = path.secondary_to_detector_mm
     wrong = [d for d in distances_mm if not 0 < d < longest]
     if wrong or not distances_mm:
-        got = f"{wrong[0]:g}" if wrong else "none"
-        raise DataError("bad-distance", f"expected distances over 0 and under {longest:g} mm; got {got}")
+        got = f"{wrong[0]:g} mm" if wrong else "no distance"
+        raise DataError(
+            "bad-distance", f"expected distances between 0 and {longest:g} mm (exclusive); got {got}"
+        )
     for distance_mm in distances_mm:
         _grids(path, distance_mm)
     for code, value, most in (("bad-phases", phases, 1000), ("bad-windows", windows, 100_000)):
         if not 1 <= value <= most:
-            raise DataError(code, f"expected 1 to {most}; got {value}")
+            raise DataError(code, f"expected 1 to {most} {code.removeprefix('bad-')}; got {value}")
 
 
-def _thinned(radii_px: Line) -> NDArray[np.int64]:
-    """Indices of the radii that a report keeps."""
+def _thinned(radii_px: Vector) -> NDArray[np.int64]:
+    """Indices of the radii that the JSON keeps."""
     far = np.geomspace(ZOOM_PX, radii_px.size - 1, 96).round().astype(np.int64)
     return np.unique(np.concatenate([np.arange(ZOOM_PX), far]))
 
@@ -370,4 +372,4 @@ def _distance_json(result: DistanceResult, kept: NDArray[np.int64]) -> dict[str,
 
 
 def _silent(done: int, of: int) -> None:
-    """No one listens."""
+    """Ignore progress."""

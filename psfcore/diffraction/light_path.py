@@ -1,7 +1,7 @@
-"""A two-mirror telescope along its axis: what a wave meets, and where rays go.
+"""The optical path of a two-mirror telescope: the planes that a wave crosses, and the paths of rays.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Fresnel propagation": the wave goes from
-the entrance aperture over primary and secondary to the filter wheel and the detector. Rays parallel to the
+the entrance aperture over primary and secondary to the filter wheel and the detector. For rays parallel to the
 axis at height 1, with thin mirrors, f = R / 2 for a concave and -R / 2 for a convex one:
 
     y2 = 1 - s / f1,   u2 = -1 / f1 - y2 / f2,   y(z) = y2 + z u2,   focal length = -1 / u2        Eq. (1)
@@ -11,7 +11,7 @@ axis at height 1, with thin mirrors, f = R / 2 for a concave and -R / 2 for a co
 | s | separation_mm, of the mirrors | mm |
 | f1, f2 | focal_mm of primary and secondary | mm |
 | z | distance behind the secondary | mm |
-| y, u | height, slope, for a ray that came in at height 1 | -, 1/mm |
+| y, u | height and slope of a ray that enters at height 1 | -, 1/mm |
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from psfcore.diffraction.fresnel import (
     Grid,
-    Line,
+    Vector,
     Wave,
     aperture_openings_mm,
     common_openings_mm,
@@ -43,7 +43,7 @@ _MM_PER_ANGSTROM = 1e-7
 
 @dataclass(frozen=True)
 class LightPath:
-    """The numbers of a telescope that a wave meets on its way. Lengths in mm."""
+    """The quantities of a telescope that propagation needs. Lengths are in mm."""
 
     wavelength_mm: float
     aperture: Aperture
@@ -64,20 +64,20 @@ class LightPath:
         return Grid("detector", samples, self.pixel_mm / SAMPLES_PER_PIXEL)
 
     @property
-    def aperture_mm(self) -> Line:
+    def aperture_mm(self) -> Vector:
         """The open entrance, without its mesh, rows of (begin, end)."""
         return aperture_openings_mm(self.aperture)
 
     @property
-    def entrance_mm(self) -> Line:
+    def entrance_mm(self) -> Vector:
         """The entrance through its mesh, rows of (begin, end)."""
-        # An odd number of windows has one on the axis, an even number a wire.
+        # With an odd number of windows one is on the axis, with an even number a wire.
         phase = 0.0 if self.entrance_mesh.windows % 2 else 0.5
         windows_mm = mesh_windows_mm(self.entrance_mesh, phase, self.aperture.diameter_mm)
         return common_openings_mm(self.aperture_mm, windows_mm)
 
     def slope_per_mm(self, separation_mm: float) -> float:
-        """Slope behind the secondary of a ray that came in at height 1, Eq. (1)."""
+        """Slope behind the secondary of a ray that enters at height 1, Eq. (1)."""
         f1, f2 = focal_mm(self.primary), focal_mm(self.secondary)
         return -1 / f1 - (1 - separation_mm / f1) / f2
 
@@ -86,13 +86,13 @@ class LightPath:
         return -1 / self.slope_per_mm(separation_mm)
 
     def beam_mm(self, separation_mm: float, behind_secondary_mm: float) -> float:
-        """Width of one field point's beam at a distance behind the secondary, Eq. (1)."""
+        """Width of the beam of one field point at a distance behind the secondary, Eq. (1)."""
         height = 1 - separation_mm / focal_mm(self.primary)
         height += behind_secondary_mm * self.slope_per_mm(separation_mm)
         return abs(height) * self.aperture.diameter_mm
 
     def entrance_grids(self) -> tuple[Grid, Grid]:
-        """Grids of the aperture, for all of the primary, and of the primary, for all of the secondary."""
+        """Grids of the aperture and of the primary; light from each must reach all of the next mirror."""
         return self._grid(
             "aperture", self.aperture.diameter_mm, self.primary.diameter_mm, self.aperture_to_primary_mm
         ), self._grid(
@@ -100,17 +100,17 @@ class LightPath:
         )
 
     def secondary_grid(self, *, next_width_mm: float, distance_mm: float) -> Grid:
-        """Grid of the secondary for light that goes on to a plane of `next_width_mm`."""
+        """Grid of the secondary; its light must reach all of a plane of `next_width_mm`."""
         return self._grid("secondary", self.secondary.diameter_mm, next_width_mm, distance_mm)
 
     def wheel_grid(self, distance_mm: float) -> Grid:
         """Grid of a filter wheel at a distance from the detector.
 
-        As wide as what straight lines from all of the secondary to all of the detector cross there.
+        Its width includes all straight lines from the secondary to the detector.
         """
-        part = distance_mm / self.secondary_to_detector_mm
+        share = distance_mm / self.secondary_to_detector_mm
         detector_mm = self.detector_grid.width_mm
-        width_mm = part * self.secondary.diameter_mm + (1 - part) * detector_mm
+        width_mm = share * self.secondary.diameter_mm + (1 - share) * detector_mm
         return self._grid("filter wheel", width_mm, detector_mm, distance_mm)
 
     def _grid(self, plane: str, width_mm: float, next_width_mm: float, distance_mm: float) -> Grid:
@@ -122,8 +122,8 @@ class LightPath:
             distance_mm=distance_mm,
         )
 
-    def field_at_primary(self, openings_mm: Line, aperture: Grid, primary: Grid) -> Wave:
-        """A plane wave on the axis through the openings, to behind the primary; light 1 enters."""
+    def field_at_primary(self, openings_mm: Vector, aperture: Grid, primary: Grid) -> Wave:
+        """The field behind the primary, of a plane wave along the axis through the openings; light 1 enters."""
         field = open_share(aperture, openings_mm).astype(np.complex128)
         field /= np.sqrt(aperture.light(field))
         field = propagate(
@@ -138,7 +138,7 @@ class LightPath:
     def field_at_secondary(
         self, at_primary: Wave, primary: Grid, secondary: Grid, separation_mm: float
     ) -> Wave:
-        """From behind the primary to behind the secondary."""
+        """The field behind the secondary, from the field behind the primary."""
         field = propagate(
             at_primary,
             primary,
@@ -154,7 +154,7 @@ def focal_mm(mirror: Mirror) -> float:
     return mirror.radius_mm / 2 if mirror.figure == "concave" else -mirror.radius_mm / 2
 
 
-def mesh_windows_mm(mesh: Mesh, phase: float, width_mm: float) -> Line:
+def mesh_windows_mm(mesh: Mesh, phase: float, width_mm: float) -> Vector:
     """Windows of an instrument's mesh over at least `width_mm`, rows of (begin, end)."""
     return mesh_openings_mm(
         pitch_mm=mesh.pitch_um * MM_PER_UM,
@@ -165,21 +165,24 @@ def mesh_windows_mm(mesh: Mesh, phase: float, width_mm: float) -> Line:
 
 
 def light_path(instrument: Instrument) -> LightPath:
-    """What propagation needs of an instrument.
+    """The optical path of an instrument.
 
-    Raises DataError "bad-instrument-file", naming the key, where the instrument lacks some of it.
+    Raises DataError "bad-instrument-file", with the name of the key that the instrument lacks.
     """
     if len(instrument.mirrors) != 2:
         raise _lacking(
             instrument, "mirrors", "a primary and a secondary", f"{len(instrument.mirrors)} mirrors"
         )
     if instrument.distances is None:
-        raise _lacking(instrument, "distances", "the distances along the light's way", "none")
+        raise _lacking(instrument, "distances", "the distances along the optical path", "none")
     entrance, wheel = (_one_mesh(instrument, place) for place in ("entrance", "filter_wheel"))
     if (entrance.angle_deg - wheel.angle_deg) % 90:
         angles = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
         raise _lacking(
-            instrument, "meshes.angle_deg", "meshes along the same axes, for one dimension", angles
+            instrument,
+            "meshes.angle_deg",
+            "meshes with the same axes, for propagation in one dimension",
+            angles,
         )
     distances = instrument.distances
     return LightPath(

@@ -1,25 +1,25 @@
 """Diffraction by a regular mesh in the far field.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Analytical solution for mesh diffraction",
-here Eq. (1), separable in x and y; one axis of it, with sinc(u) = sin(u) / u:
+here Eq. (1). It is separable in x and y; this is one axis, with sinc(u) = sin(u) / u:
 
     I(x) = sinc^2(pi w x / (lambda z)) (sin(N pi d x / (lambda z)) / sin(pi d x / (lambda z)))^2     Eq. (1)
 
-The paper samples Eq. (1) finely and bins it. Here it is integrated over each pixel exactly: the grating
-factor is a finite cosine series (Fejer), and each term has an antiderivative in the sine integral:
+The paper samples Eq. (1) finely and bins it. Here it is integrated exactly over each pixel: the grating
+factor is a finite cosine series (Fejer), and each term has an antiderivative with the sine integral Si:
 
     (sin(N p) / sin(p))^2 = sum_m (N - |m|) cos(2 m p)                                               Eq. (2)
     sinc^2(alpha x) cos(q x) = (g(2 alpha + q) + g(2 alpha - q) - 2 g(q)) / (4 alpha^2)              Eq. (3)
     g(k) = (1 - cos(k x)) / x^2,  integral of g(k) from 0 to x = k Si(k x) - (1 - cos(k x)) / x      Eq. (4)
 
-A mesh that stands at an angle has its pattern turned with it, and what was separable on the pixels is so
-no more. `rotated_mesh_kernel` cuts each axis of the turned pattern into cells, small where the orders are,
-and shares the light of every pair of cells out to the pixels that it covers:
+The pattern of a mesh at an angle is rotated with the mesh, and is no longer separable on the pixels.
+`rotated_mesh_kernel` divides each axis of the rotated pattern into cells, which are small at the orders,
+and distributes the light of every pair of cells over the pixels that it covers:
 
     integral of Eq. (1) over all x = N d w^-1 lambda z / d                                           Eq. (5)
 
-(of the cosine series only m = 0 lies within the support of the envelope's transform, a triangle). Weights
-are fractions of the light over the whole plane, so what falls off the array is missing from the sum.
+(Of the cosine series only m = 0 lies within the support of the envelope's transform, a triangle.) The weights
+are fractions of the light on the whole plane, so light outside the array is missing from the sum.
 
 | symbol | name | unit |
 |---|---|---|
@@ -44,8 +44,8 @@ _UM_PER_ANGSTROM = 1e-4
 _UM_PER_MM = 1e3
 _FINEST_CELL_PX = 0.02
 _LARGEST_CELL_PX = 0.4
-# Cells go with the root of light times width: so many where an order's light is 1, so many for all of it,
-# and fewer in an order with less of all light than the faint share.
+# The number of cells grows with the root of light times width: _CELLS_AN_ORDER within one order, _CELLS_IN_ALL over all
+# light, and fewer in an order that holds less than _FAINT_SHARE of all light.
 _CELLS_AN_ORDER = 30
 _CELLS_IN_ALL = 600
 _FAINT_SHARE = 1e-4
@@ -55,7 +55,7 @@ _GAUSS_POINTS = 6
 def order_spacing_px(
     *, wavelength_angstrom: float, distance_mm: float, pitch_um: float, pixel_pitch_um: float
 ) -> float:
-    """Distance between diffraction orders, lambda z / d, px."""
+    """Spacing of the diffraction orders, lambda z / d, px."""
     reach_um2 = wavelength_angstrom * _UM_PER_ANGSTROM * distance_mm * _UM_PER_MM
     return reach_um2 / pitch_um / pixel_pitch_um
 
@@ -72,7 +72,7 @@ def mesh_line(
 ) -> NDArray[np.float64]:
     """Eq. (1) integrated over `size` pixels, centre at [size // 2], as a fraction of the light on them.
 
-    Returns shape (size,), sum 1: normalised to the light over this reach.
+    Returns shape (size,), sum 1.
     """
     spacing_px = order_spacing_px(
         wavelength_angstrom=wavelength_angstrom,
@@ -83,12 +83,12 @@ def mesh_line(
     alpha = np.pi * (pitch_um - wire_um) / pitch_um / spacing_px
     edges_px = np.arange(size + 1, dtype=np.float64) - size // 2 - 0.5
     light = np.diff(_integral(edges_px, alpha=alpha, spacing_px=spacing_px, windows=windows))
-    line = np.maximum(light, 0.0)  # an integral of a square: only rounding takes it below zero
+    line = np.maximum(light, 0.0)  # the integral of a square is negative only by rounding
     return np.asarray(line / line.sum())
 
 
 def mesh_kernel(line_y: NDArray[np.float64], line_x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pattern of a mesh, the outer product of its two lines, [y, x]."""
+    """The pattern of a mesh [y, x], the outer product of its two lines."""
     return np.outer(line_y, line_x)
 
 
@@ -103,12 +103,11 @@ def rotated_mesh_kernel(
     angle_deg: float,
     size: int,
 ) -> NDArray[np.float64]:
-    """Eq. (1) turned by `angle_deg` (from +x towards +y) and integrated over pixels.
+    """Eq. (1) rotated by `angle_deg` (from +x towards +y) and integrated over pixels.
 
-    Returns shape (size, size), centre at [size // 2, size // 2]; weights are fractions of the light over
-    the whole plane, Eq. (5). At angle 0 no pixel is off by more than 1e-4 of the light from the product of
-    exact lines, and all differences together by no more than 5e-4; what is shared out wrongly stays within
-    neighbouring pixels.
+    Returns shape (size, size), centre at [size // 2, size // 2]; weights are fractions of the light on
+    the whole plane, Eq. (5). At angle 0 each pixel differs from the product of exact lines by at most 1e-4 of the
+    light, and the sum of all absolute differences is at most 5e-4; misplaced light stays within neighbouring pixels.
     """
     spacing_px = order_spacing_px(
         wavelength_angstrom=wavelength_angstrom,
@@ -116,7 +115,7 @@ def rotated_mesh_kernel(
         pitch_um=pitch_um,
         pixel_pitch_um=pixel_pitch_um,
     )
-    # A square mesh looks the same after a quarter turn.
+    # A square mesh is unchanged by a turn of 90 degrees.
     turn = np.deg2rad((angle_deg + 45.0) % 90.0 - 45.0)
     reach_px = (size // 2 + 1.5) * float(np.cos(turn) + abs(np.sin(turn)))
     where_px, width_px, light = _cells(
@@ -132,8 +131,8 @@ def _cells(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """One axis of the pattern from -reach_px to reach_px as cells: middle (px), width (px), light.
 
-    The light is a fraction of that over the whole axis. A cell is a lobe of the grating factor, or a part of
-    one, or several where there is little light; its middle is that of its light.
+    The light is a fraction of that on the whole axis. A cell is a lobe of the grating factor, or a part of one, or
+    several lobes where there is little light. Its middle is the centroid of its light.
     """
     lobe_px = spacing_px / windows
     parts = max(1, int(np.ceil(lobe_px / _FINEST_CELL_PX)))
@@ -159,7 +158,7 @@ def _cells(
 def _first_of_each_cell(
     edges: NDArray[np.float64], light: NDArray[np.float64], spacing_px: float
 ) -> NDArray[np.intp]:
-    """Index of the first fine cell of each cell: as many cells as the width and the light ask for."""
+    """Index of the first fine cell of each cell; width and light determine the number of cells."""
     half = max(spacing_px, 1.0) / 2
     below = np.concatenate(([0.0], np.cumsum(light)))
     middle = (edges[1:] + edges[:-1]) / 2
@@ -192,12 +191,12 @@ def _share_out(
     cosine: float,
     sine: float,
 ) -> None:
-    """Add the light of all pairs of cells (u along the mesh, v across) to the pixels they cover.
+    """Add the light of all pairs of cells (u along the mesh, v across) to the pixels that they cover.
 
-    A turned cell is taken as an upright box of the same extent, narrower than a pixel, evenly lit.
+    A rotated cell is replaced by an upright box of the same extent, narrower than a pixel and evenly bright.
     """
     size = kernel.shape[0]
-    origin = size // 2 + 0.5  # the pixel i runs from i to i + 1
+    origin = size // 2 + 0.5  # pixel i extends from i to i + 1
     for i in range(where_px.size):
         for j in range(where_px.size):
             x = cosine * where_px[i] - sine * where_px[j] + origin
@@ -231,5 +230,5 @@ def _integral(
 
 
 def _primitive(k: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Eq. (4); x is never 0 because pixel edges lie at half pixels."""
+    """Eq. (4); x is never 0, because pixel edges are at half pixels."""
     return np.asarray(k * sici(k * x)[0] - (1 - np.cos(k * x)) / x)

@@ -1,6 +1,6 @@
-"""Pictures of diffraction studies for people.
+"""Plots of the Fresnel study.
 
-Drawn on figures of their own with the Agg canvas, so that threads and processes do not meet in pyplot.
+Each plot has its own figure on the Agg canvas. So threads and processes share no state, as they would with pyplot.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ _FRESNEL, _COMBINED, _DIFFERENCE, _INK = "#1f6fb4", "#e0761a", "#2b8a4e", "#2222
 
 
 def fresnel_png(study: FresnelStudy, path: str | Path, *, distance_mm: float | None = None) -> None:
-    """Three panels: the PSF's centre, light beyond a distance with the difference, and all distances.
+    """Three panels: the centre of the PSF, 1 - encircled energy with the difference, and all distances.
 
-    distance_mm: which of the study's to show in the first two, the nearest one; by default the printed one.
+    distance_mm: the first two panels show the study's nearest distance to it; default: the printed distance.
     """
     wanted_mm = study.printed_distance_mm if distance_mm is None else distance_mm
     shown = min(study.distances, key=lambda result: abs(result.distance_mm - wanted_mm))
@@ -35,7 +35,7 @@ def fresnel_png(study: FresnelStudy, path: str | Path, *, distance_mm: float | N
     )
     focus = study.focus
     below = (
-        f"best focus: mirror separation {focus.separation_mm:.2f} mm ({focus.shift_mm:+.2f} mm from the printed), "
+        f"best focus: mirror separation {focus.separation_mm:.2f} mm ({focus.shift_mm:+.2f} mm from the printed value), "
         f"focal length {focus.focal_length_mm:.0f} mm; mean of {study.phases} mesh phases; "
         f"series of {study.windows} windows"
     )
@@ -53,7 +53,7 @@ def fresnel_png(study: FresnelStudy, path: str | Path, *, distance_mm: float | N
 def _draw_centre(axes: Any, shown: DistanceResult, centre: int) -> None:
     offsets = np.arange(-SHOWN_PX, SHOWN_PX + 1)
     near = slice(centre - SHOWN_PX, centre + SHOWN_PX + 1)
-    # Where the two agree, the wider line shows on both sides of the thinner one.
+    # Where the two agree, the wider curve is visible on both sides of the thinner one.
     for line, colour, width, label in (
         (shown.combined_line, _COMBINED, 3.2, "Simplified-combined"),
         (shown.fresnel_line, _FRESNEL, 1.2, "Fresnel"),
@@ -64,13 +64,15 @@ def _draw_centre(axes: Any, shown: DistanceResult, centre: int) -> None:
 
 
 def _draw_curves(axes: Any, shown: DistanceResult, study: FresnelStudy) -> None:
-    # The central pixel, at radius 0, is drawn at half a pixel: a logarithmic axis has no zero.
+    # The central pixel, radius 0, is drawn at half a pixel, because a logarithmic axis has no zero.
     radii_px = np.maximum(study.radii_px, 0.5)
     axes.semilogx(
         radii_px, shown.combined_beyond_pct, color=_COMBINED, linewidth=3.2, label="Simplified-combined"
     )
     axes.semilogx(radii_px, shown.fresnel_beyond_pct, color=_FRESNEL, linewidth=1.2, label="Fresnel")
-    axes.semilogx(radii_px, shown.difference_points, color=_DIFFERENCE, label="Difference (points)")
+    axes.semilogx(
+        radii_px, shown.difference_points, color=_DIFFERENCE, label="Difference (percentage points)"
+    )
     axes.fill_between(
         radii_px,
         shown.phase_lowest_points,
@@ -81,8 +83,8 @@ def _draw_curves(axes: Any, shown: DistanceResult, study: FresnelStudy) -> None:
         label="Difference, single phases",
     )
     axes.axhline(0, color=_INK, linewidth=0.7)
-    title = f"Light beyond a distance: at most {shown.largest_points:.2f} points apart"
-    axes.set(xlabel="Distance (px)", ylabel="Light beyond (%)", title=title)
+    title = f"Light beyond a distance: largest difference {shown.largest_points:.2f} points"
+    axes.set(xlabel="Distance (px)", ylabel="1 - encircled energy (%)", title=title)
     axes.legend(frameon=False, loc="upper right")
 
 
@@ -100,7 +102,7 @@ def _draw_distances(axes: Any, study: FresnelStudy) -> None:
     )
     means = [result.largest_points for result in study.distances]
     axes.plot(distances_mm, means, "o-", color=_DIFFERENCE, label="Mean over phases")
-    axes.axhline(1.0, color=_INK, linewidth=0.8, linestyle=":", label="1 point")
+    axes.axhline(1.0, color=_INK, linewidth=0.8, linestyle=":", label="1 percentage point")
     axes.axvline(study.printed_distance_mm, color="#888888", linewidth=0.8)
     axes.set(
         xlabel="Filter wheel to detector (mm)",

@@ -1,9 +1,9 @@
-"""The entrance pupil as a transmission mask, made a strip of rows at a time.
+"""The entrance pupil as a transmission mask, computed in strips of rows.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation": amplitude masks of the
-aperture, its mount and its mesh. A cell of the mask holds the open share of its area: exactly, because
-every outline is a polygon (a circle one of 4096 corners and of the circle's area) and the area under a
-polygon's edge in a cell is a trapezoid:
+Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation": amplitude masks of the aperture,
+its mount and its mesh. A cell of the mask holds the open share of its area. This share is exact, because every
+outline is a polygon (a circle is one with 4096 corners and the circle's area), and the area under a polygon's edge in
+a cell is a trapezoid:
 
     open area of cell i = sum over edges of dy (i + 1 - x), x the mean of the edge's part in the cell   Eq. (1)
     circle of radius R: corners at R sqrt((2 pi / m) / sin(2 pi / m))                                   Eq. (2)
@@ -12,13 +12,13 @@ Where outlines of different parts cross in one cell, their open shares are multi
 
 | symbol | name | unit |
 |---|---|---|
-| d | pitch_um of a mesh; wires lie at (k + 1/2) d, or at k d where its windows are even | um |
-| wire_um | wire width | um |
+| d | pitch_um of a mesh; wires are at (k + 1/2) d, or at k d if its number of windows is even | um |
+| wire_um | width of a wire | um |
 | dx | cell_mm, edge of a cell of the mask | mm |
 | N | cells along an edge of the mask, the optical axis in its middle | - |
 | m | corners of a circle | - |
 
-Angles run from +x of the detector towards +y, and mask[y, x] has the axes of image[y, x].
+Angles are measured from +x of the detector towards +y, and mask[y, x] has the axes of image[y, x].
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount
 
 CIRCLE_CORNERS = 4096
 _UM_PER_MM = 1e3
-# A bar of no visible width or a ring beyond the rim would be a slip of the pen in an instrument file.
+# A ring that crosses the rim is a mistake in the instrument file; rounding may exceed the rim by this much.
 _RIM_TOLERANCE_MM = 1e-6
 
 Corners = NDArray[np.float64]
@@ -45,7 +45,7 @@ Outline = tuple[Corners, ...]
 
 @dataclass(frozen=True)
 class MaskPicture:
-    """A mask given as pixels: open share 0..1 [y, x] of a square of `width_mm`, row 0 at the lowest y."""
+    """A mask given as pixels: open share 0 to 1 [y, x] of a square of `width_mm`, row 0 at the lowest y."""
 
     open_share: NDArray[np.float64]
     width_mm: float
@@ -53,9 +53,9 @@ class MaskPicture:
 
 @dataclass(frozen=True)
 class Pupil:
-    """What is open: the opening, less all opaque outlines, the wires of the meshes, and a picture's dark parts.
+    """The open area: the opening, less the opaque outlines, the wires of the meshes and the closed parts of a picture.
 
-    Outlines are closed polygons, corners (x, y) in mm; several of one outline cut each other out.
+    An outline is one or more closed polygons with corners (x, y) in mm; its polygons may cut holes into each other.
     """
 
     opening: Outline
@@ -65,7 +65,7 @@ class Pupil:
 
     @property
     def width_mm(self) -> float:
-        """Edge of the smallest square round the optical axis that holds the opening."""
+        """Edge of the smallest square around the optical axis that contains the opening."""
         return 2 * float(max(np.abs(corners).max() for corners in self.opening))
 
 
@@ -76,7 +76,7 @@ def entrance_pupil(
     mount_image: NDArray[np.floating] | None = None,
     meshes: Iterable[Mesh] = (),
 ) -> Pupil:
-    """The pupil of an aperture, with its mount and its meshes where they are given.
+    """The pupil of an aperture, with its mount and meshes if given.
 
     mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y, 0 opaque.
     Raises DataError "bad-mount" (names the key) for a bar outside the aperture or an unfit mask image.
@@ -95,14 +95,14 @@ def entrance_pupil(
 def circle(radius_mm: float) -> Corners:
     """Corners (4096, 2) in mm of a polygon with the area of a circle, counter-clockwise."""
     step = 2 * math.pi / CIRCLE_CORNERS
-    # Corners straddle both axes and the diagonals, so that the polygon has the circle's mirror symmetries.
+    # No corner lies on an axis or a diagonal, so the polygon has the mirror symmetries of a circle.
     angle = (np.arange(CIRCLE_CORNERS) + 0.5) * step
     reach_mm = radius_mm * math.sqrt(step / math.sin(step))  # Eq. (2)
     return reach_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def bar(start_mm: float, end_mm: float, width_mm: float, angle_deg: float, across_mm: float = 0.0) -> Corners:
-    """Corners (4, 2) in mm of a bar along `angle_deg`, from start to end, its middle `across_mm` to the left."""
+    """Corners (4, 2) in mm of a bar along `angle_deg` from start to end, its centre line `across_mm` to the left."""
     left, right = across_mm + width_mm / 2, across_mm - width_mm / 2
     corners = np.array([(start_mm, right), (end_mm, right), (end_mm, left), (start_mm, left)])
     return corners @ _rotation(angle_deg).T
@@ -145,9 +145,11 @@ def _mask_picture(
     if pixels is None:
         raise DataError("bad-mount", f"{key}: expected the pixels of {described.file}; got none")
     if pixels.ndim != 2 or pixels.shape[0] != pixels.shape[1] or pixels.size == 0:
-        raise DataError("bad-mount", f"{key}: expected a square image on two axes; got shape {pixels.shape}")
+        raise DataError(
+            "bad-mount", f"{key}: expected a square image with two axes; got shape {pixels.shape}"
+        )
     if not np.isfinite(pixels).all() or pixels.min() < 0 or pixels.max() <= 0:
-        wanted = "expected finite values, 0 where opaque and the largest where open"
+        wanted = "expected finite values of 0 (opaque) or more, with an open part above 0"
         raise DataError("bad-mount", f"{key}: {wanted}; got {pixels.min():g} to {pixels.max():g}")
     if described.width_mm < aperture.diameter_mm:
         wanted = f"{key}.width_mm: expected at least the aperture's {aperture.diameter_mm:g} mm"
@@ -156,7 +158,7 @@ def _mask_picture(
 
 
 class MaskGrid:
-    """The mask of `pupil` in cells of `cell_mm`, N x N round the optical axis, computed where it is asked for."""
+    """The mask of `pupil` in N x N cells of `cell_mm` around the optical axis; rows are computed on request."""
 
     def __init__(self, pupil: Pupil, cell_mm: float) -> None:
         self.cell_mm = cell_mm
@@ -172,7 +174,7 @@ class MaskGrid:
         self._picture = pupil.picture
 
     def rows(self, first: int, stop: int, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Open shares of the rows `first` to `stop` - 1; shape (stop - first, cells), in `out` if it is given."""
+        """Open shares of the rows `first` to `stop` - 1; shape (stop - first, cells), written to `out` if given."""
         strip = np.empty((stop - first, self.cells), dtype=np.float32) if out is None else out[: stop - first]
         _cover(
             strip,
@@ -189,7 +191,7 @@ class MaskGrid:
         return strip
 
     def _in_cells(self, outlines: tuple[Outline, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """All edges (x0, y0, x1, y1) in cells from the mask's lower left, and the outline each belongs to."""
+        """All edges (x0, y0, x1, y1) in cells from the mask's lower left corner, and the outline of each edge."""
         edges, owners = [], []
         for owner, outline in enumerate(outlines):
             for corners in outline:
@@ -205,7 +207,7 @@ class MaskGrid:
 
 
 def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float64]:
-    """Integral of the open share along a mesh, up to a constant: windows are w wide, pitch d apart."""
+    """Integral of the open share along a mesh, up to a constant: windows of width w at a pitch d."""
     window_um = mesh.pitch_um - mesh.wire_um
     from_window_um = x_um + window_um / 2 - (0 if mesh.windows % 2 else mesh.pitch_um / 2)
     whole, part_um = np.divmod(from_window_um, mesh.pitch_um)
@@ -213,7 +215,7 @@ def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float6
 
 
 def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
-    """The wires of a tilted mesh, as bars that reach past the pupil; one of an axis is one outline."""
+    """The wires of a tilted mesh, as bars that extend beyond the pupil; all wires of one direction are one outline."""
     reach_mm = width_mm  # > width / sqrt(2), half the diagonal
     pitch_mm, wire_mm = mesh.pitch_um / _UM_PER_MM, mesh.wire_um / _UM_PER_MM
     count = math.ceil(reach_mm / pitch_mm)
@@ -226,7 +228,7 @@ def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
 
 @compiled()
 def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
-    """For each row of cells the edges that pass it: entries[first[row] : first[row + 1]], in their order."""
+    """For each row of cells the edges that cross it: entries[first[row] : first[row + 1]], in order."""
     first = np.zeros(rows + 1, dtype=np.int64)
     low = np.empty(len(edges), dtype=np.int64)
     high = np.empty(len(edges), dtype=np.int64)
@@ -247,7 +249,7 @@ def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
-    """Write open shares into `strip`: mesh, times the opening (outline 0), times what others leave open."""
+    """Write open shares into `strip`: mesh, times the opening (outline 0), times the open share of the other outlines."""
     rows, cells = strip.shape
     area = np.zeros(cells + 2)
     most = 1
@@ -269,20 +271,22 @@ def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries)
                     touched += 1
             inside, done = 0.0, cells
             for j in range(touched):
-                # Between the cells that edges touch the cover is constant.
+                # Between the cells that edges cross the covered share is constant.
                 _apply(strip[k], line, line[row], done, begins[j], inside, outline)
                 for i in range(max(begins[j], done if j else 0), min(ends[j] + 2, cells)):
                     inside += area[i]
                     area[i] = 0.0
                     _apply(strip[k], line, line[row], i, i + 1, inside, outline)
                 done = max(ends[j] + 2, done if j else 0)
-            _apply(strip[k], line, line[row], done, cells, inside, outline)  # an edge may lie beyond the mask
+            _apply(
+                strip[k], line, line[row], done, cells, inside, outline
+            )  # an edge may lie outside the mask
             area[cells:] = 0.0
 
 
 @compiled()
 def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
-    """Put a range of cells into a list sorted by where they begin."""
+    """Insert a range of cells into a list that is sorted by first cell."""
     j = count
     while j > 0 and begins[j - 1] > begin:
         begins[j], ends[j] = begins[j - 1], ends[j - 1]
@@ -307,7 +311,7 @@ def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-
 def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
     """Add an edge's part in a row, Eq. (1), to `area`, whose running sum is the covered share of each cell.
 
-    Returns the first and last cell touched, the last before the first where there is none.
+    Returns the first and last cell that the edge crosses; if there is none, the last is before the first.
     """
     x0, y0, x1, y1 = edge[0], edge[1], edge[2], edge[3]
     ya, yb = min(max(y0, row), row + 1), min(max(y1, row), row + 1)
@@ -343,7 +347,7 @@ def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-untyped-def]
-    """Multiply `strip` by a picture's mean over each cell; outside the picture nothing is open."""
+    """Multiply `strip` by the mean of a picture over each cell; outside the picture all is opaque."""
     rows, cells = strip.shape
     pixels = len(open_share)
     corner = 0.5 * (cells - pixels * cells_per_pixel)  # lower left of the picture, in cells
@@ -367,7 +371,7 @@ def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-un
 
 @compiled()
 def _running_at(running, x):  # type: ignore[no-untyped-def]
-    """Running sum at a place between pixels."""
+    """The running sum at a position between pixels."""
     last = len(running) - 1
     if x <= 0:
         return running[0]

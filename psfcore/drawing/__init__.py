@@ -1,0 +1,1 @@
+"""Plots of images and PSFs, and the HTML page of reports."""

@@ -1,7 +1,7 @@
-"""One HTML page that holds all it needs: words, figures, tables and numbers with their errors.
+"""One HTML page that contains all it needs: text, figures, tables, and numbers with their errors.
 
-It opens from a file, needs no script and asks for nothing over a network; pictures are inside. Every text is
-escaped, also one that came with the data, as a file's name does.
+A browser can open the page from a file: it has no script and loads nothing over a network, and the figures are inside.
+Every text is escaped, including texts from the data, such as the name of a file.
 
     Page("Title", "What was found.", (Section("Figures", ("A paragraph.", Figure(png, "How to read it.", "What it shows"))),))
 """
@@ -24,15 +24,15 @@ from psfcore.errors import DataError
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 DASH = "\N{EN DASH}"
-PLOT_DPI = 160  # of figures made for a page: sharp on a fine screen and on paper
-CSS_DPI = 96  # a figure is shown as large as it was drawn: in inches of so many CSS pixels
+PLOT_DPI = 160  # of the figures on a page: sharp on screens of high resolution and on paper
+CSS_DPI = 96  # CSS pixels per inch: a figure is shown in the size in inches in which it was drawn
 
 _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?[\d.]+(e[-+]?\d+)?( ?%)?( (±|to) [-+]?[\d.]+(e[-+]?\d+)?)?")
 
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A picture (PNG). caption: how to read it; alt: what it shows, for who cannot see it.
+    """A figure (PNG). caption: how to read it; alt: a description for readers who cannot see it.
 
     Raises DataError "not-a-png".
     """
@@ -44,21 +44,23 @@ class Figure:
 
     def __post_init__(self) -> None:
         if self.png[:8] != PNG_START or len(self.png) < 24:
-            raise DataError("not-a-png", f"expected a figure as PNG; got {self.png[:8]!r}")
+            raise DataError(
+                "not-a-png", f"expected a figure as PNG; got data that begin with {self.png[:8]!r}"
+            )
 
     @property
     def data_uri(self) -> str:
-        """The picture as an address that holds it."""
+        """The figure as a data URI."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
 
     @property
     def shown_width(self) -> int:
-        """CSS pixels."""
+        """Width in CSS pixels."""
         return self._size()[0]
 
     @property
     def shown_height(self) -> int:
-        """CSS pixels."""
+        """Height in CSS pixels."""
         return self._size()[1]
 
     def _size(self) -> tuple[int, int]:
@@ -68,9 +70,9 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of cells, written as they are given; columns of numbers stand to the right.
+    """Rows of cells, shown as given; columns of numbers are right-aligned.
 
-    Raises DataError "uneven-table" where a row is not as long as the header.
+    Raises DataError "uneven-table" if a row does not have the length of the header.
     """
 
     kind: ClassVar[str] = "table"
@@ -83,19 +85,19 @@ class Table:
             if len(row) != len(self.header):
                 raise DataError(
                     "uneven-table",
-                    f"expected {len(self.header)} cells a row; got {len(row)}: {list(row)[:3]}",
+                    f"expected {len(self.header)} cells in each row; got {len(row)}: {list(row)[:3]}",
                 )
 
     @property
     def numeric(self) -> tuple[bool, ...]:
-        """Which columns hold numbers alone, or nothing."""
+        """For each column, whether all its cells are numbers or empty."""
         columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
         return tuple(all(_is_number(cell) for cell in column) for column in columns)
 
 
 @dataclass(frozen=True)
 class Value:
-    """A number with its standard error, or a text. sigma None: it has none, or it is not known."""
+    """A number with its standard error, or a text. sigma: None if the error is unknown or there is none."""
 
     name: str
     value: float | str
@@ -105,7 +107,7 @@ class Value:
 
     @property
     def text(self) -> str:
-        """As it is written: digits down to the second of the error's."""
+        """The number with its error and unit, rounded to the second digit of the error."""
         number = self.value if isinstance(self.value, str) else with_error(self.value, self.sigma)
         return f"{number} {self.unit}".rstrip()
 
@@ -128,19 +130,19 @@ class Bullets:
 
 @dataclass(frozen=True, eq=False)
 class Details:
-    """What is long and folded away until it is asked for."""
+    """A part that is collapsed until the reader opens it."""
 
     kind: ClassVar[str] = "details"
     summary: str
     parts: Sequence[Part]
 
 
-Part = str | Figure | Table | Values | Bullets | Details  # a text is a paragraph
+Part = str | Figure | Table | Values | Bullets | Details  # a str is a paragraph
 
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A heading, and what stands below it."""
+    """A heading and the parts below it."""
 
     title: str
     parts: Sequence[Part]
@@ -148,7 +150,7 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """A page. lead: the sentence that is read first."""
+    """A page. lead: the sentence that the reader meets first."""
 
     title: str
     lead: str
@@ -164,7 +166,7 @@ class Page:
 
 
 def with_error(value: float, sigma: float | None = None) -> str:
-    """A number to the second digit of its error, "12.34 ± 0.56"; to five digits where it has none."""
+    """A number rounded to the second digit of its error, "12.34 ± 0.56"; to five digits if it has no error."""
     if not math.isfinite(value):
         return DASH
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
@@ -172,20 +174,20 @@ def with_error(value: float, sigma: float | None = None) -> str:
     if abs(value) >= 1e6 or max(abs(value), sigma) < 1e-3:
         return f"{value:.3e} ± {sigma:.1e}"
     digits = max(0, 1 - math.floor(math.log10(sigma)))
-    rounded = round(value, digits) + 0.0  # no minus before a zero
+    rounded = round(value, digits) + 0.0  # + 0.0 turns -0.0 into 0.0
     return f"{rounded:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def provenance_values(provenance: Mapping[str, Any]) -> Values:
-    """What made a report: names and texts, a nested one's name with those that it lies in before it."""
-    return Values([Value(name, text) for name, text in _told(provenance)])
+    """The provenance of a report as names and texts; a nested name is preceded by the names around it."""
+    return Values([Value(name, text) for name, text in _named_texts(provenance)])
 
 
-def _told(provenance: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+def _named_texts(provenance: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
     for key, value in provenance.items():
         name = f"{before}{key}".replace("_", " ")
         if isinstance(value, Mapping):
-            yield from _told(value, f"{name}: ")
+            yield from _named_texts(value, f"{name}: ")
         elif value is not None:
             yield name, str(value)
 
@@ -195,7 +197,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _flat(parts: Sequence[Part]) -> Iterator[Part]:
-    """Parts in the order in which they are read, those folded away among them."""
+    """All parts in reading order, including those inside Details."""
     for part in parts:
         yield part
         if isinstance(part, Details):
@@ -216,6 +218,6 @@ def _template() -> Template:
 
 
 def _unbroken(text: str) -> str:
-    """A text whose lines do not end between a number and its error or its percent sign."""
+    """The text, with no line break between a number and its error or its percent sign."""
     space = "\N{NO-BREAK SPACE}"
     return text.replace(" ± ", f"{space}±{space}").replace(" %", f"{space}%")

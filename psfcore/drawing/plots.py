@@ -1,6 +1,6 @@
-"""Pictures for people: an image before and after, and a point-spread function.
+"""Plots: an image before and after deconvolution, and a PSF.
 
-Drawn on figures of their own with the Agg canvas, so that threads and processes do not meet in pyplot.
+Each plot has its own figure on the Agg canvas. So threads and processes share no state, as they would with pyplot.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ GOLD = LinearSegmentedColormap.from_list(
 CHANGE = LinearSegmentedColormap.from_list(
     "change", ["#123a7a", "#3f7fc1", "#b9d5ea", "#f7f7f4", "#f6c9a4", "#d5642f", "#7d1a12"]
 ).with_extremes(bad=_NO_DATA)
-# Colour, width and dashes of a component's curve; reference and parts stand behind the sums.
+# Colour, width and dashes of each component's curve; thin curves are drawn behind wide ones.
 _CURVES: dict[str, tuple[str, float, Any]] = {
     "TOTAL": ("#111111", 2.4, "-"),
     "DIFFRACTION": ("#7b3fa0", 2.0, "-"),
@@ -81,9 +81,9 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
 
 
 def psf_png(psf: Psf, path: str | Path) -> None:
-    """Three panels: the centre on a logarithmic scale, weight by radius, light beyond a radius.
+    """Three panels: the centre on a logarithmic scale, mean weight by radius, 1 - encircled energy by radius.
 
-    The curves are those of the total and of each component, an Airy pattern among them as the reference.
+    The curves are those of the total PSF and of each component; the Airy pattern of the open aperture is for reference.
     """
     figure = Figure(
         figsize=(15.6, 5.6),
@@ -108,9 +108,9 @@ def psf_png(psf: Psf, path: str | Path) -> None:
         label = name.capitalize().replace("_", " ") + (" (open aperture)" if name == "AIRY" else "")
         curve_axes.semilogx(radii, cumulative_curve(kernel, radii), label=label, **style)
     profile_axes.set(
-        xlabel="Radius (px)", ylabel="Mean weight (fraction per pixel)", title="Weight by radius"
+        xlabel="Radius (px)", ylabel="Mean weight (fraction per pixel)", title="Mean weight by radius"
     )
-    curve_axes.set(xlabel="Radius (px)", ylabel="Light beyond radius (%)", title="Light beyond a radius")
+    curve_axes.set(xlabel="Radius (px)", ylabel="1 - encircled energy (%)", title="Light beyond a radius")
     curve_axes.set_ylim(bottom=0)
     profile_axes.set_ylim(bottom=max(1e-13, 0.3 * min(lowest)), top=1.5)
     for axes in (profile_axes, curve_axes):
@@ -123,13 +123,13 @@ def psf_png(psf: Psf, path: str | Path) -> None:
 
 
 def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Radius (px) and mean weight over rings of a pixel, from 17 px on of a seventeenth of the radius.
+    """Radius (px) and mean weight, over rings of 1 px, and from 17 px on over rings of 1/17 of the radius.
 
-    The centre stands at half a pixel: a logarithmic axis has no zero. Rings without light are left out.
+    The centre is at half a pixel, because a logarithmic axis has no zero. Rings without light are left out.
     """
     ring, mean = radial_profile(np.asarray(kernel, dtype=np.float64))
     group = np.where(ring < 17, ring, 17 + np.floor(17 * np.log(np.maximum(ring, 17) / 17))).astype(int)
-    pixels = np.maximum(ring, 0.5)  # in proportion: those of a ring
+    pixels = np.maximum(ring, 0.5)  # proportional to the number of pixels of a ring
     light = np.bincount(group, weights=mean * pixels)
     count = np.bincount(group, weights=pixels)
     radius = np.bincount(group, weights=pixels**2)
@@ -156,7 +156,7 @@ def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:
 
 
 def binned(plane: Plane, step: int) -> NDArray[np.float64]:
-    """Means of step x step pixels; NaN only where all of them are. An incomplete last row is dropped."""
+    """Means of step x step pixels; NaN only where all of them are NaN. An incomplete last row or column is dropped."""
     ny, nx = plane.shape[0] // step, plane.shape[1] // step
     data = np.asarray(plane[: ny * step, : nx * step], dtype=np.float32)
     finite = np.isfinite(data)
@@ -176,7 +176,7 @@ def _block_sum(data: NDArray[np.float32], step: int) -> NDArray[np.float64]:
 
 
 def square_root_stretch(before: Plane, after: Plane) -> FuncNorm:
-    """One square-root-like stretch for both: 0 to the 99.7th percentile of the brighter of the two."""
+    """One square-root stretch for both images: from 0 to the larger of their 99.7th percentiles."""
     finite = [plane[np.isfinite(plane)] for plane in (before, after)]
     top = max((float(np.percentile(values, 99.7)) for values in finite if values.size), default=1.0)
     top = top if top > 0 else 1.0
@@ -192,7 +192,7 @@ def _square(value: Any) -> Any:
 
 
 def change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
-    """100 (after / before - 1), NaN where before is not above zero."""
+    """100 (after / before - 1); NaN where before is not positive."""
     ratio = np.full(before.shape, np.nan)
     np.divide(after, before, out=ratio, where=before > 0)
     return np.asarray(100 * (ratio - 1))

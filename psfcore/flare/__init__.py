@@ -1,0 +1,1 @@
+"""Stray light of flares: measures diffraction arms, and compares PSFs along them."""

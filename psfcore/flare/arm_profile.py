@@ -1,28 +1,31 @@
-"""A PSF judged on a flare: what it makes of the flare's place, set beside what was seen along a diffraction arm.
+"""The stray light of a flare along a diffraction arm: observed, and simulated with a PSF.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Solar flare". A flare's core is saturated, so its
-light is found together with what it diffracts and scatters. The intensities x of a box of 7 x 7 px about its centre
-are free, and
+Hofmeister et al., The point-spread function of HRI_EUV, section "Solar flare". The core of a flare is saturated, so
+its light must be fitted from the light that the PSF diffracts and scatters. The intensities x of a box of 7 x 7 px
+around the centre are free:
 
     s(r) = sum over k of x_k h(r - p_k),   x_k >= 0                                          Eq. (1)
     minimise sum over u of ((s_u - d_u) / e_u)^2   with   mean s = mean d at 60 to 70 px     Eq. (2)
 
-d is the flare image less one from before the flare. s_u and d_u are means over pixels of a strip along the arm, one a
-pixel of distance u. e_u is the noise of d_u where the camera's is known, so that the sum is chi^2; else d_u itself,
-so that its root mean square is the percentage error that the paper minimises. Non-negative least squares (Lawson and
-Hanson 1974, chapter 23) finds the minimum; the constraint is one more row of great weight (their chapter 22).
+d is the flare image less an image from before the flare. s_u and d_u are means over the pixels of a strip along the
+arm, one mean per pixel of distance u. If the camera's noise is known, e_u is the noise of d_u and the sum is chi^2.
+If not, e_u = d_u, and the root mean square is the percentage error that the paper minimises. Non-negative least
+squares (Lawson and Hanson 1974, chapter 23) finds the minimum; the constraint is one more row with a large weight
+(their chapter 22).
 
-Departures: the paper iterates "until the percentage root mean square error was minimized" and does not say how. With
-noise known, chi^2 is minimised instead: at 60 px and more the percentage error of single pixels is mostly noise.
+Departure from the paper: it iterates "until the percentage root mean square error was minimized" and does not say
+how. Here chi^2 is minimised if the noise is known, because beyond 60 px the percentage error of single pixels is
+mostly noise.
 
-What it can say: x is found for each PSF anew, so a PSF is not blamed for an unknown flare. A scatter that is too strong
-or too weak all over is taken up by x. What is left is the shape: light between the orders against light in them.
+What the comparison can show: x is fitted for each PSF separately, so the unknown flare does not count against a PSF.
+But x also absorbs a scatter that is too strong or too weak at all distances. What remains is a test of the shape:
+the light between the orders against the light in them.
 
 | symbol | name | unit |
 |---|---|---|
 | d, e | difference, sigma | image unit |
 | h | kernel | - |
-| x | box [y, x] | image unit, of light before the PSF |
+| x | box [y, x] | image unit, of the scene |
 | u | distance_px, along the arm from the centre | px |
 """
 
@@ -43,10 +46,10 @@ from psfcore.scatter.samples import DIFFRACTION, SCATTER
 BOX_PX = 7
 MATCHED_PX = (60.0, 70.0)
 FITTED_PX = (10.0, 80.0)
-HALF_WIDTH_PX = BOX_PX / 2  # a strip as wide as the box sees the orders of all of its pixels
+HALF_WIDTH_PX = BOX_PX / 2  # a strip as wide as the box holds the orders of all its pixels
 FEWEST_DISTANCES = 20
 _CONSTRAINT_WEIGHT = 1e4
-_USED_SHARE = 1e-6  # of the box's light, from which a pixel of the box counts as used
+_USED_SHARE = 1e-6  # of the box's light; pixels with less do not count as free parameters
 
 Plane = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -55,9 +58,9 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ArmProfile:
-    """Light along an arm: means of a strip's pixels by distance from the flare, with the noise where it is known.
+    """Light along an arm: the strip's mean at each distance from the flare, with its noise if known.
 
-    rows, columns: the pixels; member: the index of each one's distance.
+    rows, columns: the pixels of the strip; member: for each pixel, the index of its distance.
     """
 
     centre_xy: tuple[int, int]
@@ -70,19 +73,20 @@ class ArmProfile:
     member: NDArray[np.intp]
 
     def mean(self, values: Vector) -> Vector:
-        """Means by distance of values, one a pixel of the strip."""
+        """Mean at each distance of `values`, which has one value per pixel of the strip."""
         count = np.bincount(self.member, minlength=self.distance_px.size)
         return np.asarray(np.bincount(self.member, values, minlength=self.distance_px.size) / count)
 
 
 @dataclass(frozen=True, eq=False)
 class FlareFit:
-    """What one PSF makes of a flare along an arm.
+    """The light along an arm that one PSF simulates, with the fitted flare.
 
     box [y, x]: light of the flare; simulated: s_u. rms_pct: root mean square of 100 (s_u / d_u - 1).
-    chi2_per_distance: of the sum in Eq. (2), none where the noise is not known; reduced_chi2: the same over distances
-    less pixels of the box in use, one for the constraint. matched: mean s over mean d at 60 to 70 px;
-    matched_noise_pct: how well noise lets that mean d be known, to which the constraint holds the fit exactly.
+    chi2_per_distance: the sum in Eq. (2) over the number of distances; None if the noise is unknown. reduced_chi2:
+    the sum over the degrees of freedom: distances less used pixels of the box, plus one for the constraint.
+    matched: mean s over mean d at 60 to 70 px. matched_noise_pct: the noise of that mean d, which the constraint
+    treats as exact.
     """
 
     box: Plane
@@ -95,7 +99,7 @@ class FlareFit:
     matched_noise_pct: float | None
 
     def as_json(self) -> dict[str, Any]:
-        """All but the profile."""
+        """All fields except the profile, as JSON."""
         return {
             "rms_pct": self.rms_pct,
             "chi2_per_distance": self.chi2_per_distance,
@@ -110,10 +114,10 @@ class FlareFit:
 
 @dataclass(frozen=True, eq=False)
 class FlareComparison:
-    """The total PSF and its diffraction alone, on one arm of one flare; diffraction is none where the PSF's file does
-    not tell it from scatter.
+    """The total PSF and its diffraction PSF alone, compared along one arm of one flare.
 
-    explained: share of what changed off the arm that the total PSF's box accounts for, see `explained_share`.
+    diffraction: None if the PSF's file does not separate diffraction from scatter.
+    explained: the share of the changes off the arm that the total PSF and its box explain, see `explained_share`.
     """
 
     profile: ArmProfile
@@ -123,19 +127,19 @@ class FlareComparison:
 
     @property
     def rms_factor(self) -> float | None:
-        """How many times the percentage error of the total PSF diffraction alone has."""
+        """Percentage error of diffraction alone over that of the total PSF."""
         return None if self.diffraction is None else self.diffraction.rms_pct / self.total.rms_pct
 
     @property
     def chi2_factor(self) -> float | None:
-        """How many times the chi^2 of the total PSF diffraction alone has."""
+        """chi^2 of diffraction alone over that of the total PSF."""
         alone = None if self.diffraction is None else self.diffraction.chi2_per_distance
         if alone is None or not self.total.chi2_per_distance:
             return None
         return alone / self.total.chi2_per_distance
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-able."""
+        """The comparison as JSON, with the profile."""
         profile = self.profile
         return {
             "centre_xy": list(profile.centre_xy),
@@ -154,10 +158,11 @@ class FlareComparison:
 
 
 def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tuple[int, int]:
-    """(x, y) of the flare: the middle of the largest patch that was lost since the image before, else the brightest spot.
+    """Position (x, y) of the flare, px.
 
-    usable, usable_before: pixels that can be trusted in the image and in the one before. Raises DataError
-    "flare-no-light" where nothing became brighter.
+    It is the middle of the largest patch of pixels that became unusable since the image before; if there is none, the
+    brightest pixel of the smoothed difference. usable, usable_before: usable pixels of the two images. Raises DataError
+    "flare-no-light" if nothing became brighter.
     """
     labels, count = ndimage.label(~usable & usable_before, structure=np.ones((3, 3)))
     if count:
@@ -165,7 +170,7 @@ def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tupl
         return round(float(x.mean())), round(float(y.mean()))
     smooth = ndimage.gaussian_filter(np.where(usable & usable_before, difference, 0.0), 1.0)
     if not smooth.max() > 0:
-        raise DataError("flare-no-light", "expected something brighter than in the image before; got nothing")
+        raise DataError("flare-no-light", "expected pixels brighter than in the image before; got none")
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
     return int(column), int(row)
 
@@ -180,14 +185,16 @@ def arm_profile(
     distances_px: tuple[float, float] = FITTED_PX,
     half_width_px: float = HALF_WIDTH_PX,
 ) -> ArmProfile:
-    """The profile along the arm that leaves the centre at `arm_deg`, degrees from +x towards +y.
+    """Profile along the arm that leaves the centre at `arm_deg`, degrees from +x towards +y.
 
-    Distances at which less than half of the strip can be used are left out. variance: of each pixel of the
-    difference. Raises DataError "flare-bad-centre", "flare-short-arm".
+    Distances at which less than half of the strip is usable are left out. variance: of each pixel of the difference.
+    Raises DataError "flare-bad-centre", "flare-short-arm".
     """
     ny, nx = difference.shape
     if not (0 <= centre_xy[0] < nx and 0 <= centre_xy[1] < ny):
-        raise DataError("flare-bad-centre", f"expected a centre on {nx} x {ny} px; got {centre_xy}")
+        raise DataError(
+            "flare-bad-centre", f"expected a centre (x, y) on the image of {nx} x {ny} px; got {centre_xy}"
+        )
     y, x = np.indices(difference.shape)
     angle = np.deg2rad(arm_deg)
     along = (x - centre_xy[0]) * np.cos(angle) + (y - centre_xy[1]) * np.sin(angle)
@@ -200,8 +207,8 @@ def arm_profile(
     if kept.size < FEWEST_DISTANCES:
         raise DataError(
             "flare-short-arm",
-            f"expected {FEWEST_DISTANCES} distances or more with usable pixels along {arm_deg:g} degrees from "
-            f"{centre_xy}; got {kept.size}",
+            f"expected at least {FEWEST_DISTANCES} distances with usable pixels along the arm at {arm_deg:g} degrees "
+            f"from {centre_xy}; got {kept.size}: choose another arm or a wider range of distances",
         )
     rows, columns = np.nonzero(strip & usable & np.isin(distance, kept))
     member = np.searchsorted(kept, distance[rows, columns])
@@ -223,10 +230,10 @@ def arm_profile(
 def fit_flare(
     profile: ArmProfile, kernel: Plane, *, matched_px: tuple[float, float] = MATCHED_PX, box_px: int = BOX_PX
 ) -> FlareFit:
-    """Intensities of the box that make the simulated profile like the observed one, Eq. (2).
+    """Fit the intensities of the box so that the simulated profile matches the observed one, Eq. (2).
 
-    kernel: a PSF [y, x], centre at [n // 2, n // 2]. Raises DataError "flare-no-light" where the arm has none
-    to match at 60 to 70 px.
+    kernel: a PSF [y, x], centre at [n // 2, n // 2]. Raises DataError "flare-no-light" if the mean difference at 60 to
+    70 px is not positive.
     """
     design = _design(profile, kernel, box_px)
     observed = profile.observed
@@ -235,13 +242,13 @@ def fit_flare(
     if not level > 0:
         raise DataError(
             "flare-no-light",
-            f"expected light above the image before at {matched_px[0]:g} to {matched_px[1]:g} px along the arm; "
-            f"got a mean of {level:.3g} over {int(matched.sum())} distances",
+            f"expected light of the flare at {matched_px[0]:g} to {matched_px[1]:g} px along the arm; "
+            f"got a mean difference of {level:.3g} over {int(matched.sum())} distances",
         )
     error = profile.sigma if profile.sigma is not None else _percent_error(observed, level)
     constraint = design[matched].mean(axis=0)
     weight = _CONSTRAINT_WEIGHT * np.sqrt(observed.size) / level
-    # Columns of unlike size, and light of 1e7, are made alike for the solver.
+    # The solver needs columns of similar size: they differ, and the light is about 1e7.
     scale = np.linalg.norm(design / error[:, None], axis=0)
     rows = np.vstack((design / error[:, None], weight * constraint)) / np.where(scale > 0, scale, 1.0)
     found, _ = nnls(rows, np.append(observed / error, weight * level))
@@ -260,7 +267,7 @@ def compare_on_flare(
     distances_px: tuple[float, float] = FITTED_PX,
     matched_px: tuple[float, float] = MATCHED_PX,
 ) -> FlareComparison:
-    """The total PSF, and diffraction alone where the PSF has it and scatter as components, along one arm of a flare.
+    """Compare the total PSF along one arm of a flare; also its diffraction alone if the PSF has both components.
 
     Raises DataError as `arm_profile` and `fit_flare` do.
     """
@@ -286,32 +293,33 @@ def explained_share(
     *,
     variance: Plane | None = None,
 ) -> float:
-    """Share of what changed round the flare, as far as the arm goes and off it, that is the light of the box:
+    """Share of the changes around the flare, off the arm but at the arm's distances, that stray light explains:
 
         1 - (sum (s - d)^2 - sum e^2) / (sum d^2 - sum e^2)
 
-    1 where all is stray light of the flare; 0 and below where other things changed as much.
+    It is 1 if all changes are stray light of the flare, and 0 or less if other changes are as large.
     """
     x0, y0 = profile.centre_xy
     near, far = profile.distance_px[[0, -1]]
     half = int(far) + 1
     top, left = max(0, y0 - half), max(0, x0 - half)
     window = np.s_[top : y0 + half + 1, left : x0 + half + 1]
-    seen = difference[window]
-    place: NDArray[np.intp] = np.indices(seen.shape) + np.array([top, left])[:, None, None]
+    observed = difference[window]
+    place: NDArray[np.intp] = np.indices(observed.shape) + np.array([top, left])[:, None, None]
     radius = np.hypot(place[0] - y0, place[1] - x0)
     counted = usable[window] & (radius >= near) & (radius <= far)
     counted[profile.rows - top, profile.columns - left] = False
-    simulated = np.zeros(seen.shape)
+    simulated = np.zeros(observed.shape)
     for row, column, light in _box(profile, fit.box):
         if light > 0:
             simulated += light * _at(kernel, np.asarray(place[0] - row), np.asarray(place[1] - column))
     noise = 0.0 if variance is None else float(variance[window][counted].sum())
-    left_over = float(((simulated - seen)[counted] ** 2).sum()) - noise
-    return 1 - left_over / max(float((seen[counted] ** 2).sum()) - noise, 1e-300)
+    left_over = float(((simulated - observed)[counted] ** 2).sum()) - noise
+    return 1 - left_over / max(float((observed[counted] ** 2).sum()) - noise, 1e-300)
 
 
 def _judged(profile: ArmProfile, design: Plane, box: Plane, matched: Flags) -> FlareFit:
+    """The fit's result for the given box."""
     simulated, observed = design @ box.ravel(), profile.observed
     used = int(np.count_nonzero(box > _USED_SHARE * box.sum()))
     chi2 = None if profile.sigma is None else float((((simulated - observed) / profile.sigma) ** 2).sum())
@@ -330,6 +338,7 @@ def _judged(profile: ArmProfile, design: Plane, box: Plane, matched: Flags) -> F
 
 
 def _noise_of_mean_pct(profile: ArmProfile, matched: Flags) -> float | None:
+    """Noise of the mean over the matched distances, percent of that mean."""
     if profile.sigma is None:
         return None
     sigma = np.sqrt((profile.sigma[matched] ** 2).sum()) / np.count_nonzero(matched)
@@ -337,12 +346,12 @@ def _noise_of_mean_pct(profile: ArmProfile, matched: Flags) -> float | None:
 
 
 def _percent_error(observed: Vector, level: float) -> Vector:
-    """d_u, but not less than a tenth of the level at 60 to 70 px: a distance that noise made dark does not decide."""
+    """d_u, but at least a tenth of the mean at 60 to 70 px: a distance that noise made dark must not dominate."""
     return np.maximum(observed, 0.1 * level)
 
 
 def _design(profile: ArmProfile, kernel: Plane, box_px: int) -> Plane:
-    """What one unit in each pixel of the box gives at each distance: (distances, pixels of the box)."""
+    """Design matrix (distances, pixels of the box): the profile of unit light in each pixel of the box."""
     columns = [
         profile.mean(_at(kernel, profile.rows - row, profile.columns - column))
         for row, column, _ in _box(profile, np.zeros((box_px, box_px)))
@@ -358,7 +367,7 @@ def _box(profile: ArmProfile, box: Plane) -> list[tuple[int, int, float]]:
 
 
 def _at(kernel: Plane, dy: NDArray[np.intp], dx: NDArray[np.intp]) -> Vector:
-    """Weights at these offsets from the centre; 0 off the array."""
+    """The kernel's weights at these offsets from its centre; 0 outside its array."""
     ny, nx = kernel.shape
     row, column = dy + ny // 2, dx + nx // 2
     there = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)

@@ -1,4 +1,4 @@
-"""A PSF judged on a flare, as a picture: the flare and its arm, and the light along the arm, seen and simulated."""
+"""A plot of a PSF compared on a flare: image and arm, the light along the arm, and its residuals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from psfcore.drawing.plots import INK
 from psfcore.flare.arm_profile import BOX_PX, MATCHED_PX, FlareComparison, FlareFit
 
-_SEEN, _TOTAL, _ALONE = "#6d6d6d", "#c2402f", "#7b3fa0"
+_OBSERVED, _TOTAL, _ALONE = "#6d6d6d", "#c2402f", "#7b3fa0"
 
 
 def flare_png(
@@ -27,7 +27,7 @@ def flare_png(
     *,
     unit: str,
 ) -> None:
-    """The difference [y, x] round the flare with the arm, the profile along it, and what is left in it."""
+    """Plot the difference [y, x] around the flare with the arm, the profile along the arm, and the residuals."""
     layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06)
     figure = Figure(figsize=(15.6, 6.2), dpi=100, facecolor="white", layout=layout)
     figure.suptitle(_heading(found), x=0.01, ha="left", weight="bold", color=INK)
@@ -37,7 +37,7 @@ def flare_png(
     below = figure.add_subplot(grid[1, 1], sharex=above)
     above.tick_params(labelbottom=False)
     _draw_profile(above, found, unit)
-    _draw_rest(below, found)
+    _draw_residuals(below, found)
     for axes in (above, below):
         axes.axvspan(*MATCHED_PX, color="#eeeae0", zorder=0)
         axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
@@ -47,17 +47,15 @@ def flare_png(
 
 
 def _heading(found: FlareComparison) -> str:
-    words = f"Arm at {found.profile.arm_deg:.2f} degrees: {_figures('total PSF', found.total)}"
+    words = f"Arm at {found.profile.arm_deg:.2f} degrees: {_summary('total PSF', found.total)}"
     if found.diffraction is not None:
-        words += (
-            f"; {_figures('diffraction alone', found.diffraction)}, {found.rms_factor:.1f} times the error"
-        )
+        words += f"; {_summary('diffraction alone', found.diffraction)}, {found.rms_factor:.1f} times the rms of the total PSF"
     return words
 
 
-def _figures(name: str, fit: FlareFit) -> str:
-    chi2 = "" if fit.chi2_per_distance is None else f", chi2 {fit.chi2_per_distance:.2f} a distance"
-    return f"{name} {fit.rms_pct:.1f} % rms{chi2}"
+def _summary(name: str, fit: FlareFit) -> str:
+    chi2 = "" if fit.chi2_per_distance is None else f", chi2 per distance {fit.chi2_per_distance:.2f}"
+    return f"{name} rms error {fit.rms_pct:.1f} %{chi2}"
 
 
 def _draw_flare(
@@ -85,7 +83,7 @@ def _draw_flare(
         ylim=(max(-0.5, y - reach), min(difference.shape[0] - 0.5, y + reach)),
         xlabel="x (px)",
         ylabel="y (px)",
-        title="Flare less the image before; not usable: white",
+        title="Flare less the image before (white: unusable)",
     )
     axes.legend(loc="upper right", fontsize=9)
     figure.colorbar(drawn, ax=axes, shrink=0.8, label=unit)
@@ -99,9 +97,9 @@ def _draw_profile(axes: Any, found: FlareComparison, unit: str) -> None:
         yerr=profile.sigma,
         fmt="o",
         markersize=3.5,
-        color=_SEEN,
+        color=_OBSERVED,
         elinewidth=0.9,
-        label="seen",
+        label="observed",
     )
     for name, fit, colour in _fits(found):
         axes.plot(profile.distance_px, fit.simulated, color=colour, linewidth=1.6, label=name)
@@ -115,18 +113,20 @@ def _draw_profile(axes: Any, found: FlareComparison, unit: str) -> None:
     axes.legend(frameon=False)
 
 
-def _draw_rest(axes: Any, found: FlareComparison) -> None:
-    """Simulated less seen, over the noise; over the light seen where the noise is not known."""
+def _draw_residuals(axes: Any, found: FlareComparison) -> None:
+    """Simulated less observed: over the noise, or over the observed light if the noise is unknown."""
     profile = found.profile
     unit = np.maximum(profile.observed, 1e-300) / 100 if profile.sigma is None else profile.sigma
-    rests = [((fit.simulated - profile.observed) / unit, colour) for _, fit, colour in _fits(found)]
-    for rest, colour in rests:
-        axes.plot(profile.distance_px, rest, color=colour, linewidth=1.2)
-    limit = min(100.0, 1.2 * float(np.percentile(np.abs(np.concatenate([r for r, _ in rests])), 98)))
+    residuals = [((fit.simulated - profile.observed) / unit, colour) for _, fit, colour in _fits(found)]
+    for residual, colour in residuals:
+        axes.plot(profile.distance_px, residual, color=colour, linewidth=1.2)
+    limit = min(100.0, 1.2 * float(np.percentile(np.abs(np.concatenate([r for r, _ in residuals])), 98)))
     axes.axhline(0, color="#999999", linewidth=0.8)
     axes.set(
-        xlabel="Distance from the flare along the arm (px); shaded: matched",
-        ylabel="Simulated - seen\n(% of seen)" if profile.sigma is None else "Simulated - seen\n(sigma)",
+        xlabel="Distance from the flare along the arm (px); shaded: means are matched",
+        ylabel="Simulated - observed\n(% of observed)"
+        if profile.sigma is None
+        else "Simulated - observed\n(sigma)",
         ylim=(-limit, limit),
     )
 

@@ -1,4 +1,4 @@
-"""A measurement of arms as a picture: the image with the orders found, and fit against data along the arms."""
+"""A plot of measured arms: the image with the fitted orders, and the fit beside the data along the arms."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _COLOURS = ("#c2402f", "#1b4f8a", "#2b8a6e", "#e0a100", "#7b3fa0", "#1b1b1b")
 
 
 def arms_png(image: NDArray[np.float64], found: ArmMeasurement, path: str | Path) -> None:
-    """The image [y, x] (DN, or a difference), the orders used, and cuts along each arm."""
+    """Plot the image [y, x] (DN, or a difference), the fitted orders, and cuts along each arm."""
     layout = ConstrainedLayoutEngine(w_pad=0.08)
     figure = Figure(figsize=(15.6, 6.2), dpi=100, facecolor="white", layout=layout)
     spacing = f"{found.spacing_px:.4f} +- {found.spacing_sigma_px:.4f} px"
     figure.suptitle(
-        f"Orders {spacing} apart, {len(found.peaks)} used, reduced chi2 {found.reduced_chi2:.2f}",
+        f"Order spacing {spacing}, {len(found.peaks)} orders fitted, reduced chi2 {found.reduced_chi2:.2f}",
         x=0.01,
         ha="left",
         weight="bold",
@@ -52,7 +52,7 @@ def _draw_image(figure: Figure, axes: Any, image: NDArray[np.float64], found: Ar
 
 
 def _draw_cuts(axes: Any, image: NDArray[np.float64], found: ArmMeasurement) -> None:
-    """Image, and where it was fitted the fit, along each arm; arms one above the other."""
+    """Cuts along each arm: the image, and the fit where pixels were fitted; one arm above the other."""
     reach = max((abs(peak.order) for peak in found.peaks), default=1) * found.spacing_px + 5
     along = np.arange(-reach, reach, 0.25)
     clean = np.nan_to_num(image)
@@ -70,7 +70,10 @@ def _draw_cuts(axes: Any, image: NDArray[np.float64], found: ArmMeasurement) -> 
         colour = _COLOURS[arm % len(_COLOURS)]
         axes.plot(along, np.where(shown, data / height, np.nan) + arm, color="#888888", linewidth=2.2)
         axes.plot(along, np.where(shown, model / height, np.nan) + arm, color=colour, linewidth=1.1)
-    axes.set(xlabel="Distance from the centre along the arm (px)", ylabel="Image (grey) and fit, arm by arm")
+    axes.set(
+        xlabel="Distance from the centre along the arm (px)",
+        ylabel="Image (grey) and fit (colour), one curve per arm",
+    )
     axes.set_yticks([])
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)

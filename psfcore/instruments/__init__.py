@@ -1,1 +1,1 @@
-"""Instrument descriptions: one TOML file each, found by `files`, checked by `model`."""
+"""Instrument descriptions: one TOML file each; `files` finds them, `model` checks them."""

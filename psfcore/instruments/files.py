@@ -1,6 +1,6 @@
-"""Where the instrument files lie, what they hash to, and which of them a header belongs to.
+"""Finds the instrument files: by name, by the hash of their bytes, and by the header of an image.
 
-Standard library only, so that a process that never computes can import it.
+Standard library only, so that the web process can import it.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ _FOLDER = Path(__file__).parent
 
 
 def instrument_names() -> tuple[str, ...]:
-    """Names of all instruments shipped, sorted."""
+    """Names of all shipped instruments, sorted."""
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
 
 
 def instrument_path(name: str) -> Path:
-    """The description of instrument `name`; DataError "unknown-instrument" when there is none."""
+    """Path of the file of instrument `name`; raises DataError "unknown-instrument"."""
     if name not in instrument_names():
         known = ", ".join(instrument_names())
         raise DataError("unknown-instrument", f"expected one of: {known}; got {name!r}")
@@ -30,12 +30,12 @@ def instrument_path(name: str) -> Path:
 
 
 def instrument_digest(name: str) -> str:
-    """SHA-256 (hex) of the bytes of instrument `name`'s description."""
+    """SHA-256 (hex) of the bytes of the file of instrument `name`."""
     return hashlib.sha256(instrument_path(name).read_bytes()).hexdigest()
 
 
 def match_instrument(cards: Mapping[str, object]) -> str | None:
-    """Name of the instrument all of whose [match] cards equal those given, or None."""
+    """Name of the first instrument whose [match] cards all equal the given header cards, or None."""
     for name in instrument_names():
         wanted = _match_table(name)
         if wanted and all(_same(cards.get(key), value) for key, value in wanted.items()):

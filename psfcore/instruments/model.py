@@ -1,6 +1,6 @@
-"""An instrument as its TOML file describes it, checked key by key.
+"""The instrument file (TOML): its tables and keys, checked key by key.
 
-Units stand in the keys. Angles are in degrees from +x of the detector towards +y.
+Every key names its unit. Angles are in degrees from +x of the detector towards +y. docs/instruments.md is the reference.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_path
 
-_MOST_DOTS = 64  # in one stretch of a file without brackets, commas or line ends
+_MOST_DOTS = 64  # in one part of a file without brackets, commas or line ends
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-# Lengths and angles are multiplied and divided with each other: within these bounds, which no telescope from X-rays to
-# the far infrared comes near to in the unit of its key, none of that overflows or comes to 0.
+# The software multiplies and divides lengths by each other. Within these limits no result overflows or becomes 0, and
+# no telescope from X-rays to the far infrared comes close to them in the units of the keys.
 _LEAST, _MOST = 1e-9, 1e9
 Size = Annotated[float, Field(ge=_LEAST, le=_MOST, allow_inf_nan=False)]
 SizeOrNone = Annotated[float, Field(ge=0, le=_MOST, allow_inf_nan=False)]
@@ -33,7 +33,7 @@ class _Frozen(BaseModel):
 
 
 class GainMode(_Frozen):
-    """What a readout mode does to a photon. ``basis`` says how far the figures can be trusted."""
+    """Saturation and noise of one readout mode. ``basis`` says where the numbers come from."""
 
     saturation_dn: Positive | None = None
     photon_gain_dn: Positive | None = None
@@ -42,7 +42,7 @@ class GainMode(_Frozen):
 
 
 class Detector(_Frozen):
-    """The sensor. ``gain_modes`` is keyed by the mode as GAINCOMB spells it."""
+    """The sensor. The keys of ``gain_modes`` are the values of the header's GAINCOMB."""
 
     pixel_pitch_um: Size
     pixels: Count
@@ -60,12 +60,14 @@ class Aperture(_Frozen):
     @model_validator(mode="after")
     def _ring(self) -> Aperture:
         if self.obscuration_diameter_mm >= self.diameter_mm:
-            raise ValueError(f"obscuration_diameter_mm must be less than diameter_mm {self.diameter_mm}")
+            raise ValueError(
+                f"obscuration_diameter_mm ({self.obscuration_diameter_mm}) must be less than diameter_mm ({self.diameter_mm})"
+            )
         return self
 
 
-class Line(_Frozen):
-    """A wavelength of the bandpass and its share of the light (shares are normalised to their sum)."""
+class SpectralLine(_Frozen):
+    """A spectral line of the bandpass and its share of the light; the shares are normalised to sum 1."""
 
     wavelength_angstrom: Size
     weight: Positive
@@ -82,7 +84,7 @@ class Mirror(_Frozen):
 
 
 class Distances(_Frozen):
-    """Distances along the light's way, as the drawings give them."""
+    """Distances along the optical path, as the drawings give them."""
 
     aperture_to_primary_mm: Size
     primary_to_secondary_mm: Size
@@ -91,10 +93,10 @@ class Distances(_Frozen):
 
 
 class Mesh(_Frozen):
-    """A square mesh that carries a filter.
+    """A square mesh that supports a filter.
 
-    ``windows`` is how many the light of one field point passes in each direction, as the paper counts them.
-    ``share``: where a telescope has several meshes at one place that each see a part of the light, the part.
+    ``windows``: how many windows the light of one field point crosses in each direction, as the paper counts them.
+    ``share``: the share of the light that crosses this mesh, where several meshes stand side by side.
     """
 
     name: str
@@ -108,7 +110,7 @@ class Mesh(_Frozen):
     @model_validator(mode="after")
     def _wire_fits(self) -> Mesh:
         if self.wire_um >= self.pitch_um:
-            raise ValueError(f"wire_um {self.wire_um} must be less than pitch_um {self.pitch_um}")
+            raise ValueError(f"wire_um ({self.wire_um}) must be less than pitch_um ({self.pitch_um})")
         return self
 
 
@@ -121,22 +123,22 @@ class Rays(_Frozen):
 
 
 class Ring(_Frozen):
-    """A circular bar; the radius is that of its middle."""
+    """A circular bar; ``radius_mm`` is the radius of its centre line."""
 
     radius_mm: Size
     width_mm: Size
 
 
 class Polygon(_Frozen):
-    """An opaque polygon, corners (x, y) in mm from the centre of the aperture."""
+    """An opaque polygon with corners (x, y) in mm from the centre of the aperture."""
 
     corners_mm: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=3)]
 
 
 class MaskImage(_Frozen):
-    """A mask as FITS or PNG: 0 is opaque and the largest value open, centred on the aperture.
+    """A mask as a FITS or PNG image centred on the aperture: 0 is opaque, the largest value is open.
 
-    ``file`` is the name of a file beside the instrument file.
+    ``file`` is the name of a file in the folder of the instrument file.
     """
 
     file: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*\.(png|fits|fits\.gz)$")]
@@ -144,7 +146,7 @@ class MaskImage(_Frozen):
 
 
 class Mount(_Frozen):
-    """What holds the entrance filter. ``basis`` must say where it comes from."""
+    """The mount of the entrance filter. ``basis`` must say where its description comes from."""
 
     basis: Literal["drawing", "assumed"]
     rays: tuple[Rays, ...] = ()
@@ -155,7 +157,7 @@ class Mount(_Frozen):
 
 
 class Scatter(_Frozen):
-    """Softened power law a / (b + r)^c whose sum over r > 0 on the full reach is ``total``."""
+    """The softened power law a / (b + r)^c; ``total`` is its sum over r > 0 on the full reach."""
 
     b_px: Positive
     c: Positive
@@ -164,13 +166,13 @@ class Scatter(_Frozen):
 
 
 class Instrument(_Frozen):
-    """All that a PSF is built from."""
+    """An instrument: all quantities that a PSF is computed from."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
     version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")]
     status: Literal["draft", "released"]
     wavelength_angstrom: Size
-    bandpass: tuple[Line, ...] = ()
+    bandpass: tuple[SpectralLine, ...] = ()
     focal_length_mm: Size
     match: dict[str, str] = {}
     aperture: Aperture
@@ -182,29 +184,29 @@ class Instrument(_Frozen):
     scatter: Scatter | None = None
 
     @property
-    def lines(self) -> tuple[Line, ...]:
-        """The bandpass, or the one wavelength; weights sum to 1."""
-        lines = self.bandpass or (Line(wavelength_angstrom=self.wavelength_angstrom, weight=1.0),)
+    def spectral_lines(self) -> tuple[SpectralLine, ...]:
+        """The bandpass, or the one wavelength; the weights sum to 1."""
+        lines = self.bandpass or (SpectralLine(wavelength_angstrom=self.wavelength_angstrom, weight=1.0),)
         total = sum(line.weight for line in lines)
         return tuple(line.model_copy(update={"weight": line.weight / total}) for line in lines)
 
     def mesh_distance_mm(self, mesh: Mesh) -> float:
-        """Distance over which a mesh diffracts: the focal length at the entrance, else that to the detector.
+        """Distance over which a mesh diffracts: the focal length at the entrance, else the distance to the detector.
 
-        Raises DataError "bad-instrument-file" where the file gives no distances.
+        Raises DataError "bad-instrument-file" if the file gives no distances.
         """
         if mesh.place == "entrance":
             return self.focal_length_mm
         if self.distances is None:
             raise DataError(
                 "bad-instrument-file",
-                f"{self.name}: distances: expected them, since mesh {mesh.name} is at the filter wheel; got none",
+                f"{self.name}: distances: expected this table, because mesh {mesh.name!r} is at the filter wheel; got none",
             )
         return self.distances.filter_wheel_to_detector_mm
 
 
 def load_instrument(name_or_path: str | Path) -> Instrument:
-    """Read an instrument by its name, or from a TOML file given as a Path or as a string in .toml.
+    """Read an instrument by its name, or from a TOML file given as a Path or as a string that ends in .toml.
 
     Raises DataError "unknown-instrument" or "bad-instrument-file" (one line that names the key).
     """
@@ -219,9 +221,9 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
 
 
 def parse_instrument(text: str, label: str) -> Instrument:
-    """An instrument from the text of its TOML file; ``label`` names it in errors.
+    """Read an instrument from the text of its TOML file; ``label`` names the file in errors.
 
-    Raises DataError "bad-instrument-file" (one line that names the key, what was expected and what came).
+    Raises DataError "bad-instrument-file": one line with the key, the expected and the given value.
     """
     try:
         return Instrument.model_validate(_parse_toml(text))
@@ -232,15 +234,15 @@ def parse_instrument(text: str, label: str) -> Instrument:
         problem = f"{label}: {key}: {first['msg']}; got {first['input']!r:.80}{more}"
         raise DataError("bad-instrument-file", problem) from None
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
-        # Integers of thousands of digits, and lists in lists in lists, end as the latter two.
+        # Integers of thousands of digits raise ValueError, deeply nested lists RecursionError.
         deep = isinstance(error, RecursionError)
-        reason = "values nested less deeply" if deep else " ".join(str(error).split())
+        reason = "too many levels of nesting" if deep else " ".join(str(error).split())
         raise DataError("bad-instrument-file", f"{label}: expected TOML; {reason:.200}") from None
 
 
 def _parse_toml(text: str) -> dict[str, Any]:
-    # The parser's time goes with the square of a dotted key's length: 64 kB of "a.a.a" would take half a minute.
+    # The parser's time grows with the square of a dotted key's length: 64 kB of "a.a.a" would take half a minute.
     for stretch in re.split(r"[^\w\"'. \t-]", text):
         if stretch.count(".") > _MOST_DOTS:
-            raise ValueError(f"keys of at most {_MOST_DOTS} parts; got {stretch.strip()[:40]!r} ...")
+            raise ValueError(f"a key may have at most {_MOST_DOTS} parts; got {stretch.strip()[:40]!r} ...")
     return tomllib.loads(text)

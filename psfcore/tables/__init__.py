@@ -1,0 +1,1 @@
+"""Tables of a PSF: `make` writes them, `lookup` answers questions from them, `layout` describes them."""

@@ -1,10 +1,9 @@
-"""Questions about a PSF, answered from its tables: looked up and interpolated, nothing computed anew.
+"""Answers questions about a PSF from its tables: numbers are looked up and interpolated, pixels are not read.
 
-The tables are those of `psfcore.tables.make`. E(R), the light within R, is a staircase as far as they are exact,
-and taken as linear between their radii beyond. A 1-sigma error is the same figure read off the changes that a fit
-leaves open, so that an annulus has its own error and not those of two curves added up.
+`psfcore.tables.layout` describes the tables, E(R) and 1 - E(R). E is a staircase as far as the tables are exact, and
+interpolated linearly between their radii farther out.
 
-No numerics are imported: the web process answers with this, and so does the command line.
+This module imports no numerical library: the web process and the command line answer with it.
 """
 
 from __future__ import annotations
@@ -15,27 +14,31 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from psfcore.errors import DataError
+from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
+from psfcore.tables.layout import SCHEMA as SCHEMA
+from psfcore.tables.layout import TOTAL, WHOLE_TO_PX
 
-SCHEMA = "psf-tables/1"
-LARGEST_COUNT = 500
-PLATE_SCALE_TOLERANCE = 0.01
-SMALLEST_WORTH_SAYING = 0.005  # points
+LARGEST_COUNT = 500  # of radii in one question
+NEGLIGIBLE_POINTS = 0.005  # an interpolation error below this is not given as a number
 
 Tables = Mapping[str, Any]
 Numbers = list[float]
 
 
 def curve(tables: Tables, radii: Sequence[float] | None = None) -> dict[str, Any]:
-    """Light beyond each radius in percent, by component; without radii at those of the tables."""
+    """1 - encircled energy at each radius in percent, by component; without radii, at those of the tables.
+
+    Raises DataError "bad-radius", "radius-beyond-reach".
+    """
     wanted: Sequence[float] = tables["radii_px"] if radii is None else radii
     if radii is not None and not 0 < len(radii) <= LARGEST_COUNT:
         raise DataError("bad-radius", f"expected 1 to {LARGEST_COUNT} radii; got {len(wanted)}")
-    find = _finder(tables, wanted)
+    find = _reader_at(tables, wanted)
     return {
-        **_what(tables),
+        **_about(tables),
         "radii_px": list(wanted),
         "light_beyond_pct": {
-            name: [_beyond(e) for e in find(row)] for name, row in tables["encircled"].items()
+            name: [_one_minus(e) for e in find(row)] for name, row in tables["encircled"].items()
         },
         "sigma_points": _sigma(tables, lambda row: [100 * e for e in find(row)]),
         "resolution": _resolution(tables),
@@ -43,15 +46,22 @@ def curve(tables: Tables, radii: Sequence[float] | None = None) -> dict[str, Any
 
 
 def profile(tables: Tables) -> dict[str, Any]:
-    """Mean weight of a pixel by ring, one ring a pixel of radius, by component."""
-    return {**_what(tables), **tables["profile"], "resolution": "rings one pixel wide: r rounds to radius_px"}
+    """Mean weight of a pixel by ring, by component; each ring is one pixel wide."""
+    return {
+        **_about(tables),
+        **tables["profile"],
+        "resolution": "rings one pixel wide: the distance r, rounded to whole pixels, is radius_px",
+    }
 
 
 def encircled(tables: Tables, radius: float) -> dict[str, Any]:
-    """Light within a radius as a fraction of all light, by component."""
-    find = _finder(tables, [radius])
+    """Encircled energy within a radius as a fraction of all light, by component.
+
+    Raises DataError "bad-radius", "radius-beyond-reach".
+    """
+    find = _reader_at(tables, [radius])
     return {
-        **_what(tables),
+        **_about(tables),
         "radius_px": radius,
         "light_within": {name: find(row)[0] for name, row in tables["encircled"].items()},
         "sigma": {name: s[0] for name, s in _sigma(tables, find).items()},
@@ -60,8 +70,11 @@ def encircled(tables: Tables, radius: float) -> dict[str, Any]:
 
 
 def annulus(tables: Tables, inner: float, outer: float) -> dict[str, Any]:
-    """Light farther than `inner` and not farther than `outer`, as a fraction of all light, by component."""
-    find = _finder(tables, [inner, outer])
+    """Light at inner < r <= outer as a fraction of all light, by component.
+
+    Raises DataError "bad-annulus", "bad-radius", "radius-beyond-reach".
+    """
+    find = _reader_at(tables, [inner, outer])
     if inner >= outer:
         raise DataError("bad-annulus", f"expected inner < outer; got {inner:g} and {outer:g} px")
 
@@ -70,7 +83,7 @@ def annulus(tables: Tables, inner: float, outer: float) -> dict[str, Any]:
         return [far - near]
 
     return {
-        **_what(tables),
+        **_about(tables),
         "inner_px": inner,
         "outer_px": outer,
         "light": {name: between(row)[0] for name, row in tables["encircled"].items()},
@@ -88,24 +101,24 @@ QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
 
 
 def compare(one: Tables, other: Tables) -> dict[str, Any]:
-    """Differences of two PSFs, `other` minus `one`: of their curves at the radii that both have, and of their totals.
+    """Differences of two PSFs, `other` minus `one`: of 1 - encircled energy at common radii, and of the totals.
 
-    Raises DataError "plate-scale-mismatch" where their pixels are not the same.
+    Raises DataError "plate-scale-mismatch".
     """
     scales = [tables["plate_scale_arcsec"] for tables in (one, other)]
     if None not in scales and abs(scales[1] / scales[0] - 1) > PLATE_SCALE_TOLERANCE:
         raise DataError(
             "plate-scale-mismatch",
-            f"expected two PSFs on the same pixels; got {scales[0]:g} and {scales[1]:g} arcsec/px: rebin one first",
+            f"expected two PSFs of the same plate scale; got {scales[0]:g} and {scales[1]:g} arcsec/px: rebin one of them first",
         )
     reach = min(one["reach_px"], other["reach_px"])
     shared = set(other["radii_px"])
     radii = [r for r in one["radii_px"] if r <= reach and r in shared]
     names = [name for name in one["encircled"] if name in other["encircled"]]
-    find = [_finder(tables, radii) for tables in (one, other)]
+    find = [_reader_at(tables, radii) for tables in (one, other)]
     points = {
         name: [
-            _beyond(new) - _beyond(old)
+            _one_minus(new) - _one_minus(old)
             for old, new in zip(
                 find[0](one["encircled"][name]), find[1](other["encircled"][name]), strict=True
             )
@@ -116,8 +129,8 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
     known = [name for name in names if name in sigmas[0] or name in sigmas[1]]
     none = [0.0] * len(radii)
     return {
-        "one": _what(one),
-        "other": _what(other),
+        "one": _about(one),
+        "other": _about(other),
         "radii_px": radii,
         "difference_points": points,
         "sigma_points": {
@@ -132,11 +145,12 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
         "difference_of_central_weights": other["central_weight"] - one["central_weight"],
         "only_in_one": sorted(set(one["encircled"]) - set(names)),
         "only_in_other": sorted(set(other["encircled"]) - set(names)),
-        "resolution": "at the radii of the tables, without interpolation; errors as of two fits that share no data",
+        "resolution": "at the radii of the tables, without interpolation; errors assume two fits of independent data",
     }
 
 
-def _what(tables: Tables) -> dict[str, Any]:
+def _about(tables: Tables) -> dict[str, Any]:
+    """The fields that identify a PSF in an answer."""
     return {
         "name": tables["name"],
         "version": tables["version"],
@@ -149,28 +163,32 @@ def _what(tables: Tables) -> dict[str, Any]:
 
 
 def _resolution(tables: Tables) -> str:
+    """A sentence on where the answer is exact, and how large the interpolation error is elsewhere."""
     worst = 100 * max(tables["interpolation_error"].values())
-    near = f"exact to {min(tables['exact_to_px'], tables['reach_px']):g} px and at whole pixels to 100"
-    if worst < SMALLEST_WORTH_SAYING:
-        return f"{near}; between the table's radii linear, off by less than {SMALLEST_WORTH_SAYING} points"
+    near = f"exact to {min(tables['exact_to_px'], tables['reach_px']):g} px and at whole pixels up to {WHOLE_TO_PX} px"
+    if worst < NEGLIGIBLE_POINTS:
+        return f"{near}; elsewhere interpolated linearly, with an error below {NEGLIGIBLE_POINTS} points"
     return (
-        f"{near}; between the table's radii (steps of 1 px to 100, 2 % beyond) linear, off by up to {worst:.2f} points "
-        f"({100 * tables['interpolation_error']['TOTAL']:.2f} for the total)"
+        f"{near}; elsewhere interpolated linearly (steps of 1 px up to {WHOLE_TO_PX} px, 2 % farther out), with an error "
+        f"of up to {worst:.2f} points ({100 * tables['interpolation_error'][TOTAL]:.2f} for the total PSF)"
     )
 
 
-def _finder(tables: Tables, radii: Sequence[float]) -> Callable[[Numbers], Numbers]:
-    """What reads a row of the tables at these radii; DataError where one cannot be."""
+def _reader_at(tables: Tables, radii: Sequence[float]) -> Callable[[Numbers], Numbers]:
+    """A function that reads a row of the tables at these radii.
+
+    Raises DataError "bad-radius", "radius-beyond-reach".
+    """
     grid, reach = tables["radii_px"], tables["reach_px"]
     for radius in radii:
         if not radius >= 0 or math.isinf(radius):
-            raise DataError("bad-radius", f"expected radii of 0 px or more; got {radius:g}")
+            raise DataError("bad-radius", f"expected finite radii of 0 px or more; got {radius:g}")
         if radius > reach * (1 + 1e-9):
             raise DataError(
                 "radius-beyond-reach",
-                f"expected radii within {reach:.1f} px, the PSF's reach; got {radius:g}",
+                f"expected radii up to the reach of the PSF, {reach:.1f} px; got {radius:g}",
             )
-    # Stored radii are rounded: a radius such as sqrt(2) may be given with more digits, or fewer.
+    # Stored radii are rounded, and a caller may give a radius such as sqrt(2) with more or fewer digits.
     places = [min(bisect_right(grid, radius * (1 + 1e-9)) - 1, len(grid) - 1) for radius in radii]
 
     def find(row: Numbers) -> Numbers:
@@ -191,13 +209,13 @@ def _read(exact_to_px: float, grid: Numbers, row: Numbers, at: int, radius: floa
 
 
 def _sigma(tables: Tables, of: Callable[[Numbers], Numbers]) -> dict[str, Numbers]:
-    """1-sigma errors of figures that are linear in E, by component; none where the PSF was not fitted."""
+    """1-sigma errors of numbers that are linear in E, by component; empty if the PSF was not fitted."""
     return {
         name: [math.hypot(*column) for column in zip(*(of(row) for row in rows), strict=True)]
         for name, rows in tables["encircled_changes"].items()
     }
 
 
-def _beyond(within: float) -> float:
-    """Light beyond, percent: an array larger than the full reach holds more than all of the light."""
+def _one_minus(within: float) -> float:
+    """1 - encircled energy in percent, Eq. (2) of the layout."""
     return 100 * max(1 - within, 0.0)

@@ -1,15 +1,15 @@
-"""What a PSF says, as tables: questions are answered from them, and its pixels are not read again.
+"""Makes the tables of a PSF, from which `lookup` answers questions without reading the pixels.
 
-    E(R) = sum of the weights with r <= R                                                Eq. (1)
-    C(R) = 100 max(1 - E(R), 0)    light beyond R, or off the array, in percent           Eq. (2)
+`psfcore.tables.layout` describes the tables, E(R) and 1 - E(R). The radii are the same for every PSF, up to its reach:
 
-Radii are the same for every PSF, as far as it reaches: each distance that a pixel can have up to EXACT_TO_PX,
-where E is a staircase and the table is exact; every whole pixel to 100; steps of 2 % from there on, and the reach.
-Between these E is taken as linear, and the tables say by how much that was off at worst where it was tried.
+- up to EXACT_TO_PX every distance that a pixel can have, so that the staircase E is exact;
+- up to WHOLE_TO_PX every whole pixel;
+- farther out steps of 2 %, and the reach itself.
 
-Where the PSF was fitted, what its covariance leaves open stands beside: the changes of E by one sigma along each of
-the covariance's axes, to first order as the fit's own report has it. The error of whatever is read off the tables is
-the root of the squares of the same figure read off each of these, correlations included.
+Between the radii beyond EXACT_TO_PX, E is interpolated linearly. The tables state the largest error found at test radii.
+
+If the PSF was fitted, the tables also hold the changes of E by 1 sigma along each axis of the fit's covariance, to
+first order, as in the fit's own report.
 
 | symbol | name | unit |
 |---|---|---|
@@ -29,13 +29,9 @@ from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.psf import Psf, encircled_energy, radial_profile, squared_radii
 from psfcore.scatter.samples import DIFFRACTION, SCATTER
 from psfcore.scatter.shapes import DIFFERENCE, shape_named
+from psfcore.tables.layout import EXACT_TO_PX, SCHEMA, STEP, TOTAL, WHOLE_TO_PX
 
-SCHEMA = "psf-tables/1"
-TOTAL = "TOTAL"
-EXACT_TO_PX = 50
-WHOLE_TO_PX = 100
-STEP = 1.02
-DIGITS = 10  # of a number in the tables
+DIGITS = 10  # significant digits of a number in the tables
 
 Kernel = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -43,22 +39,17 @@ Numbers = list[float]
 
 
 def tables_of(psf: Psf, *, threads: int = 1) -> dict[str, Any]:
-    """The tables of a PSF, as JSON has them.
-
-    radii_px; encircled: E by component, TOTAL among them; encircled_changes: E's changes by component,
-    none where the PSF was not fitted; interpolation_error: largest error of E between radii by component; profile:
-    ring radius, pixels, mean weight by component, its 1-sigma error where known, rms over its mean of TOTAL round each ring.
-    """
+    """The tables of a PSF as JSON values, with the fields of `psfcore.tables.layout`."""
     kernels = {TOTAL: psf.kernel, **psf.components}
     radii = table_radii(psf.reach_px)
-    tried = _tried_radii(radii)
+    test_radii = _test_radii(radii)
     encircled: dict[str, Numbers] = {}
     interpolation_error: dict[str, float] = {}
     for name, kernel in kernels.items():
-        both = encircled_energy(kernel, np.concatenate((radii, tried)))
+        both = encircled_energy(kernel, np.concatenate((radii, test_radii)))
         within, between = both[: radii.size], both[radii.size :]
         encircled[name] = _numbers(within)
-        off = np.abs(np.interp(tried, radii, within) - between)
+        off = np.abs(np.interp(test_radii, radii, within) - between)
         interpolation_error[name] = float(off.max(initial=0.0))
     changes = _changes(psf, radii, threads)
     return {
@@ -82,7 +73,7 @@ def tables_of(psf: Psf, *, threads: int = 1) -> dict[str, Any]:
 
 
 def table_radii(reach_px: float) -> Vector:
-    """The radii of the tables of a PSF that reaches so far, ascending, px."""
+    """The radii of the tables of a PSF with this reach, ascending, px."""
     squares = np.unique(squared_radii((2 * EXACT_TO_PX + 1, 2 * EXACT_TO_PX + 1)))
     near = np.sqrt(squares[squares <= EXACT_TO_PX**2])
     steps = int(np.ceil(np.log(max(reach_px, WHOLE_TO_PX) / WHOLE_TO_PX) / np.log(STEP)))
@@ -91,7 +82,7 @@ def table_radii(reach_px: float) -> Vector:
     return np.append(radii[radii < reach_px], reach_px)
 
 
-def _tried_radii(radii: Vector) -> Vector:
+def _test_radii(radii: Vector) -> Vector:
     """Five radii within each interval beyond the staircase."""
     low, high = radii[:-1], radii[1:]
     wide = low >= EXACT_TO_PX
@@ -100,15 +91,16 @@ def _tried_radii(radii: Vector) -> Vector:
 
 
 def _changes(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vector], list[Vector]]]:
-    """What the fit leaves open, along the covariance's axes: 1-sigma changes of E at the radii, and of mean weights by
-    ring, of the total and of its scatter.
+    """1-sigma changes along the axes of the covariance: of E at the radii, and of the mean weights by ring.
+
+    Given for the total PSF and for its scatter; empty if the PSF was not fitted.
     """
     if psf.fitted is None or DIFFRACTION not in psf.components:
         return {}
     shape, size = shape_named(psf.fitted.shape), psf.kernel.shape[0]
     at = np.array(psf.fitted.coordinates)
     axes = sigma_points(np.zeros(at.size), np.array(psf.fitted.covariance))[: at.size] / np.sqrt(at.size)
-    # Slopes need no more than single precision, which takes half the time.
+    # Single precision suffices for derivatives, and takes half the time.
     diffract = Convolver(psf.components[DIFFRACTION], psf.kernel.shape, dtype=np.float32, threads=threads)
     of_total, of_scatter = [], []
     for axis in axes:
@@ -121,6 +113,7 @@ def _changes(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vect
 
 
 def _read_off(changes: list[Kernel], radii: Vector) -> tuple[list[Vector], list[Vector]]:
+    """E at the radii, and mean weights by ring, of each change."""
     within = [encircled_energy(change, radii) for change in changes]
     return within, [radial_profile(change)[1] for change in changes]
 

@@ -1,4 +1,4 @@
-"""Figures of the published instrument, from the paper and from an independent calculation."""
+"""The PSF meets the numbers of the published instrument, from the paper and from an independent calculation."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from psfcore.errors import DataError
 from psfcore.instruments.model import (
     Aperture,
     Instrument,
-    Line,
     MaskImage,
     Mesh,
     Mount,
     Rays,
+    SpectralLine,
     load_instrument,
 )
 from psfcore.psf import Psf, cumulative_curve
@@ -54,7 +54,7 @@ def test_order_spacings() -> None:
     assert spacing_px(WHEEL) == pytest.approx(0.374, abs=0.001)
 
 
-def test_orders_lie_where_the_spacing_puts_them() -> None:
+def test_orders_lie_at_multiples_of_the_spacing() -> None:
     pattern = line(ENTRANCE)[1024:]
     for order in range(1, 20):
         near = round(order * spacing_px(ENTRANCE))
@@ -66,7 +66,7 @@ def test_filter_wheel_keeps_its_share_in_the_central_pixel() -> None:
 
 
 @pytest.mark.parametrize("mesh", [ENTRANCE, WHEEL], ids=lambda mesh: mesh.name)
-def test_exact_integral_equals_fine_sampling_of_the_published_formula(mesh: Mesh) -> None:
+def test_the_exact_integral_equals_fine_sampling_of_the_published_formula(mesh: Mesh) -> None:
     size, fine = 64, 2048
     x = (np.arange(size * fine) + 0.5) / fine - size // 2 - 0.5
     # sinc(u) = sin(u) / u here; numpy's sinc takes u / pi
@@ -78,16 +78,16 @@ def test_exact_integral_equals_fine_sampling_of_the_published_formula(mesh: Mesh
 
 
 def test_an_open_grating_without_wires_has_no_orders() -> None:
-    """With no wires the windows join to one slit of N pitches: sinc^2 with its zeros at lambda z / (N d)."""
+    """Without wires the windows form one slit of N pitches: sinc^2 with zeros at lambda z / (N d)."""
     slit = Mesh(name="slit", place="entrance", pitch_um=100.0, wire_um=1e-9, windows=4)
-    spacing = spacing_px(slit)  # orders would stand at multiples of this
+    spacing = spacing_px(slit)  # with wires, the orders would lie at multiples of this
     pattern = line(slit)
     assert pattern[1024 + round(spacing)] < 1e-3 * pattern[1024]
 
 
 def test_scatter_amplitude_and_tail() -> None:
     amplitude = amplitude_for_total(6.15, 2.53, 0.411)
-    # 0.152 was inferred with more digits of c than the 2.53 that is quoted: +-0.005 in c moves a by 1.7 %.
+    # 0.152 was inferred with more digits of c than the quoted 2.53: +-0.005 in c changes a by 1.7 %.
     assert amplitude == pytest.approx(0.152, rel=0.02)
     low, high = (amplitude_for_total(6.15, c, 0.411) for c in (2.525, 2.535))
     assert low < 0.152 < high
@@ -101,7 +101,7 @@ def test_scatter_amplitude_and_tail() -> None:
 
 
 def test_total_psf_meets_the_published_curve(hri_psf: Psf) -> None:
-    """56.6 % outside the central pixel; 37, 12 and < 1 % beyond 10, 100 and 1000 px; core 0.4335."""
+    """56.6 % outside the central pixel; 37, 12 and < 1 % beyond 10, 100 and 1000 px; core weight 0.4335."""
     outside, beyond_10, beyond_100, beyond_1000 = cumulative_curve(hri_psf.kernel, [0.5, 10, 100, 1000])
     assert outside == pytest.approx(56.6, abs=0.2)
     assert beyond_10 == pytest.approx(37, abs=0.5)
@@ -147,27 +147,26 @@ def test_every_component_is_kept_and_sums_to_1(hri_psf: Psf) -> None:
     for name, kernel in {"TOTAL": hri_psf.kernel, **hri_psf.components}.items():
         assert kernel.sum() == pytest.approx(1, abs=1e-6), name
         assert kernel.min() >= 0, name
-        # Nothing that HRI_EUV is described by tells left from right, up from down; near the edge of an even
-        # grid a convolution does.
+        # The description of HRI_EUV is symmetric in x and y; only near the edge of an even grid a convolution is not.
         inner = kernel[129:1920, 129:1920]
         np.testing.assert_allclose(inner, inner[::-1], rtol=1e-3, atol=1e-12, err_msg=name)
         np.testing.assert_allclose(inner, inner.T, rtol=1e-3, atol=1e-12, err_msg=name)
 
 
-def test_core_is_what_neither_diffraction_nor_mirrors_move(hri_psf: Psf) -> None:
+def test_the_core_weight_is_the_product_of_the_two_core_weights(hri_psf: Psf) -> None:
     diffraction, scatter = hri_psf.components["DIFFRACTION"], hri_psf.components["SCATTER"]
     assert hri_psf.kernel[1024, 1024] == pytest.approx(
         diffraction[1024, 1024] * scatter[1024, 1024], rel=0.002
     )
 
 
-def test_outside_the_centre_light_adds_as_probabilities_do(hri_psf: Psf) -> None:
+def test_light_outside_the_centre_combines_like_probabilities(hri_psf: Psf) -> None:
     diffracted = cumulative_curve(hri_psf.components["DIFFRACTION"], [0.5])[0] / 100
     total = cumulative_curve(hri_psf.kernel, [0.5])[0] / 100
     assert total == pytest.approx(1 - (1 - diffracted) * (1 - 0.411), abs=0.001)
 
 
-def test_what_was_assumed_is_written_down(hri_psf: Psf) -> None:
+def test_assumptions_are_in_the_provenance(hri_psf: Psf) -> None:
     assert hri_psf.provenance["scatter_basis"] == "inferred"
     assert hri_psf.provenance["mount_basis"] == "assumed"
     assert hri_psf.provenance["entrance_route"].startswith("Fraunhofer transform of the mask, 14 samples")
@@ -177,7 +176,7 @@ def test_what_was_assumed_is_written_down(hri_psf: Psf) -> None:
     json.dumps(hri_psf.provenance)
 
 
-# --- an instrument of few cells, on which the ways through the software are quick ---------------------------
+# --- an instrument with a small pupil, for which every route is quick ---------------------------------------
 
 SMALL = HRI.model_copy(
     update={"aperture": Aperture(diameter_mm=4.0), "meshes": (WHEEL,), "mount": None, "scatter": None}
@@ -203,7 +202,7 @@ def test_a_bare_aperture_is_its_airy_pattern() -> None:
     np.testing.assert_array_equal(psf.kernel, psf.components["AIRY"])
 
 
-def test_a_smaller_array_is_the_middle_of_the_full_one_and_one_component_can_be_had_alone() -> None:
+def test_a_smaller_array_is_the_middle_of_the_full_one_and_one_component_can_be_built_alone() -> None:
     instrument = changed(scatter=HRI.scatter)
     full, small = build_psf(instrument), build_psf(instrument, size=64)
     middle = slice(992, 1056)
@@ -216,17 +215,17 @@ def test_a_smaller_array_is_the_middle_of_the_full_one_and_one_component_can_be_
 
 
 @pytest.mark.slow
-def test_a_larger_array_has_the_full_reach_in_its_middle() -> None:
+def test_a_larger_array_holds_the_full_reach_in_its_middle() -> None:
     instrument = changed(scatter=HRI.scatter)
     full, larger = build_psf(instrument, threads=2), build_psf(instrument, size=4096, threads=2)
     middle = larger.kernel[1024:3072, 1024:3072]
     assert middle.sum() == pytest.approx(1, abs=1e-12)
     np.testing.assert_allclose(middle, full.kernel, rtol=2e-3, atol=5e-9)
-    assert 1.01 < larger.total < 1.02  # beyond the reach: scatter of 1.3 % more
+    assert 1.01 < larger.total < 1.02  # 1.3 % more scatter beyond the reach
     assert cumulative_curve(larger.kernel, [2000.0])[0] == 0
 
 
-def test_tilted_and_shared_meshes_go_by_the_series() -> None:
+def test_tilted_and_shared_meshes_use_the_series() -> None:
     turned = changed(meshes=(FINE_MESH.model_copy(update={"angle_deg": 30.0}),))
     psf = build_psf(turned, size=128, threads=2)
     assert "meshes as series" in psf.provenance["entrance_route"]
@@ -244,7 +243,7 @@ def test_tilted_and_shared_meshes_go_by_the_series() -> None:
     np.testing.assert_allclose(shared, (psf.kernel + other.kernel) / 2, rtol=0.02, atol=1e-6)
 
 
-def test_a_route_too_expensive_for_the_mask_is_analytic_and_leaves_the_mount_out() -> None:
+def test_a_wide_aperture_is_analytic_and_leaves_the_mount_out() -> None:
     wide = changed(
         aperture=Aperture(diameter_mm=200.0),
         mount=Mount(basis="assumed", rays=(Rays(count=4, width_mm=3.0),)),
@@ -255,8 +254,11 @@ def test_a_route_too_expensive_for_the_mask_is_analytic_and_leaves_the_mount_out
     assert component_names(wide) == ("AIRY", "ENTRANCE", "FILTER_WHEEL", "DIFFRACTION")
 
 
-def test_lines_of_the_bandpass_add_by_weight() -> None:
-    lines = (Line(wavelength_angstrom=171.0, weight=3.0), Line(wavelength_angstrom=180.0, weight=1.0))
+def test_spectral_lines_add_by_weight() -> None:
+    lines = (
+        SpectralLine(wavelength_angstrom=171.0, weight=3.0),
+        SpectralLine(wavelength_angstrom=180.0, weight=1.0),
+    )
     both = build_psf(changed(bandpass=lines), size=64).components["AIRY"]
     first, second = (
         build_psf(changed(wavelength_angstrom=line.wavelength_angstrom), size=64).components["AIRY"]
@@ -267,7 +269,7 @@ def test_lines_of_the_bandpass_add_by_weight() -> None:
     assert provenance["lines"] == [[171.0, 0.75], [180.0, 0.25]]
 
 
-def test_a_mask_image_stands_for_the_mount() -> None:
+def test_a_mask_image_replaces_the_bars_of_the_mount() -> None:
     pixels = np.ones((64, 64))
     pixels[:, 28:36] = 0
     mount = Mount(basis="drawing", mask_image=MaskImage(file="mask.png", width_mm=4.0))
@@ -279,19 +281,19 @@ def test_a_mask_image_stands_for_the_mount() -> None:
         build_psf(changed(mount=mount), size=64)
 
 
-def test_progress_is_told_and_may_stop_the_work() -> None:
-    told: list[tuple[int, int]] = []
+def test_progress_is_reported_and_may_stop_the_work() -> None:
+    reported: list[tuple[int, int]] = []
 
     def note(done: int, of: int) -> None:
-        told.append((done, of))
+        reported.append((done, of))
 
     build_psf(
         changed(mount=Mount(basis="assumed", rays=(Rays(count=1, width_mm=1.0),))), size=64, progress=note
     )
-    steps = [done for done, _ in told]
+    steps = [done for done, _ in reported]
     assert steps == sorted(steps)
     assert len(set(steps)) > 20
-    assert (told[0], told[-1]) == ((0, 1000), (1000, 1000))
+    assert (reported[0], reported[-1]) == ((0, 1000), (1000, 1000))
 
     def stop(done: int, of: int) -> None:
         raise InterruptedError("enough")
@@ -307,7 +309,7 @@ def test_other_sizes_are_refused(size: int) -> None:
     assert caught.value.code == "bad-size"
 
 
-def test_an_unknown_component_is_refused_with_the_known_ones() -> None:
+def test_the_error_of_an_unknown_component_names_the_known_ones() -> None:
     with pytest.raises(DataError, match=r"AIRY, ENTRANCE, .*; got 'SCATTER'") as caught:
         build_psf(SMALL, component="SCATTER")
     assert caught.value.code == "unknown-component"

@@ -177,7 +177,7 @@ def _margin_px(method: Mapping[str, Any], field: tuple[int, int], psf_px: int) -
 def _build(build: PsfBuild) -> tuple[float, float]:
     instrument = parse_instrument(instrument_text(build), build.instrument or "instrument_file")
     grid = max(build.size, GRID_PX) / GRID_PX
-    shortest_mm = min(line.wavelength_angstrom for line in instrument.lines) * 1e-7
+    shortest_mm = min(line.wavelength_angstrom for line in instrument.spectral_lines) * 1e-7
     resolved_mm = shortest_mm * instrument.focal_length_mm / (instrument.detector.pixel_pitch_um * 1e-3)
     samples = max(FEWEST_SAMPLES, 2 * instrument.aperture.diameter_mm / resolved_mm)
     # More samples than these are not taken: the pattern is then that of a disc.
@@ -186,7 +186,7 @@ def _build(build: PsfBuild) -> tuple[float, float]:
     if mask:
         a_line_s += MASK_S * (samples / FEWEST_SAMPLES) ** SAMPLES_EXPONENT
     more_mib = MESHES_MIB if mask or instrument.meshes else 0.0
-    return len(instrument.lines) * a_line_s * grid**GRID_EXPONENT, more_mib + GRID_MIB * grid**2
+    return len(instrument.spectral_lines) * a_line_s * grid**GRID_EXPONENT, more_mib + GRID_MIB * grid**2
 
 
 def _tables(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""What the paper says of mesh geometry, as trends of the study."""
+"""The study shows the trends that the paper states for the geometry of meshes."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ def by_pitch(study: DesignStudy, wire_um: float) -> list[MeshDesign]:
     return [row for row in study.rows if row.wire_um == wire_um]
 
 
-def test_the_flown_mesh_has_the_published_spacing_and_its_geometric_share(study: DesignStudy) -> None:
+def test_the_flown_mesh_has_the_published_spacing_and_diffracted_share(study: DesignStudy) -> None:
     flown = study.flown
     assert flown is not None
     assert flown in study.rows
     assert flown.spacing_px == pytest.approx(5.7365, abs=1e-3)
     assert flown.windows == 37
     assert flown.diffracted_pct == pytest.approx(100 * (1 - (1230 / 1270) ** 2))
-    # pupil and mesh put 5.7 % beyond 11.5 px; the order at 11.47 px is counted here
+    # pupil and mesh have 5.7 % beyond 11.5 px; here the order at 11.47 px counts too
     assert 5.5 < flown.beyond_10_px_pct < 6.2
 
 
-def test_a_larger_pitch_diffracts_less_and_less_far_but_its_orders_run_together(study: DesignStudy) -> None:
+def test_a_larger_pitch_diffracts_less_and_less_far_but_its_orders_overlap(study: DesignStudy) -> None:
     for wire_um in (20.0, 40.0):
         rows = by_pitch(study, wire_um)
         for fine, coarse in pairwise(rows):
@@ -50,32 +50,32 @@ def test_a_larger_pitch_diffracts_less_and_less_far_but_its_orders_run_together(
             assert (fine.peak_over_scatter or 0) > (coarse.peak_over_scatter or 0)
 
 
-def test_a_thinner_wire_diffracts_less_but_wider(study: DesignStudy) -> None:
+def test_a_thinner_wire_diffracts_less_but_farther(study: DesignStudy) -> None:
     for thin, thick in zip(by_pitch(study, 20.0), by_pitch(study, 40.0), strict=True):
         assert thin.diffracted_pct < thick.diffracted_pct
         assert thin.beyond_100_px_pct / thin.diffracted_pct > thick.beyond_100_px_pct / thick.diffracted_pct
 
 
-def test_orders_of_a_flare_as_wide_as_their_spacing_run_together() -> None:
+def test_orders_of_a_flare_as_wide_as_their_spacing_overlap() -> None:
     hri = load_instrument("hri_euv")
     small, large = (design_study(hri, [1270.0], [40.0], flare_px=n).rows[0] for n in (2, 5))
     assert small.peak_visibility == 1
     assert 0.3 < large.peak_visibility < 0.8
 
 
-def test_without_scatter_nothing_is_said_of_it() -> None:
+def test_without_scatter_there_is_no_ratio_to_it() -> None:
     hri = load_instrument("hri_euv").model_copy(update={"scatter": None})
     assert design_study(hri, [1270.0], [40.0]).rows[0].peak_over_scatter is None
 
 
-def test_it_is_quick_and_drawn_and_json(study: DesignStudy, tmp_path: Path) -> None:
+def test_the_study_is_quick_and_is_plotted_and_written_as_json(study: DesignStudy, tmp_path: Path) -> None:
     start = time.perf_counter()
     larger = design_study(load_instrument("hri_euv"), [300.0 + 300 * i for i in range(8)], [20, 30, 40, 50])
     assert time.perf_counter() - start < 20
     assert len(larger.rows) == 32
-    told = json.loads(study.as_json())
-    assert told["flown"]["pitch_um"] == 1270
-    assert len(told["rows"]) == 8
+    content = json.loads(study.as_json())
+    assert content["flown"]["pitch_um"] == 1270
+    assert len(content["rows"]) == 8
     design_png(study, tmp_path / "design.png")
     assert matplotlib.image.imread(tmp_path / "design.png").std() > 0.05
 
@@ -84,7 +84,7 @@ def test_it_is_quick_and_drawn_and_json(study: DesignStudy, tmp_path: Path) -> N
     ("pitches", "wires", "flare_px"),
     [([], [40.0], 5), ([100.0], [100.0], 5), ([100.0], [-1.0], 5), ([float("inf")], [40.0], 5), ([100.0], [4.0], 0)],
 )  # fmt: skip
-def test_meshes_that_cannot_be_are_refused(pitches: list[float], wires: list[float], flare_px: int) -> None:
+def test_impossible_meshes_are_refused(pitches: list[float], wires: list[float], flare_px: int) -> None:
     with pytest.raises(DataError, match=r"expected .*; got") as caught:
         design_study(load_instrument("hri_euv"), pitches, wires, flare_px=flare_px)
     assert caught.value.code == "bad-design"

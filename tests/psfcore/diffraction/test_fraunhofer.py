@@ -1,4 +1,4 @@
-"""The far field against direct sums, formulas, and energy."""
+"""The far field agrees with direct sums and with formulas, and conserves energy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
-from psfcore.diffraction.airy import airy_kernel, first_dark_ring_v, light_beyond
+from psfcore.diffraction.airy import airy_kernel, airy_light_beyond, first_dark_ring_v
 from psfcore.diffraction.fraunhofer import FarField, far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import mesh_line
 from psfcore.diffraction.pupil import MaskGrid, MaskPicture, Pupil, bar, circle, entrance_pupil
@@ -70,8 +70,8 @@ def test_a_small_pupil_equals_the_direct_sum(pupil: Pupil, symmetry: str) -> Non
     np.testing.assert_allclose(unwindowed(found.pattern), wanted, rtol=2e-5, atol=1e-9)
 
 
-def test_a_bar_sends_its_light_across_itself() -> None:
-    """Along 30 degrees from +x towards +y; its light goes to 120 degrees."""
+def test_a_bar_diffracts_perpendicular_to_itself() -> None:
+    """The bar lies at 30 degrees from +x towards +y; its light goes to 120 degrees."""
     pattern = far(small((bar(-7, 7, 0.5, 30.0),)), 128).pattern
     y, x = np.indices(pattern.shape) - 64
     towards = {
@@ -83,14 +83,14 @@ def test_a_bar_sends_its_light_across_itself() -> None:
     assert towards[120] > 5 * max(towards[30], towards[60], towards[150])
 
 
-def test_threads_change_nothing() -> None:
+def test_the_number_of_threads_does_not_change_the_result() -> None:
     one, three = (far(small((POLYGON,)), 32, threads=threads).pattern for threads in (1, 3))
     np.testing.assert_array_equal(one, three)
 
 
 @pytest.mark.parametrize("pupil", [small(), small((POLYGON,))], ids=["disc", "polygon"])
-def test_energy_is_kept(pupil: Pupil) -> None:
-    """Over a whole period the pattern holds the mask's squares (Parseval), to the rounding of float32."""
+def test_energy_is_conserved(pupil: Pupil) -> None:
+    """Over a whole period the sum is that of the mask's squares (Parseval), within the rounding of float32."""
     found = far(pupil, 256)
     grid = MaskGrid(pupil, LAMBDA_F_OVER_P_MM / 256)
     c = grid.rows(0, grid.cells).astype(np.float64)
@@ -104,10 +104,10 @@ def test_samples_follow_the_pupils_width() -> None:
     assert samples_per_pixel(10.01 * LAMBDA_F_OVER_P_MM, **OPTICS) == 22
 
 
-def test_a_longer_period_takes_wrapped_light_out() -> None:
+def test_a_longer_period_removes_wrapped_light() -> None:
     exact = airy_kernel(**OPTICS, diameter_mm=12.0, size=64)
     wrapped, longer = (far(small(), 64, period=period).pattern for period in (64, 256))
-    outside = squared_radii(exact.shape) > 5**2  # further in, summing samples is what differs
+    outside = squared_radii(exact.shape) > 5**2  # further in, the sum over samples dominates the difference
     errors = [np.abs(found - exact)[outside].sum() for found in (wrapped, longer)]
     assert longer.shape == (64, 64)
     assert errors[1] < 0.1 * errors[0]
@@ -115,7 +115,7 @@ def test_a_longer_period_takes_wrapped_light_out() -> None:
 
 
 def test_the_open_disc_is_the_airy_pattern() -> None:
-    """Summed samples against the integral: 4e-4 of the light at most in a pixel."""
+    """The sum over samples and the integral differ by at most 4e-4 of the light in a pixel."""
     pupil = entrance_pupil(HRI.aperture)
     found = far(pupil, 128, period=512).pattern
     exact = airy_kernel(**OPTICS, diameter_mm=47.4, size=128)
@@ -125,10 +125,10 @@ def test_the_open_disc_is_the_airy_pattern() -> None:
     assert found.sum() == pytest.approx(exact.sum(), abs=2e-5)
 
 
-def test_an_airy_pattern_meets_its_formula() -> None:
-    """Dark at 1.22 lambda f / D, 83.8 % within; pixels against a fine sum of (2 J1(v) / v)^2."""
+def test_the_airy_pattern_agrees_with_its_formula() -> None:
+    """Dark at 1.22 lambda f / D with 83.8 % within; the pixels equal a fine sum of (2 J1(v) / v)^2."""
     assert first_dark_ring_v() / np.pi == pytest.approx(1.2197, abs=1e-4)
-    assert 1 - light_beyond(np.array([first_dark_ring_v()]))[0] == pytest.approx(0.8378, abs=1e-4)
+    assert 1 - airy_light_beyond(np.array([first_dark_ring_v()]))[0] == pytest.approx(0.8378, abs=1e-4)
     fine, size = 100, 16
     q = (np.arange(size * fine) + 0.5) / fine - 0.5 - size // 2
     v_per_px = np.pi * 5.0 / LAMBDA_F_OVER_P_MM
@@ -139,9 +139,9 @@ def test_an_airy_pattern_meets_its_formula() -> None:
     np.testing.assert_allclose(found, wanted, rtol=3e-4)
 
 
-def test_a_ring_aperture_loses_the_light_of_its_hole_and_spreads_it() -> None:
+def test_a_ring_aperture_agrees_with_the_integral_and_spreads_more_light() -> None:
     v = np.arange(0, 60, 0.02)
-    np.testing.assert_allclose(light_beyond(v, 1e-9), j0(v) ** 2 + j1(v) ** 2, atol=1e-7)
+    np.testing.assert_allclose(airy_light_beyond(v, 1e-9), j0(v) ** 2 + j1(v) ** 2, atol=1e-7)
     ring = Aperture(diameter_mm=12.0, obscuration_diameter_mm=5.0)
     found = far(entrance_pupil(ring), 64, period=256).pattern
     exact = airy_kernel(**OPTICS, diameter_mm=12.0, obscuration_diameter_mm=5.0, size=64)
@@ -153,7 +153,7 @@ def test_a_ring_aperture_loses_the_light_of_its_hole_and_spreads_it() -> None:
 
 
 def test_a_square_mesh_is_the_analytic_series() -> None:
-    """N windows in a square pupil: the published formula, along an axis and off it."""
+    """With N windows in a square pupil the published formula holds, along an axis and off it."""
     windows, pitch_mm = 11, 1.27
     side_mm = windows * pitch_mm
     mesh = Mesh(name="m", place="entrance", pitch_um=1270.0, wire_um=40.0, windows=windows)
@@ -176,7 +176,10 @@ def test_a_square_mesh_is_the_analytic_series() -> None:
 
 
 def test_orders_of_the_entrance_mesh_are_5_7365_px_apart() -> None:
-    """On pixels of 1 um: tops of parabolas through the logarithm. Wings of the centre move the first two."""
+    """Maxima of parabolas through the logarithm, on pixels of 1 um.
+
+    Orders 1 and 2 are left out: the wings of the centre shift them.
+    """
     meshes = [mesh for mesh in HRI.meshes if mesh.place == "entrance"]
     fine, size = 10, 1024
     pattern = far(entrance_pupil(HRI.aperture, meshes=meshes), size, pixel_pitch_um=10 / fine).pattern
@@ -191,18 +194,18 @@ def test_orders_of_the_entrance_mesh_are_5_7365_px_apart() -> None:
     assert np.mean(spacings) == pytest.approx(5.7365, abs=0.001)
 
 
-def test_progress_is_told_and_ends_the_work() -> None:
-    told: list[tuple[int, int]] = []
+def test_progress_is_reported_and_may_stop_the_work() -> None:
+    reported: list[tuple[int, int]] = []
 
     def stop(done: int, of: int) -> None:
-        told.append((done, of))
+        reported.append((done, of))
         if done == 3:
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
         far(small((POLYGON,)), 32, progress=stop)
-    assert [done for done, _ in told] == [1, 2, 3]
-    assert len({of for _, of in told}) == 1
+    assert [done for done, _ in reported] == [1, 2, 3]
+    assert len({of for _, of in reported}) == 1
 
 
 def test_mount_and_polygons_come_from_the_instrument_file() -> None:

@@ -1,4 +1,4 @@
-"""Waves against closed forms: Gaussian beams, slits, parabolas, a whole telescope of parabolas."""
+"""Waves agree with closed forms: Gaussian beams, slits, parabolas, a whole telescope of parabolas."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from psfcore.diffraction.fresnel import (
     conic_sag_mm,
     fraunhofer_field,
     grid_for,
-    light_beyond,
+    line_light_beyond,
     mesh_openings_mm,
     mirror_transmission,
     open_share,
@@ -73,7 +73,7 @@ def slit_field(x_mm: NDArray[np.float64], begin_mm: float, end_mm: float, z_mm: 
 
 
 @pytest.mark.parametrize(("samples", "out_samples"), [(7, 7), (12, 5), (5, 12), (1, 4), (64, 33)])
-def test_the_chirp_transform_is_the_sum_it_stands_for(samples: int, out_samples: int) -> None:
+def test_the_chirp_transform_equals_the_direct_sum(samples: int, out_samples: int) -> None:
     f = np.random.default_rng(1).normal(size=samples) + 1j * np.arange(samples)
     n, k = np.arange(samples) - (samples - 1) / 2, np.arange(out_samples) - (out_samples - 1) / 2
     plain = np.exp(-2j * np.pi * 0.037 * np.outer(k, n)) @ f
@@ -88,7 +88,7 @@ def test_the_chirp_transform_refuses_another_length() -> None:
 
 
 @pytest.mark.parametrize("out_samples", [2000, 3001])
-def test_propagation_keeps_the_light_of_any_field(out_samples: int) -> None:
+def test_propagation_conserves_the_light_of_any_field(out_samples: int) -> None:
     source = Grid("a", 2000, 0.001)
     target = Grid("b", out_samples, LAMBDA_MM * 300.0 / 0.001 / out_samples)  # one period of the sum
     rng = np.random.default_rng(0)
@@ -99,7 +99,7 @@ def test_propagation_keeps_the_light_of_any_field(out_samples: int) -> None:
 
 @pytest.mark.parametrize("z_mm", [50.0, 655.9])
 def test_a_gaussian_beam_spreads_by_its_formula(z_mm: float) -> None:
-    # The sum repeats itself after lambda z / step, 1.7 mm at the least.
+    # The sum is periodic in lambda z / step, at least 1.7 mm.
     source, target = Grid("a", 8000, 0.0005), Grid("b", 1601, 0.0008)
     after = propagate(
         gaussian_beam(source.x_mm, 0.0, 0.2).astype(complex),
@@ -111,7 +111,7 @@ def test_a_gaussian_beam_spreads_by_its_formula(z_mm: float) -> None:
     np.testing.assert_allclose(after, gaussian_beam(target.x_mm, z_mm, 0.2), atol=1e-10)
 
 
-def test_two_half_ways_are_the_whole_way() -> None:
+def test_two_half_distances_equal_the_whole_distance() -> None:
     source, between, target = Grid("a", 6000, 0.0006), Grid("b", 8000, 0.0005), Grid("c", 3000, 0.001)
     field = np.exp(-((source.x_mm / 0.5) ** 8)) * np.exp(40j * source.x_mm)
     once = propagate(field, source, target, wavelength_mm=LAMBDA_MM, distance_mm=400.0)
@@ -139,7 +139,7 @@ def test_the_sag_lies_on_its_conic(conic: float) -> None:
     assert sag[12] == 0 and np.all(sag >= 0)
 
 
-def test_a_sphere_ends() -> None:
+def test_the_sag_of_a_sphere_ends_at_its_radius() -> None:
     sag = conic_sag_mm([0.0, 3.0, 5.0, 6.0], radius_mm=5.0, conic=0.0)
     np.testing.assert_allclose(sag, [0, 1, 5, np.nan])
 
@@ -161,7 +161,7 @@ def test_a_parabola_focuses_at_half_its_radius() -> None:
     np.testing.assert_allclose(np.abs(image) ** 2, expected, atol=1e-4 * expected.max())
 
 
-def test_a_convex_mirror_spreads_what_a_concave_one_gathers() -> None:
+def test_a_convex_mirror_cancels_a_concave_one() -> None:
     grid = Grid("mirror", 4001, 0.001)
     concave = Mirror(name="m", radius_mm=257.0, conic=-2.04, diameter_mm=3.001, figure="concave")
     convex = concave.model_copy(update={"figure": "convex"})
@@ -169,7 +169,7 @@ def test_a_convex_mirror_spreads_what_a_concave_one_gathers() -> None:
     np.testing.assert_allclose(product, np.abs(grid.x_mm) < 1.5005, atol=1e-9)
 
 
-def test_a_mesh_is_open_by_its_windows() -> None:
+def test_a_mesh_is_open_in_its_windows() -> None:
     windows = mesh_openings_mm(pitch_mm=1.27, wire_mm=0.04, phase=0.0, width_mm=20.0)
     grid = Grid("g", 1270, 0.01)  # ten pitches
     assert open_share(grid, windows).mean() == pytest.approx(1.23 / 1.27, rel=1e-12)
@@ -178,7 +178,7 @@ def test_a_mesh_is_open_by_its_windows() -> None:
     assert open_share(grid, moved)[635] == pytest.approx(0, abs=1e-9), "at phase 0.5 a wire is"
 
 
-def test_openings_have_their_length_wherever_samples_lie() -> None:
+def test_the_open_length_does_not_depend_on_the_samples() -> None:
     aperture = Aperture(diameter_mm=47.4, obscuration_diameter_mm=9.1)
     windows = mesh_openings_mm(pitch_mm=1.27, wire_mm=0.04, phase=0.21, width_mm=47.4)
     both = common_openings_mm(aperture_openings_mm(aperture), windows)
@@ -202,14 +202,14 @@ def test_fraunhofer_is_the_integral_over_the_openings() -> None:
 
 def test_light_beyond_counts_whole_pixels_on_both_sides() -> None:
     line = np.array([1.0, 2.0, 10.0, 3.0, 4.0])
-    np.testing.assert_allclose(light_beyond(line, [0, 1, 2]), [0.5, 0.25, 0.0])
+    np.testing.assert_allclose(line_light_beyond(line, [0, 1, 2]), [0.5, 0.25, 0.0])
 
 
 # --- the telescope ---
 
 
 def collins(path: LightPath, separation_mm: float, behind_mm: float, x_mm: NDArray[np.float64]) -> Complex:
-    """Entrance to a plane behind a parabolic secondary: one integral, each window in closed form."""
+    """The field behind a parabolic secondary as one integral from the entrance, each window in closed form."""
     free: Callable[[float], NDArray[np.float64]] = lambda z: np.array([[1.0, z], [0.0, 1.0]])  # noqa: E731
     lens: Callable[[float], NDArray[np.float64]] = lambda f: np.array([[1.0, 0.0], [-1 / f, 1.0]])  # noqa: E731
     system = free(behind_mm) @ lens(focal_mm(path.secondary)) @ free(separation_mm)
@@ -227,7 +227,7 @@ def collins(path: LightPath, separation_mm: float, behind_mm: float, x_mm: NDArr
 
 
 def test_a_telescope_of_parabolas_matches_the_closed_form(path: LightPath) -> None:
-    """Every plane, both meshes: chain of transforms against Fresnel integrals and a plain sum."""
+    """At every plane and with both meshes, the transforms agree with Fresnel integrals and with a plain sum."""
     secondary = path.secondary.model_copy(update={"conic": -1.0})
     path = dataclasses.replace(path, secondary=secondary)
     separation = paraxial_separation_mm(path)
@@ -250,7 +250,7 @@ def test_a_telescope_of_parabolas_matches_the_closed_form(path: LightPath) -> No
         wavelength_mm=path.wavelength_mm,
         distance_mm=distance,
     )
-    # An independent grid, finer over the beam and narrower than the chain's.
+    # An independent grid, finer and narrower than that of the study.
     fine = Grid("fine", 60_001, 8.0 / 60_001)
     lit = collins(path, separation, behind, fine.x_mm) * open_share(fine, windows)
     points = detector.samples // 2 + np.array([0, 2, 9, 40, 92, 183])
@@ -276,7 +276,7 @@ def test_the_focal_length_of_rays_is_that_of_the_orders(focus: BestFocus) -> Non
 
 
 def test_the_ideal_slit_in_focus_matches_fraunhofer(path: LightPath, focus: BestFocus) -> None:
-    """The open aperture's light outside the central pixel, and 1 - integral of sinc^2."""
+    """The light of the open aperture outside the central pixel is 1 - integral of sinc^2."""
     grid = path.detector_grid
     field = fraunhofer_field(
         path.aperture_mm, grid, wavelength_mm=path.wavelength_mm, focal_length_mm=focus.focal_length_mm
@@ -289,7 +289,7 @@ def test_the_ideal_slit_in_focus_matches_fraunhofer(path: LightPath, focus: Best
 # --- the study ---
 
 
-def test_the_methods_agree_within_a_point(study: FresnelStudy) -> None:
+def test_the_methods_agree_within_a_percentage_point(study: FresnelStudy) -> None:
     (result,) = study.distances
     assert result.largest_points < 0.6
     assert result.largest_single_points < 1.5
@@ -297,14 +297,14 @@ def test_the_methods_agree_within_a_point(study: FresnelStudy) -> None:
     assert result.beam_mm == pytest.approx(3.09, abs=0.01)
 
 
-def test_a_mesh_moved_left_is_one_moved_right(study: FresnelStudy) -> None:
+def test_moving_the_mesh_left_or_right_gives_the_same(study: FresnelStudy) -> None:
     lowest = study.distances[0].phase_largest_points
     assert lowest[1] == pytest.approx(lowest[3], abs=1e-6)
     line = study.distances[0].fresnel_line
     np.testing.assert_allclose(line, line[::-1], atol=1e-9)
 
 
-def test_the_sampling_is_told_and_loses_no_light(study: FresnelStudy) -> None:
+def test_the_sampling_is_reported_and_loses_no_light(study: FresnelStudy) -> None:
     planes = {plane.plane: plane for plane in study.distances[0].sampling}
     assert list(planes) == ["aperture", "primary", "secondary", "filter wheel", "detector"]
     assert planes["aperture"].least_samples == pytest.approx(47.4 * 66 / (LAMBDA_MM * 655.9), rel=1e-5)
@@ -322,7 +322,7 @@ def test_finer_sampling_changes_nothing(study: FresnelStudy, monkeypatch: pytest
 
 
 def test_more_windows_bring_the_series_closer() -> None:
-    """A series of few windows adds the beam's edges, which the entrance's image holds already."""
+    """A series of few windows adds the diffraction at the edges of the beam, which the entrance's image already has."""
     few, many = (
         fresnel_study(HRI, distances_mm=(400.0,), phases=2, windows=n).distances[0].largest_points
         for n in (4, 100)
@@ -330,18 +330,18 @@ def test_more_windows_bring_the_series_closer() -> None:
     assert many < 0.3 < 1.0 < few
 
 
-def test_a_study_is_plain_json_and_its_progress_is_told() -> None:
-    seen: list[tuple[int, int]] = []
+def test_a_study_is_plain_json_and_reports_its_progress() -> None:
+    reported: list[tuple[int, int]] = []
     study = fresnel_study(
-        HRI, distances_mm=(300.0, 250.0), phases=2, windows=16, progress=lambda *done: seen.append(done)
+        HRI, distances_mm=(300.0, 250.0), phases=2, windows=16, progress=lambda *done: reported.append(done)
     )
-    assert seen == [(done, 5) for done in range(6)]
-    told = json.loads(json.dumps(study.as_json(), allow_nan=False))
-    assert told["focus"]["shift_mm"] == pytest.approx(-1.89, abs=0.01)
-    assert [result["distance_mm"] for result in told["distances"]] == [300.0, 250.0]
-    for result in told["distances"]:
-        assert len(result["difference_points"]) == len(told["radii_px"])
-        assert len(result["fresnel_line"]) == len(told["offsets_px"])
+    assert reported == [(done, 5) for done in range(6)]
+    content = json.loads(json.dumps(study.as_json(), allow_nan=False))
+    assert content["focus"]["shift_mm"] == pytest.approx(-1.89, abs=0.01)
+    assert [result["distance_mm"] for result in content["distances"]] == [300.0, 250.0]
+    for result in content["distances"]:
+        assert len(result["difference_points"]) == len(content["radii_px"])
+        assert len(result["fresnel_line"]) == len(content["offsets_px"])
         assert len(result["phase_largest_points"]) == 2
 
 
@@ -359,7 +359,7 @@ def without(**changes: object) -> Instrument:
         (without(meshes=(HRI.meshes[0].model_copy(update={"angle_deg": 45.0}), HRI.meshes[1])), "angle_deg"),
     ],
 )
-def test_an_instrument_that_lacks_something_is_told_what(instrument: Instrument, key: str) -> None:
+def test_the_error_names_the_key_that_an_instrument_lacks(instrument: Instrument, key: str) -> None:
     with pytest.raises(DataError, match=f"hri_euv: .*{key}") as caught:
         fresnel_study(instrument)
     assert caught.value.code == "bad-instrument-file"
@@ -382,11 +382,11 @@ def test_bad_requests_are_refused(code: str, arguments: dict[str, object]) -> No
 
 
 @pytest.mark.parametrize("distance_mm", [1.0, 579.0])
-def test_a_wheel_too_near_a_neighbour_is_refused_before_the_work(distance_mm: float) -> None:
-    seen: list[int] = []
+def test_a_wheel_too_close_to_another_plane_is_refused_before_the_work(distance_mm: float) -> None:
+    reported: list[int] = []
     with pytest.raises(DataError, match="too-many-samples"):
-        fresnel_study(HRI, distances_mm=(273.0, distance_mm), progress=lambda done, of: seen.append(done))
-    assert seen == []
+        fresnel_study(HRI, distances_mm=(273.0, distance_mm), progress=lambda done, of: reported.append(done))
+    assert reported == []
 
 
 def test_mirrors_without_a_focus_are_refused(path: LightPath) -> None:
@@ -396,14 +396,14 @@ def test_mirrors_without_a_focus_are_refused(path: LightPath) -> None:
         paraxial_separation_mm(blind)
 
 
-def test_the_study_is_drawn(study: FresnelStudy, tmp_path: Path) -> None:
+def test_the_study_is_plotted(study: FresnelStudy, tmp_path: Path) -> None:
     fresnel_png(study, tmp_path / "f.png")
     assert matplotlib.image.imread(tmp_path / "f.png").std() > 0.05
 
 
 @pytest.mark.slow
 def test_every_distance_of_the_published_study() -> None:
-    """Mean over phases within a point everywhere; single phases reach 3.7 points near the detector."""
+    """The mean over phases is within a point everywhere; single phases reach 3.7 points near the detector."""
     study = fresnel_study(HRI)
     largest = {result.distance_mm: result.largest_points for result in study.distances}
     assert list(largest) == [50, 100, 200, 273, 400, 500, 550]

@@ -1,4 +1,4 @@
-"""The pattern of a turned mesh: against the product of exact lines, by symmetry, and against a published PSF."""
+"""The pattern of a rotated mesh agrees with exact lines, with its symmetries, and with a published PSF."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def share_on_line(mesh: dict[str, float], size: int) -> float:
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_unturned_it_is_the_product_of_exact_lines(name: str) -> None:
+def test_without_rotation_the_pattern_is_the_product_of_exact_lines(name: str) -> None:
     mesh = MESHES[name]
     line = mesh_line(**mesh, size=512) * share_on_line(mesh, 512)  # type: ignore[arg-type]
     exact = mesh_kernel(line, line)
@@ -67,15 +67,15 @@ def test_unturned_it_is_the_product_of_exact_lines(name: str) -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [1.3, 30.0, 45.0, -50.4])
-def test_a_turn_moves_no_light_to_other_radii(angle_deg: float) -> None:
+def test_rotation_moves_no_light_to_other_radii(angle_deg: float) -> None:
     radii = [0.5, 20.3, 60.7, 100.0]
     turned = cumulative_curve(rotated("aia", angle_deg, 256), radii)
     straight = cumulative_curve(rotated("aia", 0.0, 256), radii)
-    # An order near the ring's edge may lie in a pixel on its other side: far orders are counted in permilles.
+    # An order near a radius may fall into a pixel on its other side; a far order holds some 0.1 % of the light.
     np.testing.assert_allclose(turned, straight, atol=0.35)
 
 
-def test_symmetries() -> None:
+def test_the_pattern_has_the_symmetries_of_a_square() -> None:
     kernel = rotated("hri entrance", 17.0, 129)
     np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
     np.testing.assert_allclose(kernel, np.rot90(kernel), atol=1e-12)
@@ -83,7 +83,7 @@ def test_symmetries() -> None:
     np.testing.assert_allclose(rotated("hri entrance", -17.0, 129), kernel[::-1], atol=2e-5)
 
 
-def test_it_turns_from_x_towards_y() -> None:
+def test_the_pattern_rotates_from_x_towards_y() -> None:
     kernel = rotated("aia", 20.0, 129)
     spacing = order_spacing_px(
         wavelength_angstrom=171.0, distance_mm=4129.0, pitch_um=362.857, pixel_pitch_um=12.0
@@ -98,7 +98,7 @@ def test_a_full_array_is_quick() -> None:
     rotated("hri entrance", 1.3, 64)  # compiles
     start = time.perf_counter()
     rotated("hri entrance", 45.0, 2048)
-    assert time.perf_counter() - start < 4.0  # 1 s on a quiet machine; wide, for busy ones
+    assert time.perf_counter() - start < 4.0  # 1 s on a quiet machine; the limit allows for a busy one
 
 
 # --- AIA 171 against aiapy --------------------------------------------------------------------------------
@@ -111,7 +111,7 @@ SIZE = 2048
 def aiapy(shared: Path) -> NDArray[np.float64]:
     path = shared / "data" / "real" / "psf" / "derived_aia171_psf_aiapy0.10.2.fits"
     if not path.exists():
-        pytest.skip(f"real data not at hand: {path}")
+        pytest.skip(f"real data not available: {path}")
     whole = np.asarray(fits.getdata(path), dtype=np.float64)
     half = whole.shape[0] // 2
     return whole[half - SIZE // 2 : half + SIZE // 2, half - SIZE // 2 : half + SIZE // 2]
@@ -141,7 +141,7 @@ def pattern(mesh: Mesh, instrument: Instrument) -> NDArray[np.float64]:
 def arms_by_centroid(kernel: NDArray[np.float64], spacing_px: float) -> list[tuple[float, float]]:
     """(angle in degrees, spacing in px) of each arm: a line through the centroids of orders 3 to 40.
 
-    All orders count alike: unblurred orders sit in one pixel each, and only their number averages that out.
+    All orders have the same weight: each unblurred order fills one pixel, and only their number averages the rounding.
     """
     found = []
     box = np.arange(-3, 4)
@@ -160,21 +160,23 @@ def arms_by_centroid(kernel: NDArray[np.float64], spacing_px: float) -> list[tup
     return found
 
 
-def test_aia_arms_lie_where_aiapy_puts_them(aiapy: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
+def test_aia_arms_agree_with_aiapy(aiapy: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
     theirs, found = arms_by_centroid(aiapy, 16.26), arms_by_centroid(ours, 16.22)
     for (their_angle, their_spacing), (angle, spacing) in zip(theirs, found, strict=True):
-        # One angle a mesh: the measured arms are 0.06 and 0.05 degrees from being square.
+        # The file has one angle per mesh; the measured arms differ from 90 degrees by 0.06 and 0.05 degrees.
         assert angle == pytest.approx(their_angle, abs=0.06)
         assert their_spacing == pytest.approx(16.26, abs=0.01)
         # 70 lines an inch give 16.22; 16.26 was measured, +- 0.10.
         assert spacing == pytest.approx(16.22, abs=0.02)
 
 
-def test_aia_light_by_radius_is_aiapys(aiapy: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
-    """18.4 % beyond 10.75 px. Both keep 0.82 in the zero order and give each arm the same.
+def test_aia_light_beyond_a_radius_agrees_with_aiapy(
+    aiapy: NDArray[np.float64], ours: NDArray[np.float64]
+) -> None:
+    """18.4 % lie beyond 10.75 px. Both keep 0.82 in order zero and give each arm the same light.
 
-    aiapy stops at order 100 and has no orders off the axes (0.9 % of the light here), so less of its light
-    lies far out; its core is a Gaussian of 0.47 px, so less of it lies in the central pixel.
+    aiapy stops at order 100 and has no orders off the axes (0.9 % of the light here), so it has less light
+    far out. Its core is a Gaussian of 0.47 px, so it has less light in the central pixel.
     """
     theirs = dict(zip((0.5, 1.5, 10.75, 100), cumulative_curve(aiapy, [0.5, 1.5, 10.75, 100]), strict=True))
     found = dict(zip((0.5, 1.5, 10.75, 100), cumulative_curve(ours, [0.5, 1.5, 10.75, 100]), strict=True))
@@ -185,10 +187,8 @@ def test_aia_light_by_radius_is_aiapys(aiapy: NDArray[np.float64], ours: NDArray
     assert 4 < theirs[0.5] - found[0.5] < 7
 
 
-def test_aia_orders_weigh_what_aiapy_gives_them(
-    aiapy: NDArray[np.float64], ours: NDArray[np.float64]
-) -> None:
-    """Same envelope. aiapy's orders of 0.47 px sampled at pixel centres gain or lose up to a fifth each."""
+def test_aia_order_weights_agree_with_aiapy(aiapy: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
+    """The envelope is the same. aiapy samples its orders of 0.47 px at pixel centres: each is off by up to a fifth."""
     ratios = []
     for order in range(2, 9):
         light = [
@@ -196,7 +196,7 @@ def test_aia_orders_weigh_what_aiapy_gives_them(
             for kernel, spacing in ((aiapy, 16.26), (ours, 16.22))
         ]
         ratios.append(light[1] / light[0])
-    # 2 f (1 - f) = 0.170 on the axes, of the 0.18 that aiapy gives them
+    # 2 f (1 - f) = 0.170 lies on the axes; aiapy puts 0.18 there
     assert np.mean(ratios) == pytest.approx(0.17 / 0.18, abs=0.06)
     assert max(abs(np.array(ratios) - 0.94)) < 0.25
 

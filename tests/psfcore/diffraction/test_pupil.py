@@ -1,4 +1,4 @@
-"""Masks have the area and the place of what is described."""
+"""Masks have the area and the position of the described parts."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def area_mm2(pupil: Pupil, cell_mm: float = CELL_MM) -> float:
 
 
 def by_points(pupil_inside: object, cells: int, cell_mm: float, points: int = 30) -> NDArray[np.float64]:
-    """Reference: share of points x points places in each cell at which a function of (x, y) is true."""
+    """Reference: share of a grid of points x points in each cell at which a function of (x, y) is true."""
     fine = (np.arange(cells * points) + 0.5) / points - cells / 2
     x, y = np.meshgrid(fine * cell_mm, fine * cell_mm)
     inside = np.asarray(pupil_inside(x, y), dtype=np.float64)  # type: ignore[operator]
@@ -43,31 +43,31 @@ def by_points(pupil_inside: object, cells: int, cell_mm: float, points: int = 30
 
 
 @pytest.mark.parametrize("cell_mm", [0.05, 0.0371, 0.3])
-def test_a_disc_and_a_ring_have_their_area(cell_mm: float) -> None:
+def test_a_disc_and_a_ring_have_the_right_area(cell_mm: float) -> None:
     assert area_mm2(entrance_pupil(APERTURE), cell_mm) == pytest.approx(DISC_MM2, rel=1e-6)
     ring = Aperture(diameter_mm=10.0, obscuration_diameter_mm=4.0)
     assert area_mm2(entrance_pupil(ring), cell_mm) == pytest.approx(DISC_MM2 * (1 - 0.16), rel=1e-6)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 17.0, 45.0, 90.0, 133.0])
-def test_a_bar_takes_its_area(angle_deg: float) -> None:
+def test_a_bar_blocks_its_area(angle_deg: float) -> None:
     square = Pupil((bar(-5, 5, 10, 0.0),), ((bar(-3, 2, 0.8, angle_deg),),))
     assert area_mm2(square) == pytest.approx(100 - 4.0, rel=1e-6)
 
 
-def test_rings_and_hub_take_their_area() -> None:
+def test_rings_and_hub_block_their_area() -> None:
     mount = Mount(basis="assumed", rings=(Ring(radius_mm=3.0, width_mm=0.4),), hub_diameter_mm=2.0)
     wanted = DISC_MM2 - 2 * math.pi * 3.0 * 0.4 - math.pi
     assert area_mm2(entrance_pupil(APERTURE, mount=mount)) == pytest.approx(wanted, rel=1e-6)
 
 
 def test_the_open_area_with_wires_is_right_to_1e_5() -> None:
-    """Full windows of a square opening, cells that fit neither pitch nor wire."""
+    """Full windows in a square opening, with cells that are no fraction of pitch or wire."""
     square = Pupil((bar(-4.5, 4.5, 9.0, 0.0),), meshes=(mesh(),))
     assert area_mm2(square, 0.0337) == pytest.approx(81 * 0.93**2, rel=1e-5)
 
 
-def test_wires_lie_between_windows_and_on_the_axis_for_an_even_number() -> None:
+def test_an_odd_number_of_windows_has_one_on_the_axis_and_an_even_number_a_wire() -> None:
     odd, even = (mask(Pupil((bar(-4, 4, 8.0, 0.0),), meshes=(mesh(windows=n),))) for n in (9, 8))
     centre = len(odd) // 2
     assert odd[centre - 9 : centre + 9, centre - 9 : centre + 9].min() == 1
@@ -76,11 +76,11 @@ def test_wires_lie_between_windows_and_on_the_axis_for_an_even_number() -> None:
     np.testing.assert_allclose(odd, odd.T, atol=1e-6)
 
 
-def test_a_tilted_mesh_is_the_straight_one_turned() -> None:
+def test_a_tilted_mesh_is_the_straight_one_rotated() -> None:
     disc = (circle(4.0),)
     straight, quarter = (mask(Pupil(disc, meshes=(mesh(angle_deg=a),))) for a in (0.0, 90.0))
     np.testing.assert_allclose(straight, quarter)
-    # 0.001 degrees moves a wire's end by 0.07 um, 0.0014 of a cell; crossings differ where products meet.
+    # 0.001 degrees moves the end of a wire by 0.07 um, 0.0014 of a cell; where wires cross, shares are multiplied.
     tilted = mask(Pupil(disc, meshes=(mesh(angle_deg=0.001),)))
     np.testing.assert_allclose(tilted, straight, atol=0.005)
     turned = mask(Pupil(disc, meshes=(mesh(angle_deg=30.0),)))
@@ -89,7 +89,7 @@ def test_a_tilted_mesh_is_the_straight_one_turned() -> None:
 
 
 def test_a_mask_equals_counting_points_in_each_cell() -> None:
-    """Off-centre, without symmetry, in all its parts."""
+    """With off-centre parts and no symmetry."""
     corners = ((0.3, -2.0), (2.9, -1.1), (1.2, 0.7))
     mount = Mount(
         basis="drawing",
@@ -110,7 +110,7 @@ def test_a_mask_equals_counting_points_in_each_cell() -> None:
 
     found = mask(entrance_pupil(APERTURE, mount=mount), 0.1)
     wanted = by_points(inside, len(found), 0.1)
-    # 900 points tell a cell's share to 0.03; where two edges meet in a cell shares are multiplied.
+    # 900 points give the share of a cell to 0.03; where two edges cross in a cell, shares are multiplied.
     assert np.abs(found - wanted).mean() < 2e-4
     assert np.quantile(np.abs(found - wanted), 0.999) < 0.05
     assert found.sum() == pytest.approx(wanted.sum(), rel=2e-5)
@@ -125,8 +125,8 @@ def test_strips_are_parts_of_the_whole() -> None:
 
 
 @pytest.mark.parametrize("pixels", [37, 200, 1000])
-def test_a_mask_image_keeps_its_area_and_place(pixels: int) -> None:
-    """A quarter in the upper left (y high, x low) is dark; pixels wider and narrower than cells."""
+def test_a_mask_image_keeps_its_area_and_position(pixels: int) -> None:
+    """The upper left quarter (y high, x low) is opaque; pixels are wider or narrower than cells."""
     share = np.ones((pixels, pixels))
     share[pixels // 2 :, : pixels // 2] = 0
     square = Pupil((bar(-5, 5, 10.0, 0.0),), picture=MaskPicture(share, 10.0))
@@ -157,7 +157,7 @@ def image_mount(width_mm: float = 10.0) -> Mount:
         (Mount(basis="assumed", rays=(Rays(count=2, width_mm=10.0),)), None, "rays.0.width_mm"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_its_key(
+def test_the_error_of_an_unfit_mount_names_the_key(
     mount: Mount, image: NDArray[np.float64] | None, key: str
 ) -> None:
     with pytest.raises(DataError, match=rf"mount\.{key}: expected") as caught:

@@ -1,4 +1,4 @@
-"""A page stands alone, escapes what it is given, counts its figures, and rounds to the error."""
+"""A page needs no other file, escapes all texts, numbers its figures, and rounds values to their errors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def png(width_in: float = 3.0) -> bytes:
 
 
 def page(name: str = "000.fits") -> Page:
-    """All kinds of parts, with a name that came with the data in every place that takes a text."""
+    """A page with all kinds of parts; the given name is in every place that takes a text."""
     table = Table(("file", "residual (%)"), ((name, "1.0 ± 0.2"), ("b", "-3 to 4")), f"Caption of {name}.")
     figure = Figure(png(), f"How to read {name}.", f"alt {name}")
     values = Values((Value(name, 0.12345, 0.0023, "px", name), Value("name", name)))
@@ -57,7 +57,7 @@ def figure_of(name: str) -> Figure:
 
 
 @pytest.mark.parametrize("name", ["000.fits", MALICIOUS, "' onload='alert(3)", "{{ 7 * 7 }}", "&amp;é日"])
-def test_a_page_stands_alone_whatever_a_file_is_called(name: str) -> None:
+def test_a_page_stands_alone_and_escapes_any_file_name(name: str) -> None:
     html = page(name).html()
     check_stands_alone(html)
     tags = read_page(html)
@@ -68,7 +68,7 @@ def test_a_page_stands_alone_whatever_a_file_is_called(name: str) -> None:
     assert next(t for t in tags if t.name == "img").attributes["alt"] == f"alt {name}"
 
 
-def test_figures_and_tables_are_counted_apart_in_the_order_of_reading() -> None:
+def test_figures_and_tables_are_numbered_separately_in_reading_order() -> None:
     captions = [t.text for t in read_page(page().html()) if t.name == "figcaption"]
     assert [re.match(r"(Figure|Table) \d", caption)[0] for caption in captions] == [  # type: ignore[index]
         "Figure 1",
@@ -77,20 +77,20 @@ def test_figures_and_tables_are_counted_apart_in_the_order_of_reading() -> None:
     ]
 
 
-def test_columns_of_numbers_stand_to_the_right_and_a_number_is_not_torn_from_its_error() -> None:
+def test_numbers_are_right_aligned_and_stay_on_one_line_with_their_error() -> None:
     html = page().html()
     cells = {t.text: t.attributes.get("class") for t in read_page(html) if t.name == "td"}
     assert cells == {"000.fits": None, "b": None, "1.0 ± 0.2": "n", "-3 to 4": "n"}
     assert "12.3\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}0.4\N{NO-BREAK SPACE}%" in html
 
 
-def test_a_picture_is_as_large_as_it_was_drawn() -> None:
+def test_a_figure_is_shown_in_the_size_it_was_drawn() -> None:
     figure = Figure(png(3.0), "c", "a")
     assert (figure.shown_width, figure.shown_height) == (288, 192)
 
 
 @pytest.mark.parametrize(
-    ("value", "sigma", "said"),
+    ("value", "sigma", "written"),
     [
         (12.3456, 0.564, "12.35 ± 0.56"),
         (0.42834, 0.00851, "0.4283 ± 0.0085"),
@@ -104,25 +104,25 @@ def test_a_picture_is_as_large_as_it_was_drawn() -> None:
         (math.nan, 0.1, "\N{EN DASH}"),
     ],
 )
-def test_a_number_ends_with_the_second_digit_of_its_error(
-    value: float, sigma: float | None, said: str
+def test_a_value_is_rounded_to_the_second_digit_of_its_error(
+    value: float, sigma: float | None, written: str
 ) -> None:
-    assert with_error(value, sigma) == said
+    assert with_error(value, sigma) == written
 
 
-def test_what_cannot_be_shown() -> None:
+def test_bad_figures_and_tables_are_refused() -> None:
     with pytest.raises(DataError, match="expected a figure as PNG") as caught:
         Figure(b"GIF89a", "c", "a")
     assert caught.value.code == "not-a-png"
-    with pytest.raises(DataError, match="expected 2 cells a row; got 3") as caught:
+    with pytest.raises(DataError, match="expected 2 cells in each row; got 3") as caught:
         Table(("a", "b"), (("1", "2", "3"),), "c")
     assert caught.value.code == "uneven-table"
 
 
-def test_a_browser_opens_it_from_a_file_and_has_nothing_to_complain_of(tmp_path: Path) -> None:
+def test_a_browser_opens_the_page_from_a_file_without_console_messages(tmp_path: Path) -> None:
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if browser is None:
-        pytest.skip("no Chromium on this machine, so no browser looks at the page")
+        pytest.skip("no Chromium on this machine to open the page with")
     (tmp_path / "page.html").write_text(page(MALICIOUS).html(), "utf-8")
     picture = tmp_path / "page.png"
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0"]

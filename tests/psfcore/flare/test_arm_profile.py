@@ -1,4 +1,4 @@
-"""A flare's stray light along an arm tells a PSF with its scatter from diffraction alone."""
+"""The stray light of a flare along an arm distinguishes the total PSF from diffraction alone."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from tests.simulated_flare import (
     SIZE,
     flare_light,
     flare_psf,
+    observed,
     pair,
     quiet_sun,
-    seen,
 )
 
 EVERYWHERE = np.ones((SIZE, SIZE), dtype=bool)
@@ -46,13 +46,13 @@ def compared(seed: int, arm_deg: float = 0.0, c: float = 2.53) -> FlareCompariso
 
 
 @pytest.mark.parametrize("arm_deg", [0.0, 90.0, 180.0])
-def test_the_total_psf_is_within_noise_and_diffraction_alone_is_not(arm_deg: float) -> None:
+def test_the_total_psf_fits_within_noise_and_diffraction_alone_does_not(arm_deg: float) -> None:
     found = [compared(seed, arm_deg) for seed in range(5)]
-    # Some ten of the seventy distances' freedom go into the box.
+    # About ten of the seventy degrees of freedom go into the box.
     assert 0.6 < np.mean([one.total.chi2_per_distance for one in found]) < 1.15
     assert 0.8 < np.mean([one.total.reduced_chi2 for one in found]) < 1.25
-    # Of 90 flares this is 0.965 +- 0.024, and of one in thirty less than 0.9. Another processor's last digit of a
-    # logarithm draws another Poisson noise, and so another five of these.
+    # Over 90 flares this share is 0.965 +- 0.024; one in thirty is below 0.9. Another processor may round a
+    # logarithm differently, which changes the Poisson noise and hence these five flares.
     assert np.mean([one.explained for one in found]) > 0.92
     for one in found:
         assert one.diffraction is not None and one.chi2_factor is not None and one.rms_factor is not None
@@ -66,13 +66,15 @@ def test_the_total_psf_is_within_noise_and_diffraction_alone_is_not(arm_deg: flo
 
 
 @pytest.mark.slow
-def test_of_hri_euv_diffraction_alone_is_ten_times_worse(hri_psf: Psf) -> None:
-    """The instrument's own PSF, whose orders fall off faster than its scatter."""
-    see = Convolver(hri_psf.kernel, (SIZE, SIZE), dtype=np.float64)
+def test_diffraction_alone_is_ten_times_worse_for_hri_euv(hri_psf: Psf) -> None:
+    """With the PSF of the instrument itself, whose orders fall off faster than its scatter."""
+    through = Convolver(hri_psf.kernel, (SIZE, SIZE), dtype=np.float64)
     chi2, factors = [], []
     for seed in range(6):
-        flaring = NOISE.observe(see.apply(quiet_sun() + flare_light(seed)), 1.4, np.random.default_rng(seed))
-        before = NOISE.observe(see.apply(quiet_sun()), 1.4, np.random.default_rng(100 + seed))
+        flaring = NOISE.observe(
+            through.apply(quiet_sun() + flare_light(seed)), 1.4, np.random.default_rng(seed)
+        )
+        before = NOISE.observe(through.apply(quiet_sun()), 1.4, np.random.default_rng(100 + seed))
         variance = NOISE.variance(flaring, 1.4) + NOISE.variance(before, 1.4)
         found = compare_on_flare(
             flaring - before, flaring < SATURATION, hri_psf, CENTRE, 0.0, variance=variance
@@ -84,23 +86,23 @@ def test_of_hri_euv_diffraction_alone_is_ten_times_worse(hri_psf: Psf) -> None:
     assert np.median([chi2 for _, chi2 in factors]) > 100, factors
 
 
-def test_a_wrong_scatter_shows() -> None:
-    """Not only none at all: an exponent 0.4 off, with the same light scattered."""
+def test_a_wrong_scatter_exponent_raises_chi2() -> None:
+    """The exponent is wrong by 0.4; the scattered light is the same in total."""
     right, wrong = (
         np.mean([compared(s, c=c).total.chi2_per_distance for s in range(3)]) for c in (2.53, 2.1)
     )
     assert wrong > 3 * right
 
 
-def test_without_noise_the_flare_is_found_to_the_last_digit() -> None:
-    light = seen(flare_light(3), None)
+def test_without_noise_the_light_of_the_flare_is_recovered() -> None:
+    light = observed(flare_light(3), None)
     profile = arm_profile(light, EVERYWHERE, CENTRE, 0.0)
     fit = fit_flare(profile, flare_psf().kernel)
     assert fit.rms_pct < 0.05 and fit.chi2_per_distance is None
     assert fit.simulated == pytest.approx(profile.observed, rel=5e-3)
     truth = flare_light(3)[CENTRE[1] - 3 : CENTRE[1] + 4, CENTRE[0] - 3 : CENTRE[0] + 4]
     assert fit.box.sum() == pytest.approx(truth.sum(), rel=0.01)
-    # Along the arm the light is where it was; across it the strip does not tell.
+    # The strip resolves the light along the arm only, not across it.
     assert fit.box.sum(axis=0) / truth.sum() == pytest.approx(truth.sum(axis=0) / truth.sum(), abs=0.1)
 
 
@@ -108,26 +110,26 @@ def test_a_box_of_one_pixel_is_the_kernel_itself() -> None:
     """Eq. (1) by convolution, on a strip at an odd angle."""
     one = np.zeros((SIZE, SIZE))
     one[CENTRE[1], CENTRE[0]] = 1e6
-    light = seen(one, None)
+    light = observed(one, None)
     profile = arm_profile(light, EVERYWHERE, CENTRE, 33.0, distances_px=(8, 75))
     fit = fit_flare(profile, flare_psf().kernel, box_px=1)
     assert fit.box == pytest.approx(np.array([[1e6]]), rel=1e-6)
     assert fit.simulated == pytest.approx(profile.observed, rel=1e-6)
 
 
-def test_the_strip_is_as_wide_as_the_box_and_leaves_out_what_cannot_be_used() -> None:
+def test_the_strip_is_as_wide_as_the_box_and_skips_unusable_distances() -> None:
     usable = EVERYWHERE.copy()
     usable[:, CENTRE[0] + 20] = False
     usable[CENTRE[1], CENTRE[0] + 30] = False
     index = np.arange(SIZE, dtype=float) * np.ones((SIZE, 1))
-    for angle in (0.0, 0.003, -0.003):  # a strip that an arm's small tilt does not make lopsided
+    for angle in (0.0, 0.003, -0.003):  # a small tilt of the arm must not make the strip asymmetric
         profile = arm_profile(index, usable, CENTRE, angle)
         assert 20 not in profile.distance_px and 30 in profile.distance_px and 21 in profile.distance_px
         assert np.bincount(profile.member)[:5].tolist() == [BOX_PX] * 5
         assert profile.observed == pytest.approx(CENTRE[0] + profile.distance_px)
 
 
-def test_the_centre_is_what_was_lost_since_the_image_before() -> None:
+def test_the_centre_is_the_patch_that_became_unusable() -> None:
     flaring, before = pair(0)
     flaring[10:40, 10:40] = before[10:40, 10:40] = SATURATION
     lost = flaring < SATURATION, before < SATURATION
@@ -140,7 +142,7 @@ def test_the_centre_is_what_was_lost_since_the_image_before() -> None:
     assert caught.value.code == "flare-no-light"
 
 
-def test_what_is_no_flares_stray_light_explains_nothing() -> None:
+def test_changes_that_are_not_stray_light_lower_the_explained_share() -> None:
     flaring, before = pair(0)
     y, x = np.indices((SIZE, SIZE))
     elsewhere = 3e4 * np.exp(-((x - 60) ** 2 + (y - 60) ** 2) / 200)
@@ -150,14 +152,14 @@ def test_what_is_no_flares_stray_light_explains_nothing() -> None:
     assert alone > 0.9 and beside < 0.3
 
 
-def test_a_psf_without_components_is_judged_alone() -> None:
+def test_a_psf_without_components_is_compared_without_diffraction() -> None:
     flaring, before = pair(0)
     plain = make_psf(flare_psf().kernel)
     found = compare_on_flare(flaring - before, flaring < SATURATION, plain, CENTRE, 0.0)
     assert found.diffraction is None and found.rms_factor is None and found.chi2_factor is None
 
 
-def test_what_cannot_be_judged_is_refused() -> None:
+def test_flares_that_cannot_be_compared_are_refused() -> None:
     flaring, before = pair(0)
     light, usable = flaring - before, flaring < SATURATION
     cases = [
@@ -174,7 +176,7 @@ def test_what_cannot_be_judged_is_refused() -> None:
     assert caught.value.code == "flare-no-light"
 
 
-def test_the_comparison_is_drawn(tmp_path: Path) -> None:
+def test_the_comparison_is_plotted(tmp_path: Path) -> None:
     flaring, before = pair(0)
     usable = flaring < SATURATION
     for noise in (None, NOISE.variance(flaring, 1.0)):
@@ -183,13 +185,13 @@ def test_the_comparison_is_drawn(tmp_path: Path) -> None:
         assert matplotlib.image.imread(tmp_path / "flare.png").std() > 0.05
 
 
-def test_the_limb_flare_of_aia_is_no_test_of_a_psf(shared: Path) -> None:
-    """Loops 100 px long that change all over: no box of 7 px explains them, and the comparison says so."""
+def test_extended_flare_loops_of_aia_give_a_low_explained_share(shared: Path) -> None:
+    """The loops are 100 px long and change everywhere: a box of 7 px cannot explain them."""
     folder = shared / "data" / "real" / "aia" / "limbflare_20120719"
     files = sorted(folder.glob("*T0734*.fits")) + sorted(folder.glob("*T0733*.fits"))
     psf_file = shared / "data" / "real" / "psf" / "derived_aia171_psf_aiapy0.10.2.fits"
     if len(files) < 3 or not psf_file.exists():
-        pytest.skip(f"real data not at hand: {folder}")
+        pytest.skip(f"real data not available: {folder}")
     rates, usable = [], []
     for file in (files[1], files[3]):  # short exposures, one after the other
         with fits.open(file) as hdus:

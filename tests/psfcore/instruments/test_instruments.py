@@ -1,3 +1,5 @@
+"""Instrument files load, match headers, and are refused with the key that is wrong."""
+
 from __future__ import annotations
 
 import hashlib
@@ -9,7 +11,7 @@ from pydantic import ValidationError
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_digest, instrument_names, instrument_path, match_instrument
-from psfcore.instruments.model import Line, load_instrument, parse_instrument
+from psfcore.instruments.model import SpectralLine, load_instrument, parse_instrument
 from tests.conftest import SMALL_INSTRUMENT
 
 
@@ -19,7 +21,7 @@ def test_every_shipped_instrument_loads_under_its_own_name() -> None:
         assert load_instrument(name).name == name
 
 
-def test_the_digest_is_of_the_files_bytes() -> None:
+def test_the_digest_is_that_of_the_files_bytes() -> None:
     assert instrument_digest("hri_euv") == hashlib.sha256(instrument_path("hri_euv").read_bytes()).hexdigest()
 
 
@@ -37,7 +39,7 @@ def test_headers_are_matched(cards: dict[str, object], name: str | None) -> None
     assert match_instrument(cards) == name
 
 
-def test_an_unknown_instrument_names_the_known_ones() -> None:
+def test_the_error_of_an_unknown_instrument_names_the_known_ones() -> None:
     with pytest.raises(DataError, match="hri_euv") as caught:
         load_instrument("../../etc/passwd")
     assert caught.value.code == "unknown-instrument"
@@ -75,7 +77,9 @@ def test_an_unknown_instrument_names_the_known_ones() -> None:
         ('name = "hri_euv"', "name = ", "TOML"),
     ],
 )
-def test_a_bad_file_is_one_line_that_names_the_key(tmp_path: Path, old: str, new: str, key: str) -> None:
+def test_the_error_of_a_bad_file_is_one_line_that_names_the_key(
+    tmp_path: Path, old: str, new: str, key: str
+) -> None:
     text = instrument_path("hri_euv").read_text()
     assert old in text
     path = tmp_path / "mine.toml"
@@ -93,7 +97,7 @@ def test_a_bad_file_is_one_line_that_names_the_key(tmp_path: Path, old: str, new
 @pytest.mark.parametrize(
     ("value", "bound"), [("1e-320", "0.000000001"), ("1e300", "1000000000"), ("inf", "finite")]
 )
-def test_a_size_that_no_telescope_has_is_told_with_what_may_be(key: str, value: str, bound: str) -> None:
+def test_an_impossible_size_is_refused_with_its_limit(key: str, value: str, bound: str) -> None:
     text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", SMALL_INSTRUMENT)
     with pytest.raises(DataError) as caught:
         parse_instrument(text, "mine")
@@ -106,7 +110,7 @@ def test_a_size_that_no_telescope_has_is_told_with_what_may_be(key: str, value: 
     ("wavelength_angstrom", "focal_length_mm", "pixel_pitch_um"),
     [(0.06, 1e4, 50.0), (1.24, 2e4, 24.0), (1e7, 1.5e5, 5e3)],  # hard X-rays, X-rays, far infrared
 )
-def test_telescopes_of_all_wavelengths_are_taken(
+def test_telescopes_of_all_wavelengths_are_accepted(
     wavelength_angstrom: float, focal_length_mm: float, pixel_pitch_um: float
 ) -> None:
     text = SMALL_INSTRUMENT
@@ -128,12 +132,15 @@ def test_instruments_do_not_change() -> None:
         instrument.focal_length_mm = 1.0  # type: ignore[misc]
 
 
-def test_lines_of_the_bandpass_are_normalised_or_the_one_wavelength() -> None:
+def test_spectral_lines_are_the_normalised_bandpass_or_the_one_wavelength() -> None:
     instrument = load_instrument("hri_euv")
-    assert [(line.wavelength_angstrom, line.weight) for line in instrument.lines] == [(174.0, 1.0)]
-    lines = (Line(wavelength_angstrom=171.0, weight=3.0), Line(wavelength_angstrom=177.0, weight=1.0))
+    assert [(line.wavelength_angstrom, line.weight) for line in instrument.spectral_lines] == [(174.0, 1.0)]
+    lines = (
+        SpectralLine(wavelength_angstrom=171.0, weight=3.0),
+        SpectralLine(wavelength_angstrom=177.0, weight=1.0),
+    )
     several = instrument.model_copy(update={"bandpass": lines})
-    assert [line.weight for line in several.lines] == [0.75, 0.25]
+    assert [line.weight for line in several.spectral_lines] == [0.75, 0.25]
 
 
 def test_a_filter_wheel_mesh_needs_distances() -> None:

@@ -1,4 +1,4 @@
-"""What is read off the tables is what the pixels say, as far as the tables say they know it."""
+"""Numbers read from the tables equal those computed from the pixels, within the stated interpolation error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from psfcore.errors import DataError
 from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy, radial_profile
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.tables import lookup as psf_lookup
-from psfcore.tables.make import EXACT_TO_PX, SCHEMA, table_radii, tables_of
+from psfcore.tables.layout import EXACT_TO_PX, FIELDS, SCHEMA
+from psfcore.tables.make import table_radii, tables_of
 from tests.psfcore.conftest import delta, gaussian, make_psf
 
 SIZE = 256
@@ -49,12 +50,16 @@ def test_the_radii_are_the_same_for_every_psf_and_end_at_its_reach() -> None:
     beyond = large[large > 100]
     assert (beyond[1:] / beyond[:-1]).max() < 1.03
     assert table_radii(0.0).tolist() == [0.0]
-    # As psf_lookup expects them.
-    assert SCHEMA == psf_lookup.SCHEMA
+
+
+def test_the_tables_have_the_fields_of_the_layout() -> None:
+    tables = tables_of(make_psf(delta(9)))
+    assert tuple(tables) == FIELDS
+    assert tables["schema"] == SCHEMA == psf_lookup.SCHEMA
 
 
 @pytest.mark.parametrize("kernel", [scattering(), gaussian(65, 2.0), delta(9), gaussian(33, 1.0)[:, 4:-4]])
-def test_at_the_radii_of_the_table_and_near_the_centre_every_digit_is_right(kernel: np.ndarray) -> None:
+def test_the_tables_are_exact_near_the_centre_and_at_their_radii(kernel: np.ndarray) -> None:
     psf = make_psf(kernel)
     tables = json.loads(json.dumps(tables_of(psf), allow_nan=False))
     rng = np.random.default_rng(1)
@@ -65,7 +70,7 @@ def test_at_the_radii_of_the_table_and_near_the_centre_every_digit_is_right(kern
     assert whole["radii_px"] == pytest.approx(table_radii(psf.reach_px), rel=1e-9)
     wanted = cumulative_curve(kernel, table_radii(psf.reach_px))
     assert whole["light_beyond_pct"]["TOTAL"] == pytest.approx(wanted, abs=1e-7)
-    # Distances with more digits than the tables keep, and with fewer.
+    # Radii with more digits than the tables keep, and with fewer.
     for root in (2.0**0.5, 1.4142135624, 10**0.5):
         if root < psf.reach_px:
             assert psf_lookup.encircled(tables, root)["light_within"]["TOTAL"] == pytest.approx(
@@ -73,42 +78,42 @@ def test_at_the_radii_of_the_table_and_near_the_centre_every_digit_is_right(kern
             )
 
 
-def test_between_the_radii_the_tables_say_how_far_off_they_are() -> None:
+def test_the_stated_interpolation_error_covers_the_true_one() -> None:
     psf = spiked()
     tables = tables_of(psf)
     radii = np.random.default_rng(2).uniform(EXACT_TO_PX, psf.reach_px, 3000)
     within = [psf_lookup.encircled(tables, r)["light_within"]["TOTAL"] for r in radii]
     off = np.abs(np.array(within) - encircled_energy(psf.kernel, radii)).max()
     said = tables["interpolation_error"]["TOTAL"]
-    assert 0.003 < said <= 0.01  # two orders of 0.005, met by one step or in two halves
+    assert 0.003 < said <= 0.01  # two orders of 0.005, in one interval or in two
     assert off < 1.3 * said
     assert f"{100 * said:.2f} points" in psf_lookup.curve(tables)["resolution"]
     smooth = tables_of(make_psf(scattering()))
     assert smooth["interpolation_error"]["TOTAL"] < 1e-3
 
 
-def test_an_array_beyond_the_reach_scatters_no_less_than_nothing() -> None:
+def test_an_array_beyond_the_full_reach_has_no_negative_light_beyond() -> None:
     kernel = np.pad(gaussian(2048, 3.0), 50)
     kernel[0, 0] = 5e-4  # farther than 1448 px
     said = psf_lookup.curve(tables_of(make_psf(kernel)))["light_beyond_pct"]["TOTAL"]
     assert said[-1] == 0 and min(said) == 0
 
 
-def test_errors_are_those_of_the_covariance_and_keep_what_is_correlated() -> None:
-    """With the total alone uncertain all scattered light moves together: an annulus by its share of it."""
+def test_errors_follow_the_covariance_and_its_correlations() -> None:
+    """If only the total is uncertain, all scattered light changes by the same factor, in an annulus too."""
     sigma = 0.05
     tables = tables_of(fitted(np.diag([0.0, 0.0, sigma**2])))
     total = 0.41
-    moved = sigma * total * (1 - total)  # d total of a step of sigma of its logit
+    moved = sigma * total * (1 - total)  # change of the total for a step of sigma in its logit
     found = psf_lookup.annulus(tables, 5, 60)
     light = encircled_energy(scattering(), [5, 60])
     wanted = moved * (light[1] - light[0]) / total
     assert found["sigma"] == {k: pytest.approx(wanted, rel=1e-3) for k in ("TOTAL", "SCATTER")}
     curve = psf_lookup.curve(tables, [5, 60])["sigma_points"]["TOTAL"]
-    assert math.hypot(*curve) / 100 > 1.15 * wanted  # what two errors taken as independent would make of it
+    assert math.hypot(*curve) / 100 > 1.15 * wanted  # the error if both were independent
 
 
-def test_errors_of_a_whole_covariance_are_linear_propagation() -> None:
+def test_errors_of_a_full_covariance_are_linear_propagation() -> None:
     covariance = np.array([[0.0025, 0.0009, 0.0], [0.0009, 0.0016, -0.0004], [0.0, -0.0004, 0.0009]])
     radii = np.array([1.0, 10.0, 57.0, 100.0])
     slopes = []
@@ -127,7 +132,7 @@ def test_errors_of_a_whole_covariance_are_linear_propagation() -> None:
     assert psf_lookup.curve(tables_of(make_psf(scattering())))["sigma_points"] == {}
 
 
-def test_the_profile_holds_all_light_and_tells_a_round_psf_from_arms() -> None:
+def test_the_profile_holds_all_light_and_shows_arms() -> None:
     psf = make_psf(scattering())
     round_one, armed = tables_of(psf)["profile"], tables_of(spiked())["profile"]
     mean = np.array(round_one["mean_weight"]["TOTAL"])
@@ -137,13 +142,13 @@ def test_the_profile_holds_all_light_and_tells_a_round_psf_from_arms() -> None:
     assert round_one["azimuthal_rms_over_mean"][ring] < 0.05 < 5 < armed["azimuthal_rms_over_mean"][ring]
 
 
-def test_two_psfs_are_compared_at_the_radii_that_both_have() -> None:
+def test_two_psfs_are_compared_at_their_common_radii() -> None:
     less = SOFTENED_POWER_LAW.kernel(AT + np.array([0, 0, -0.1]), 128)
     one, other = tables_of(make_psf(scattering())), tables_of(make_psf(less))
     found = psf_lookup.compare(one, other)
     radii = np.array(found["radii_px"])
     assert radii.max() <= other["reach_px"] and set(range(91)) <= set(radii)
-    # Radii are rounded to ten digits: a root must not fall short of its pixels.
+    # Radii are rounded to ten digits: a rounded root must still include its pixels.
     wanted = np.subtract(*(cumulative_curve(kernel, radii * (1 + 1e-9)) for kernel in (less, scattering())))
     assert found["difference_points"]["TOTAL"] == pytest.approx(wanted, abs=1e-6)
     assert found["largest_points"]["TOTAL"] == pytest.approx(wanted[np.abs(wanted).argmax()], abs=1e-6)
@@ -152,7 +157,7 @@ def test_two_psfs_are_compared_at_the_radii_that_both_have() -> None:
     assert psf_lookup.compare(one, one)["largest_points"]["TOTAL"] == 0
 
 
-def test_questions_that_have_no_answer() -> None:
+def test_bad_questions_are_refused() -> None:
     tables = tables_of(make_psf(scattering(), plate_scale_arcsec=0.5))
     other = tables_of(make_psf(scattering(), plate_scale_arcsec=0.6))
     cases = [

@@ -1,4 +1,4 @@
-"""Arms put into a simulated flare come out again, with errors that cover what is left."""
+"""The measurement recovers the arms of a simulated flare, and its stated errors cover the true values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SPACING_PX = order_spacing_px(
     wavelength_angstrom=174.0, distance_mm=4187.0, pitch_um=1270.0, pixel_pitch_um=10.0
 )
 SIZE = 240
-FINE = 6  # samples a pixel, so that orders are not put on whole pixels
+FINE = 6  # samples a pixel, so that orders do not all lie on pixel centres
 CENTRE = (123.3, 118.8)
 FLARE_PX = 5
 FLARE_PHOTONS = 6e4  # a pixel of the core
@@ -30,7 +30,7 @@ READ_NOISE = 2.0
 
 
 def flare_light() -> NDArray[np.float64]:
-    """Expected light [y, x] of a 5 x 5 px flare of one photon a pixel: mesh orders and a wide halo."""
+    """Expected light [y, x] of a 5 x 5 px flare of one photon per pixel: mesh orders and a wide halo."""
     n = SIZE * FINE
     kernel = rotated_mesh_kernel(
         wavelength_angstrom=174.0,
@@ -77,19 +77,19 @@ def measured(expected: NDArray[np.float64], seed: int) -> ArmMeasurement:
 
 
 @pytest.mark.parametrize("seed", [100, *(pytest.param(n, marks=pytest.mark.slow) for n in (101, 102))])
-def test_angle_and_spacing_come_out(expected: NDArray[np.float64], seed: int) -> None:
+def test_angles_and_spacing_are_recovered(expected: NDArray[np.float64], seed: int) -> None:
     found = measured(expected, seed)
     assert found.angles_deg == pytest.approx((ANGLE_DEG - 90, ANGLE_DEG), abs=0.1)
     assert found.spacing_px == pytest.approx(SPACING_PX, abs=0.02)
     assert 0.005 < min(found.angles_sigma_deg) <= max(found.angles_sigma_deg) < 0.05
     assert 0.0005 < found.spacing_sigma_px < 0.005
-    assert 0.9 < found.reduced_chi2 < 1.5  # a sharp-edged flare is a little more than the spline can follow
+    assert 0.9 < found.reduced_chi2 < 1.5  # the spline cannot quite follow a flare with sharp edges
     assert len(found.peaks) > 40
     assert "less than" in found.stopped_because
 
 
 @pytest.mark.slow
-def test_errors_cover_the_truth(expected: NDArray[np.float64]) -> None:
+def test_errors_cover_the_true_values(expected: NDArray[np.float64]) -> None:
     pulls = []
     for seed in range(36):
         found = measured(expected, seed)
@@ -102,7 +102,7 @@ def test_errors_cover_the_truth(expected: NDArray[np.float64]) -> None:
     assert np.all((width > 0.7) & (width < 1.4)), width
 
 
-def test_a_difference_of_two_images_serves_as_well(expected: NDArray[np.float64]) -> None:
+def test_a_difference_of_two_images_gives_the_same_arms(expected: NDArray[np.float64]) -> None:
     image, saturated = observed(expected, 5)
     before = np.random.default_rng(6).poisson(corona()).astype(float)
     found = measure_arms(image, reference=before, noise=(1.0, READ_NOISE), saturated=saturated)
@@ -110,7 +110,9 @@ def test_a_difference_of_two_images_serves_as_well(expected: NDArray[np.float64]
     assert found.angles_deg == pytest.approx((ANGLE_DEG - 90, ANGLE_DEG), abs=0.1)
 
 
-def test_noise_unknown_centre_a_little_off_and_holes(expected: NDArray[np.float64]) -> None:
+def test_unknown_noise_an_inexact_centre_and_masked_pixels_are_tolerated(
+    expected: NDArray[np.float64],
+) -> None:
     image, saturated = observed(expected, 7)
     image[30:40, 100:140] = np.nan
     found = measure_arms(image, (124.5, 118.0), saturated=saturated, spacing_range_px=(5.0, 7.0))
@@ -120,7 +122,7 @@ def test_noise_unknown_centre_a_little_off_and_holes(expected: NDArray[np.float6
     assert not any(30 <= peak.y_px < 40 and 100 <= peak.x_px < 140 for peak in found.peaks)
 
 
-def test_the_fit_is_drawn(expected: NDArray[np.float64], tmp_path: Path) -> None:
+def test_the_fit_is_plotted(expected: NDArray[np.float64], tmp_path: Path) -> None:
     image, saturated = observed(expected, 8)
     found = measure_arms(image, noise=(1.0, READ_NOISE), saturated=saturated)
     arms_png(image, found, tmp_path / "arms.png")
@@ -131,7 +133,7 @@ def flat(seed: int = 0) -> NDArray[np.float64]:
     return np.random.default_rng(seed).poisson(100, (SIZE, SIZE)).astype(float)
 
 
-def test_what_cannot_be_measured_is_refused() -> None:
+def test_images_without_measurable_arms_are_refused() -> None:
     image = flat()
     with_spot = image.copy()
     with_spot[110:115, 110:115] = 1e5
@@ -143,7 +145,7 @@ def test_what_cannot_be_measured_is_refused() -> None:
         ("too-few-peaks", {"image": with_spot, "saturated": with_spot > 1e4}),
         ("arms-bad-input", {"image": image, "reference": image[:100]}),
         ("arms-bad-input", {"image": image, "centre_xy": (1e4, 3.0)}),
-        # Every direction scores alike: the arms that are taken leave the image at once.
+        # Every direction scores the same, so the chosen arms leave the image at once.
         ("too-few-peaks", {"image": image, "reference": image, "centre_xy": (1.0, 1.0)}),
         ("too-few-peaks", {"image": image, "reference": image, "centre_xy": (SIZE - 1.0, SIZE - 1.0)}),
     ]
@@ -153,11 +155,14 @@ def test_what_cannot_be_measured_is_refused() -> None:
         assert caught.value.code == code
 
 
-def test_aiapys_arms_are_measured_in_its_psf(shared: Path) -> None:
-    """Its own input, 16.26 px and four angles; the errors are small and not of noise, so not asked to cover."""
+def test_the_arms_of_the_aiapy_psf_are_recovered(shared: Path) -> None:
+    """aiapy built this PSF with a spacing of 16.26 px and four angles.
+
+    The PSF has no noise, so the stated errors are not tested.
+    """
     path = shared / "data" / "real" / "psf" / "derived_aia171_psf_aiapy0.10.2.fits"
     if not path.exists():
-        pytest.skip(f"real data not at hand: {path}")
+        pytest.skip(f"real data not available: {path}")
     middle = slice(2048 - 250, 2048 + 251)
     psf = np.asarray(fits.getdata(path), dtype=np.float64)[middle, middle]
     found = measure_arms(psf, (250.0, 250.0), n_arms=4)
@@ -165,12 +170,12 @@ def test_aiapys_arms_are_measured_in_its_psf(shared: Path) -> None:
     assert found.spacing_px == pytest.approx(16.26, abs=0.005)
 
 
-def test_loops_at_the_limb_are_no_flare_to_measure(shared: Path) -> None:
-    """Loops 100 px across: their orders, 16 px apart, run together. The answer is no, not a number."""
+def test_flare_loops_at_the_limb_are_refused(shared: Path) -> None:
+    """The loops are 100 px across, so their orders, 16 px apart, overlap: an error must come, not a number."""
     folder = shared / "data" / "real" / "aia" / "limbflare_20120719"
     files = sorted(folder.glob("*.fits"))
     if not files:
-        pytest.skip(f"real data not at hand: {folder}")
+        pytest.skip(f"real data not available: {folder}")
     with fits.open(files[1]) as hdus:
         image = np.asarray(next(h.data for h in hdus if h.data is not None), dtype=np.float64)
     for near in (None, (49.81, 39.57, -40.13, -50.38)):

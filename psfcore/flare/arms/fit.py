@@ -1,0 +1,278 @@
+"""The least-squares fit of Eq. (2) of `measure`: amplitudes, source, angles and spacing.
+
+Amplitudes and source are fitted alternately first, at fixed angles and spacing; then Gauss-Newton steps
+fit everything at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.flare.arms.image import Flags, Plane
+from psfcore.flare.arms.orders import (
+    KNOT_PX,
+    ORDER_SIGMA,
+    Geometry,
+    Orders,
+    check_enough_orders,
+    order_positions,
+    orders_between,
+    select_pixels,
+)
+
+_STEPS = 30  # of Gauss-Newton at most
+_TURNS = 3  # of amplitudes and source, fitted alternately
+_CONVERGED = 1e-3  # of a standard error
+_RANK = 1e-11  # of the largest eigenvalue; smaller ones are taken as 0
+
+
+@dataclass(frozen=True)
+class FitState:
+    """The fitted quantities: angles (radian) followed by the spacing (px); A_ak; coefficients of S [y, x]."""
+
+    pattern: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
+    source: Plane
+
+    def moved(self, step: NDArray[np.float64], geometry: Geometry) -> FitState:
+        """The state after a step in all quantities, in the order above."""
+        one, two = self.pattern.size, self.pattern.size + self.amplitude.size
+        return FitState(
+            self.pattern + step[:one],
+            self.amplitude + step[one:two],
+            self.source + geometry.source(step[two:]),
+        )
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """How a fit ended.
+
+    error: of pattern and amplitudes; freedom: degrees of freedom; light: the fitted light of each pixel, DN;
+    done, why: the steps done, and why they stopped.
+    """
+
+    error: NDArray[np.float64]
+    chi2: float
+    freedom: int
+    light: NDArray[np.float64]
+    done: int
+    why: str
+
+
+def first_fit(
+    difference: Plane,
+    usable: Flags,
+    sigma: Plane,
+    geometry: Geometry,
+    pattern: NDArray[np.float64],
+    source: Plane,
+) -> tuple[FitState, Orders]:
+    """Fit amplitudes and S at given angles and spacing; keep the significant orders.
+
+    Raises DataError "too-few-peaks".
+    """
+    arm, k = orders_between(pattern, geometry.radii_px)
+    state = FitState(pattern, np.ones(arm.size), source)
+    for _ in range(2):  # first all orders, then the significant ones
+        orders = select_pixels(difference, usable, sigma, geometry, pattern, arm, k)
+        check_enough_orders(orders.arm, pattern.size - 1)  # near a corner an arm may leave the image at once
+        state, error = _alternate(orders, geometry, state)
+        significant = state.amplitude > ORDER_SIGMA * error
+        arm, k = orders.arm[significant], orders.k[significant]
+        check_enough_orders(arm, pattern.size - 1)
+    orders = select_pixels(difference, usable, sigma, geometry, pattern, arm, k)
+    return _alternate(orders, geometry, state)[0], orders
+
+
+def iterate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitState, FitResult]:
+    """Gauss-Newton steps in all quantities at once; the first values must be close to the solution."""
+    weight = 1 / orders.sigma
+    of_pattern = state.pattern.size
+    done, why = 0, f"the limit of {_STEPS} steps was reached"
+    while done < _STEPS:
+        done += 1
+        bases = _bases(orders, geometry, state.pattern)
+        columns = np.hstack(
+            (
+                _columns_of_pattern(orders, bases, state),
+                _columns_of_stamps(orders, bases, bases.stamps(state.source)),
+                _columns_of_source(orders, bases, geometry, state.amplitude),
+            )
+        )
+        left = (orders.value - _light(orders, bases, state)) * weight
+        step, covariance, rank = _solve(
+            _without_planes(orders, columns * weight[:, None]), _without_planes(orders, left)
+        )
+        state = state.moved(step, geometry)
+        error = np.sqrt(np.diag(covariance))[: of_pattern + state.amplitude.size]
+        if np.all(np.abs(step[:of_pattern]) < _CONVERGED * error[:of_pattern]):
+            why = f"angles and spacing changed by less than {_CONVERGED:g} of their errors"
+            break
+    light = _light(orders, _bases(orders, geometry, state.pattern), state)
+    left = _without_planes(orders, (orders.value - light) * weight)
+    freedom = max(orders.value.size - rank - 3 * state.amplitude.size, 1)
+    chi2 = float(left @ left)
+    scale = np.sqrt(chi2 / freedom)
+    return state, FitResult(error * scale, chi2, freedom, orders.value - left / weight, done, why)
+
+
+def _alternate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitState, NDArray[np.float64]]:
+    """Fit amplitudes and S in turn at given angles and spacing; return the state and the amplitudes' errors."""
+    bases = _bases(orders, geometry, state.pattern)
+    weight = 1 / orders.sigma
+    target = _without_planes(orders, orders.value * weight)
+    source = state.source
+    for turn in range(_TURNS):
+        columns = _columns_of_stamps(orders, bases, bases.stamps(source)) * weight[:, None]
+        columns = _without_planes(orders, columns)
+        amplitude, covariance, rank = _solve(columns, target)
+        if turn < _TURNS - 1:
+            shaped = _columns_of_source(orders, bases, geometry, np.maximum(amplitude, 0.0)) * weight[:, None]
+            found, _, _ = _solve(_without_planes(orders, shaped), target)
+            source = geometry.source(found)
+    left = target - columns @ amplitude
+    chi2 = float(left @ left) / max(target.size - 3 * amplitude.size - rank, 1)
+    return FitState(state.pattern, amplitude, source), np.sqrt(np.diag(covariance) * chi2)
+
+
+def first_source(geometry: Geometry) -> Plane:
+    """First coefficients of S: a round Gaussian."""
+    knots = np.arange(-geometry.reach, geometry.reach + 1) * KNOT_PX
+    line = np.exp(-0.5 * (knots / (0.4 * geometry.half_px)) ** 2)
+    return np.outer(line, line)
+
+
+@dataclass(frozen=True)
+class _Bases:
+    """Cubic splines and their slopes at the pixels around each order, [order, pixel of the box, coefficient].
+
+    `index` [order, y, x] is the index of the pixel among the fitted pixels, or -1.
+    """
+
+    index: NDArray[np.intp]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    slope_x: NDArray[np.float64]
+    slope_y: NDArray[np.float64]
+
+    def stamps(self, source: Plane, *, slope: str = "") -> NDArray[np.float64]:
+        """S, or its slope along x or y, on the box of each order [order, y, x]."""
+        along_x = self.slope_x if slope == "x" else self.x
+        along_y = self.slope_y if slope == "y" else self.y
+        return np.asarray(along_y @ source @ along_x.transpose(0, 2, 1))
+
+
+def _bases(orders: Orders, geometry: Geometry, pattern: NDArray[np.float64]) -> _Bases:
+    """Evaluate the splines at the pixels around each order."""
+    box_px = int(np.ceil((geometry.reach + 2) * KNOT_PX))
+    box = np.arange(-box_px, box_px + 1)
+    coefficients = np.arange(-geometry.reach, geometry.reach + 1)
+    index, lines, slopes = [], [], []
+    for place, limit in zip(
+        order_positions(geometry.centre, pattern, orders.arm, orders.k),
+        orders.number.shape[::-1],
+        strict=True,
+    ):
+        pixels = np.rint(place).astype(np.intp)[:, None] + box
+        offset = (pixels - place[:, None])[:, :, None] / KNOT_PX - coefficients
+        lines.append(_spline(offset))
+        slopes.append(_spline_slope(offset) / KNOT_PX)
+        index.append(np.where((pixels >= 0) & (pixels < limit), pixels, -1))
+    columns, rows = index
+    inside = (rows[:, :, None] >= 0) & (columns[:, None, :] >= 0)
+    number = np.where(inside, orders.number[rows[:, :, None], columns[:, None, :]], -1)
+    return _Bases(index=number, x=lines[0], y=lines[1], slope_x=slopes[0], slope_y=slopes[1])
+
+
+def _spline(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The cubic B-spline."""
+    u = np.abs(t)
+    near, far = 2 / 3 - u**2 + u**3 / 2, (2 - u) ** 3 / 6
+    return np.where(u < 1, near, np.where(u < 2, far, 0.0))
+
+
+def _spline_slope(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivative of the cubic B-spline."""
+    u = np.abs(t)
+    near, far = -2 * u + 1.5 * u**2, -((2 - u) ** 2) / 2
+    return np.sign(t) * np.where(u < 1, near, np.where(u < 2, far, 0.0))
+
+
+def _light(orders: Orders, bases: _Bases, state: FitState) -> NDArray[np.float64]:
+    """Sum of A S of Eq. (2) at the fitted pixels."""
+    return _added_up(orders, bases, state.amplitude[:, None, None] * bases.stamps(state.source))
+
+
+def _added_up(orders: Orders, bases: _Bases, stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum over the orders of their stamps, at each fitted pixel."""
+    on = bases.index >= 0
+    total = np.bincount(bases.index[on], weights=stamps[on], minlength=orders.value.size)
+    return np.asarray(total, dtype=np.float64)
+
+
+def _columns_of_stamps(orders: Orders, bases: _Bases, stamps: NDArray[np.float64]) -> Plane:
+    """Columns [pixel, order] of the Jacobian: one stamp each."""
+    columns = np.zeros((orders.value.size, orders.k.size))
+    which, y, x = np.nonzero(bases.index >= 0)
+    columns[bases.index[which, y, x], which] = stamps[which, y, x]
+    return columns
+
+
+def _columns_of_source(
+    orders: Orders, bases: _Bases, geometry: Geometry, amplitude: NDArray[np.float64]
+) -> Plane:
+    """Columns of the Jacobian [pixel, coefficient of S on the disc]."""
+    row, column = np.nonzero(geometry.disc)
+    columns = np.zeros((orders.value.size, row.size))
+    for which, a in enumerate(amplitude):
+        y, x = np.nonzero(bases.index[which] >= 0)
+        product = bases.y[which, y][:, row] * bases.x[which, x][:, column]
+        columns[bases.index[which, y, x]] += a * product
+    return columns
+
+
+def _columns_of_pattern(orders: Orders, bases: _Bases, state: FitState) -> Plane:
+    """Columns of the Jacobian for each angle (radian) and for the spacing, from Eq. (1) and (2)."""
+    spacing = state.pattern[-1]
+    cosine, sine = np.cos(state.pattern[orders.arm]), np.sin(state.pattern[orders.arm])
+    to_x = -state.amplitude[:, None, None] * bases.stamps(state.source, slope="x")
+    to_y = -state.amplitude[:, None, None] * bases.stamps(state.source, slope="y")
+    k = orders.k[:, None, None]
+    outward = k * (cosine[:, None, None] * to_x + sine[:, None, None] * to_y)
+    across = k * spacing * (cosine[:, None, None] * to_y - sine[:, None, None] * to_x)
+    by_angle = [
+        _added_up(orders, bases, across * (orders.arm == arm)[:, None, None])
+        for arm in range(state.pattern.size - 1)
+    ]
+    return np.stack((*by_angle, _added_up(orders, bases, outward)), axis=1)
+
+
+def _without_planes(orders: Orders, weighted: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Columns (or one column), already divided by sigma, less their best-fitting planes around each order.
+
+    The planes then need no parameters in the fit: solution and errors stay the same.
+    """
+    rest = weighted.copy()
+    for pixels, basis in orders.planes():
+        rest[pixels] -= basis @ (basis.T @ rest[pixels])
+    return rest
+
+
+def _solve(columns: Plane, target: NDArray[np.float64]) -> tuple[NDArray[np.float64], Plane, int]:
+    """Least squares of least norm: solution, covariance and rank. Undetermined combinations stay 0.
+
+    The planes can absorb a constant and slopes of S, and A can absorb a factor of S. These combinations are
+    undetermined, and neither the angles nor the spacing depend on them.
+    """
+    scale = np.sqrt((columns**2).sum(axis=0))
+    scale[scale == 0] = 1.0
+    scaled = columns / scale
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    kept = values > _RANK * values[-1]
+    vectors = vectors[:, kept]
+    covariance = (vectors / values[kept]) @ vectors.T / np.outer(scale, scale)
+    return covariance @ (columns.T @ target), covariance, int(kept.sum())

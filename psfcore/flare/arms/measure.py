@@ -1,0 +1,179 @@
+"""Angles and order spacing of the arms of a mesh's diffraction pattern around a bright compact source.
+
+Hofmeister et al., The point-spread function of HRI_EUV, sections "Solar flare" and "Mesh geometry": the
+diffraction pattern of a flare shows the orientation of the meshes and the spacing of their orders. The core of
+the flare is saturated and its shape is unknown, so the shape S is fitted together with the pattern. Every order
+is narrow, so every order is the same picture S of the source:
+
+    r_ak = r_0 + k s e_a,   e_a = (cos t_a, sin t_a),   k = +-1, +-2, ...                            Eq. (1)
+    d(r) = sum over a, k of A_ak S(r - r_ak) + plane_ak(r),                                          Eq. (2)
+
+S is a cubic spline on the pixels. The plane is that of the nearest order. Before the fit, the median of each ring
+away from the arms is subtracted. Weighted least squares (Gauss-Newton) fits all quantities at once except r_0: an
+error of r_0 shifts S and nothing else. The errors of t and s come from the normal equations with all other
+quantities free, times the square root of the reduced chi^2. S must be blurred over at least one pixel, as in real
+images: where each order of a point source fills one pixel, the fit would only find the pixel centres.
+
+`search` finds the first values, `image` prepares the data, `orders` and `fit` hold Eq. (1) and Eq. (2).
+
+| symbol | name | unit |
+|---|---|---|
+| d | difference: image, less the reference if there is one | DN |
+| r_0 | centre_xy | px |
+| t_a | angles_deg, from +x towards +y, -90 to 90: an arm is a line through the centre | degrees |
+| s | spacing_px | px |
+| A_ak, S | amplitudes, source | -, DN |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from psfcore.flare.arms.fit import FitResult, FitState, first_fit, first_source, iterate
+from psfcore.flare.arms.image import (
+    Flags,
+    Plane,
+    expected_light,
+    pixel_sigma,
+    prepared,
+    ring_halo,
+    smooth,
+    source_centre,
+)
+from psfcore.flare.arms.orders import Geometry, Orders, order_positions
+from psfcore.flare.arms.search import search_arms
+
+SMALLEST_SPACING_PX = 4.0
+LARGEST_SPACING_PX = 40.0
+_LARGEST_SEARCH_PX = 300.0
+_NEAR_PX = 100.0  # the first fit uses orders within this radius,
+_NEAR_ORDERS = 6  # or at least so many orders of each arm
+
+
+@dataclass(frozen=True)
+class Peak:
+    """One diffraction order: index of its arm, its order k, fitted position (px), amplitude over its error."""
+
+    arm: int
+    order: int
+    x_px: float
+    y_px: float
+    significance: float
+
+
+@dataclass(frozen=True)
+class ArmMeasurement:
+    """Directions of the arms and spacing of the orders, with 1-sigma errors.
+
+    angles_deg: ascending, within -90 to 90. spacing_px: common to all arms. chi2: of the fitted pixels;
+    degrees_of_freedom: their number less that of the fitted quantities. source [y, x]: S around the centre;
+    model [y, x]: the fitted image; fitted [y, x]: True where it was fitted.
+    """
+
+    angles_deg: tuple[float, ...]
+    angles_sigma_deg: tuple[float, ...]
+    spacing_px: float
+    spacing_sigma_px: float
+    centre_xy: tuple[float, float]
+    chi2: float
+    degrees_of_freedom: int
+    peaks: tuple[Peak, ...]
+    steps_done: int
+    stopped_because: str
+    source: Plane
+    model: Plane
+    fitted: Flags
+
+    @property
+    def reduced_chi2(self) -> float:
+        """chi^2 over degrees of freedom; its square root scales the errors."""
+        return self.chi2 / self.degrees_of_freedom
+
+
+# The matrices are so small that threads cost several times more than they save.
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def measure_arms(
+    image: Plane,
+    centre_xy: tuple[float, float] | None = None,
+    *,
+    reference: Plane | None = None,
+    noise: tuple[float, float] | None = None,
+    saturated: Flags | None = None,
+    n_arms: int = 2,
+    spacing_range_px: tuple[float, float] = (SMALLEST_SPACING_PX, LARGEST_SPACING_PX),
+    angles_near_deg: tuple[float, ...] | None = None,
+    source_radius_px: float | None = None,
+    reach_px: float | None = None,
+) -> ArmMeasurement:
+    """Measure `n_arms` arms around a flare in `image` [y, x] (DN), or in image less `reference`.
+
+    centre_xy: the source; default: the middle of the largest saturated patch, else the brightest pixel.
+    noise: (DN per photon, rms of the read noise in DN); default: estimated from the residuals.
+    saturated: True where pixels must not be used; pixels that are not finite are never used.
+    angles_near_deg: search one arm within 3 degrees of each. spacing_range_px: search only there.
+    source_radius_px: half size of S; default: from the saturated patch. reach_px: largest radius of an order.
+
+    Raises DataError "arms-bad-input", "all-masked", "no-flare", "too-few-peaks".
+    """
+    difference, usable, patch = prepared(image, reference, saturated)
+    centre, patch_radius = source_centre(difference, usable, patch, centre_xy)
+    half = source_radius_px or float(np.clip(patch_radius + 2.0, 3.0, 8.0))
+    inner = 2 * (patch_radius + half)  # closer in, a plane does not describe the halo
+    reach = min(reach_px or np.inf, _LARGEST_SEARCH_PX, float(np.hypot(*image.shape)))
+    angles, spacing = search_arms(
+        difference, usable, centre, n_arms, spacing_range_px, angles_near_deg, (inner, reach)
+    )
+    halo = ring_halo(difference, usable, centre, angles, half)
+    difference = difference - halo
+    expected = expected_light(image, reference, usable)
+    # Near orders first: the search's angles are too uncertain to find the far ones.
+    near = Geometry(centre, half, (inner, min(reach, max(_NEAR_PX, inner + _NEAR_ORDERS * spacing))))
+    geometry = Geometry(centre, half, (inner, reach))
+    sigma = pixel_sigma(expected, noise)
+    pattern = np.append(np.deg2rad(angles), spacing)
+    state, orders = first_fit(difference, usable, sigma, near, pattern, first_source(near))
+    state, _ = iterate(orders, near, state)
+    state, orders = first_fit(difference, usable, sigma, geometry, state.pattern, state.source)
+    state, result = iterate(orders, geometry, state)
+    # Once more, with weights from the light that the fitted model expects.
+    rest = (expected - smooth(difference, usable, 2.0))[orders.row, orders.column]
+    orders = replace(orders, sigma=pixel_sigma(result.light + rest, noise))
+    state, result = iterate(orders, geometry, state)
+    return _measurement(orders, geometry, state, result, halo)
+
+
+def _measurement(
+    orders: Orders, geometry: Geometry, state: FitState, result: FitResult, halo: Plane
+) -> ArmMeasurement:
+    """The measurement, with arms sorted by angle."""
+    arms = state.pattern.size - 1
+    angles = (np.rad2deg(state.pattern[:-1]) + 90.0) % 180.0 - 90.0
+    by_angle = np.argsort(angles)
+    place = np.argsort(by_angle)
+    x, y = order_positions(geometry.centre, state.pattern, orders.arm, orders.k)
+    significance = state.amplitude / result.error[arms + 1 :]
+    peaks = tuple(
+        Peak(int(place[arm]), int(k), float(px), float(py), float(s))
+        for arm, k, px, py, s in zip(orders.arm, orders.k, x, y, significance, strict=True)
+    )
+    model, fitted = np.zeros(halo.shape), np.zeros(halo.shape, dtype=bool)
+    model[orders.row, orders.column] = result.light + halo[orders.row, orders.column]
+    fitted[orders.row, orders.column] = True
+    return ArmMeasurement(
+        angles_deg=tuple(float(a) for a in angles[by_angle]),
+        angles_sigma_deg=tuple(float(s) for s in np.rad2deg(result.error[:arms])[by_angle]),
+        spacing_px=float(state.pattern[-1]),
+        spacing_sigma_px=float(result.error[arms]),
+        centre_xy=geometry.centre,
+        chi2=result.chi2,
+        degrees_of_freedom=result.freedom,
+        peaks=peaks,
+        steps_done=result.done,
+        stopped_because=result.why,
+        source=state.source,
+        model=model,
+        fitted=fitted,
+    )

@@ -1,0 +1,5 @@
+"""How closely two plate scales must agree to count as the same."""
+
+from __future__ import annotations
+
+PLATE_SCALE_TOLERANCE = 0.01  # of the ratio of two plate scales, from 1

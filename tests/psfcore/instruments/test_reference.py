@@ -1,0 +1,128 @@
+"""docs/instruments.md lists every key of an instrument file, with its default and limits, and no other key."""
+
+from __future__ import annotations
+
+import re
+import types
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from psfcore.instruments.model import Instrument, parse_instrument
+
+REFERENCE = (Path(__file__).parents[3] / "docs" / "instruments.md").read_text("utf-8")
+# How the reference writes defaults that are not numbers.
+UNSET = {"": "none", "detector.gain_modes.MODE.": "unknown"}
+KEYED = {"match": "KEYWORD", "detector.gain_modes": "MODE"}
+
+
+def documented() -> dict[str, dict[str, str]]:
+    """The rows of the reference's tables by key; cells by the name of their column."""
+    rows: dict[str, dict[str, str]] = {}
+    for line in REFERENCE.splitlines():
+        if not line.startswith("| `"):
+            continue
+        cells = [cell.strip() for cell in line.strip("|").split(" | ")]
+        names = ("key", "type", "unit", "default", "limits", "meaning")
+        row = dict(zip(names, cells, strict=True))
+        key = row["key"].strip("` ")
+        assert key not in rows, f"{key} is documented twice"
+        rows[key] = row
+    return rows
+
+
+def models(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
+    """The models inside an annotation, with how a key below them is written."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield ".", annotation
+    elif origin is tuple and isinstance(arguments[0], type) and issubclass(arguments[0], BaseModel):
+        yield "[].", arguments[0]
+    elif origin is dict and isinstance(arguments[1], type) and issubclass(arguments[1], BaseModel):
+        yield ".MODE.", arguments[1]
+    elif origin in (types.UnionType, typing.Union):
+        for argument in arguments:
+            yield from models(argument)
+
+
+def accepted(model: type[BaseModel] = Instrument, before: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Every key that the model accepts, as the reference writes it."""
+    for name, field in model.model_fields.items():
+        key = before + name
+        yield key, field
+        for join, below in models(field.annotation):
+            yield from accepted(below, key + join)
+
+
+KEYS = dict(accepted())
+
+
+def test_the_reference_lists_every_key_and_no_other() -> None:
+    assert set(documented()) - {"match.KEYWORD"} == set(KEYS)
+    assert len(KEYS) > 60
+
+
+@pytest.mark.parametrize("key", sorted(KEYS))
+def test_the_reference_states_the_default_of_a_key(key: str) -> None:
+    stated, field = documented()[key]["default"], KEYS[key]
+    if field.is_required():
+        assert stated == "required"
+    elif field.default is None:
+        assert stated in UNSET.values()
+    elif field.default in ((), {}):
+        assert stated == "empty"
+    else:
+        assert float(stated) == field.default
+
+
+@pytest.mark.parametrize("key", sorted(KEYS))
+def test_the_reference_states_the_limits_of_a_key(key: str) -> None:
+    stated, field = documented()[key]["limits"], KEYS[key]
+    low, high = "", ""
+    for limit in limits_of(field):
+        if isinstance(limit, Ge):
+            low = f"{limit.ge:g}"
+        elif isinstance(limit, Gt):
+            low = f"> {limit.gt:g}"
+        elif isinstance(limit, Le):
+            high = f"<= {limit.le:g}"
+        elif isinstance(limit, Lt):
+            high = f"< {limit.lt:g}"
+    if low and not low.startswith(">"):
+        assert stated.startswith(plain(low) + " to " + plain(high.removeprefix("<= ")))
+    elif low:
+        assert stated == ", ".join(part for part in (low, high) if part)
+    for choice in choices_of(field.annotation):
+        assert f"`{choice}`" in stated
+
+
+def limits_of(field: FieldInfo) -> list[Any]:
+    """The limits of a field's value, also where the field may be left out."""
+    found = list(field.metadata)
+    for argument in typing.get_args(field.annotation):
+        for extra in getattr(argument, "__metadata__", ()):
+            found += getattr(extra, "metadata", [])
+    return found
+
+
+def plain(number: str) -> str:
+    """1e-9 for 1e-09; 100000 for 1e+05."""
+    return "100000" if number == "1e+05" else re.sub(r"e([+-])0*", lambda m: "e" + m[1].strip("+"), number)
+
+
+def choices_of(annotation: Any) -> tuple[str, ...]:
+    return typing.get_args(annotation) if typing.get_origin(annotation) is Literal else ()
+
+
+def test_the_example_is_a_complete_instrument_file() -> None:
+    (example,) = re.findall(r"```toml\n(.*?)```", REFERENCE, flags=re.DOTALL)
+    instrument = parse_instrument(example, "docs/instruments.md")
+    assert instrument.name == "small_telescope"
+    assert instrument.scatter is not None and instrument.mount is not None
+    assert instrument.mesh_distance_mm(instrument.meshes[0]) == instrument.focal_length_mm
