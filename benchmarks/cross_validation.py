@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.deconvolution import THREADS, reference
 from psfcore.fits.header import FitsLimits
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.validation.cross_validation import FoldFit, bands, draws, shared_fits
+from psfcore.scatter.validation.cross_validation import FoldFit, bands, bootstrap_samples, shared_fits
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.simulate.transit_files import write
@@ -46,7 +46,7 @@ def shared(folder: Path, f_s: float) -> tuple[FoldFit, ...]:
     start = time.perf_counter()
     solution = invert(transit, threads=THREADS)
     fitted = time.perf_counter() - start
-    fits = shared_fits(solution, draws(IMAGES, runs=RUNS))
+    fits = shared_fits(solution, bootstrap_samples(IMAGES, runs=RUNS))
     told(f"shared scheme, {len(fits)} folds with free fits ({fitted:.0f} s of it the fit)", start, f_s)
     return fits
 

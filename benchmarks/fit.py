@@ -96,9 +96,9 @@ def straightforward(solution: Solution) -> NDArray[np.float64]:
             frame = transit.frames[n]
             level = np.maximum(here[k], LEAST_LEVEL * here[k].mean())
             weight = 1 / transit.noise.variance(level, frame.exposure_s)
-            answers = np.array([slope[k] for slope in slopes])
-            normal += (answers * weight) @ answers.T
-            score += (answers * weight) @ (frame.pixels[solution.sky.dark[n]] - here[k])
+            jacobian = np.array([slope[k] for slope in slopes])
+            normal += (jacobian * weight) @ jacobian.T
+            score += (jacobian * weight) @ (frame.pixels[solution.sky.dark[n]] - here[k])
         at = at + np.linalg.solve(normal, score)
     return cumulative_curve(total.kernel(at), total.radii_px)
 

@@ -47,8 +47,8 @@ Plane = NDArray[np.float64]
 LEAST_DEPTH = 0.2  # less than the inversion's: a PSF without scatter expects far more to be missing than is
 SLICE_HALF_PX = 20
 SLICES_A_POINTING = 3
-DRAWS = 4
-UNDO_STEPS = 6
+NOISE_REALISATIONS = 4
+INVERSION_STEPS = 6
 _SCENES_KEPT = 24
 
 
@@ -66,7 +66,7 @@ def evaluate(
     transit: Transit,
     psf_for_frame: Callable[[int], Kernel],
     *,
-    draws: int = DRAWS,
+    noise_realisations: int = NOISE_REALISATIONS,
     seed: int = 1,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
@@ -81,24 +81,24 @@ def evaluate(
     Raises DataError "no-occulter" where no image has one that can be looked at.
     """
     kernels = [psf_for_frame(n) for n in range(len(transit.frames))]
-    superposition = Superposition(max(frame.place.radius_px for frame in transit.frames), draws)
+    superposition = Superposition(max(frame.place.radius_px for frame in transit.frames), noise_realisations)
     sliced = _sliced(transit.frames)
     done: dict[int, FrameEvaluation] = {}
     left_out: dict[str, str] = {}
     for indices in _sharing(kernels):
-        look = _Look(transit, kernels[indices[0]], threads)
+        simulator = _FrameSimulator(transit, kernels[indices[0]], threads)
         for n in indices:
             progress("evaluating", len(done) + len(left_out), len(kernels))
             frame = transit.frames[n]
-            found, dark = look.find(n)
+            found, dark = simulator.find(n)
             reason = _reason(frame, found, dark)
             if reason is not None:
                 left_out[frame.file] = reason
                 continue
-            simulated = look.simulated(n, dark)
-            done[n] = _compared(look, n, found, dark, simulated, sliced=n in sliced)
+            simulated = simulator.simulated(n, dark)
+            done[n] = _compared(simulator, n, found, dark, simulated, sliced=n in sliced)
             rng = np.random.default_rng([seed, n])
-            noise = [look.noise_alone(n, dark, simulated, rng) for _ in range(draws)]
+            noise = [simulator.noise_alone(n, dark, simulated, rng) for _ in range(noise_realisations)]
             share = 100 / done[n].observed_dn_s
             superposition.add(found.place, dark, done[n].pe_pct, [share * r for r in noise])
     if not done:
@@ -126,7 +126,7 @@ def _sliced(frames: Sequence[Frame]) -> set[int]:
     return chosen
 
 
-class _Look:
+class _FrameSimulator:
     """The frames of a transit as seen with one PSF."""
 
     def __init__(self, transit: Transit, kernel: Kernel, threads: int) -> None:
@@ -145,7 +145,7 @@ class _Look:
         """s of Eq. (1), [y, x]."""
         scene = self._scenes[n].copy()
         scene[dark] = 0.0
-        return self.optics.field(self.optics.see(self.optics.lanes(scene)))
+        return self.optics.field(self.optics.convolve(self.optics.lanes(scene)))
 
     def noise_alone(
         self, n: int, dark: Pixels, simulated: NDArray[np.float32], rng: np.random.Generator
@@ -156,9 +156,9 @@ class _Look:
         expected[dark] = simulated[dark]
         expected = np.maximum(expected, 0.0)
         drawn = self.transit.noise.observe(expected, frame.exposure_s, rng) - expected
-        scene = optics.undo_once(optics.lanes(drawn))
+        scene = optics.invert_once(optics.lanes(drawn))
         put(scene, dark, 0.0)
-        return pick(optics.see(scene), dark) - drawn[dark]
+        return pick(optics.convolve(scene), dark) - drawn[dark]
 
 
 class _Scenes(Sequence[NDArray[np.float32]]):
@@ -175,7 +175,7 @@ class _Scenes(Sequence[NDArray[np.float32]]):
         scene = self._kept.pop(index, None)
         if scene is None:
             observed = self._optics.lanes(self._transit.frames[index].pixels)
-            scene = self._optics.field(self._optics.undo(observed, steps=UNDO_STEPS))
+            scene = self._optics.field(self._optics.invert(observed, steps=INVERSION_STEPS))
             if len(self._kept) >= _SCENES_KEPT:
                 self._kept.pop(next(iter(self._kept)))
         self._kept[index] = scene  # last asked for, last to go
@@ -196,7 +196,7 @@ def _reason(frame: Frame, found: FoundPlace, dark: Pixels) -> str | None:
 
 
 def _compared(
-    look: _Look,
+    simulator: _FrameSimulator,
     n: int,
     found: FoundPlace,
     dark: Pixels,
@@ -204,8 +204,8 @@ def _compared(
     *,
     sliced: bool,
 ) -> FrameEvaluation:
-    frame = look.transit.frames[n]
-    noise, centre_noise = _standard_errors(look.optics, frame, dark, found, look.transit.noise)
+    frame = simulator.transit.frames[n]
+    noise, centre_noise = _standard_errors(simulator.optics, frame, dark, found, simulator.transit.noise)
     along_x, along_y = _slices(frame, found, dark, simulated) if sliced else (None, None)
     return FrameEvaluation(
         index=n,

@@ -27,7 +27,7 @@ from psfcore.evaluation.frame import FrameEvaluation
 from psfcore.evaluation.superposed import LEAST_SHARE
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
-from psfcore.scatter.validation.cross_validation import Draw, shared_step
+from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
 from psfcore.scatter.validation.free_shells import free_kernel, free_shares, law_light
 from psfcore.transit.blocks import folds
 from psfcore.transit.transit import Kernel
@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 
 FREE_SHELLS = "free-shells"
 STRETCHED = ("stretched-along-x", "stretched")
-RESAMPLES = 1000
+BOOTSTRAP_SAMPLES = 1000
 FIGURES = ("residual_mean_pct", "residual_rms_pct", "mpe_rms_pct", "mape_mean_pct")
 KernelOf = Callable[[int], Kernel]
 
@@ -77,7 +77,7 @@ class ShapesByErrors:
         return {
             "images": self.images,
             "folds": self.folds,
-            "resamples": RESAMPLES,
+            "resamples": BOOTSTRAP_SAMPLES,
             "shapes": [shape.to_json() for shape in self.shapes],
         }
 
@@ -106,7 +106,7 @@ def compare_shapes_by_errors(
 ) -> ShapesByErrors:
     """The softened power law that `solution` fitted to all images, both stretched ones, and free shells.
 
-    seed: of the images drawn again. Raises DataError "unknown-shape" where `solution` is of another shape,
+    seed: of the images counts again. Raises DataError "unknown-shape" where `solution` is of another shape,
     "too-few-frames" where there are too few images for two folds, and as `inversion.invert` and `evaluate`.
     """
     if solution.inversion.shape.name != SOFTENED_POWER_LAW.name:
@@ -114,22 +114,22 @@ def compare_shapes_by_errors(
             "unknown-shape",
             f"expected a fit of {SOFTENED_POWER_LAW.name}; got {solution.inversion.shape.name}",
         )
-    draws = _fold_draws(len(solution.transit.frames))
+    samples = _fold_samples(len(solution.transit.frames))
     named: dict[str, tuple[Solution | None, KernelOf]] = {
-        SOFTENED_POWER_LAW.name: (solution, _fold_kernels(solution, draws))
+        SOFTENED_POWER_LAW.name: (solution, _fold_kernels(solution, samples))
     }
     for name in STRETCHED:
         stretched = _fit_of(solution, name, progress)
-        named[name] = stretched, _fold_kernels(stretched, draws)
-    named[FREE_SHELLS] = None, _free_fold_kernels(solution, draws, progress)
+        named[name] = stretched, _fold_kernels(stretched, samples)
+    named[FREE_SHELLS] = None, _free_fold_kernels(solution, samples, progress)
     looks = {name: _looked(solution, kernel_of, name, progress) for name, (_, kernel_of) in named.items()}
     images = sorted(set.intersection(*(set(look) for look in looks.values())))
-    drawn = _drawn_again(len(images), seed)
-    found = {name: _figures([look[n] for n in images], drawn) for name, look in looks.items()}
+    counts = _bootstrap_counts(len(images), seed)
+    found = {name: _figures([look[n] for n in images], counts) for name, look in looks.items()}
     first = found[SOFTENED_POWER_LAW.name]
     return ShapesByErrors(
         images=len(images),
-        folds=len(draws),
+        folds=len(samples),
         shapes=tuple(
             ShapeErrors(
                 name=name,
@@ -158,40 +158,40 @@ def _parameters(solution: Solution) -> dict[str, tuple[float, float]]:
     return {name: (values[name], sigma[name]) for name in values}
 
 
-def _fold_draws(images: int) -> tuple[Draw, ...]:
-    """One draw a fold, of each of its images once."""
+def _fold_samples(images: int) -> tuple[FoldSample, ...]:
+    """One sample a fold, of each of its images once."""
     parts = folds(images)
     if not parts:
         raise DataError("too-few-frames", f"expected at least 6 images, to hold some out; got {images}")
     return tuple(
-        Draw(0, k, tuple(int(n in fold.fitted) for n in range(images)), fold.held_out)
+        FoldSample(0, k, tuple(int(n in fold.fitted) for n in range(images)), fold.held_out)
         for k, fold in enumerate(parts)
     )
 
 
-def _fold_kernels(solution: Solution, draws: tuple[Draw, ...]) -> KernelOf:
+def _fold_kernels(solution: Solution, samples: tuple[FoldSample, ...]) -> KernelOf:
     """The total PSF [y, x] of the fold that holds an image out."""
     at = solution.inversion.coordinates
-    kernels = [solution.total.kernel(at + shared_step(solution, draw)) for draw in draws]
-    return _by_image(draws, kernels)
+    kernels = [solution.total.kernel(at + shared_step(solution, sample)) for sample in samples]
+    return _by_image(samples, kernels)
 
 
-def _free_fold_kernels(solution: Solution, draws: tuple[Draw, ...], progress: Progress) -> KernelOf:
+def _free_fold_kernels(solution: Solution, samples: tuple[FoldSample, ...], progress: Progress) -> KernelOf:
     """The same of free shells."""
     shape, diffraction = solution.inversion.shape, solution.transit.diffraction
     shares = free_shares(solution, solution.inversion.coordinates, progress=progress)
     kernels = []
-    for draw in draws:
-        at = solution.inversion.coordinates + shared_step(solution, draw)
-        free = shares.fit(draw.counts, law_light(shape, at))
+    for sample in samples:
+        at = solution.inversion.coordinates + shared_step(solution, sample)
+        free = shares.fit(sample.counts, law_light(shape, at))
         kernels.append(
             free_kernel(free, shape, at, diffraction, solution.total.size, threads=solution.threads)
         )
-    return _by_image(draws, kernels)
+    return _by_image(samples, kernels)
 
 
-def _by_image(draws: tuple[Draw, ...], kernels: list[Kernel]) -> KernelOf:
-    fold_of = {n: draw.fold for draw in draws for n in draw.held_out}
+def _by_image(samples: tuple[FoldSample, ...], kernels: list[Kernel]) -> KernelOf:
+    fold_of = {n: sample.fold for sample in samples for n in sample.held_out}
     return lambda n: kernels[fold_of[n]]
 
 
@@ -203,28 +203,30 @@ def _looked(
     def said(stage: str, step: int, steps: int) -> None:
         progress(f"{name}: {stage}", step, steps)
 
-    looked = evaluate(solution.transit, kernel_of, draws=0, threads=solution.threads, progress=said)
+    looked = evaluate(
+        solution.transit, kernel_of, noise_realisations=0, threads=solution.threads, progress=said
+    )
     return {frame.index: frame for frame in looked.frames}
 
 
-def _drawn_again(images: int, seed: int) -> Floats:
-    """How often each image counts, (1 + RESAMPLES, images): first all of them once."""
+def _bootstrap_counts(images: int, seed: int) -> Floats:
+    """How often each image counts, (1 + BOOTSTRAP_SAMPLES, images): first all of them once."""
     rng = np.random.default_rng(seed)
-    drawn = rng.multinomial(images, np.full(images, 1 / images), RESAMPLES)
-    return np.concatenate((np.ones((1, images)), drawn))
+    counts = rng.multinomial(images, np.full(images, 1 / images), BOOTSTRAP_SAMPLES)
+    return np.concatenate((np.ones((1, images)), counts))
 
 
-def _figures(frames: list[FrameEvaluation], drawn: Floats) -> Floats:
-    """FIGURES of all images and of each resample: (FIGURES, 1 + RESAMPLES)."""
+def _figures(frames: list[FrameEvaluation], counts: Floats) -> Floats:
+    """FIGURES of all images and of each resample: (FIGURES, 1 + BOOTSTRAP_SAMPLES)."""
     maps = _maps(frames)
     dark = np.isfinite(maps)
     shown = dark.sum(axis=0) >= LEAST_SHARE * len(frames)
     pe, dark = np.nan_to_num(maps[:, shown]), dark[:, shown]
     # A place that no image of a resample shows counts as one without error, in one resample of very many.
-    count = np.maximum(drawn @ dark, 1)
-    mpe, mape = drawn @ pe / count, drawn @ np.abs(pe) / count
+    count = np.maximum(counts @ dark, 1)
+    mpe, mape = counts @ pe / count, counts @ np.abs(pe) / count
     residual = np.array([frame.residual_pct for frame in frames])
-    share = drawn / len(frames)
+    share = counts / len(frames)
     return np.array(
         [
             share @ residual,

@@ -82,13 +82,16 @@ class Superposed:
 class Superposition:
     """Sums over the images laid on one another so far. draws: of noise, with every image."""
 
-    def __init__(self, radius_px: float, draws: int) -> None:
+    def __init__(self, radius_px: float, noise_realisations: int) -> None:
         self._half = math.ceil(radius_px) + 1
         shape = (2 * self._half + 1, 2 * self._half + 1)
         self._images = 0
         self._count = np.zeros(shape, np.int64)
         self._pe, self._ape = np.zeros(shape), np.zeros(shape)
-        self._noise_pe, self._noise_ape = np.zeros((draws, *shape)), np.zeros((draws, *shape))
+        self._noise_pe, self._noise_ape = (
+            np.zeros((noise_realisations, *shape)),
+            np.zeros((noise_realisations, *shape)),
+        )
 
     def add(self, place: Place, dark: Pixels, pe_pct: Vector, noise_pe_pct: Sequence[Vector]) -> None:
         """One more image: the PE of its dark pixels, and that of each draw of noise."""
@@ -97,23 +100,23 @@ class Superposition:
         self._count[at] += 1
         self._pe[at] += pe_pct
         self._ape[at] += np.abs(pe_pct)
-        for draw, noise in enumerate(noise_pe_pct):
-            self._noise_pe[draw][at] += noise
-            self._noise_ape[draw][at] += np.abs(noise)
+        for k, noise in enumerate(noise_pe_pct):
+            self._noise_pe[k][at] += noise
+            self._noise_ape[k][at] += np.abs(noise)
 
     def superposed(self) -> Superposed:
         """Eq. (1), where at least LEAST_SHARE of the images are dark."""
         shown = self._count >= max(LEAST_SHARE * self._images, 1)
         count = np.where(shown, self._count, np.nan)
-        draws = max(len(self._noise_pe), 1)
-        noise_mpe = np.sqrt(np.sum((self._noise_pe / count) ** 2, axis=0) / draws)
+        realisations = max(len(self._noise_pe), 1)
+        noise_mpe = np.sqrt(np.sum((self._noise_pe / count) ** 2, axis=0) / realisations)
         return Superposed(
             images=self._images,
             count=self._count,
             mpe_pct=self._pe / count,  # Eq. (1)
             mape_pct=self._ape / count,  # Eq. (1)
             noise_mpe_pct=noise_mpe,
-            noise_mape_pct=np.sum(self._noise_ape, axis=0) / draws / count,
+            noise_mape_pct=np.sum(self._noise_ape, axis=0) / realisations / count,
         )
 
 

@@ -21,7 +21,7 @@ from psfcore.drawing.page import (
     provenance_values,
     with_error,
 )
-from psfcore.evaluation.evaluation import DRAWS, UNDO_STEPS, Evaluation
+from psfcore.evaluation.evaluation import INVERSION_STEPS, NOISE_REALISATIONS, Evaluation
 from psfcore.evaluation.frame import CENTRE_PX, FrameEvaluation
 from psfcore.evaluation.report import TREND_PX, Summary, summaries, trends
 from psfcore.evaluation.superposed import Superposed
@@ -542,8 +542,8 @@ def _made_of(report: PsfReport, provenance: dict[str, Any]) -> list[Part]:
 
 def _algorithm(report: PsfReport) -> list[Value]:
     values = [
-        Value("steps of a reconstruction", f"{UNDO_STEPS}", meaning="linear, for the evaluation"),
-        Value("draws of noise", f"{DRAWS}", meaning="for what noise alone does to the maps"),
+        Value("steps of a reconstruction", f"{INVERSION_STEPS}", meaning="linear, for the evaluation"),
+        Value("draws of noise", f"{NOISE_REALISATIONS}", meaning="for what noise alone does to the maps"),
         Value(
             "fully dark pixels",
             f"{DARK_MARGIN_PX:g} px and {DARK_MARGIN_SIGMAS:g} sigma of the place",

@@ -20,15 +20,15 @@ from psfcore.evaluation.evaluation import Evaluation, evaluate
 from psfcore.evaluation.plot import sentence as evaluation_sentence
 from psfcore.evaluation.report import report as evaluation_json
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
-from psfcore.scatter.fit import TransitFit, fit_transit, psf_of
+from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.scatter.fit import report as fit_json
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.validation.cross_validation import (
     Bands,
-    Draw,
     FoldFit,
+    FoldSample,
     bands,
-    draws,
+    bootstrap_samples,
     shared_fits,
     shared_step,
 )
@@ -128,13 +128,15 @@ def make_report(
     wanted = [s for s in STAGES if psf is None or s in ("evaluating", "tables")]
     if not dark_offsets and psf is None:
         wanted.remove("dark offsets")
-    stages = _Stages(progress, {name: STAGES[name] for name in wanted})
+    stages = _ReportProgress(progress, {name: STAGES[name] for name in wanted})
     if psf is not None:
         _check_scale(transit, psf)
         return _on_a_given(transit, prepared, psf, seed, threads, stages)
     missing: list[Missing] = []
     fit = fit_transit(transit, seed=seed, threads=threads, progress=stages.of("fit"))
-    made = psf_of(fit, name=f"{transit.instrument or 'transit'}-fitted", version="this report", provenance={})
+    made = fitted_psf(
+        fit, name=f"{transit.instrument or 'transit'}-fitted", version="this report", provenance={}
+    )
     cross = _cross_validated(fit, seed, missing, stages.of("folds"))
     kernels = _held_out_kernels(fit.solution, missing)
     evaluation = evaluate(
@@ -166,7 +168,7 @@ def make_report(
 
 
 def _on_a_given(
-    transit: Transit, prepared: Prepared, psf: Psf, seed: int, threads: int, stages: _Stages
+    transit: Transit, prepared: Prepared, psf: Psf, seed: int, threads: int, stages: _ReportProgress
 ) -> PsfReport:
     """The report on a PSF that nobody fits here."""
     evaluation = evaluate(
@@ -214,7 +216,7 @@ def _names_images(psf: Psf, transit: Transit) -> bool:
     return any(transit.sha256.get(frame.file, "-") in history for frame in transit.frames)
 
 
-def _tables(psf: Psf, threads: int, stages: _Stages) -> dict[str, Any]:
+def _tables(psf: Psf, threads: int, stages: _ReportProgress) -> dict[str, Any]:
     stages.of("tables")("tables of the PSF", 0, 1)
     return tables_of(psf, threads=threads)
 
@@ -224,7 +226,9 @@ def _cross_validated(
 ) -> CrossValidated | None:
     """All draws of all runs, by the shared scheme; none, and the reason, where the images do not suffice."""
     try:
-        fits = shared_fits(fit.solution, draws(len(fit.transit.frames), seed=seed), progress=progress)
+        fits = shared_fits(
+            fit.solution, bootstrap_samples(len(fit.transit.frames), seed=seed), progress=progress
+        )
     except DataError as error:
         what = "the cross-validation, and scatter without a formula beside it"
         missing.append(Missing(what, error.message))
@@ -242,7 +246,7 @@ def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[i
             raise DataError("too-few-images", f"expected at least 6 images to hold some out; got {images}")
         for k, fold in enumerate(parts):
             once = tuple(int(n in set(fold.fitted)) for n in range(images))
-            step = shared_step(solution, Draw(0, k, once, fold.held_out))
+            step = shared_step(solution, FoldSample(0, k, once, fold.held_out))
             kernels.append(solution.total.kernel(solution.inversion.coordinates + step))
     except DataError as error:
         missing.append(Missing("a test on images held out", error.message))
@@ -252,7 +256,7 @@ def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[i
 
 
 def _offsets(
-    fit: TransitFit, threads: int, missing: list[Missing], stages: _Stages
+    fit: TransitFit, threads: int, missing: list[Missing], stages: _ReportProgress
 ) -> DarkOffsetStudy | None:
     visits = len(fit.transit.frames) * len(OFFSETS_DN) * OFFSET_VISITS
     try:
@@ -267,7 +271,7 @@ def _offsets(
         return None
 
 
-class _Stages:
+class _ReportProgress:
     """Progress of the whole out of that of its stages; it never goes back."""
 
     SCALE = 1000

@@ -27,8 +27,13 @@ from psfcore.psf import (
     cumulative_curve,
     encircled_energy,
 )
-from psfcore.scatter.as_published.equations import Drawn, Lines, free_fit
-from psfcore.scatter.as_published.published import AS_PUBLISHED, MENDED_ALONE, Published, invert_as_published
+from psfcore.scatter.as_published.equations import Equations, SubsetFits, free_fit
+from psfcore.scatter.as_published.published import (
+    AS_PUBLISHED,
+    CORRECTED_ALONE,
+    Published,
+    invert_as_published,
+)
 from psfcore.scatter.as_published.ring_sums import segment_sums
 from psfcore.scatter.as_published.segments import Segments, shells_as_published
 from psfcore.scatter.inversion import Inversion, Progress, Solution, invert
@@ -45,7 +50,7 @@ Kernel = NDArray[np.float64]
 
 SCHEMA = "psf-fit/1"
 RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
-ALONE_DRAWS = 30  # of each bias mended alone: differences between recipes that share their draws
+ALONE_SUBSETS = 30  # of each bias mended alone: differences between recipes that share their subsets
 WORST_CHI2 = 1.5  # a pixel; that of 10,000 pixels is known to 0.014
 OPEN_POINTS = 3.0  # an error of the curve from which a radius is said to be open
 
@@ -60,21 +65,21 @@ class Curve:
 
 
 @dataclass(frozen=True, eq=False)
-class FreeShells:
-    """Scatter without a formula: weights by shell (draws kept, shells) on `segments`, and the light beyond each edge.
+class ShellWeightFits:
+    """Scatter without a formula: weights by shell (subsets kept, shells) on `segments`, and the light beyond each edge.
 
     Where no pixel decides, a shell is held at the fitted shape: its spread there says nothing.
     """
 
     segments: Segments
-    drawn: Drawn
+    drawn: SubsetFits
 
     def weights_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
-        """Percentiles over the draws of the weight of a pixel of each shell: (percentiles, shells)."""
+        """Percentiles over the subsets of the weight of a pixel of each shell: (percentiles, shells)."""
         return np.asarray(np.percentile(self.drawn.fits, percentiles, axis=0))
 
     def beyond_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
-        """Percentiles over the draws of the diffuse light beyond each shell's inner edge, percent."""
+        """Percentiles over the subsets of the diffuse light beyond each shell's inner edge, percent."""
         light = self.drawn.fits * self.segments.counts
         beyond = 100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1]
         return np.asarray(np.percentile(beyond, percentiles, axis=0))
@@ -92,7 +97,7 @@ class TransitFit:
     kernel: Kernel
     scatter: Kernel
     first_guess: FirstGuess
-    free: FreeShells | None
+    free: ShellWeightFits | None
     shapes: tuple[ComparedShape, ...]
     published: Published | None
     published_alone: dict[str, Published]
@@ -130,11 +135,11 @@ def fit_transit(
     """
     wanted = shape_named(shape)
     guess = first_guess(transit)
-    progress = _Whole(
+    progress = _FitProgress(
         progress,
         len(transit.frames),
         compared=wanted is SOFTENED_POWER_LAW,
-        published=1 + len(MENDED_ALONE) if as_published else 0,
+        published=1 + len(CORRECTED_ALONE) if as_published else 0,
     )
     solution = invert(transit, wanted, threads=threads, progress=progress)
     factor = overdispersion(solution.inversion)
@@ -146,9 +151,9 @@ def fit_transit(
         published = invert_as_published(transit, AS_PUBLISHED, seed=seed, threads=threads, progress=progress)
         alone = {
             name: invert_as_published(
-                transit, choices, seed=seed, draws=ALONE_DRAWS, threads=threads, progress=progress
+                transit, choices, seed=seed, subsets=ALONE_SUBSETS, threads=threads, progress=progress
             )
-            for name, choices in MENDED_ALONE.items()
+            for name, choices in CORRECTED_ALONE.items()
         }
     return TransitFit(
         transit=transit,
@@ -167,7 +172,7 @@ def fit_transit(
     )
 
 
-class _Whole:
+class _FitProgress:
     """Progress of the whole fit out of that of its stages: each call of a stage is a visit to one frame.
 
     The rounds that a fit will take are a guess; the total grows where there are more.
@@ -231,7 +236,7 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
     return kernel, scatter, curve(kernel, total_slopes), curve(scatter, diffuse_slopes)
 
 
-def _free_shells(solution: Solution, seed: int, progress: Progress) -> FreeShells:
+def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeightFits:
     """The free fit on the reconstructed scenes, its biases mended, held at the fitted shape where nothing decides."""
     segments = Segments(tuple(shells_as_published()))
     diffract = Blur(solution.transit.diffraction, solution.transit.shape, threads=solution.threads)
@@ -239,12 +244,12 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> FreeShell
     for step, n in enumerate(solution.part):
         progress("free shells", step, len(solution.part))
         frame, dark = solution.transit.frames[n], solution.sky.dark[n]
-        lit = solution.lit(n)
-        diffracted = diffract.see(lit)
-        expected = pick(solution.optics.see(lit), dark)
+        lit = solution.blanked_scene(n)
+        diffracted = diffract.convolve(lit)
+        expected = pick(solution.optics.convolve(lit), dark)
         distance = disc_distance(solution.transit.shape, solution.sky.found[n].place)[dark]
         parts.append(
-            Lines(
+            Equations(
                 observed=pick(solution.sky.observed[n], dark),
                 ring_sums=segment_sums(
                     diffract.field(diffracted), np.stack(dark, axis=1), segments, threads=solution.threads
@@ -257,7 +262,7 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> FreeShell
     shape, at = solution.inversion.shape, solution.inversion.coordinates
     towards = segments.mean_of_map(shape.kernel(at, REACH_GRID_PX))
     counts = segments.counts.astype(np.float64)
-    return FreeShells(segments, free_fit(Lines.joined(parts), counts, seed=seed, towards=towards))
+    return ShellWeightFits(segments, free_fit(Equations.joined(parts), counts, seed=seed, towards=towards))
 
 
 def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
@@ -300,7 +305,7 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
     return tuple(out)
 
 
-def psf_of(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
+def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
     """The PSF of a fit on the full reach, its components DIFFRACTION and SCATTER beside it."""
     return Psf(
         kernel=fit.kernel,
@@ -417,7 +422,7 @@ def _curve_json(curve: Curve) -> dict[str, list[float]]:
     }
 
 
-def _free_json(free: FreeShells) -> dict[str, Any]:
+def _free_json(free: ShellWeightFits) -> dict[str, Any]:
     percentiles = (50.0, *ONE_SIGMA, *TWO_SIGMA)
     names = ("median", "minus_1_sigma", "plus_1_sigma", "minus_2_sigma", "plus_2_sigma")
     weights, beyond = free.weights_pct(percentiles), free.beyond_pct(percentiles)

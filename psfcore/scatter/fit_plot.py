@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from psfcore.drawing.plots import INK
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.as_published.published import Published
-from psfcore.scatter.fit import ONE_SIGMA, TWO_SIGMA, Curve, FreeShells, TransitFit, sentence
+from psfcore.scatter.fit import ONE_SIGMA, TWO_SIGMA, Curve, ShellWeightFits, TransitFit, sentence
 from psfcore.scatter.inversion import CONVERGED_POINTS
 from psfcore.transit.first_guess import ESTIMATORS
 
@@ -113,7 +113,7 @@ def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
     return radius, weight, np.sqrt(np.maximum(variance, 0.0))
 
 
-def _draw_free_weights(axes: Any, free: FreeShells, field_px: int) -> None:
+def _draw_free_weights(axes: Any, free: ShellWeightFits, field_px: int) -> None:
     """Median and spread of shells that begin within the field: farther ones are held, and say nothing."""
     edges, shown = _shells_within(free, field_px)
     for percentiles, alpha, label in (
@@ -128,7 +128,7 @@ def _draw_free_weights(axes: Any, free: FreeShells, field_px: int) -> None:
     axes.stairs(median, edges, baseline=None, color=_FREE, linewidth=1.1, label="free shells, median")
 
 
-def _shells_within(free: FreeShells, field_px: int) -> tuple[Vector, NDArray[np.bool_]]:
+def _shells_within(free: ShellWeightFits, field_px: int) -> tuple[Vector, NDArray[np.bool_]]:
     """Edges of the shells that begin within the field, one more than shells, and which they are."""
     edges = np.array(free.segments.edges_px)
     shown = edges[:-1] < field_px

@@ -36,9 +36,9 @@ def noise_covariance(
     for template in templates:
         here = np.zeros(optics.engine.lanes_shape, np.float32)
         put(here, dark, template)
-        scattered = optics.see_back(here)
+        scattered = optics.correlate(here)
         put(scattered, dark, 0.0)
-        here -= optics.undo_once(scattered, adjoint=True)  # Eq. (1)
+        here -= optics.invert_once(scattered, adjoint=True)  # Eq. (1)
         spread.append(optics.field(here).ravel())
     b = np.array(spread, dtype=np.float32)
     # Linear in the observed value, so its own noise averages out.

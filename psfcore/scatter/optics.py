@@ -42,11 +42,11 @@ class Blur:
         """The field [y, x] of lanes."""
         return self.engine.from_lanes(lanes)
 
-    def see(self, lanes: Lanes) -> Lanes:
+    def convolve(self, lanes: Lanes) -> Lanes:
         """H x."""
         return self._through(lanes, self.engine.transfer)
 
-    def see_back(self, lanes: Lanes) -> Lanes:
+    def correlate(self, lanes: Lanes) -> Lanes:
         """H^T y."""
         return self._through(lanes, self.engine.transfer, conjugate=True)
 
@@ -71,17 +71,17 @@ class Optics(Blur):
         super().__init__(psf_kernel, field_shape, threads=threads)
         self._inverse = inverse_filter(self.engine)
 
-    def undo_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
+    def invert_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
         """G y; G^T y where adjoint."""
         return self._through(lanes, self._inverse, conjugate=adjoint)
 
-    def undo(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
+    def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
         """The scene x behind an observation, Eq. (1), from a start (none: the observation)."""
         x = observed.copy() if start is None else start.copy()
         for _ in range(steps):
-            residual = self.see(x)
+            residual = self.convolve(x)
             np.subtract(observed, residual, out=residual)
-            x += self.undo_once(residual)  # Eq. (1)
+            x += self.invert_once(residual)  # Eq. (1)
         return x
 
 

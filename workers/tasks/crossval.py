@@ -19,10 +19,10 @@ from psfcore.scatter.validation.cross_validation import (
     NEAR_CENTRE_PX,
     PARTING_SIGMAS,
     Bands,
-    Draw,
     FoldFit,
+    FoldSample,
     bands,
-    draws,
+    bootstrap_samples,
     exact_fit,
     shared_fits,
 )
@@ -46,7 +46,7 @@ def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
     if context.catalogue.get(ReportRow, identity, context.owner) is not None:
         return identity
     transit = load_transit(context, request)[0]
-    wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
+    wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
     solution = _solution(context, request, transit)
     if request.scheme == "shared":
         fits = shared_fits(solution, wanted, progress=context.report)
@@ -65,7 +65,7 @@ def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> 
         return
     context.catalogue.parts.release(part)  # reading and fitting a transit takes longer than a lease may last
     transit = load_transit(context, request)[0]
-    wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
+    wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
     solution = _solution(context, request, transit)
     while (
         part := context.catalogue.parts.take(context.owner, identity, context.settings.lease_s)
@@ -81,7 +81,7 @@ def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit
 
 
 def _exact(
-    context: Context, identity: str, solution: Solution, wanted: tuple[Draw, ...]
+    context: Context, identity: str, solution: Solution, wanted: tuple[FoldSample, ...]
 ) -> tuple[FoldFit, ...]:
     """Every fold a fit of its own, done here or by whoever helps."""
     catalogue, owner = context.catalogue, context.owner
@@ -99,7 +99,9 @@ def _exact(
         _one(context, solution, wanted, part, done=len(done))
 
 
-def _one(context: Context, solution: Solution, wanted: tuple[Draw, ...], part: Part, *, done: int) -> None:
+def _one(
+    context: Context, solution: Solution, wanted: tuple[FoldSample, ...], part: Part, *, done: int
+) -> None:
     """One fold; what it raises gives the fold back."""
     try:
         fit = exact_fit(solution, wanted[part.number], progress=_alive(context, part, done, len(wanted)))

@@ -5,7 +5,7 @@ Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion 
     I_o = sum over S of psf_S A_S + (1 - sum over S of n_S psf_S) B      Eq. (1)
 
 one line for each pixel chosen, I_o observed. Every line is divided by its scale, and the coefficients are fitted to
-many draws of lines: 1000 from occulted pixels, the same number from each shell of the selection mask, and 100 from
+many subsets of lines: 1000 from occulted pixels, the same number from each shell of the selection mask, and 100 from
 lit pixels near the edge. The 30 worst of 100 fits are dropped and the others averaged.
 
     free fit        psf_S >= 0, by the Trust Region Reflective algorithm             Eq. (2)
@@ -20,7 +20,7 @@ lit pixels near the edge. The 30 worst of 100 fits are dropped and the others av
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,22 +32,23 @@ from psfcore.errors import DataError
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Solve = Callable[[Matrix, Vector], tuple[Vector, float]]
 
-DRAWS = 100
-KEPT_DRAWS = 70
-OCCULTED_LINES = 1000
-LIT_LINES = 100
-LIT = -1
+SUBSETS = 100
+KEPT_SUBSETS = 70
+OCCULTED_EQUATIONS = 1000
+UNOCCULTED_EQUATIONS = 100
+UNOCCULTED = -1
 LEAST_LIGHT = 1e-5
 HOLD = 10.0  # times a line's worth of misfit is what a shell with all of the light costs
 PIVOT_PX = 15.0
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
-    """Lines of Eq. (1): observed, unscattered and scale (n,), ring_sums (n, segments).
+class Equations:
+    """Equations of Eq. (1): observed, unscattered and scale (n,), ring_sums (n, segments).
 
-    stratum: the shell of the selection mask that a pixel lies in (0 outermost), LIT for a lit one. scale: what a
+    stratum: the shell of the selection mask that a pixel lies in (0 outermost), UNOCCULTED for a lit one. scale: what a
     line is divided by.
     """
 
@@ -61,9 +62,9 @@ class Lines:
         return int(self.observed.size)
 
     @staticmethod
-    def joined(parts: Sequence[Lines]) -> Lines:
+    def joined(parts: Sequence[Equations]) -> Equations:
         """All lines of several frames."""
-        return Lines(
+        return Equations(
             *(
                 np.concatenate([getattr(part, name) for part in parts])
                 for name in ("observed", "ring_sums", "unscattered", "scale", "stratum")
@@ -72,21 +73,21 @@ class Lines:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """Fits to draws of lines: coefficients (draws kept, n), the worst dropped, and their cost a line."""
+class SubsetFits:
+    """Fits to subsets of lines: coefficients (subsets kept, n), the worst dropped, and their cost a line."""
 
     fits: Matrix
     cost: Vector
 
     @property
     def mean(self) -> Vector:
-        """The average of the draws kept."""
+        """The average of the subsets kept."""
         return np.asarray(self.fits.mean(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
-class PowerLawDrawn:
-    """The average of fits of Eq. (3) to draws of lines, and the fits: a, b (px) and c, (draws kept, 3)."""
+class PowerLawSubsetFits:
+    """The average of fits of Eq. (3) to subsets of lines, and the fits: a, b (px) and c, (subsets kept, 3)."""
 
     a: float
     b_px: float
@@ -100,17 +101,19 @@ class PowerLawDrawn:
         return np.array([self.a, self.b_px, self.c])
 
 
-def draw(lines: Lines, rng: np.random.Generator) -> NDArray[np.intp]:
+def choose_subset(lines: Equations, rng: np.random.Generator) -> NDArray[np.intp]:
     """Indices of one draw: as many occulted lines from each stratum, and lit ones; without repetition within one.
 
     A stratum that holds fewer lines than its share gives all it has.
     """
-    strata = np.unique(lines.stratum[lines.stratum != LIT])
+    strata = np.unique(lines.stratum[lines.stratum != UNOCCULTED])
     if strata.size == 0:
         raise DataError("no-lines", "expected occulted pixels to draw lines from; got none")
-    share = -(-OCCULTED_LINES // strata.size)
+    share = -(-OCCULTED_EQUATIONS // strata.size)
     chosen = [_some(np.flatnonzero(lines.stratum == stratum), share, rng) for stratum in strata]
-    return np.concatenate([*chosen, _some(np.flatnonzero(lines.stratum == LIT), LIT_LINES, rng)])
+    return np.concatenate(
+        [*chosen, _some(np.flatnonzero(lines.stratum == UNOCCULTED), UNOCCULTED_EQUATIONS, rng)]
+    )
 
 
 def _some(of: NDArray[np.intp], number: int, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -118,9 +121,9 @@ def _some(of: NDArray[np.intp], number: int, rng: np.random.Generator) -> NDArra
 
 
 def free_fit(
-    lines: Lines, counts: Vector, *, seed: int, draws: int = DRAWS, towards: Vector | None = None
-) -> Drawn:
-    """Eq. (2): coefficients (draws kept, segments), per px^2.
+    lines: Equations, counts: Vector, *, seed: int, subsets: int = SUBSETS, towards: Vector | None = None
+) -> SubsetFits:
+    """Eq. (2): coefficients (subsets kept, segments), per px^2.
 
     towards: the coefficients that hold where no line decides, each loosely enough to double or vanish at the price
     of one line's misfit; none: all are held to nothing, by HOLD.
@@ -129,20 +132,20 @@ def free_fit(
     light = held_at * counts
     hold = np.full_like(counts, HOLD) if towards is None else 1 / np.maximum(light, LEAST_LIGHT)
     rng = np.random.default_rng(seed)
-    return _drawn(
-        lines, counts, rng, draws, lambda matrix, target: _solve_free(matrix, target, counts, held_at, hold)
+    return _fit_subsets(
+        lines, counts, rng, subsets, lambda matrix, target: _solve_free(matrix, target, counts, held_at, hold)
     )
 
 
 def power_law_fit(
-    lines: Lines,
+    lines: Equations,
     counts: Vector,
     radii: Sequence[tuple[Vector, Vector]],
     start: Vector,
     *,
     seed: int,
-    draws: int = DRAWS,
-) -> PowerLawDrawn:
+    subsets: int = SUBSETS,
+) -> PowerLawSubsetFits:
     """Eq. (3), a, b (px) and c.
 
     radii: for each segment the distances of its pixels and how many have each. start: a, b, c.
@@ -164,10 +167,10 @@ def power_law_fit(
         )
         return solved.x, float(2 * solved.cost)
 
-    drawn = _drawn(lines, counts, rng, draws, solve)
+    drawn = _fit_subsets(lines, counts, rng, subsets, solve)
     # Averaged where a fit's errors are near to Gaussian: a itself spans decades from draw to draw.
     a, b, c = _from_pivot(drawn.mean)
-    return PowerLawDrawn(
+    return PowerLawSubsetFits(
         float(a), float(b), float(c), fits=np.array([_from_pivot(fit) for fit in drawn.fits]), cost=drawn.cost
     )
 
@@ -222,17 +225,19 @@ def _solve_free(
     return out, float(np.sum((light @ solved.x - target) ** 2))
 
 
-def _drawn(lines: Lines, counts: Vector, rng: np.random.Generator, draws: int, solve) -> Drawn:  # type: ignore[no-untyped-def]
-    """Fit many draws, drop the worst, keep the share that the paper keeps."""
+def _fit_subsets(
+    lines: Equations, counts: Vector, rng: np.random.Generator, subsets: int, solve: Solve
+) -> SubsetFits:
+    """Fit many subsets, drop the worst, keep the share that the paper keeps."""
     matrix = (lines.ring_sums - lines.unscattered[:, None] * counts) / lines.scale[:, None]
     target = (lines.observed - lines.unscattered) / lines.scale
     fits, cost = [], []
     # So small are these factorisations that threads cost more than they bring, and most where the cores are busy.
     with threadpool_limits(limits=1, user_api="blas"):
-        for _ in range(draws):
-            chosen = draw(lines, rng)
+        for _ in range(subsets):
+            chosen = choose_subset(lines, rng)
             fit, misfit = solve(matrix[chosen], target[chosen])
             fits.append(fit)
             cost.append(misfit / chosen.size)
-    best = np.argsort(cost, kind="stable")[: max(1, draws * KEPT_DRAWS // DRAWS)]
-    return Drawn(np.array(fits)[best], np.array(cost)[best])
+    best = np.argsort(cost, kind="stable")[: max(1, subsets * KEPT_SUBSETS // SUBSETS)]
+    return SubsetFits(np.array(fits)[best], np.array(cost)[best])

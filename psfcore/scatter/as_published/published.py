@@ -23,7 +23,14 @@ from psfcore.deconvolve.methods.richardson_lucy import deconvolve
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import CENTRE_TOLERANCE, REACH_GRID_PX, Psf, crop_or_pad, cumulative_curve, squared_radii
-from psfcore.scatter.as_published.equations import LIT, Drawn, Lines, PowerLawDrawn, free_fit, power_law_fit
+from psfcore.scatter.as_published.equations import (
+    UNOCCULTED,
+    Equations,
+    PowerLawSubsetFits,
+    SubsetFits,
+    free_fit,
+    power_law_fit,
+)
 from psfcore.scatter.as_published.ring_sums import segment_sums
 from psfcore.scatter.as_published.segments import Segments, shells_as_published
 from psfcore.scatter.total_psf import CURVE_RADII_PX
@@ -38,10 +45,10 @@ LUCY_STEPS = 20
 FREE_ROUNDS = 3
 POWER_LAW_ROUNDS = 3
 SHRUNK_PX = 1.0
-LIT_WITHIN_PX = 5.0
-LIT_A_FRAME = 10
+UNOCCULTED_WITHIN_PX = 5.0
+UNOCCULTED_A_FRAME = 10
 LEAST_LEVEL_DN_S = 1e-3
-# Lines are divided by their observed value. Where a pixel holds a few photons some are zero or less, and would weigh
+# Equations are divided by their observed value. Where a pixel holds a few photons some are zero or less, and would weigh
 # without bound: no line is divided by less than this share of its disc's mean.
 LEAST_OF_MEAN = 0.5
 
@@ -64,13 +71,13 @@ class Choices:
 
 
 AS_PUBLISHED = Choices()
-MENDED_ALONE = {
+CORRECTED_ALONE = {
     "weights from the expected intensity": replace(AS_PUBLISHED, weighed_by_observed=False),
     "scatter and diffraction convolved": replace(AS_PUBLISHED, added=False),
     "light counted on the full reach": replace(AS_PUBLISHED, counted_on_array=False),
     "only fully dark pixels blanked": replace(AS_PUBLISHED, whole_disc_blanked=False),
 }
-ALL_MENDED = Choices(False, False, False, False)
+ALL_CORRECTED = Choices(False, False, False, False)
 
 
 @dataclass(frozen=True)
@@ -85,9 +92,9 @@ class PublishedRound:
 class Published:
     """What the published recipe finds.
 
-    a, b_px, c: the power law of the last round, with the spread of its draws, none where fewer than two draws were
+    a, b_px, c: the power law of the last round, with the spread of its subsets, none where fewer than two subsets were
     kept. total: scattered light on the array
-    it was counted on, a grid of grid_px. free: draws of the last free fit, on `segments`. curve_pct at radii_px: of
+    it was counted on, a grid of grid_px. free: subsets of the last free fit, on `segments`. curve_pct at radii_px: of
     the final total PSF, scatter convolved with diffraction.
     """
 
@@ -97,7 +104,7 @@ class Published:
     spread: dict[str, float] | None
     total: float
     grid_px: int
-    free: Drawn
+    free: SubsetFits
     segments: Segments
     radii_px: Vector
     curve_pct: Vector
@@ -115,21 +122,21 @@ def invert_as_published(
     choices: Choices = AS_PUBLISHED,
     *,
     seed: int = 1,
-    draws: int = 100,
+    subsets: int = 100,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Published:
     """Steps (a) to (j). Raises DataError "no-lines" where no pixel is occulted, "no-scatter" where what is found is
     no scatter: more than all light, or a PSF that is not brightest at its centre."""
-    recipe = _Recipe(transit, choices, seed, draws, threads, progress)
+    recipe = _Recipe(transit, choices, seed, subsets, threads, progress)
     return recipe.run()
 
 
 class _Recipe:
     def __init__(
-        self, transit: Transit, choices: Choices, seed: int, draws: int, threads: int, progress: Progress
+        self, transit: Transit, choices: Choices, seed: int, subsets: int, threads: int, progress: Progress
     ) -> None:
-        self.transit, self.choices, self.seed, self.draws = transit, choices, seed, draws
+        self.transit, self.choices, self.seed, self.subsets = transit, choices, seed, subsets
         self.threads, self.progress = threads, progress
         field = max(transit.shape)
         # "Out to the edge of the PSF": the array of the known part, which in the paper is as large as the images.
@@ -150,18 +157,18 @@ class _Recipe:
         kernel = crop_or_pad(self.transit.diffraction, self.psf_size)
         rounds = []
         law = np.array([0.15, 6.0, 2.5])
-        free: Drawn | None = None
+        free: SubsetFits | None = None
         count = 0
         for n in range(FREE_ROUNDS + POWER_LAW_ROUNDS):
             lines = self._lines(kernel, n)
             count = len(lines)
             counts = self.segments.counts.astype(np.float64)
             if n < FREE_ROUNDS:
-                free = free_fit(lines, counts, seed=self.seed * 100 + n, draws=self.draws)
+                free = free_fit(lines, counts, seed=self.seed * 100 + n, subsets=self.subsets)
                 scatter, name = self._free_kernel(free.mean), "free shells"
             else:
                 fitted = power_law_fit(
-                    lines, counts, self.radius_of_segment, law, seed=self.seed * 100 + n, draws=self.draws
+                    lines, counts, self.radius_of_segment, law, seed=self.seed * 100 + n, subsets=self.subsets
                 )
                 law, name = fitted.law, "softened power law"
                 scatter = _power_law_kernel(law, self.grid)
@@ -191,7 +198,7 @@ class _Recipe:
             lines=count,
         )
 
-    def _lines(self, kernel: Kernel, n: int) -> Lines:
+    def _lines(self, kernel: Kernel, n: int) -> Equations:
         """Steps (d) to (h) for all frames."""
         frames = self.transit.frames
         scenes = self._deconvolved(kernel, n)
@@ -207,7 +214,7 @@ class _Recipe:
                 parts.append(part)
         if not parts:
             raise DataError("no-lines", "expected occulted pixels in the images; got none")
-        return Lines.joined(parts)
+        return Equations.joined(parts)
 
     def _deconvolved(self, kernel: Kernel, n: int) -> list[NDArray[np.float32]]:
         """Step (d)."""
@@ -228,7 +235,7 @@ class _Recipe:
 
     def _frame_lines(
         self, frame: Frame, scene: NDArray[np.float32], found: FoundPlace, rng: np.random.Generator
-    ) -> Lines | None:
+    ) -> Equations | None:
         """Steps (f) to (h) for one frame; None where no pixel of it is occulted."""
         shape, place = self.transit.shape, found.place
         distance = disc_distance(shape, place)
@@ -241,17 +248,17 @@ class _Recipe:
         rows, columns = np.nonzero(occulted)
         if rows.size == 0:
             return None
-        lit = np.flatnonzero((~within & (distance <= place.radius_px + LIT_WITHIN_PX)).ravel())
-        lit = rng.choice(lit, min(LIT_A_FRAME, lit.size), replace=False)
+        lit = np.flatnonzero((~within & (distance <= place.radius_px + UNOCCULTED_WITHIN_PX)).ravel())
+        lit = rng.choice(lit, min(UNOCCULTED_A_FRAME, lit.size), replace=False)
         targets = np.concatenate(
             (np.stack((rows, columns), axis=1), np.stack(np.unravel_index(lit, shape), axis=1))
         )
         stratum = np.floor(place.radius_px - SHRUNK_PX - distance[rows, columns]).astype(np.int64)  # step (g)
-        stratum = np.concatenate((np.maximum(stratum, 0), np.full(lit.size, LIT)))
+        stratum = np.concatenate((np.maximum(stratum, 0), np.full(lit.size, UNOCCULTED)))
         observed = frame.pixels[targets[:, 0], targets[:, 1]].astype(np.float64)
         diffracted = self.diffract.apply(true)
         summed = true if self.choices.added else diffracted
-        return Lines(
+        return Equations(
             observed=observed,
             ring_sums=segment_sums(summed, targets, self.segments, threads=self.threads),
             unscattered=diffracted[targets[:, 0], targets[:, 1]].astype(np.float64),
@@ -262,7 +269,7 @@ class _Recipe:
     def _scale(self, frame: Frame, observed: Vector, stratum: NDArray[np.int64]) -> Vector:
         """What each line is divided by."""
         level = np.empty_like(observed)
-        for here in (stratum == LIT, stratum != LIT):
+        for here in (stratum == UNOCCULTED, stratum != UNOCCULTED):
             level[here] = max(float(observed[here].mean()), LEAST_LEVEL_DN_S) if here.any() else 1.0
         if self.choices.weighed_by_observed:
             return np.maximum(observed, LEAST_OF_MEAN * level)
@@ -288,8 +295,8 @@ def _check_brightest_at_centre(kernel: Kernel, found: str) -> None:
         )
 
 
-def _spread(fitted: PowerLawDrawn) -> dict[str, float] | None:
-    """Standard deviations of a, b and c over the draws; none of fewer than two."""
+def _spread(fitted: PowerLawSubsetFits) -> dict[str, float] | None:
+    """Standard deviations of a, b and c over the subsets; none of fewer than two."""
     if len(fitted.fits) < 2:
         return None
     return dict(zip(("a", "b_px", "c"), fitted.fits.std(axis=0, ddof=1).tolist(), strict=True))

@@ -93,7 +93,7 @@ class FrameFit:
     chi2: float
     normal: NDArray[np.float64]
     score: Vector
-    answer: Vector
+    mean_jacobian: Vector
 
     @property
     def residual_pct(self) -> float:
@@ -142,7 +142,7 @@ class Inversion:
         return sum(frame.chi2 for frame in self.frames) / (pixels - self.coordinates.size)
 
 
-class Sky:
+class TransitScenes:
     """The frames in the engine's order, their scenes as last reconstructed, their occulters as last found."""
 
     def __init__(self, transit: Transit, optics: Optics, progress: Progress) -> None:
@@ -152,11 +152,11 @@ class Sky:
         for n, frame in enumerate(transit.frames):
             progress("reconstructing", n, len(transit.frames))
             self.observed.append(optics.lanes(frame.pixels))
-            self.scenes.append(optics.undo(self.observed[-1]))
+            self.scenes.append(optics.invert(self.observed[-1]))
         self.found: list[FoundPlace] = []
         self.dark: list[Pixels] = []
 
-    def copy(self) -> Sky:
+    def copy(self) -> TransitScenes:
         """One more, to go on from here with: no array is copied, and none is ever written to."""
         other = copy(self)
         other.scenes, other.found, other.dark = list(self.scenes), list(self.found), list(self.dark)
@@ -170,7 +170,7 @@ class Sky:
     ) -> None:
         """Step (e): where every occulter is, and which pixels are fully dark."""
         frames = self.transit.frames
-        scenes = _Fields(self.scenes, optics)
+        scenes = _SceneFields(self.scenes, optics)
         places = [f.place for f in self.found] or [frame.place for frame in frames]
         self.found = []
         for n in range(len(frames)):
@@ -199,7 +199,7 @@ class Sky:
         return reasons
 
 
-class _Fields(Sequence[NDArray[np.float32]]):
+class _SceneFields(Sequence[NDArray[np.float32]]):
     """Scenes as fields [y, x], turned out of the engine's order only where asked for."""
 
     def __init__(self, lanes: Sequence[Lanes], optics: Optics) -> None:
@@ -236,7 +236,7 @@ def dark_pixels(frame: Frame, found: FoundPlace) -> Pixels:
 
 @dataclass(frozen=True, eq=False)
 class _Slopes:
-    """How one frame's model answers to the coordinates, weighted: kept while the PSF hardly moves."""
+    """How one frame's model jacobian to the coordinates, weighted: kept while the PSF hardly moves."""
 
     weight: Vector
     weighted: NDArray[np.float64]
@@ -271,11 +271,11 @@ class Reconstruction:
     transit: Transit
     total: TotalPsf
     optics: Optics
-    sky: Sky
+    sky: TransitScenes
     part: tuple[int, ...]
     threads: int
 
-    def lit(self, n: int) -> Lanes:
+    def blanked_scene(self, n: int) -> Lanes:
         """The scene of frame n with its occulter dark, in the engine's order."""
         scene = self.sky.scenes[n].copy()
         put(scene, self.sky.dark[n], 0.0)
@@ -283,16 +283,16 @@ class Reconstruction:
 
     def residual(self, n: int) -> tuple[Vector, Vector]:
         """Eq. (1) for the dark pixels of frame n, and what was expected there, DN/s."""
-        expected = pick(self.optics.see(self.lit(n)), self.sky.dark[n])
+        expected = pick(self.optics.convolve(self.blanked_scene(n)), self.sky.dark[n])
         return pick(self.sky.observed[n], self.sky.dark[n]) - expected, expected
 
     def weight(self, n: int, expected: Vector) -> Vector:
         """One over the variance of Eq. (3) at an expected intensity."""
-        return _weight(self.transit, n, expected)
+        return pixel_weight(self.transit, n, expected)
 
-    def answer(self, n: int, slope: Blur) -> Vector:
+    def jacobian(self, n: int, slope: Blur) -> Vector:
         """How the expected dark pixels of frame n change with a change of the PSF, Eq. (4)."""
-        return _answer(self.optics, slope, self.lit(n), self.sky.dark[n])
+        return jacobian_row(self.optics, slope, self.blanked_scene(n), self.sky.dark[n])
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +303,7 @@ class Solution(Reconstruction):
 
 
 @dataclass(frozen=True, eq=False)
-class Refit(Reconstruction):
+class SolutionWithoutErrors(Reconstruction):
     """The fit of some of a transit's frames, without its errors. left_out: frames that could not take part, and why.
 
     Scenes of frames that did not take part are still those of the fit before.
@@ -337,7 +337,7 @@ def invert(
     at = shape.start if start is None else np.asarray(start, dtype=np.float64)
     kernel = total.kernel(at)
     optics = Optics(kernel, transit.shape, threads=threads)
-    sky = Sky(transit, optics, progress)
+    sky = TransitScenes(transit, optics, progress)
     sky.find(optics, kernel)
     solver = _Solver(sky, total, counts or [1] * len(transit.frames), threads, progress)
     frames = solver.taking_part()
@@ -362,7 +362,7 @@ def refit(
     start: Vector,
     *,
     progress: Progress = lambda stage, step, steps: None,
-) -> Refit:
+) -> SolutionWithoutErrors:
     """The same fit with other counts, as `invert` has them, where one with all frames is there to begin from.
 
     start: coordinates near to the result, such as one step from the solution. Scenes are iterated on from those of
@@ -375,7 +375,7 @@ def refit(
     solver = _Solver(sky, total, counts, threads, progress)
     frames = solver.taking_part()
     at = solver.solve(start, frames, CONVERGED_POINTS)
-    return Refit(
+    return SolutionWithoutErrors(
         transit=solution.transit,
         total=total,
         optics=Optics(total.kernel(at), solution.transit.shape, threads=threads),
@@ -393,7 +393,7 @@ class _Solver:
     """Gauss-Newton steps on Eq. (2)."""
 
     def __init__(
-        self, sky: Sky, total: TotalPsf, counts: Sequence[int], threads: int, progress: Progress
+        self, sky: TransitScenes, total: TotalPsf, counts: Sequence[int], threads: int, progress: Progress
     ) -> None:
         self._sky, self._total, self._threads, self._progress = sky, total, threads, progress
         self._counts = counts
@@ -486,18 +486,18 @@ class _Solver:
         """Eq. (1) for one frame; Eq. (3) and (4) unless they are kept from the last round."""
         sky, optics = self._sky, model.optics
         dark, observed = sky.dark[n], sky.observed[n]
-        scene = optics.undo(observed, sky.scenes[n], steps=WARM_STEPS)  # step (d)
+        scene = optics.invert(observed, sky.scenes[n], steps=WARM_STEPS)  # step (d)
         sky.scenes[n] = scene
         lit = scene.copy()
         put(lit, dark, 0.0)  # step (f)
-        expected = pick(optics.see(lit), dark)
+        expected = pick(optics.convolve(lit), dark)
         residual = pick(observed, dark) - expected  # Eq. (1)
         if kept is not None:
             return _Measured(residual, expected, kept)
-        weight = _weight(sky.transit, n, expected)
-        answers = np.array([_answer(optics, blur, lit, dark) for blur in model.slope_blurs])
-        weighted = answers * weight
-        return _Measured(residual, expected, _Slopes(weight, weighted, weighted @ answers.T))
+        weight = pixel_weight(sky.transit, n, expected)
+        jacobian = np.array([jacobian_row(optics, blur, lit, dark) for blur in model.slope_blurs])
+        weighted = jacobian * weight
+        return _Measured(residual, expected, _Slopes(weight, weighted, weighted @ jacobian.T))
 
     def solution(self, at: Vector) -> Solution:
         """Everything at the solution: one more look at every frame, for residuals and errors."""
@@ -557,7 +557,7 @@ class _Solver:
             chi2=measured.chi2,
             normal=measured.slopes.normal,
             score=measured.score,
-            answer=(measured.slopes.weighted / measured.slopes.weight).mean(axis=1),
+            mean_jacobian=(measured.slopes.weighted / measured.slopes.weight).mean(axis=1),
         )
 
 
@@ -571,18 +571,18 @@ class _Model:
     curve_slopes: NDArray[np.float64]
 
 
-def _weight(transit: Transit, n: int, expected: Vector) -> Vector:
+def pixel_weight(transit: Transit, n: int, expected: Vector) -> Vector:
     """One over the variance of Eq. (3)."""
     level = np.maximum(expected, LEAST_LEVEL * expected.mean())
     return np.asarray(1 / transit.noise.variance(level, transit.frames[n].exposure_s))
 
 
-def _answer(optics: Optics, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
+def jacobian_row(optics: Optics, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
     """Eq. (4), its sign turned: how the expected dark pixels change with one coordinate."""
-    changed = slope.see(lit)
-    scene = optics.undo_once(changed)
+    changed = slope.convolve(lit)
+    scene = optics.invert_once(changed)
     put(scene, dark, 0.0)
-    return pick(changed, dark) - pick(optics.see(scene), dark)
+    return pick(changed, dark) - pick(optics.convolve(scene), dark)
 
 
 def _check_determined(normal: NDArray[np.float64], shape: Shape) -> None:

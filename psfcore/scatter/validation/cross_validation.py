@@ -23,7 +23,7 @@ the draws and the covariance of the fit of Eq. (2) there, without bounds and wit
 | symbol | name |
 |---|---|
 | A_i, v_i | FrameFit.normal, FrameFit.score |
-| k_i | Draw.counts |
+| k_i | FoldSample.counts |
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ PARTING_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
-class Draw:
+class FoldSample:
     """One fold of one run: how often each image counts, and which are held out."""
 
     run: int
@@ -68,7 +68,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class FoldShells:
-    """Diffuse light of each shell in one draw, of all light: of the free fit and of the formula.
+    """Diffuse light of each shell in one sample, of all light: of the free fit and of the formula.
 
     excess_sigma: error of the excess within each shell's outer edge by the fit's covariance.
     """
@@ -90,7 +90,7 @@ class FoldShells:
 
 @dataclass(frozen=True)
 class FoldFit:
-    """The PSF of one draw: coordinates, values by name, cumulative curve (percent), and residuals of images held out
+    """The PSF of one sample: coordinates, values by name, cumulative curve (percent), and residuals of images held out
     (percent of their observed mean, by index). shells: none where the formula is not one of distance alone."""
 
     run: int
@@ -245,16 +245,22 @@ class Bands:
         }
 
 
-def draws(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[Draw, ...]:
+def bootstrap_samples(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[FoldSample, ...]:
     """All draws of all runs. Raises DataError "too-few-images" where there are not two blocks."""
     blocks = folds(images)
     if not blocks:
         raise DataError("too-few-images", f"expected at least 6 images to hold blocks out; got {images}")
     rng = np.random.default_rng(seed)
-    return tuple(_draw(run, fold, blocks, images, rng) for run in range(runs) for fold in range(len(blocks)))
+    return tuple(
+        _bootstrap_sample(run, fold, blocks, images, rng)
+        for run in range(runs)
+        for fold in range(len(blocks))
+    )
 
 
-def _draw(run: int, fold: int, blocks: tuple[Fold, ...], images: int, rng: np.random.Generator) -> Draw:
+def _bootstrap_sample(
+    run: int, fold: int, blocks: tuple[Fold, ...], images: int, rng: np.random.Generator
+) -> FoldSample:
     """Every block but the one held out gives as many images as it has left, drawn with repetition."""
     counts = np.zeros(images, dtype=np.int64)
     fitted = set(blocks[fold].fitted)
@@ -262,15 +268,18 @@ def _draw(run: int, fold: int, blocks: tuple[Fold, ...], images: int, rng: np.ra
         left = [image for image in block.held_out if image in fitted]
         if k != fold and left:
             np.add.at(counts, rng.choice(left, len(left)), 1)
-    return Draw(run, fold, tuple(int(c) for c in counts), blocks[fold].held_out)
+    return FoldSample(run, fold, tuple(int(c) for c in counts), blocks[fold].held_out)
 
 
 def shared_fits(
-    solution: Solution, wanted: tuple[Draw, ...], *, progress: Progress = lambda stage, step, steps: None
+    solution: Solution,
+    wanted: tuple[FoldSample, ...],
+    *,
+    progress: Progress = lambda stage, step, steps: None,
 ) -> tuple[FoldFit, ...]:
     """The PSFs of all draws by Eq. (1), from the solution of all images.
 
-    Images left out of the solution are left out of every draw. Raises DataError "transit-says-too-little" where
+    Images left out of the solution are left out of every sample. Raises DataError "transit-says-too-little" where
     a draw leaves a parameter open.
     """
     inversion = solution.inversion
@@ -278,36 +287,36 @@ def shared_fits(
     frames = dict(zip(solution.part, inversion.frames, strict=True))
     shares = free_shares(solution, at, progress=progress) if shape.isotropic else None
     out = []
-    for step, draw in enumerate(wanted):
+    for step, sample in enumerate(wanted):
         progress("folds", step, len(wanted))
-        move = shared_step(solution, draw)
+        move = shared_step(solution, sample)
         held_out = {
             n: 100
-            * (frames[n].expected + float(frames[n].answer @ move) - frames[n].observed)
+            * (frames[n].expected + float(frames[n].mean_jacobian @ move) - frames[n].observed)
             / frames[n].observed
-            for n in draw.held_out
+            for n in sample.held_out
             if n in frames
         }
-        free = None if shares is None else _fold_shells(shares, shape, draw, at + move)
-        out.append(_fold_fit(draw, shape, solution.total, at + move, held_out, free))
+        free = None if shares is None else _fold_shells(shares, shape, sample, at + move)
+        out.append(_fold_fit(sample, shape, solution.total, at + move, held_out, free))
     return tuple(out)
 
 
-def shared_step(solution: Solution, draw: Draw) -> Vector:
-    """Eq. (1): from the solution of all images to that of a draw, in coordinates. Raises DataError as `shared_fits`."""
-    counts = [draw.counts[n] for n in solution.part]
+def shared_step(solution: Solution, sample: FoldSample) -> Vector:
+    """Eq. (1): from the solution of all images to that of a sample, in coordinates. Raises DataError as `shared_fits`."""
+    counts = [sample.counts[n] for n in solution.part]
     drawn = [(k, frame) for k, frame in zip(counts, solution.inversion.frames, strict=True) if k]
     normal = np.sum([k * frame.normal for k, frame in drawn], axis=0)
     if not drawn or np.linalg.cond(normal) > 1e12:
         raise DataError(
             "transit-says-too-little",
-            f"run {draw.run}, fold {draw.fold}: expected images that fix all parameters; got too few",
+            f"run {sample.run}, fold {sample.fold}: expected images that fix all parameters; got too few",
         )
     return np.asarray(np.linalg.solve(normal, np.sum([k * f.score for k, f in drawn], axis=0)))  # Eq. (1)
 
 
 def exact_fit(
-    solution: Solution, draw: Draw, *, progress: Progress = lambda stage, step, steps: None
+    solution: Solution, sample: FoldSample, *, progress: Progress = lambda stage, step, steps: None
 ) -> FoldFit:
     """The PSF of one draw by a fit of its own; images held out are looked at with that PSF afterwards.
 
@@ -315,15 +324,15 @@ def exact_fit(
     that it is alive, and stop. Raises DataError as `shared_fits` and `inversion.invert`.
     """
     shape = solution.inversion.shape
-    start = solution.inversion.coordinates + shared_step(solution, draw)
-    found = refit(solution, draw.counts, start, progress=progress)
+    start = solution.inversion.coordinates + shared_step(solution, sample)
+    found = refit(solution, sample.counts, start, progress=progress)
     sky, at = found.sky, found.coordinates
     held_out = {}
-    for step, n in enumerate(draw.held_out):
-        progress("images held out", step, len(draw.held_out))
+    for step, n in enumerate(sample.held_out):
+        progress("images held out", step, len(sample.held_out))
         if solution.transit.frames[n].file in found.left_out:
             continue
-        sky.scenes[n] = found.optics.undo(sky.observed[n], sky.scenes[n], steps=RESOLVE_STEPS)
+        sky.scenes[n] = found.optics.invert(sky.observed[n], sky.scenes[n], steps=RESOLVE_STEPS)
         residual, expected = found.residual(n)
         held_out[n] = float(-100 * residual.mean() / (expected + residual).mean())
     free = None
@@ -331,17 +340,17 @@ def exact_fit(
         # The last step of the fit moved the PSF by less than shows, and not the scenes.
         for step, n in enumerate(found.part):
             progress("settling", step, len(found.part))
-            sky.scenes[n] = found.optics.undo(sky.observed[n], sky.scenes[n], steps=SETTLE_STEPS)
-        free = _fold_shells(free_shares(found, at, progress=progress), shape, draw, at)
-    return _fold_fit(draw, shape, solution.total, at, held_out, free)
+            sky.scenes[n] = found.optics.invert(sky.observed[n], sky.scenes[n], steps=SETTLE_STEPS)
+        free = _fold_shells(free_shares(found, at, progress=progress), shape, sample, at)
+    return _fold_fit(sample, shape, solution.total, at, held_out, free)
 
 
-def _fold_shells(shares: FreeShares, shape: Shape, draw: Draw, at: Vector) -> FoldShells:
-    return FoldShells.of(shares.fit(draw.counts, law_light(shape, at)))
+def _fold_shells(shares: FreeShares, shape: Shape, sample: FoldSample, at: Vector) -> FoldShells:
+    return FoldShells.of(shares.fit(sample.counts, law_light(shape, at)))
 
 
 def _fold_fit(
-    draw: Draw,
+    sample: FoldSample,
     shape: Shape,
     total: TotalPsf,
     at: Vector,
@@ -349,8 +358,8 @@ def _fold_fit(
     free: FoldShells | None,
 ) -> FoldFit:
     return FoldFit(
-        run=draw.run,
-        fold=draw.fold,
+        run=sample.run,
+        fold=sample.fold,
         coordinates=tuple(float(q) for q in at),
         values=shape.values(at),
         curve_pct=tuple(float(c) for c in cumulative_curve(total.kernel(at), total.radii_px)),

@@ -84,8 +84,8 @@ def dark_offset_study(
     """
     if nominal is None:
         nominal = invert(transit, shape, threads=threads, progress=progress).inversion
-    looks = _Looks(transit, nominal.shape, threads)
-    before = looks.of(nominal.coordinates)
+    curves_of = _WeightsAndCurves(transit, nominal.shape, threads)
+    before = curves_of.of(nominal.coordinates)
     found = []
     for offset_dn in offsets_dn:
 
@@ -99,7 +99,7 @@ def dark_offset_study(
             threads=threads,
             progress=report,
         ).inversion
-        weights, diffuse, total = looks.of(at.coordinates)
+        weights, diffuse, total = curves_of.of(at.coordinates)
         found.append(
             DarkOffset(
                 offset_dn=float(offset_dn),
@@ -111,7 +111,7 @@ def dark_offset_study(
                 total_curve_change_points=total - before[2],
             )
         )
-    return DarkOffsetStudy(looks.radii_px, looks.curve_radii_px, nominal.values, tuple(found))
+    return DarkOffsetStudy(curves_of.radii_px, curves_of.curve_radii_px, nominal.values, tuple(found))
 
 
 def with_offset(transit: Transit, offset_dn: float) -> Transit:
@@ -123,7 +123,7 @@ def with_offset(transit: Transit, offset_dn: float) -> Transit:
     return replace(transit, frames=frames)
 
 
-class _Looks:
+class _WeightsAndCurves:
     """Weights and curves of a shape by distance."""
 
     def __init__(self, transit: Transit, shape: Shape, threads: int) -> None:

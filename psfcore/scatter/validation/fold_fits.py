@@ -19,7 +19,7 @@ from psfcore.transit.transit import Transit
 
 
 @dataclass(frozen=True, eq=False)
-class FoldFit:
+class FoldInversion:
     """The fit of one fold: its inversion, and the total PSF [y, x] on what the field can see."""
 
     fold: Fold
@@ -31,7 +31,7 @@ class FoldFit:
 class FoldKernels:
     """A total PSF for every image of a transit, fitted without it. Called with an image's index, it gives the PSF."""
 
-    fits: tuple[FoldFit, ...]
+    fits: tuple[FoldInversion, ...]
 
     def __call__(self, index: int) -> Kernel:
         """The PSF of the fold that holds image `index` out."""
@@ -57,7 +57,7 @@ def fold_kernels(
         )
     fits = []
     for number, fold in enumerate(parts, start=1):
-        stage = _Stage(progress, number, len(parts))
+        stage = _FoldProgress(progress, number, len(parts))
         fits.append(fit_fold(transit, fold, shape, start=start, threads=threads, progress=stage))
     return FoldKernels(tuple(fits))
 
@@ -70,14 +70,14 @@ def fit_fold(
     start: Vector | None = None,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
-) -> FoldFit:
+) -> FoldInversion:
     """The fit of one fold. Raises DataError as `inversion.invert`, the images held out named first."""
     part = replace(transit, frames=tuple(transit.frames[n] for n in fold.fitted))
     try:
         solution = invert(part, shape, start=start, threads=threads, progress=progress)
     except DataError as error:
         raise DataError(error.code, f"without {_named(transit, fold.held_out)}: {error.message}") from error
-    return FoldFit(fold, solution.inversion, solution.total.kernel(solution.inversion.coordinates))
+    return FoldInversion(fold, solution.inversion, solution.total.kernel(solution.inversion.coordinates))
 
 
 def _named(transit: Transit, images: Sequence[int]) -> str:
@@ -85,7 +85,7 @@ def _named(transit: Transit, images: Sequence[int]) -> str:
     return first if first == last else f"{first} to {last}"
 
 
-class _Stage:
+class _FoldProgress:
     """Progress of one fold among all: each counts as much as another."""
 
     def __init__(self, progress: Progress, number: int, of: int) -> None:

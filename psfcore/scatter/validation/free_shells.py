@@ -15,7 +15,7 @@ is good to a few percent, and to a tenth for discs near the field's edge; r is e
 Images add up: a draw's fit is made of the sums of its images' J^T w J and J^T w r.
 
 Departures: all dark pixels count by their noise, not a thousand drawn ones by their shell; every shell is held to the
-formula, by s. Near it is held so loosely that the images decide, far out so that they hardly can. Without a hold the
+formula, by s. Near it is held so looseness_of that the images decide, far out so that they hardly can. Without a hold the
 innermost shells and the centre cannot be told apart, and the light beyond the field is anything.
 
 | symbol | name | unit |
@@ -82,7 +82,7 @@ class FreeShares:
     def fit(self, counts: Sequence[int], law_light: Vector) -> FreeLight:
         """Eq. (2) with each image as often as counts (of all images by index) says, held to law_light."""
         times = np.array([counts[n] for n in self.frames], dtype=np.float64)
-        looseness = loosely(self.law_light)
+        looseness = looseness_of(self.law_light)
         towards = law_light - self.law_light
         normal = np.einsum("n,nij->ij", times, self.normal) + np.diag(looseness**-2)
         score = times @ self.score + towards / looseness**2
@@ -103,7 +103,7 @@ def law_light(shape: Shape, coordinates: Vector) -> Vector:
     return shells().mean_of_map(shape.kernel(coordinates, REACH_GRID_PX)) * shells().counts
 
 
-def loosely(light: Vector) -> Vector:
+def looseness_of(light: Vector) -> Vector:
     """By how much each shell may differ from the formula, at one sigma of the hold."""
     edges = np.array(shells().edges_px)
     near = edges[1:] <= NEAR_PX
@@ -125,7 +125,7 @@ def free_shares(
         progress("free shells", step, len(of.part))
         residual, expected = of.residual(n)
         rows, columns = dark = of.sky.dark[n]
-        undone = of.optics.undo_once(diffract.see(of.lit(n)))  # G B
+        undone = of.optics.invert_once(diffract.convolve(of.blanked_scene(n)))  # G B
         sums = segment_sums(diffract.field(undone), np.stack(dark, axis=1), shells(), threads=of.threads)
         middle = kernel.shape[0] // 2
         within = kernel[middle + rows[:, None] - rows[None, :], middle + columns[:, None] - columns[None, :]]

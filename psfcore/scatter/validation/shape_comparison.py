@@ -73,9 +73,9 @@ def compare_shapes(
     for step, n in enumerate(solution.part):
         progress("comparing shapes", step, len(solution.part))
         residual, expected = solution.residual(n)
-        answers = np.array([solution.answer(n, blur) for blur in blurs])
-        weighted = answers * solution.weight(n, expected)
-        normals.append(weighted @ answers.T)
+        jacobian = np.array([solution.jacobian(n, blur) for blur in blurs])
+        weighted = jacobian * solution.weight(n, expected)
+        normals.append(weighted @ jacobian.T)
         scores.append(weighted @ residual)
     normal, score = np.array(normals), np.array(scores)
     return tuple(_compared(shape, columns[shape.name], normal, score) for shape in shapes)
@@ -90,7 +90,7 @@ def _slope(solution: Solution, shape: Shape, parameter: int) -> Blur:
 
 def _compared(shape: Shape, extra: list[int], normal: Matrix, score: Matrix) -> ComparedShape:
     every = [*range(BASE), *extra]
-    whole, alone = _Part(normal, score, every), _Part(normal, score, list(range(BASE)))
+    whole, alone = _ParameterSubset(normal, score, every), _ParameterSubset(normal, score, list(range(BASE)))
     step, covariance = whole.solved()
     sigma = np.sqrt(np.diag(covariance))
     gains = []
@@ -109,7 +109,7 @@ def _compared(shape: Shape, extra: list[int], normal: Matrix, score: Matrix) -> 
     )
 
 
-class _Part:
+class _ParameterSubset:
     """The normal equations of some of the parameters."""
 
     def __init__(self, normal: Matrix, score: Matrix, columns: list[int]) -> None:

@@ -177,9 +177,9 @@ def test_noise_is_carried_as_pixel_after_pixel_would_carry_it() -> None:
     for j in range(size * size):
         one = np.zeros((size, size), np.float32)
         one.flat[j] = 1.0
-        scene = optics.undo_once(optics.lanes(one))
+        scene = optics.invert_once(optics.lanes(one))
         put(scene, dark, 0.0)
-        left = one[dark] - pick(optics.see(scene), dark)
+        left = one[dark] - pick(optics.convolve(scene), dark)
         b = np.array([t @ left for t in templates])
         by_hand += np.outer(b, b) * (6.0 * 9.0 / 2.0 + 4.0 / 4.0)
     found = noise_covariance(optics, frame, dark, templates, Noise(6.0, 2.0))

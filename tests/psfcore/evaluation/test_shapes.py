@@ -72,7 +72,7 @@ def test_a_stretch_that_is_there_is_seen_in_held_out_errors() -> None:
 def test_figures_are_those_of_the_evaluation() -> None:
     """All images once: the superposed epoch's own maps."""
     kernel = solved().total.kernel(solved().inversion.coordinates)
-    looked = evaluate(solved().transit, lambda _n: kernel, draws=0)
+    looked = evaluate(solved().transit, lambda _n: kernel, noise_realisations=0)
     mean, rms, mpe, mape = _figures(list(looked.frames), np.ones((1, len(looked.frames))))[:, 0]
     residual = np.array([frame.residual_pct for frame in looked.frames])
     assert mean == pytest.approx(residual.mean()) and rms == pytest.approx(np.sqrt((residual**2).mean()))

@@ -21,7 +21,7 @@ from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.scatter import fit
 from psfcore.scatter.as_published.equations import free_fit
 from psfcore.scatter.samples import SCATTER
-from psfcore.scatter.validation.cross_validation import Draw, shared_step
+from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.tables.make import TOTAL
 from psfcore.transit.blocks import folds
@@ -34,7 +34,7 @@ from tests.psfcore.small_transits import DIFFRACTION, TRUE_VALUES, observed, sky
 
 PROVENANCE = {"software_version": "1.2.3", "libraries": {"numpy": "9.9"}, "algorithm_version": 1}
 
-QUICK = patch.object(fit, "free_fit", partial(free_fit, draws=20))  # quicker than 100
+QUICK = patch.object(fit, "free_fit", partial(free_fit, subsets=20))  # quicker than 100
 
 
 def untouched(transit: Transit) -> Prepared:
@@ -83,7 +83,7 @@ def test_each_image_is_judged_with_the_psf_of_the_fold_that_holds_it_out() -> No
     solution, images = report.fit.solution, len(report.transit.frames)
     fold = folds(images)[1]
     counts = tuple(int(n in fold.fitted) for n in range(images))
-    step = shared_step(solution, Draw(0, 1, counts, fold.held_out))
+    step = shared_step(solution, FoldSample(0, 1, counts, fold.held_out))
     kernel = solution.total.kernel(solution.inversion.coordinates + step)
     by_hand = evaluate(report.transit, lambda _n: kernel, seed=5)
     want = {f.file: f.residual_pct for f in by_hand.frames if f.index in fold.held_out}

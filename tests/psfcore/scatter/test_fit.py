@@ -18,14 +18,14 @@ from psfcore.errors import DataError
 from psfcore.fits.fits_io import read_psf, write_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter import fit as fit_module
-from psfcore.scatter.as_published.published import AS_PUBLISHED, MENDED_ALONE, Choices, Published
+from psfcore.scatter.as_published.published import AS_PUBLISHED, CORRECTED_ALONE, Choices, Published
 from psfcore.scatter.fit import (
-    ALONE_DRAWS,
+    ALONE_SUBSETS,
     RADII_PX,
     TransitFit,
     fit_transit,
+    fitted_psf,
     overdispersion,
-    psf_of,
     report,
     sentence,
 )
@@ -257,14 +257,14 @@ def test_a_shape_that_is_not_there_is_refused() -> None:
 def test_the_published_recipe_stands_beside_it_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[Choices, int]] = []
 
-    def published(transit: Transit, choices: Choices, *, draws: int = 100, **_: Any) -> Published:
-        asked.append((choices, draws))
+    def published(transit: Transit, choices: Choices, *, subsets: int = 100, **_: Any) -> Published:
+        asked.append((choices, subsets))
         found = recipe(AS_PUBLISHED)[0]
         return dataclasses.replace(found, curve_pct=found.curve_pct + len(asked) - 1)
 
     monkeypatch.setattr(fit_module, "invert_as_published", published)
     fit = fit_of(monkeypatch, solved(), as_published=True)
-    assert asked == [(AS_PUBLISHED, 100), *((choices, ALONE_DRAWS) for choices in MENDED_ALONE.values())]
+    assert asked == [(AS_PUBLISHED, 100), *((choices, ALONE_SUBSETS) for choices in CORRECTED_ALONE.values())]
     content = as_json(fit)["as_published"]
     whole = content["whole"]
     assert whole["radii_px"] == [0.5, 2, 5, 10, 20, 50]
@@ -274,7 +274,7 @@ def test_the_published_recipe_stands_beside_it_where_asked_for(monkeypatch: pyte
     assert set(whole["spread_of_draws"]) == {"a", "b_px", "c"}
     assert [r["fit"] for r in whole["rounds"]] == ["free shells"] * 3 + ["softened power law"] * 3
     alone = content["one_bias_mended"]
-    assert list(alone) == list(MENDED_ALONE)
+    assert list(alone) == list(CORRECTED_ALONE)
     for n, one in enumerate(alone.values(), start=1):
         assert one["minus_published_points"] == pytest.approx([n] * 6)
 
@@ -282,7 +282,7 @@ def test_the_published_recipe_stands_beside_it_where_asked_for(monkeypatch: pyte
 def test_progress_of_the_whole_rises_to_its_end() -> None:
     """Of a fit with all its parts but the published: each step further than the last, none beyond the total."""
     seen: list[tuple[str, int, int]] = []
-    whole = fit_module._Whole(lambda *at: seen.append(at), 2, compared=True, published=0)
+    whole = fit_module._FitProgress(lambda *at: seen.append(at), 2, compared=True, published=0)
     stages = [
         "reconstructing",
         *[f"round {n}" for n in range(1, 9)],
@@ -306,7 +306,7 @@ def test_progress_of_the_whole_rises_to_its_end() -> None:
 
 def test_a_fitted_psf_is_written_and_read(tmp_path: Path) -> None:
     fit = fitted()
-    psf = psf_of(fit, name="test", version="1.0.0", provenance={"images": IMAGES})
+    psf = fitted_psf(fit, name="test", version="1.0.0", provenance={"images": IMAGES})
     assert psf.total == pytest.approx(1, abs=1e-4)
     middle = slice(REACH_GRID_PX // 2 - 15, REACH_GRID_PX // 2 + 16)
     np.testing.assert_array_equal(psf.components["DIFFRACTION"][middle, middle], DIFFRACTION)

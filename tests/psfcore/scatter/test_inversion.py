@@ -183,7 +183,7 @@ def test_eq_4_is_what_a_change_of_the_psf_does(n: int) -> None:
         step = np.zeros_like(at)
         step[k] = 0.02
         ahead, behind = (expected_with(solution, n, at + side * step) for side in (1, -1))
-        found = solution.answer(n, Blur(slopes[k], solution.transit.shape))
+        found = solution.jacobian(n, Blur(slopes[k], solution.transit.shape))
         expected = (ahead - behind) / 0.04
         assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 
@@ -191,17 +191,17 @@ def test_eq_4_is_what_a_change_of_the_psf_does(n: int) -> None:
 def expected_with(solution: Solution, n: int, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """The dark pixels of a frame as the PSF at these coordinates has them."""
     optics, dark = Optics(solution.total.kernel(at), solution.transit.shape), solution.sky.dark[n]
-    scene = optics.undo(solution.sky.observed[n], steps=10)
+    scene = optics.invert(solution.sky.observed[n], steps=10)
     put(scene, dark, 0.0)
-    return pick(optics.see(scene), dark)
+    return pick(optics.convolve(scene), dark)
 
 
 def test_the_scene_matters_to_eq_4() -> None:
     """Without the scene's answer to the PSF it would be another number."""
     solution = solved_noise_free()
     slope = Blur(solution.total.slope(solution.inversion.coordinates, 2), solution.transit.shape)
-    direct = pick(slope.see(solution.lit(5)), solution.sky.dark[5])
-    assert np.linalg.norm(solution.answer(5, slope) - direct) > 0.1 * np.linalg.norm(direct)
+    direct = pick(slope.convolve(solution.blanked_scene(5)), solution.sky.dark[5])
+    assert np.linalg.norm(solution.jacobian(5, slope) - direct) > 0.1 * np.linalg.norm(direct)
 
 
 def test_the_solution_is_a_minimum() -> None:

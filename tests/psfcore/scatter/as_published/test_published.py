@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter.as_published import published
-from psfcore.scatter.as_published.equations import LIT, Drawn, Lines
+from psfcore.scatter.as_published.equations import UNOCCULTED, Equations, SubsetFits
 from psfcore.scatter.as_published.published import (
-    ALL_MENDED,
+    ALL_CORRECTED,
     AS_PUBLISHED,
-    MENDED_ALONE,
+    CORRECTED_ALONE,
     SHRUNK_PX,
     Choices,
     Published,
@@ -49,7 +49,7 @@ def test_the_recipe_is_followed_to_its_end() -> None:
     assert all(np.isfinite(value) for value in of.spread.values())
 
 
-@pytest.mark.parametrize("choices", [AS_PUBLISHED, ALL_MENDED], ids=["published", "mended"])
+@pytest.mark.parametrize("choices", [AS_PUBLISHED, ALL_CORRECTED], ids=["published", "mended"])
 def test_its_law_is_its_scatter_and_its_curve(choices: Choices) -> None:
     """a / (b + r)^c off the centre and the rest at the centre, convolved with diffraction."""
     of, _ = recipe(choices)
@@ -65,7 +65,7 @@ def test_its_law_is_its_scatter_and_its_curve(choices: Choices) -> None:
 
 def test_all_mended_it_is_near_the_truth_and_as_published_far_from_it() -> None:
     """Before discs of few photons: as published, those that happened to come faint weigh most."""
-    mended, bent = recipe(ALL_MENDED)[0], recipe(AS_PUBLISHED)[0]
+    mended, bent = recipe(ALL_CORRECTED)[0], recipe(AS_PUBLISHED)[0]
     assert np.abs(off(mended)).max() < 4
     assert mended.total == pytest.approx(0.4, abs=0.05)
     assert (off(bent)[:4] < -5).all()
@@ -78,11 +78,11 @@ class _SeenEnough(Exception):
 
 def first_lines(
     patch: pytest.MonkeyPatch, choices: Choices, *, seed: int = 1
-) -> tuple[Lines, NDArray[np.float64]]:
+) -> tuple[Equations, NDArray[np.float64]]:
     """The lines of the first round, and how many pixels each segment counts."""
-    seen: list[tuple[Lines, NDArray[np.float64]]] = []
+    seen: list[tuple[Equations, NDArray[np.float64]]] = []
 
-    def stop(lines: Lines, counts: NDArray[np.float64], **_: object) -> Drawn:
+    def stop(lines: Equations, counts: NDArray[np.float64], **_: object) -> SubsetFits:
         seen.append((lines, counts))
         raise _SeenEnough
 
@@ -94,17 +94,19 @@ def first_lines(
 
 def test_lines_are_of_all_occulted_pixels_and_some_lit_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     lines, _ = first_lines(monkeypatch, AS_PUBLISHED)
-    assert (lines.stratum == LIT).sum() == 10 * IMAGES
-    assert (lines.stratum != LIT).sum() == pytest.approx(IMAGES * np.pi * (10.75 - SHRUNK_PX) ** 2, rel=0.03)
+    assert (lines.stratum == UNOCCULTED).sum() == 10 * IMAGES
+    assert (lines.stratum != UNOCCULTED).sum() == pytest.approx(
+        IMAGES * np.pi * (10.75 - SHRUNK_PX) ** 2, rel=0.03
+    )
     assert set(np.unique(lines.stratum)) == set(range(-1, 10))
-    dark = lines.stratum != LIT
+    dark = lines.stratum != UNOCCULTED
     assert lines.unscattered[~dark].mean() > 3 * lines.unscattered[dark].mean()
 
 
 def test_each_choice_changes_its_own_part_of_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert [sum(dataclasses.astuple(choices)) for choices in MENDED_ALONE.values()] == [3, 3, 3, 3]
+    assert [sum(dataclasses.astuple(choices)) for choices in CORRECTED_ALONE.values()] == [3, 3, 3, 3]
     as_published, counts = first_lines(monkeypatch, AS_PUBLISHED)
-    dark = as_published.stratum != LIT
+    dark = as_published.stratum != UNOCCULTED
     first = as_published.observed[: int(np.argmin(dark))]  # the disc of the first image
     assert first.min() < 0.5 * first.mean()
     # However little was observed, no pixel weighs without bound.
@@ -152,9 +154,9 @@ def test_filled_pixels_make_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_one_draw_has_no_spread() -> None:
-    """Of two draws one is kept."""
-    for draws in (1, 2):
-        of = invert_as_published(faint(), draws=draws)
+    """Of two subsets one is kept."""
+    for subsets in (1, 2):
+        of = invert_as_published(faint(), subsets=subsets)
         assert of.free.fits.shape[0] == 1
         assert of.spread is None
         assert np.isfinite(of.curve_pct).all()
@@ -164,15 +166,15 @@ def test_shells_that_outshine_the_centre_are_no_scatter(monkeypatch: pytest.Monk
     """Less than all light in the four pixels next to the centre, and yet each brighter than it."""
     nearest = np.zeros(50)
     nearest[0] = 0.22
-    monkeypatch.setattr(published, "free_fit", lambda *_, **__: Drawn(nearest[None], np.zeros(1)))
+    monkeypatch.setattr(published, "free_fit", lambda *_, **__: SubsetFits(nearest[None], np.zeros(1)))
     with pytest.raises(
         DataError, match=r"round 1: free shells: expected a PSF .* centre; got .* 1 px"
     ) as caught:
-        invert_as_published(faint(), draws=1)
+        invert_as_published(faint(), subsets=1)
     assert caught.value.code == "no-scatter"
 
 
 def test_without_an_occulted_pixel_there_are_no_lines() -> None:
     frames = [dataclasses.replace(f, place=Place(50.0, 50.0, 0.9)) for f in faint().frames]
     with pytest.raises(DataError, match="no-lines"):
-        invert_as_published(dataclasses.replace(faint(), frames=tuple(frames)), draws=1)
+        invert_as_published(dataclasses.replace(faint(), frames=tuple(frames)), subsets=1)

@@ -23,7 +23,7 @@ from psfcore.scatter.validation.cross_validation import (
     FoldFit,
     FoldShells,
     bands,
-    draws,
+    bootstrap_samples,
     exact_fit,
     shared_fits,
     shared_step,
@@ -37,7 +37,7 @@ from tests.psfcore.small_transits import IMAGES, observed, sky, solved
 
 @cache
 def shared() -> tuple[FoldFit, ...]:
-    return shared_fits(solved(), draws(IMAGES, runs=5))
+    return shared_fits(solved(), bootstrap_samples(IMAGES, runs=5))
 
 
 @cache
@@ -53,17 +53,17 @@ def test_percentiles_are_a_gaussians() -> None:
 
 def test_a_draw_holds_its_block_and_guard_out_and_keeps_the_blocks_sizes() -> None:
     parts = folds(IMAGES)
-    for draw in draws(IMAGES, runs=3):
+    for draw in bootstrap_samples(IMAGES, runs=3):
         fitted = set(parts[draw.fold].fitted)
         assert draw.held_out == parts[draw.fold].held_out
         assert {n for n, k in enumerate(draw.counts) if k} <= fitted and sum(draw.counts) == len(fitted)
     with pytest.raises(DataError, match="too-few-images"):
-        draws(5)
+        bootstrap_samples(5)
 
 
 def test_an_exact_fold_is_what_a_fit_from_the_start_finds() -> None:
     """Begun at the shared step it ends, within what a fit settles to, where `invert` ends with the same counts."""
-    draw = draws(IMAGES, runs=1)[1]
+    draw = bootstrap_samples(IMAGES, runs=1)[1]
     slow = invert(observed(sky()).transit, counts=draw.counts)
     found = exact_fit(solved(), draw)
     sigma = solved().inversion.curve_sigma
@@ -75,7 +75,7 @@ def test_an_exact_fold_is_what_a_fit_from_the_start_finds() -> None:
 def test_the_solution_is_as_it_was_after_its_folds() -> None:
     before = [scene.copy() for scene in solved().sky.scenes]
     places = list(solved().sky.found)
-    exact_fit(solved(), draws(IMAGES, runs=1)[0])
+    exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[0])
     assert all((a == b).all() for a, b in zip(before, solved().sky.scenes, strict=True))
     assert places == solved().sky.found
 
@@ -83,7 +83,7 @@ def test_the_solution_is_as_it_was_after_its_folds() -> None:
 def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.MonkeyPatch) -> None:
     """So a worker's lease outlasts what is done in silence, and a cancel is seen."""
     since_report, most = 0, 0
-    undo = Optics.undo
+    undo = Optics.invert
 
     def counted(optics: Optics, observed: Lanes, start: Lanes | None = None, *, steps: int) -> Lanes:
         nonlocal since_report, most
@@ -100,7 +100,7 @@ def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.
         assert 0 <= step < steps
 
     monkeypatch.setattr(Optics, "undo", counted)
-    draw = draws(IMAGES, runs=1)[1]
+    draw = bootstrap_samples(IMAGES, runs=1)[1]
     exact_fit(solved(), draw, progress=progress)
     assert most == 1
     assert stages["images held out"] == list(range(len(draw.held_out)))
@@ -117,11 +117,11 @@ def test_a_fold_stops_where_its_report_says_so(stage: str) -> None:
             raise Stop
 
     with pytest.raises(Stop):
-        exact_fit(solved(), draws(IMAGES, runs=1)[1], progress=progress)
+        exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[1], progress=progress)
 
 
 def test_both_schemes_agree() -> None:
-    wanted = draws(IMAGES, runs=1)
+    wanted = bootstrap_samples(IMAGES, runs=1)
     quick = shared_fits(solved(), wanted)
     assert quick == shared()[: len(wanted)]
     exactly = tuple(exact_fit(solved(), draw) for draw in wanted)
@@ -136,13 +136,13 @@ def test_both_schemes_agree() -> None:
 
 
 def test_all_images_once_take_no_step() -> None:
-    everything = dataclasses.replace(draws(IMAGES, runs=1)[0], counts=(1,) * IMAGES)
+    everything = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(1,) * IMAGES)
     moved = np.abs(shared_step(solved(), everything))
     assert (moved < 0.05 * np.sqrt(np.diag(solved().inversion.covariance))).all()
 
 
 def test_a_draw_of_nothing_is_refused() -> None:
-    nothing = dataclasses.replace(draws(IMAGES, runs=1)[0], counts=(0,) * IMAGES)
+    nothing = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(0,) * IMAGES)
     with pytest.raises(DataError, match=r"transit-says-too-little.*run 0, fold 0"):
         shared_fits(solved(), (nothing,))
     with pytest.raises(DataError, match="transit-says-too-little"):
@@ -193,7 +193,7 @@ def test_folds_go_to_json_and_back() -> None:
 def test_a_shape_that_is_stretched_has_no_shells() -> None:
     start = SHAPES["stretched"].coordinates(solved().inversion.values)
     solution = invert(observed(sky()).transit, SHAPES["stretched"], start=start)
-    found = bands(shared_fits(solution, draws(IMAGES, runs=1)), solution.inversion.radii_px)
+    found = bands(shared_fits(solution, bootstrap_samples(IMAGES, runs=1)), solution.inversion.radii_px)
     assert found.shells is None and found.to_json()["shells"] is None
 
 

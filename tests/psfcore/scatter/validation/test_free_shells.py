@@ -18,7 +18,7 @@ from psfcore.scatter.validation.free_shells import (
     free_kernel,
     free_shares,
     law_light,
-    loosely,
+    looseness_of,
     shells,
 )
 from tests.psfcore.small_transits import BRIGHT, noise_free, sky, solved
@@ -49,7 +49,7 @@ def test_slopes_are_those_of_the_inversion(shell: int) -> None:
     blur = shell_blur(solution, shell)
     for k, n in list(enumerate(solution.part))[::4]:
         residual, expected = solution.residual(n)
-        slope = solution.answer(n, blur)
+        slope = solution.jacobian(n, blur)
         weight = solution.weight(n, expected)
         normal = float(weight @ slope**2)
         assert shares().normal[k, shell, shell] == pytest.approx(normal, rel=0.2)  # slopes to a tenth
@@ -81,7 +81,7 @@ def test_no_shell_takes_light_away_and_none_that_is_undecided_moves_much() -> No
     beyond = np.array(shells().edges_px[:-1]) > 200.0  # farther than any two pixels of a field of 128 px
     np.testing.assert_allclose(found.light[beyond], found.law_light[beyond], rtol=0.02)
     held = np.sqrt(np.diag(found.covariance))[beyond]
-    np.testing.assert_allclose(held, loosely(shares().law_light)[beyond], rtol=0.02)
+    np.testing.assert_allclose(held, looseness_of(shares().law_light)[beyond], rtol=0.02)
 
 
 def test_where_the_formula_goes_the_undecided_shells_follow() -> None:

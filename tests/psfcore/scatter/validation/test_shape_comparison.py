@@ -68,8 +68,8 @@ def test_gains_are_what_the_residuals_say() -> None:
     frames = []
     for n in solution.part:
         residual, expected = solution.residual(n)
-        answers = np.array([solution.answer(n, blur) for blur in blurs])
-        frames.append((residual, answers, solution.weight(n, expected)))
+        jacobian = np.array([solution.jacobian(n, blur) for blur in blurs])
+        frames.append((residual, jacobian, solution.weight(n, expected)))
 
     def step(of: list[int], size: int) -> np.ndarray:
         lines = np.concatenate([(frames[n][1][:size] * np.sqrt(frames[n][2])).T for n in of])
