@@ -25,8 +25,9 @@ from benchmarks.peers import peak_gib
 from psfcore.convolution.convolver import Convolver
 from psfcore.fits.header import FitsLimits
 from psfcore.psf import cumulative_curve
-from psfcore.scatter.fit import fit_transit, sentence
+from psfcore.scatter.fit import fit_transit
 from psfcore.scatter.inversion import LEAST_LEVEL, Solution, invert
+from psfcore.scatter.report import fit_sentence
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
@@ -126,7 +127,7 @@ def one(folder: Path) -> None:
     found = fit_transit(transit, threads=THREADS)
     print(time.perf_counter() - start)
     print(f"{peak_gib():.2f}")
-    print(sentence(found))
+    print(fit_sentence(found))
 
 
 def main() -> None:

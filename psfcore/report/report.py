@@ -21,8 +21,8 @@ from psfcore.evaluation.plot import sentence as evaluation_sentence
 from psfcore.evaluation.report import report as evaluation_json
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
-from psfcore.scatter.fit import report as fit_json
 from psfcore.scatter.inversion import Progress, Solution
+from psfcore.scatter.report import fit_json
 from psfcore.scatter.validation.cross_validation import (
     Bands,
     FoldFit,

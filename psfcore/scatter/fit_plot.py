@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from psfcore.drawing.plots import INK
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.as_published.published import Published
-from psfcore.scatter.fit import ONE_SIGMA, TWO_SIGMA, Curve, ShellWeightFits, TransitFit, sentence
+from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
 from psfcore.scatter.inversion import CONVERGED_POINTS
+from psfcore.scatter.report import fit_sentence
+from psfcore.scatter.validation.cross_validation import ONE_SIGMA, TWO_SIGMA
 from psfcore.transit.first_guess import ESTIMATORS
 
 Vector = NDArray[np.float64]
@@ -40,7 +42,7 @@ def fit_png(fit: TransitFit, path: str | Path) -> None:
         layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1, hspace=0.04),
     )
     name = f"{fit.transit.instrument or 'Transit'}: {fit.inversion.shape.name.replace('-', ' ')}"
-    words = "\n".join(textwrap.wrap(sentence(fit), _TITLE_LETTERS))
+    words = "\n".join(textwrap.wrap(fit_sentence(fit), _TITLE_LETTERS))
     # The layout makes room for one title: its first line is empty, and the name stands there in bold.
     figure.suptitle(f"\n{words}", fontsize=11, color=INK, x=0.012, ha="left", linespacing=1.5)
     figure.text(0.012, 0.987, name, fontsize=14, color=INK, weight="bold", va="top")

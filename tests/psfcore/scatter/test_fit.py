@@ -26,11 +26,10 @@ from psfcore.scatter.fit import (
     fit_transit,
     fitted_psf,
     overdispersion,
-    report,
-    sentence,
 )
 from psfcore.scatter.fit_plot import fit_png
 from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.report import fit_json, fit_sentence
 from psfcore.scatter.shapes import SHAPES
 from psfcore.simulate.transit import observed_transit
 from psfcore.transit.transit import Transit
@@ -140,7 +139,7 @@ def test_an_effect_that_is_not_modelled_is_told(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(
         fit.curve.sigma[:7], math.sqrt(fit.overdispersion) * fit.inversion.curve_sigma, rtol=0.02
     )
-    assert report(fit)["overdispersion"] == fit.overdispersion
+    assert fit_json(fit)["overdispersion"] == fit.overdispersion
 
 
 def test_doubts_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,7 +194,7 @@ def test_free_shells_are_about_the_truth_where_the_field_tells() -> None:
 
 def as_json(fit: TransitFit) -> dict[str, Any]:
     """What a program that reads it gets; fails where there is a number that JSON does not know."""
-    content = json.loads(json.dumps(report(fit), allow_nan=False))
+    content = json.loads(json.dumps(fit_json(fit), allow_nan=False))
     assert isinstance(content, dict)
     return content
 
@@ -228,7 +227,7 @@ def test_a_report_is_json_and_says_what_the_fit_says() -> None:
 
 
 def test_the_sentence_has_the_curves_numbers() -> None:
-    fit, words = fitted(), sentence(fitted())
+    fit, words = fitted(), fit_sentence(fitted())
     at = {r: (p, s) for r, p, s in zip(RADII_PX, fit.curve.pct, fit.curve.sigma, strict=True)}
     found = [float(number) for number in re.findall(r"\d+\.\d+", words)]
     total, sigma = fit.inversion.values["total"], fit.value_sigma["total"]
