@@ -1,12 +1,20 @@
-"""From a transit to a total PSF with its errors, its doubts and its history: the whole way, for people and services.
+"""Fit a transit completely: the total PSF with its errors, its limits and the alternatives beside it.
 
-The default is the inversion with the four biases of the published fit mended (`inversion`); beside it stand a free
-fit without a formula, other shapes judged on held-out images, the first guess, and, where asked for, the published
-recipe to the letter with what each of its four biases does (`published`).
+Hofmeister et al., The point-spread function of HRI_EUV, sections "The inversion algorithm" and "Inversion results".
+The default is `psfcore.scatter.inversion`, which corrects the four biases of the published fit. Beside it stand:
+- a free fit of shells without a formula,
+- other shapes, tested on held-out images,
+- the first guess,
+- on request, the published recipe unchanged, and with each of its four biases corrected alone (`published`).
 
-Errors: photon and readout noise of every pixel, carried through (`inversion`). Where the discs scatter by more than
-that from image to image, by a factor f in chi2 beyond what chance allows, all errors are multiplied by sqrt(f) and
-the report says so: something is not modelled, and the errors of a mean do not shrink below what it leaves.
+Errors come from the photon and read noise of every pixel, propagated through the fit. If the disc means scatter from
+image to image by more than this noise, by a factor f in chi2 that chance does not explain, all errors are multiplied
+by sqrt(f) and the report says so. The excess shows an effect that the model lacks, and averaging does not remove it.
+
+| symbol | name | unit |
+|---|---|---|
+| f | TransitFit.overdispersion | - |
+| C(R) | Curve.pct: 100 (1 - encircled energy) at radius R | % |
 """
 
 from __future__ import annotations
@@ -48,14 +56,18 @@ from psfcore.transit.transit import Transit
 Kernel = NDArray[np.float64]
 
 RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
-ALONE_SUBSETS = 30  # of each bias mended alone: differences between recipes that share their subsets
-WORST_CHI2 = 1.5  # a pixel; that of 10,000 pixels is known to 0.014
-OPEN_POINTS = 3.0  # an error of the curve from which a radius is said to be open
+# Recipes with one bias corrected share their subsets with the published one, so few subsets show the difference.
+ALONE_SUBSETS = 30
+WORST_CHI2 = 1.5  # per pixel; for 10,000 pixels chi2 per pixel is known to 0.014
+OPEN_POINTS = 3.0  # a larger error of the curve at a radius is reported as a limit
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A cumulative curve C(R) in percent with its standard error, at radii in px."""
+    """A cumulative curve C(R) = 100 (1 - encircled energy), percent, with its standard error, at radii in px.
+
+    C(R) is the percentage of all light that lands farther than R from its source: "light beyond R".
+    """
 
     radii_px: Vector
     pct: Vector
@@ -64,20 +76,22 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class ShellWeightFits:
-    """Scatter without a formula: weights by shell (subsets kept, shells) on `segments`, and the light beyond each edge.
+    """Scatter fitted shell by shell, without a formula, to subsets of equations.
 
-    Where no pixel decides, a shell is held at the fitted shape: its spread there says nothing.
+    segments: the shells. drawn: the fits, with weights (subsets kept, shells). A shell that no pixel constrains stays
+    at the fitted shape, so its spread there contains no information. `psfcore.scatter.validation.free_shells` has
+    another free fit: one linear least-squares problem of all dark pixels, about the fitted shape.
     """
 
     segments: Segments
     drawn: SubsetFits
 
     def weights_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
-        """Percentiles over the subsets of the weight of a pixel of each shell: (percentiles, shells)."""
+        """Percentiles over the subsets of the weight per pixel in each shell, (percentiles, shells)."""
         return np.asarray(np.percentile(self.drawn.fits, percentiles, axis=0))
 
     def beyond_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
-        """Percentiles over the subsets of the diffuse light beyond each shell's inner edge, percent."""
+        """Percentiles over the subsets of the diffuse light beyond the inner edge of each shell, percent."""
         light = self.drawn.fits * self.segments.counts
         beyond = 100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1]
         return np.asarray(np.percentile(beyond, percentiles, axis=0))
@@ -85,7 +99,13 @@ class ShellWeightFits:
 
 @dataclass(frozen=True, eq=False)
 class TransitFit:
-    """Everything that a transit says of a PSF."""
+    """The complete fit of a transit.
+
+    kernel, scatter: total PSF and scatter kernel [y, x] on the full reach. curve, diffuse_curve: their cumulative
+    curves. free: None for shapes that are not isotropic. shapes: empty unless the softened power law was fitted.
+    published, published_alone: the published recipe and its corrected variants, if requested. limits: sentences about
+    what these data do not determine.
+    """
 
     transit: Transit
     solution: Solution
@@ -103,7 +123,7 @@ class TransitFit:
 
     @property
     def inversion(self) -> Inversion:
-        """The fit of the shape."""
+        """The fit of the shape, without overdispersion in its errors."""
         return self.solution.inversion
 
     @property
@@ -114,7 +134,7 @@ class TransitFit:
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """Of the shape's coordinates, overdispersion included."""
+        """Covariance of the shape's coordinates, overdispersion included."""
         return self.inversion.covariance * self.overdispersion
 
 
@@ -127,9 +147,9 @@ def fit_transit(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> TransitFit:
-    """Fit a transit. as_published: the published recipe too, and each of its biases mended alone.
+    """Fit a transit. as_published: also run the published recipe, and each correction of one bias alone.
 
-    Raises DataError as `inversion.invert`, "unknown-shape".
+    Raises DataError "unknown-shape", and as `invert` does.
     """
     wanted = shape_named(shape)
     guess = first_guess(transit)
@@ -171,9 +191,9 @@ def fit_transit(
 
 
 class _FitProgress:
-    """Progress of the whole fit out of that of its stages: each call of a stage is a visit to one frame.
+    """Progress of the whole fit, computed from the progress of its stages. Each call of a stage is one frame.
 
-    The rounds that a fit will take are a guess; the total grows where there are more.
+    The number of rounds is an estimate. The total grows if a fit needs more.
     """
 
     _COST: ClassVar[dict[str, float]] = {"reconstructing": 1.0, "errors": 1.2, "comparing": 2.5, "free": 1.0}
@@ -197,9 +217,9 @@ class _FitProgress:
 
 
 def overdispersion(inversion: Inversion) -> float:
-    """By how much the discs' means scatter beyond noise, as a factor on chi2; 1 where chance could do it.
+    """Scatter of the disc means relative to noise, as a factor on chi2; 1 if chance explains the scatter.
 
-    Chance: two standard deviations of a chi2 with as many degrees of freedom as images less parameters.
+    Chance means two standard deviations of chi2, whose degrees of freedom are images minus parameters.
     """
     freedom = len(inversion.frames) - inversion.coordinates.size
     if freedom < 1:
@@ -218,7 +238,7 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
     diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float64, threads=threads)
     scatter = shape.kernel(at, REACH_GRID_PX)
     kernel = np.maximum(diffract.apply(scatter), 0.0)
-    # Slopes need no more than single precision, which takes half the time.
+    # Single precision is sufficient for slopes and takes half the time.
     diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float32, threads=threads)
     total_slopes, diffuse_slopes = [], []
     for k in range(at.size):
@@ -235,7 +255,7 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
 
 
 def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeightFits:
-    """The free fit on the reconstructed scenes, its biases mended, held at the fitted shape where nothing decides."""
+    """Free fit to the reconstructed scenes, biases corrected; unconstrained shells stay at the fitted shape."""
     segments = Segments(tuple(shells_as_published()))
     diffract = Blur(solution.transit.diffraction, solution.transit.shape, threads=solution.threads)
     parts = []
@@ -264,47 +284,53 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeig
 
 
 def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
-    """What these data cannot say, or where the fit is not to be trusted, in words."""
+    """Sentences about what these data do not determine, and about signs that the fit is unreliable."""
     inversion, out = solution.inversion, []
     if not inversion.converged:
-        out.append(f"the fit had not settled after {len(inversion.rounds)} rounds")
+        out.append(f"the fit did not converge in {len(inversion.rounds)} rounds")
     pointings = {frame.fov for frame in inversion.frames}
     if inversion.left_out:
         out.append(
-            f"{len(inversion.left_out)} images took no part: " + "; ".join(sorted(inversion.left_out)[:5])
+            f"the fit did not use {len(inversion.left_out)} image{'s' if len(inversion.left_out) > 1 else ''}: "
+            + "; ".join(sorted(inversion.left_out)[:5])
         )
     if len(pointings) < 3:
         out.append(
-            f"{len(pointings)} pointing{'s' if len(pointings) > 1 else ''}: scatter over short and long distances "
-            "can hardly be told apart; the errors hold for the fitted shape alone"
+            f"with {len(pointings)} pointing{'s' if len(pointings) > 1 else ''}, the data hardly distinguish scatter "
+            "over short distances from scatter over long distances; the errors assume the fitted shape"
         )
     open_at = [r for r, s in zip(curve.radii_px, curve.sigma, strict=True) if s > OPEN_POINTS]
     if open_at:
         radii = ", ".join(f"{r:g}" for r in open_at)
-        out.append(f"the light beyond {radii} px is open to more than {OPEN_POINTS:g} points")
+        out.append(
+            f"the light beyond {radii} px has a standard error of more than {OPEN_POINTS:g} percentage points"
+        )
     if factor > 1:
         out.append(
-            f"the discs scatter {math.sqrt(factor):.1f} times as much as noise allows: an effect is not modelled, "
-            "and all errors are larger by that factor"
+            f"the disc means scatter {math.sqrt(factor):.1f} times as much as noise explains: the model lacks an "
+            "effect, and all errors are multiplied by that factor"
         )
     if inversion.chi2_per_pixel > WORST_CHI2:
         out.append(
-            f"the model does not describe the occulted pixels: chi2 {inversion.chi2_per_pixel:.2f} a pixel where 1 is "
-            "expected; the noise figures are wrong, or the discs are not what transit.json says"
+            f"the model does not describe the occulted pixels: chi2 per pixel is {inversion.chi2_per_pixel:.2f}, "
+            "expected 1; check the noise figures, and the positions and radii of the discs in transit.json"
         )
     short = min(solution.transit.shape)
     if short < REACH_GRID_PX:
         out.append(
-            f"the field is {short} px: what the PSF holds beyond that distance follows from the shape alone"
+            f"the field is {short} px wide: beyond that distance the PSF is an extrapolation of the fitted shape"
         )
     unsettled = [f.file for f in inversion.frames if not f.found.settled]
     if unsettled:
-        out.append(f"the occulter's place is not settled in {len(unsettled)} images")
+        out.append(
+            f"the position of the occulter did not converge in {len(unsettled)} "
+            f"image{'s' if len(unsettled) > 1 else ''}"
+        )
     return tuple(out)
 
 
 def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
-    """The PSF of a fit on the full reach, its components DIFFRACTION and SCATTER beside it."""
+    """The PSF of a fit on the full reach, with its components DIFFRACTION and SCATTER."""
     return Psf(
         kernel=fit.kernel,
         name=name,

@@ -13,7 +13,7 @@ SCHEMA = "psf-fit/1"
 
 
 def fit_json(fit: TransitFit) -> dict[str, Any]:
-    """The fit as JSON: numbers with errors, one frame a line, what was tried beside it, and what it cannot say."""
+    """The fit as JSON: parameters and curves with errors, every frame, the alternatives, and the limits."""
     inversion = fit.inversion
     values, sigma = inversion.values, fit.value_sigma
     out: dict[str, Any] = {
@@ -87,14 +87,14 @@ def fit_json(fit: TransitFit) -> dict[str, Any]:
 
 
 def fit_sentence(fit: TransitFit) -> str:
-    """What a person reads first."""
+    """A summary of the fit in one sentence."""
     values, sigma, curve = fit.inversion.values, fit.value_sigma, fit.curve
     at = {r: (c, s) for r, c, s in zip(curve.radii_px, curve.pct, curve.sigma, strict=True)}
     beyond = ", ".join(f"{at[r][0]:.2f} ± {at[r][1]:.2f} % beyond {r:g} px" for r in (10.0, 100.0))
     return (
-        f"{100 * values['total']:.2f} ± {100 * sigma['total']:.2f} % of the light is scattered diffusely; scattered "
-        f"and diffracted together {at[0.5][0]:.2f} ± {at[0.5][1]:.2f} % leaves its pixel, {beyond} "
-        f"({len(fit.inversion.frames)} images, chi2 {fit.inversion.chi2_per_pixel:.3f} a pixel)."
+        f"{100 * values['total']:.2f} ± {100 * sigma['total']:.2f} % of the light is scattered diffusely; with "
+        f"diffraction, {at[0.5][0]:.2f} ± {at[0.5][1]:.2f} % of the light lands outside its pixel, {beyond} "
+        f"({len(fit.inversion.frames)} images, chi2 per pixel {fit.inversion.chi2_per_pixel:.3f})."
     )
 
 
