@@ -34,7 +34,8 @@ from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter.as_published.published import AS_PUBLISHED, invert_as_published
 from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.shapes import SHAPES, stretch_of
-from psfcore.scatter.validation.cross_validation import bands, bootstrap_samples, shared_fits
+from psfcore.scatter.validation.bands import bands
+from psfcore.scatter.validation.cross_validation import bootstrap_samples, shared_fits
 from psfcore.simulate.bound import photon_bound
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel

@@ -21,7 +21,8 @@ from psfcore.report.plot import beyond_of, curves_png, offsets_png, profile_png,
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.samples import SCATTER
-from psfcore.scatter.validation.cross_validation import RUNS, Excess, ShellBands
+from psfcore.scatter.validation.bands import Excess, ShellBands
+from psfcore.scatter.validation.cross_validation import RUNS
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 from psfcore.tables.make import TOTAL
 from psfcore.transit.blocks import folds

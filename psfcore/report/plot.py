@@ -29,7 +29,7 @@ from psfcore.psf import REACH_GRID_PX
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.samples import DIFFRACTION, SCATTER
-from psfcore.scatter.validation.cross_validation import ShellBands
+from psfcore.scatter.validation.bands import ShellBands
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 from psfcore.tables.make import TOTAL
 

@@ -23,11 +23,10 @@ from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.report import fit_json
+from psfcore.scatter.validation.bands import Bands, bands
 from psfcore.scatter.validation.cross_validation import (
-    Bands,
     FoldFit,
     FoldSample,
-    bands,
     bootstrap_samples,
     shared_fits,
     shared_step,

@@ -78,21 +78,21 @@ class Curve:
 class ShellWeightFits:
     """Scatter fitted shell by shell, without a formula, to subsets of equations.
 
-    segments: the shells. drawn: the fits, with weights (subsets kept, shells). A shell that no pixel constrains stays
+    segments: the shells. fits: their subset fits, with weights (subsets kept, shells). A shell that no pixel constrains stays
     at the fitted shape, so its spread there contains no information. `psfcore.scatter.validation.free_shells` has
     another free fit: one linear least-squares problem of all dark pixels, about the fitted shape.
     """
 
     segments: Segments
-    drawn: SubsetFits
+    fits: SubsetFits
 
     def weights_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
         """Percentiles over the subsets of the weight per pixel in each shell, (percentiles, shells)."""
-        return np.asarray(np.percentile(self.drawn.fits, percentiles, axis=0))
+        return np.asarray(np.percentile(self.fits.fits, percentiles, axis=0))
 
     def beyond_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
         """Percentiles over the subsets of the diffuse light beyond the inner edge of each shell, percent."""
-        light = self.drawn.fits * self.segments.counts
+        light = self.fits.fits * self.segments.counts
         beyond = 100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1]
         return np.asarray(np.percentile(beyond, percentiles, axis=0))
 

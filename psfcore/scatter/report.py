@@ -7,7 +7,7 @@ from typing import Any
 from psfcore.scatter.as_published.published import Published
 from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
 from psfcore.scatter.shapes import stretch_of
-from psfcore.scatter.validation.cross_validation import ONE_SIGMA, TWO_SIGMA
+from psfcore.scatter.validation.bands import ONE_SIGMA, TWO_SIGMA
 
 SCHEMA = "psf-fit/1"
 
@@ -129,7 +129,7 @@ def _published_json(fit: TransitFit) -> dict[str, Any]:
             "c": p.c,
             "total": p.total,
             "counted_on_grid_px": p.grid_px,
-            "lines": p.lines,
+            "lines": p.equations,
             "radii_px": p.radii_px.tolist(),
             "light_beyond_pct": p.curve_pct.tolist(),
             "minus_default_points": [c - here[r] for r, c in zip(p.radii_px, p.curve_pct, strict=True)],

@@ -15,13 +15,10 @@ import numpy as np
 from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
+from psfcore.scatter.validation.bands import NEAR_CENTRE_PX, PARTING_SIGMAS, Bands, bands
 from psfcore.scatter.validation.cross_validation import (
-    NEAR_CENTRE_PX,
-    PARTING_SIGMAS,
-    Bands,
     FoldFit,
     FoldSample,
-    bands,
     bootstrap_samples,
     exact_fit,
     shared_fits,

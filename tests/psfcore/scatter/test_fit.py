@@ -184,7 +184,7 @@ def test_free_shells_are_about_the_truth_where_the_field_tells() -> None:
     assert (np.diff(beyond) <= 1e-9).all()
     assert beyond[0] == pytest.approx(fitted().diffuse_curve.pct[0], abs=3)
     held = edges[:-1] > 2 * 128  # no pixel of the field is so far from another
-    of_held = free.drawn.fits[:, held]
+    of_held = free.fits.fits[:, held]
     assert of_held.shape[0] == 14
     np.testing.assert_allclose(of_held, np.broadcast_to(truth[held], of_held.shape), rtol=0.2)
 
