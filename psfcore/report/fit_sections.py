@@ -16,7 +16,7 @@ from psfcore.drawing.page import (
     Values,
     with_error,
 )
-from psfcore.psf import REACH_GRID_PX
+from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.report.plot import beyond_of, curves_png, offsets_png, profile_png, totals_png, weights_png
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
@@ -29,60 +29,61 @@ from psfcore.transit.blocks import folds
 
 
 def found_sections(report: PsfReport) -> list[Part]:
-    parts: list[Part] = []
-    if report.fit is not None:
-        fit = report.fit
-        values, sigma = fit.inversion.values, fit.value_sigma
-        parts.append(
-            f"Diffuse scatter of the shape “{fit.inversion.shape.name}”, a weight proportional to (b + r)^-c at r px "
-            "from a point, convolved with the known diffraction. Errors are one standard deviation: noise of every "
-            "pixel, carried through the whole fit"
-            + (
-                f", times {math.sqrt(fit.overdispersion):.2f} because the discs scatter by that much more than noise."
-                if fit.overdispersion > 1
-                else "."
-            )
-        )
-        parts.append(
-            Values(
-                [
-                    *(
-                        Value(p.name, values[p.name], sigma[p.name], p.unit, p.meaning)
-                        for p in fit.inversion.shape.parameters
-                    ),
-                    Value(
-                        "chi2 a pixel",
-                        fit.inversion.chi2_per_pixel,
-                        _chi2_error(fit),
-                        meaning="1 is expected where noise is all that is left; its error is that of chance",
-                    ),
-                    Value(
-                        "overdispersion",
-                        fit.overdispersion,
-                        meaning="of the disc means' chi2, 1 where chance could do it; taken into all errors",
-                    ),
-                ]
-            )
-        )
-    else:
-        psf = report.psf
-        parts.append("This PSF was given. It is shown and judged as it is; nothing about it was fitted here.")
-        parts.append(
-            Values(
-                [
-                    Value("name", psf.name),
-                    Value("version", psf.version),
-                    Value("status", psf.status),
-                    Value(
-                        "sum",
-                        psf.total,
-                        meaning=f"of all weights on {' x '.join(map(str, psf.kernel.shape))} px",
-                    ),
-                ]
-            )
-        )
-    parts.append(_curve_table(report))
-    return parts
+    """The fitted parameters or the given PSF, and a table of 1 - encircled energy."""
+    parts = _given(report.psf) if report.fit is None else _fitted(report.fit)
+    return [*parts, _curve_table(report)]
+
+
+def _fitted(fit: TransitFit) -> list[Part]:
+    values, sigma = fit.inversion.values, fit.value_sigma
+    enlarged = (
+        f" and multiplied by {math.sqrt(fit.overdispersion):.2f}, because the disc means scatter by that factor more "
+        "than noise explains"
+        if fit.overdispersion > 1
+        else ""
+    )
+    parameters = [
+        Value(p.name, values[p.name], sigma[p.name], p.unit, p.meaning)
+        for p in fit.inversion.shape.parameters
+    ]
+    return [
+        f"The diffuse scatter was fitted with the shape “{fit.inversion.shape.name}”: its weight at a distance of r px "
+        "from the source is proportional to (b + r)^-c. The total PSF is this scatter convolved with the known "
+        "diffraction PSF. Errors are one standard deviation, from the noise of every pixel, propagated through the whole "
+        f"fit{enlarged}.",
+        Values(
+            [
+                *parameters,
+                Value(
+                    "chi2 per pixel",
+                    fit.inversion.chi2_per_pixel,
+                    _chi2_error(fit),
+                    meaning="1 is expected if only noise is left; the error is the expected statistical scatter",
+                ),
+                Value(
+                    "overdispersion",
+                    fit.overdispersion,
+                    meaning="chi2 of the disc means over its expected value, or 1 if chance explains the excess; all "
+                    "errors contain its square root as a factor",
+                ),
+            ]
+        ),
+    ]
+
+
+def _given(psf: Psf) -> list[Part]:
+    size = " x ".join(map(str, psf.kernel.shape))
+    return [
+        "This PSF was given. It was evaluated without changes, and no fit was made.",
+        Values(
+            [
+                Value("name", psf.name),
+                Value("version", psf.version),
+                Value("status", psf.status),
+                Value("sum", psf.total, meaning=f"of all weights on {size} px"),
+            ]
+        ),
+    ]
 
 
 def _chi2_error(fit: TransitFit) -> float:
@@ -91,9 +92,9 @@ def _chi2_error(fit: TransitFit) -> float:
 
 
 def _curve_table(report: PsfReport) -> Table:
-    """Light beyond some radii, by component, and the folds' bands where they reach."""
+    """1 - encircled energy at some radii, by component, with the bands of the folds at the radii that these cover."""
     names = [name for name in (TOTAL, SCATTER) if name in report.tables["encircled"]]
-    header = ["R (px)", *(f"{'total' if name == TOTAL else 'diffuse'} beyond R (%)" for name in names)]
+    header = ["R (px)", *(f"{'total PSF' if name == TOTAL else 'diffuse scatter'} (%)" for name in names)]
     if report.cross is not None:
         header += ["folds: median (%)", "1 sigma (%)", "2 sigma (%)"]
     curves = {name: beyond_of(report.tables, name) for name in names}
@@ -107,11 +108,14 @@ def _curve_table(report: PsfReport) -> Table:
             row += _bands_at(report.cross, radius)
         rows.append(row)
     if report.cross is not None:
-        how = "Folds: total PSF, median and the range that holds 68.3 and 95.5 % of the fits."
+        how = "Folds: median of the total PSF, and the ranges that contain 68.3 and 95.5 % of the fits."
     else:
-        how = "" if report.fit or report.psf.fitted else "The PSF's file holds no errors."
+        how = "" if report.fit or report.psf.fitted else "The PSF file contains no errors."
     return Table(
-        header, rows, f"Light that lands farther than R from its point, percent of all light. {how}".rstrip()
+        header,
+        rows,
+        "1 - encircled energy within R: the light that lands farther than R from its source, in percent of all light. "
+        f"{how}".rstrip(),
     )
 
 
@@ -124,34 +128,46 @@ def _bands_at(cross: CrossValidated, radius: float) -> list[str]:
 
 
 def light_sections(report: PsfReport) -> list[Part]:
+    """Figures of 1 - encircled energy and of the radial profile, and the comparison with free shells."""
     field = max(report.transit.shape)
     beyond = (
-        f" Shaded: beyond the field of {field} px, where the shape alone speaks."
+        f" Shaded: distances beyond the field of {field} px, where the PSF is an extrapolation of its shape."
         if field < REACH_GRID_PX / 2
         else ""
     )
     parts: list[Part] = []
     if report.fit is not None:
         caption = (
-            "Light beyond a distance R, in percent of all light: of the total PSF (left) and of its diffuse part "
-            "(right); below, the same less the fit to all images, in percent points. Lines, and bars below: the fit "
-            "to all images and its own error. Blue bands: the fits of the cross-validation, from the smallest radius "
-            "at which they were looked at to the largest. Blue points: shells with a weight each, a fit that knows no "
-            "formula; bars are their spread over the folds, which is less than their error, because no weight goes "
-            f"below zero: the differences with their whole errors stand below Figure 3.{beyond}"
+            "Top: 1 - encircled energy, the percentage of all light that lands farther than R from its source, for "
+            "the total PSF (left) and for its diffuse scatter alone (right). Bottom: difference from the fit to all "
+            "images, in percentage points. Lines at the top and bars at the bottom show the fit to all images with its "
+            "error. Blue bands show the fits of the cross-validation at the radii where they were computed. Blue points "
+            "show free shells, a fit of one weight per shell without a formula. Their bars are the spread over the "
+            "folds. This spread is smaller than the error, because no weight can be negative; the values below Figure 3 "
+            f"have the full errors.{beyond}"
         )
-        alt = "Two charts of cumulative light against distance with error bands, falling from about half to zero"
+        alt = (
+            "Two charts of 1 - encircled energy by distance with error bands, falling from about half to zero"
+        )
     else:
-        caption = f"Light beyond a distance R, in percent of all light, of the PSF as given.{beyond}"
-        alt = "A chart of cumulative light against distance"
+        caption = (
+            "1 - encircled energy of the given PSF: the percentage of all light that lands farther than R from its "
+            f"source.{beyond}"
+        )
+        alt = "A chart of 1 - encircled energy by distance"
     parts.append(Figure(curves_png(report), caption, alt))
     shown = [name for name in report.tables["profile"]["mean_weight"] if name != TOTAL]
-    components = "its diffraction and its diffuse scatter" if shown else "no components are in its file"
+    components = (
+        "The total PSF, and its components diffraction and diffuse scatter."
+        if shown
+        else "The total PSF. The PSF file contains no components."
+    )
     parts.append(
         Figure(
             profile_png(report),
-            f"Mean weight of a pixel over rings one pixel wide, by distance, both axes logarithmic: the total PSF and {components}. "
-            "The centre stands at half a pixel. Shaded about a line: its standard error, where it is known.",
+            "Radial profile: mean weight per pixel in rings one pixel wide, by distance, on logarithmic axes. "
+            f"{components} The value at half a pixel is that of the central pixel. Shading about a line: its standard "
+            "error, if known.",
             "Radial profile of the PSF and its components over many powers of ten",
         )
     )
@@ -162,13 +178,14 @@ def light_sections(report: PsfReport) -> list[Part]:
 
 def _free_shells(report: PsfReport, shells: ShellBands) -> list[Part]:
     def excess(name: str, of: Excess) -> Value:
-        within = f"light of the shells less that of the formula within {of.within_px:.3g} px, of all light"
+        within = f"within {of.within_px:.3g} px, in percentage points of all light"
         return Value(name, of.points, of.sigma, "points", within)
 
     caption = (
-        "Weight of diffuse scatter by distance. Orange: the fitted shape. Blue: shells that may take any weight not "
-        "below zero, held to the formula but loosely, median and spread over the folds. Neighbours trade light with "
-        "one another, so that single shells scatter by far more than the light beyond a distance does (Figure 1); a run of shells on one side of the line would say that the formula is wrong there."
+        "Weight of the diffuse scatter per pixel, by distance. Orange: the fitted shape. Blue: free shells, median and "
+        "spread over the folds. Each free shell has its own weight, zero or more, with a weak prior at the fitted shape. "
+        "The weights of adjacent shells are anticorrelated, so they scatter much more than 1 - encircled energy in "
+        "Figure 1. Several adjacent shells on the same side of the line would indicate that the formula is wrong there."
     )
     return [
         Figure(
@@ -176,14 +193,15 @@ def _free_shells(report: PsfReport, shells: ShellBands) -> list[Part]:
         ),
         Values(
             [
-                excess("free shells less formula, near the centre", shells.near_centre),
-                excess("free shells less formula, where they part most", shells.largest),
+                excess("light of the free shells minus the formula, near the centre", shells.near_centre),
+                excess("light of the free shells minus the formula, largest difference", shells.largest),
             ]
         ),
     ]
 
 
 def uncertainty_sections(report: PsfReport, fit: TransitFit) -> list[Part]:
+    """The cross-validation, the comparison with other shapes, and the effect of dark offsets, if available."""
     parts: list[Part] = []
     if report.cross is not None:
         parts += _cross_validation(report.cross, fit, len(folds(len(fit.transit.frames))))
@@ -209,18 +227,21 @@ def _cross_validation(cross: CrossValidated, fit: TransitFit, blocks: int) -> li
             ]
         )
     return [
-        f"Each of {blocks} sequential blocks of images was held out, with a guard on both sides, and the images of the "
-        f"other blocks were drawn again with repetition, in {RUNS} runs: {len(cross.fits)} fits. They share the "
-        "reconstructions of the fit to all images and differ from it to first order.",
+        f"Cross-validation: each of {blocks} sequential blocks of images was held out, with a guard on both sides, and "
+        f"the images of the other blocks were resampled with replacement (bootstrap). {RUNS} such runs give "
+        f"{len(cross.fits)} fits. They share the reconstructed scenes of the fit to all images, and their differences "
+        "from it are computed to first order.",
         Table(
             ["parameter", "fit, with its error", "folds: median", "1 sigma", "2 sigma"],
             rows,
-            "Parameters as fitted to all images, and over the folds. A band much wider than the error says that images differ by more than noise.",
+            "Parameters of the fit to all images, and their distribution over the folds. A band much wider than the "
+            "error indicates that images differ by more than noise.",
         ),
         Figure(
             totals_png(cross, fit),
-            "How much light is scattered diffusely, by fold: the wider, the less the images agree. Orange: the fit to all images with its error.",
-            "Histogram of diffusely scattered light over the folds",
+            "Distribution of the total diffuse scatter over the folds. A wider distribution means less agreement between "
+            "the images. Orange: the fit to all images, with its error.",
+            "Histogram of the total diffuse scatter over the folds",
         ),
     ]
 
@@ -235,11 +256,12 @@ def _shapes(fit: TransitFit) -> list[Part]:
         rows.append([shape.name, added, f"{shape.gain:.1f}", str(len(shape.added)), held_out])
     return [
         Table(
-            ["shape", "what it adds", "delta chi2", "parameters", "delta chi2, held out"],
+            ["shape", "additional parameters", "delta chi2", "number added", "delta chi2, held out"],
             rows,
-            "Other shapes of scatter, each the fitted one with parameters more, to first order. Delta chi2: by how much it "
-            "describes all images better; chance gives as much as it has parameters, give or take the square root of twice that. "
-            "Held out: the same on images that were not fitted; below zero, what it adds is noise.",
+            "Other shapes of scatter, to first order. Each one is the fitted shape with additional parameters. Delta chi2: "
+            "the decrease of chi2 over all images. If the additional parameters fit only noise, its expected value is "
+            "their number n, with a standard deviation of sqrt(2 n). Held out: the decrease on held-out images; a "
+            "negative value indicates that the additional parameters fit noise.",
         )
     ]
 
@@ -264,17 +286,19 @@ def _dark_offsets(study: DarkOffsetStudy, fit: TransitFit) -> list[Part]:
                 "offset (DN)",
                 *(f"change of {n}" for n in names),
                 "largest change of a weight (%)",
-                *(f"light beyond {r} px (points)" for r in ("0.5", "10", "100")),
+                *(f"change of light beyond {r} px (points)" for r in ("0.5", "10", "100")),
                 "images",
             ],
             rows,
-            f"The fit repeated with an offset added to every readout. Errors of the fit itself, to compare with: {errors}. "
-            "Light: of the total PSF; diffuse weights are compared within the field.",
+            "Effect of a wrong dark level: the fit was repeated with an offset added to every readout. For comparison, "
+            f"the errors of the fit are {errors}. Weights are diffuse weights within the field. The light beyond a "
+            "distance is 1 - encircled energy of the total PSF, and its change is in percentage points.",
         ),
         Figure(
             offsets_png(study),
-            "What a wrong dark level does, by distance: relative change of the diffuse weights (left), change in percent points of the light "
-            "beyond a distance, diffuse as lines and total as dots (right).",
-            "Changes of weights and of cumulative light for four dark offsets",
+            "Effect of a wrong dark level by distance. Left: relative change of the diffuse weights. Right: change of 1 - "
+            "encircled energy in percentage points, for the diffuse scatter (solid lines) and the total PSF (dotted "
+            "lines).",
+            "Changes of diffuse weights and of 1 - encircled energy for four dark offsets",
         ),
     ]

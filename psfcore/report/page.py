@@ -1,4 +1,4 @@
-"""A report on a PSF as one page: every number with its error, every figure with how to read it."""
+"""The HTML page of a report on a PSF: every number with its error, every figure with a guide to reading it."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from psfcore.scatter.inversion import CONVERGED_POINTS, DARK_MARGIN_PX, DARK_MAR
 
 
 def page_of(report: PsfReport, provenance: dict[str, Any]) -> Page:
-    """The page. provenance: what made the report, as names and texts, numbers or further such."""
-    of = report.transit.instrument or "a transit"
-    title = f"PSF of {of}" if report.fit is not None else f"PSF {report.psf.name} on {of}"
+    """The page of a report. provenance: software and request, as nested names and values."""
+    of = report.transit.instrument or "an unnamed instrument"
+    title = f"PSF of {of}" if report.fit is not None else f"PSF {report.psf.name} on a transit of {of}"
     sections = [
-        Section("What was found", found_sections(report)),
-        Section("Light by distance", light_sections(report)),
+        Section("Results", found_sections(report)),
+        Section("Light by distance from the source", light_sections(report)),
     ]
     if report.fit is not None:
-        sections.append(Section("How sure it is", uncertainty_sections(report, report.fit)))
+        sections.append(Section("Uncertainties", uncertainty_sections(report, report.fit)))
     sections += [
-        Section("Against what was observed", _observed(report.evaluation, report.how_judged)),
-        Section("What these data cannot say", (Bullets(_limits(report)),)),
-        Section("Every image", _images(report)),
-        Section("What it was made of", _made_of(report, provenance)),
+        Section("Comparison with the observations", _observed(report.evaluation, report.how_judged)),
+        Section("Limits of these data", (Bullets(_limits(report)),)),
+        Section("Images", _images(report)),
+        Section("Inputs and software", _made_of(report, provenance)),
     ]
-    footer = f"heliopsf {provenance.get('software_version', '')}. After Hofmeister et al., A Point-Spread Function for the Extreme Ultraviolet High-Resolution Imager on board Solar Orbiter."
+    footer = f"heliopsf {provenance.get('software_version', '')}. Method: Hofmeister et al., A Point-Spread Function for the Extreme Ultraviolet High-Resolution Imager on board Solar Orbiter."
     return Page(title, report.sentence, sections, footer)
 
 
@@ -59,8 +59,9 @@ def page_of(report: PsfReport, provenance: dict[str, Any]) -> Page:
 
 def _observed(evaluation: Evaluation, how: str) -> list[Part]:
     parts: list[Part] = [
-        f"{how}. Light in every occulter as the PSF puts it there, less what was observed, over the observed mean of "
-        f"the disc. Centre: pixels within {CENTRE_PX:g} px of the occulter's. Noise is that of photons and readout.",
+        f"{how}. The residual of an image is the mean light that the PSF scatters into the occulter, minus the mean "
+        "observed light, divided by the mean observed light, over all fully dark pixels. The centre consists of the "
+        f"pixels within {CENTRE_PX:g} px of the occulter's centre. Noise is photon and read noise.",
         Table(
             [
                 "pointing",
@@ -73,42 +74,47 @@ def _observed(evaluation: Evaluation, how: str) -> list[Part]:
                 "mean (DN/s)",
             ],
             [_summary_row(s, evaluation) for s in summaries(evaluation)],
-            "Residuals by pointing, and last of all images. Mean: with the error that noise gives it; rms: with that of so many images. "
-            "Noise: the rms that noise alone would give. Largest: of one image.",
+            "Residuals by pointing; the last row is for all images. Mean: with its error from image noise. Rms: with its "
+            "sampling error for this number of images. Noise: the rms expected from noise alone. Largest: the residual "
+            "of the image with the largest absolute value.",
         ),
         Figure(
             slices_png(evaluation),
-            "A row (circles, full line) and a column (squares, dashed) through the middle of an occulter: observed as points, simulated as lines, "
-            "one image a pointing. Grey: pixels that are fully dark. Outside them the Sun is seen.",
-            "Observed and simulated light along slices through occulters",
+            "Intensity along a row (circles, solid line) and a column (squares, dashed line) through the centre of an "
+            "occulter, for one image per pointing. Points are observed, lines are simulated. Grey: fully dark pixels. "
+            "Outside the grey area, sunlight reaches the pixels directly.",
+            "Observed and simulated intensity along slices through occulters",
         ),
         Figure(
             residuals_png(evaluation),
-            "Residuals of disc means (top) and centres (bottom), against time, detector x and detector y, coloured by pointing; bars are noise, one standard deviation. "
-            "About one bar in three should miss zero.",
-            "Six charts of residuals scattered about zero",
+            "Residuals of disc means (top) and of disc centres (bottom) by time, detector x and detector y, coloured by "
+            "pointing. Bars show one standard deviation of the noise. If noise alone causes the residuals, about one "
+            "bar in three does not include zero.",
+            "Six charts of residuals about zero, by time and detector position",
         ),
     ]
     parts += _trends(evaluation)
     parts.append(
         Figure(
             intensities_png(evaluation),
-            "The light itself. Left: at the centre of the occulter by time, observed with its noise and simulated. Right: simulated less observed in DN/s by detector x; "
-            "linear about zero and logarithmic beyond.",
-            "Intensities in the occulter by time and absolute errors by place",
+            "Left: observed intensity at the centre of the occulter, with its noise, and simulated intensity, by time. "
+            "Right: simulated minus observed mean intensity in DN/s, by detector x. The vertical axis is linear near "
+            "zero and logarithmic beyond.",
+            "Intensities in the occulter by time, and absolute errors by detector position",
         )
     )
     maps = evaluation.superposed
     parts += [
         _map_values(maps),
-        Figure(maps_png(maps), _MAPS_CAPTION, "Four maps of errors by place in the disc"),
+        Figure(maps_png(maps), _MAPS_CAPTION, "Four maps of errors by position in the disc"),
     ]
     return parts
 
 
 _MAPS_CAPTION = (
-    "All discs laid on one another, to the nearest pixel. MPE: mean error of a pixel over the images; MAPE: mean of its absolute value. "
-    "Beside each what noise alone gives, on the same scale: where a map on the left looks as the one on the right, nothing but noise is seen."
+    "All discs superposed, aligned to the nearest pixel. MPE: mean over the images of the percentage error of a pixel. "
+    "MAPE: mean of its absolute value. Beside each map is the same map for noise alone, on the same scale. If a map "
+    "resembles its noise map, noise explains the errors."
 )
 
 
@@ -143,8 +149,8 @@ def _trends(evaluation: Evaluation) -> list[Part]:
         for t in found
     ]
     caption = (
-        f"Slopes of residuals along the detector, over {TREND_PX:g} px. The occulter's x and y move together along its track: slopes "
-        "against each are of the same images."
+        f"Slopes of the residuals along the detector axes, per {TREND_PX:g} px. The occulter's x and y change together "
+        "along its track. Slopes along x and y come from the same images and are not independent."
     )
     return [
         Table(
@@ -152,8 +158,8 @@ def _trends(evaluation: Evaluation) -> list[Part]:
                 "pointing",
                 "along",
                 "images",
-                f"slope (% in {TREND_PX:g} px)",
-                f"slope (DN/s in {TREND_PX:g} px)",
+                f"slope (% per {TREND_PX:g} px)",
+                f"slope (DN/s per {TREND_PX:g} px)",
             ],
             rows,
             caption,
@@ -162,7 +168,7 @@ def _trends(evaluation: Evaluation) -> list[Part]:
 
 
 def _map_values(maps: Superposed) -> Values:
-    noise = "what noise alone gives"
+    noise = "noise alone"
     return Values(
         [
             Value(
@@ -172,10 +178,10 @@ def _map_values(maps: Superposed) -> Values:
                 meaning=f"{noise}: {maps.mpe_noise_rms_pct:.2f} %",
             ),
             Value(
-                "MPE, largest of a pixel",
+                "MPE, largest of any pixel",
                 f"{maps.mpe_largest_pct:.2f}",
                 unit="%",
-                meaning=f"noise of a pixel: {maps.mpe_noise_rms_pct:.2f} % rms",
+                meaning=f"noise alone, rms over the pixels: {maps.mpe_noise_rms_pct:.2f} %",
             ),
             Value(
                 "MAPE, mean over the disc",
@@ -192,12 +198,16 @@ def _map_values(maps: Superposed) -> Values:
 
 def _limits(report: PsfReport) -> list[str]:
     said = list(report.fit.limits) if report.fit is not None else []
-    said += [f"Not shown: {missing.what}; {missing.why}" for missing in report.missing]
+    said += [f"Not shown: {missing.what}, because {missing.why}" for missing in report.missing]
     if report.given and report.fitted_to_these:
-        said.append("the PSF was fitted to these very images: how well it fits them is no test of it")
+        said.append(
+            "the PSF was fitted to these images, so its agreement with them is not an independent test"
+        )
     if report.evaluation.left_out:
-        said.append(f"{len(report.evaluation.left_out)} images could not be judged; they are listed below")
-    return [one[:1].upper() + one[1:] + "." for one in said] or ["Nothing beyond the errors that are stated."]
+        said.append(f"images that could not be evaluated, listed below: {len(report.evaluation.left_out)}")
+    return [one[:1].upper() + one[1:] + "." for one in said] or [
+        "There are no limits beyond the stated errors."
+    ]
 
 
 def _images(report: PsfReport) -> list[Part]:
@@ -210,15 +220,18 @@ def _images(report: PsfReport) -> list[Part]:
     table = Table(
         header,
         [_image_row(frame, exposure_s[frame.file]) for frame in frames],
-        "Every image that was judged: when, where its occulter was found, how dark it was and how dark it should be. Errors are those of noise.",
+        "Every evaluated image: its time and exposure, the fitted position of its occulter, the number of fully dark "
+        "pixels, and the mean observed and simulated intensity there. Errors are from noise.",
     )
     parts: list[Part] = [Details(f"All {len(frames)} images", (table,))]
     left_out = report.evaluation.left_out
     if left_out:
         why = Table(
-            ["file", "why"], [[file, reason] for file, reason in left_out.items()], "Images left out."
+            ["file", "reason"],
+            [[file, reason] for file, reason in left_out.items()],
+            "Images that could not be evaluated.",
         )
-        parts.append(Details(f"{len(left_out)} images left out", (why,)))
+        parts.append(Details(f"Images that could not be evaluated: {len(left_out)}", (why,)))
     return parts
 
 
@@ -247,18 +260,18 @@ def _made_of(report: PsfReport, provenance: dict[str, Any]) -> list[Part]:
         [
             Value("images", f"{inputs['images']} of {' x '.join(map(str, inputs['shape']))} px"),
             Value("exposures", exposures, unit="s"),
-            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN a detected photon, as given"),
-            Value("readout noise", noise.read_noise_dn, unit="DN", meaning="rms, as given"),
+            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN per detected photon, as given"),
+            Value("read noise", noise.read_noise_dn, unit="DN", meaning="rms, as given"),
             Value(
-                "images with pixels filled in",
+                "images with filled pixels",
                 f"{len(prepared['frames'])}",
-                meaning="saturated, or without a value",
+                meaning="the pixels were saturated or had no value",
             ),
-            Value("seed", f"{report.seed}", meaning="of all draws"),
+            Value("seed", f"{report.seed}", meaning="of all random samples"),
         ]
     )
     files = Table(
-        ["file", "SHA-256"], list(report.transit.sha256.items()), "Input files, by the hash of their bytes."
+        ["file", "SHA-256"], list(report.transit.sha256.items()), "Input files, with the hash of their bytes."
     )
     return [
         data,
@@ -270,12 +283,16 @@ def _made_of(report: PsfReport, provenance: dict[str, Any]) -> list[Part]:
 
 def _algorithm(report: PsfReport) -> list[Value]:
     values = [
-        Value("steps of a reconstruction", f"{INVERSION_STEPS}", meaning="linear, for the evaluation"),
-        Value("draws of noise", f"{NOISE_REALISATIONS}", meaning="for what noise alone does to the maps"),
+        Value(
+            "steps of a reconstruction", f"{INVERSION_STEPS}", meaning="linear iterations, for the evaluation"
+        ),
+        Value(
+            "noise realisations", f"{NOISE_REALISATIONS}", meaning="per image, for the maps of noise alone"
+        ),
         Value(
             "fully dark pixels",
-            f"{DARK_MARGIN_PX:g} px and {DARK_MARGIN_SIGMAS:g} sigma of the place",
-            meaning=f"margin inside the occulter's edge; at least {LEAST_DARK_PIXELS} pixels an image",
+            f"{DARK_MARGIN_PX:g} px and {DARK_MARGIN_SIGMAS:g} sigma of the position",
+            meaning=f"margin inside the edge of the occulter; at least {LEAST_DARK_PIXELS} pixels per image",
         ),
     ]
     if report.fit is not None:
@@ -287,13 +304,16 @@ def _algorithm(report: PsfReport) -> list[Value]:
                 meaning="converged" if report.fit.inversion.converged else "not converged",
             ),
             Value(
-                "taken as converged",
+                "convergence limit",
                 f"{CONVERGED_POINTS:g}",
-                unit="points",
-                meaning="largest move of the cumulative curve in a round",
+                unit="percentage points",
+                meaning="largest change of 1 - encircled energy in a round",
             ),
             Value(
-                "reach that light is counted to", f"{REACH_GRID_PX}", unit="px", meaning="edge of the square"
+                "grid on which light is counted",
+                f"{REACH_GRID_PX}",
+                unit="px",
+                meaning="side of the square about the source",
             ),
         ]
     return values
