@@ -1,4 +1,4 @@
-"""Seeing through a PSF and undoing it, in the engine's order, against the plain float64 convolution."""
+"""Convolution with a PSF and its inverse, in the engine's order, compared with a plain float64 convolution."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOPSIDED = total_kernel(
 
 
 def scene(shape: tuple[int, int], seed: int = 1) -> NDArray[np.float64]:
-    """A bright field with points of light, some on its edge."""
+    """A bright field with point sources, some at its edge."""
     rng = np.random.default_rng(seed)
     return np.asarray(rng.uniform(50, 150, shape) + 2000 * (rng.random(shape) > 0.98))
 
@@ -28,7 +28,7 @@ def scene(shape: tuple[int, int], seed: int = 1) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     "kernel", [total_kernel(SCATTER, DIFFRACTION, 200), LOPSIDED], ids=["even", "lopsided"]
 )
-def test_seeing_is_the_convolution(shape: tuple[int, int], kernel: NDArray[np.float64]) -> None:
+def test_it_is_the_convolution(shape: tuple[int, int], kernel: NDArray[np.float64]) -> None:
     blur, plain, x = Blur(kernel, shape), Convolver(kernel, shape, dtype=np.float64), scene(shape)
     seen, back = blur.convolve(blur.lanes(x)), blur.correlate(blur.lanes(x))
     np.testing.assert_allclose(blur.field(seen), plain.apply(x), rtol=1e-5)
@@ -37,14 +37,14 @@ def test_seeing_is_the_convolution(shape: tuple[int, int], kernel: NDArray[np.fl
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_nothing_is_left_beyond_the_fields_last_row(shape: tuple[int, int]) -> None:
-    """A field goes through twice as it would if it were cut between."""
+    """Two passes give the same result as two passes with a crop between them."""
     optics, x = Optics(LOPSIDED, shape), scene(shape)
     lanes = optics.lanes(x)
     once = optics.convolve(lanes)
     np.testing.assert_array_equal(once, optics.lanes(optics.field(once)))
     undone = optics.invert_once(lanes, adjoint=True)
     np.testing.assert_array_equal(undone, optics.lanes(optics.field(undone)))
-    np.testing.assert_array_equal(lanes, optics.lanes(x))  # what goes in stays as it is
+    np.testing.assert_array_equal(lanes, optics.lanes(x))  # the input is not modified
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -63,11 +63,11 @@ def test_adjoints(shape: tuple[int, int]) -> None:
     )
     assert (
         abs(dot(optics.convolve(x), y) - dot(x, optics.convolve(y))) > 1e-4 * size
-    )  # this PSF has a direction
+    )  # this PSF is not symmetric
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (100, 131)])
-def test_undoing_gives_the_scene_back(shape: tuple[int, int]) -> None:
+def test_inversion_recovers_the_scene(shape: tuple[int, int]) -> None:
     kernel = total_kernel(SCATTER, DIFFRACTION, 280)
     optics, x = Optics(kernel, shape), scene(shape)
     observed = Convolver(kernel, shape, dtype=np.float64).apply(x)
@@ -82,7 +82,7 @@ def test_undoing_gives_the_scene_back(shape: tuple[int, int]) -> None:
     np.testing.assert_allclose(optics.field(nearly), x, atol=0.1)
 
 
-def test_a_kernel_of_any_sign_is_seen_through() -> None:
+def test_a_kernel_may_have_any_sign() -> None:
     kernel = scatter_kernel(6.2, 2.5, 0.42, 128) - scatter_kernel(6.1, 2.5, 0.41, 128)
     blur, plain, x = Blur(kernel, (50, 60)), Convolver(kernel, (50, 60), dtype=np.float64), scene((50, 60))
     expected = plain.apply(x)

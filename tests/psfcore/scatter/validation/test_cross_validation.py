@@ -1,4 +1,4 @@
-"""Cross-validation: draws, both schemes beside a fit from the start, bands, and free fit beside formula."""
+"""Cross-validation: bootstrap samples, and both schemes compared with a fit from the start."""
 
 from __future__ import annotations
 
@@ -8,23 +8,18 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from psfcore.errors import DataError
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Lanes, Optics
-from psfcore.scatter.shapes import SHAPES
-from psfcore.scatter.validation.bands import LIMITS, ONE_SIGMA, TWO_SIGMA, Bands, Excess, bands, shell_bands
+from psfcore.scatter.validation.bands import Bands, bands
 from psfcore.scatter.validation.cross_validation import (
     FoldFit,
-    FoldShells,
     bootstrap_samples,
     exact_fit,
     shared_fits,
     shared_step,
 )
-from psfcore.scatter.validation.cross_validation_plot import cross_validation_png
-from psfcore.scatter.validation.free_shells import shells
 from psfcore.transit.blocks import folds
 from tests.psfcore.small_transits import IMAGES, observed, sky, solved
 
@@ -37,12 +32,6 @@ def shared() -> tuple[FoldFit, ...]:
 @cache
 def in_bands() -> Bands:
     return bands(shared(), solved().inversion.radii_px)
-
-
-def test_percentiles_are_a_gaussians() -> None:
-    assert np.array(ONE_SIGMA) / 100 == pytest.approx(norm.cdf([-1, 1]), abs=1e-12)
-    assert np.array(TWO_SIGMA) / 100 == pytest.approx(norm.cdf([-2, 2]), abs=1e-12)
-    assert list(LIMITS) == sorted(LIMITS)
 
 
 def test_a_draw_holds_its_block_and_guard_out_and_keeps_the_blocks_sizes() -> None:
@@ -143,58 +132,9 @@ def test_a_draw_of_nothing_is_refused() -> None:
         exact_fit(solved(), nothing)
 
 
-def test_free_fit_and_formula_do_not_part_where_the_truth_is_the_formula() -> None:
-    found = in_bands().shells
-    assert found is not None
-    assert not found.largest.parts
-    assert abs(found.near_centre.points) < 3 * found.near_centre.sigma
-    assert found.near_centre.within_px == pytest.approx(3.1)
-    assert (found.free_weight >= 0).all() and (np.diff(found.free_weight, axis=0) >= 0).all()
-    total = found.law_beyond_pct[2, 0] / 100
-    assert total == pytest.approx(np.median([f.values["total"] for f in shared()]), rel=1e-6)
-
-
-def made(extra: float, sigma: float, seed: int) -> FoldShells:
-    """A draw whose free fit has `extra` more light in its fourth shell, give or take a little."""
-    law = np.full(shells().size, 0.4 / shells().size)
-    free = law.copy()
-    free[3] += extra + 1e-4 * np.random.default_rng(seed).standard_normal()
-    return FoldShells(tuple(free), tuple(law), (sigma,) * shells().size)
-
-
-def test_an_excess_is_told_with_the_larger_of_its_errors() -> None:
-    found = shell_bands([made(0.05, 0.01, seed) for seed in range(200)])
-    near = found.near_centre
-    assert near.points == pytest.approx(5.0, abs=0.01) and near.sigma == pytest.approx(1.0)
-    assert near.of_formula_pct == pytest.approx(100 * 0.05 / (6 * 0.4 / shells().size), rel=0.01)
-    assert found.largest.parts and near.parts
-    assert not Excess(3.1, points=2.9, sigma=1.0, of_formula_pct=10.0).parts
-    by_draws = shell_bands([made(0.05, 1e-9, seed) for seed in range(200)])
-    assert by_draws.near_centre.sigma == pytest.approx(0.01, rel=0.2)
-    beyond = by_draws.free_beyond_pct[2] - by_draws.law_beyond_pct[2]
-    np.testing.assert_allclose(beyond[:4], 5.0, atol=0.02)
-    np.testing.assert_allclose(beyond[4:], 0.0, atol=1e-9)
-
-
 def test_folds_go_to_json_and_back() -> None:
     said = json.loads(json.dumps([fit.to_json() for fit in shared()], allow_nan=False))
     assert tuple(FoldFit.from_json(fold) for fold in said) == shared()
     json.dumps(in_bands().to_json(), allow_nan=False)
     without = dataclasses.replace(shared()[0], shells=None)
     assert FoldFit.from_json(json.loads(json.dumps(without.to_json()))) == without
-
-
-def test_a_shape_that_is_stretched_has_no_shells() -> None:
-    start = SHAPES["stretched"].coordinates(solved().inversion.values)
-    solution = invert(observed(sky()).transit, SHAPES["stretched"], start=start)
-    found = bands(shared_fits(solution, bootstrap_samples(IMAGES, runs=1)), solution.inversion.radii_px)
-    assert found.shells is None and found.to_json()["shells"] is None
-
-
-def test_the_picture_has_a_row_more_with_a_free_fit(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    heights = []
-    for fits in (shared(), tuple(dataclasses.replace(fit, shells=None) for fit in shared())):
-        path = tmp_path / "p.png"
-        cross_validation_png(bands(fits, solved().inversion.radii_px), fits, [1] * IMAGES, path)
-        heights.append(int.from_bytes(path.read_bytes()[20:24], "big"))
-    assert heights[0] == 2 * heights[1]
