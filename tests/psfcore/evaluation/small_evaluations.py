@@ -29,19 +29,19 @@ SEEDS = range(11, 20)
 
 @cache
 def kernel_with(total: float = SCATTER.total) -> Kernel:
-    """The true PSF, or one with another amount of scatter."""
+    """The true PSF, or a PSF with another total of scatter."""
     return total_kernel(dataclasses.replace(SCATTER, total=total), DIFFRACTION, 2 * SIZE_PX)
 
 
 @cache
 def judged(total: float = SCATTER.total) -> Evaluation:
-    """The transit without noise, with a PSF that has so much scatter."""
+    """The evaluation of a transit without noise, for a PSF with this total of scatter."""
     return evaluate(noise_free(sky()), lambda _: kernel_with(total))
 
 
 @cache
 def noisy(seed: int) -> Evaluation:
-    """A transit with noise, with the true PSF."""
+    """The evaluation of a transit with noise, for the true PSF."""
     return evaluate(observed(sky(), seed).transit, lambda _: kernel_with())
 
 
@@ -50,8 +50,8 @@ def offsets() -> DarkOffsetStudy:
     return dark_offset_study(observed(sky()).transit, (-5.0, 5.0), nominal=solved().inversion)
 
 
-def undone(through: Convolver, image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What is seen as an image, by GMRES in double precision."""
+def exact_scene(through: Convolver, image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The scene of an image by GMRES in double precision."""
     operator = LinearOperator(
         (image.size, image.size),
         lambda x: np.asarray(through.apply(x.reshape(image.shape))).ravel(),

@@ -17,7 +17,7 @@ from psfcore.scatter.noise_transfer import noise_covariance
 from psfcore.scatter.optics import Optics, pick, put
 from psfcore.transit.occulter import fully_dark
 from psfcore.transit.transit import Frame, Place
-from tests.psfcore.evaluation.small_evaluations import SEEDS, judged, kernel_with, noisy, rms, undone
+from tests.psfcore.evaluation.small_evaluations import SEEDS, exact_scene, judged, kernel_with, noisy, rms
 from tests.psfcore.small_transits import (
     IMAGES,
     SCATTER,
@@ -30,7 +30,7 @@ from tests.psfcore.small_transits import (
 )
 
 
-def test_the_true_psf_leaves_nothing() -> None:
+def test_the_true_psf_leaves_no_residual() -> None:
     found = judged()
     assert len(found.frames) == IMAGES and not found.left_out
     assert max(abs(f.residual_pct) for f in found.frames) < 0.01
@@ -41,20 +41,20 @@ def test_the_true_psf_leaves_nothing() -> None:
 
 
 @pytest.mark.parametrize("total", [1.1 * SCATTER.total, 0.0])
-def test_a_wrong_psf_leaves_what_an_exact_inverse_leaves(total: float) -> None:
-    """By brute force: the scene in double precision, blanked, seen again."""
+def test_a_wrong_psf_leaves_the_residual_of_an_exact_inverse(total: float) -> None:
+    """Compared with a double-precision inverse: invert, set the disc to zero, convolve."""
     found = judged(total)
     through = Convolver(kernel_with(total), (SIZE_PX, SIZE_PX), dtype=np.float64)
     for n in (0, 5):
         frame, image = found.frames[n], found.transit.frames[n].pixels.astype(np.float64)
-        lit = undone(through, image)
+        lit = exact_scene(through, image)
         lit[frame.dark] = 0.0
         expected, seen = through.apply(lit)[frame.dark].mean(), image[frame.dark].mean()
         assert frame.residual_pct == pytest.approx(100 * (expected - seen) / seen, abs=0.02)
 
 
-def test_too_much_scatter_is_too_much_light_and_too_little_too_little() -> None:
-    """A tenth more or less, of the half and more of a disc's light that is scattered."""
+def test_the_sign_of_the_residual_follows_the_error_of_the_scatter() -> None:
+    """With a tenth more or less scatter; more than half of the light in a disc is scattered."""
     more, less, none = (judged(share * SCATTER.total) for share in (1.1, 0.9, 0.0))
     for a, b, c in zip(more.frames, less.frames, none.frames, strict=True):
         assert 4 < a.residual_pct < 20 and -20 < b.residual_pct < -4
@@ -65,7 +65,7 @@ def test_too_much_scatter_is_too_much_light_and_too_little_too_little() -> None:
     assert summaries(more)[-1].mean_pct > 5 > -5 > summaries(less)[-1].mean_pct
 
 
-def test_it_is_what_the_inversion_says_of_its_own_solution() -> None:
+def test_it_agrees_with_the_residuals_of_the_inversion() -> None:
     solution = solved()
     kernel = solution.total.kernel(solution.inversion.coordinates)
     found = evaluate(solution.transit, lambda _: kernel)
@@ -84,7 +84,7 @@ def test_threads_change_nothing() -> None:
 
 
 def test_residuals_scatter_by_their_stated_noise() -> None:
-    """108 discs: the width of their pulls is known to 7 %."""
+    """For 108 discs, the width of the pulls is known to 7 %."""
     frames = [frame for seed in SEEDS for frame in noisy(seed).frames]
     assert 0.83 < rms([f.residual_pct / f.noise_pct for f in frames]) < 1.17
     assert 0.83 < rms([f.error_dn_s / f.noise_dn_s for f in frames]) < 1.17
@@ -94,8 +94,8 @@ def test_residuals_scatter_by_their_stated_noise() -> None:
     assert all(3 * f.noise_pct < f.centre_noise_pct < 8 * f.noise_pct for f in frames)
 
 
-def test_noise_is_carried_as_pixel_after_pixel_would_carry_it() -> None:
-    """Every pixel of a small field in turn brighter by one: what it does to the mean, and to a lopsided template."""
+def test_noise_is_propagated_as_pixel_by_pixel() -> None:
+    """Each pixel of a small field is raised in turn; its effect on the mean and on an asymmetric template is summed."""
     size = 36
     optics = Optics(kernel_with(), (size, size))
     place = Place(20.3, 15.1, 5.2)
@@ -116,13 +116,13 @@ def test_noise_is_carried_as_pixel_after_pixel_would_carry_it() -> None:
     np.testing.assert_allclose(found, by_hand, rtol=2e-4, atol=1e-4 * by_hand.max())
 
 
-def test_against_images_without_noise_little_is_left() -> None:
+def test_residuals_are_small_relative_to_images_without_noise() -> None:
     against = [f.residual_against_pct(sky().noise_free[f.index]) for f in noisy(11).frames]
     assert rms(against) < 0.6 < rms([f.noise_pct for f in noisy(11).frames])
 
 
-def test_each_image_is_judged_with_its_own_psf_alone() -> None:
-    """What a frame gives does not depend on the PSF of others, not even where they are its neighbours."""
+def test_each_image_is_evaluated_with_its_own_psf_alone() -> None:
+    """The result for a frame does not depend on the PSF of other frames, not even of its neighbours."""
     kernels = [kernel_with(0.3) if n % 2 else kernel_with() for n in range(IMAGES)]
     mixed = evaluate(observed(sky(), 11).transit, lambda n: kernels[n])
     alone = noisy(11)
@@ -133,7 +133,7 @@ def test_each_image_is_judged_with_its_own_psf_alone() -> None:
     assert all(mixed.frames[n].residual_pct < -5 for n in range(1, IMAGES, 2))
 
 
-def test_images_that_cannot_be_judged_are_named() -> None:
+def test_images_that_cannot_be_evaluated_are_left_out_with_a_reason() -> None:
     transit = noise_free(sky())
     pixels = [f.pixels for f in transit.frames]
     pixels[6] = sky().seen_scenes[2].astype(np.float32)
@@ -144,10 +144,10 @@ def test_images_that_cannot_be_judged_are_named() -> None:
     frames[2] = dataclasses.replace(frames[2], filled=np.ones((SIZE_PX, SIZE_PX), bool))
     found = evaluate(dataclasses.replace(transit, frames=tuple(frames)), lambda _: kernel_with())
     assert set(found.left_out) == {"000.fits", "002.fits", "006.fits"}
-    assert "found none there" in found.left_out["006.fits"] and "-2 DN/s" in found.left_out["000.fits"]
+    assert "found no occulter there" in found.left_out["006.fits"] and "-2 DN/s" in found.left_out["000.fits"]
     assert found.left_out["002.fits"] == f"expected at least {LEAST_DARK_PIXELS} fully dark pixels; got 0"
     assert [f.index for f in found.frames] == [1, 3, 4, 5, 7, 8, 9, 10, 11]
-    # The neighbours in time of a frame without occulter are none the worse for it.
+    # A frame without occulter does not affect its neighbours in time.
     assert max(abs(f.residual_pct) for f in found.frames) < 0.3
     assert any("002.fits" in line for line in lines(found))
 

@@ -15,7 +15,7 @@ from psfcore.evaluation.frame import FrameEvaluation
 from psfcore.evaluation.report import lines, report, slope_of, summary_of, trends
 from psfcore.transit.occulter import FoundPlace
 from psfcore.transit.transit import Place
-from tests.psfcore.evaluation.small_evaluations import judged, kernel_with, noisy, offsets, undone
+from tests.psfcore.evaluation.small_evaluations import exact_scene, judged, kernel_with, noisy, offsets
 from tests.psfcore.small_transits import (
     IMAGES,
     SIZE_PX,
@@ -34,13 +34,13 @@ def noise_dn_s(frame: FrameEvaluation) -> float:
 
 
 def test_a_gradient_over_the_detector_is_found() -> None:
-    """Even light, in proportion to the occulter's x, leaves D H D G e: what a disc of it would hold of itself."""
+    """Uniform light in proportion to the occulter's x leaves D H D G e: the light that scatters within the disc."""
     clean = noise_free(sky())
     added = np.array([0.02 * f.place.x_px for f in clean.frames])  # DN/s
     transit = with_pixels(clean, [f.pixels + a for f, a in zip(clean.frames, added, strict=True)])
     found = evaluate(transit, lambda _: kernel_with())
     through = Convolver(kernel_with(), (SIZE_PX, SIZE_PX), dtype=np.float64)
-    behind = undone(through, np.ones((SIZE_PX, SIZE_PX)))
+    behind = exact_scene(through, np.ones((SIZE_PX, SIZE_PX)))
     left = []
     for frame, light in zip(found.frames, added, strict=True):
         disc = np.zeros((SIZE_PX, SIZE_PX))
@@ -73,12 +73,12 @@ def test_a_slope_and_its_error_are_those_of_weighted_least_squares() -> None:
     assert slope.per_100_px == pytest.approx(100 * by_numpy)
     assert slope.sigma >= 100 * math.sqrt(covariance[0, 0]) * (1 - 1e-9)
     assert 0.8 < np.std(pulls) < 1.05 and abs(np.mean(pulls)) < 0.2
-    # Beyond noise the slope is as unsure as the scatter shows: three times as much.
+    # If the errors scatter more than noise, the error of the slope increases accordingly.
     wild = slope_of(where, error + 8 * noise * rng.normal(size=30), noise)
     assert 5 < wild.sigma / slope.sigma < 11
 
 
-def test_two_images_or_one_place_have_no_trend() -> None:
+def test_two_images_or_one_position_have_no_trend() -> None:
     transit = noise_free(sky())
     two = evaluate(
         dataclasses.replace(transit, frames=(*transit.frames[:2], *transit.frames[4:8])),
@@ -87,7 +87,7 @@ def test_two_images_or_one_place_have_no_trend() -> None:
     assert {t.fov for t in trends(two)} == {2}
 
 
-def test_a_centre_that_is_filled_has_no_error_of_its_own() -> None:
+def test_a_filled_centre_has_no_error() -> None:
     transit = noise_free(sky())
     place = transit.frames[5].place
     filled = np.zeros((SIZE_PX, SIZE_PX), bool)
@@ -111,7 +111,7 @@ def made_up(error_dn_s: float, noise_dn_s: float, observed_dn_s: float = 50.0) -
     )
 
 
-def test_figures_of_some_images() -> None:
+def test_a_summary_is_computed_from_residuals_and_noise() -> None:
     said = summary_of([made_up(1.0, 0.5), made_up(-2.0, 0.5), made_up(4.0, 2.0, observed_dn_s=100.0)], 7)
     assert (said.fov, said.images) == (7, 3)
     assert (said.mean_pct, said.largest_pct) == pytest.approx((2 / 3, 4.0))
@@ -124,7 +124,7 @@ def test_figures_of_some_images() -> None:
     assert summary_of([made_up(0.1, 1.0)], 1).gap_pct == 0
 
 
-def test_a_residual_is_over_the_mean_observed() -> None:
+def test_a_residual_is_relative_to_the_mean_observed_intensity() -> None:
     frame = dataclasses.replace(
         made_up(0.0, 1.0), observed=np.array([10.0, 20, 30]), simulated=np.array([12.0, 18, 33])
     )
@@ -133,7 +133,7 @@ def test_a_residual_is_over_the_mean_observed() -> None:
     assert frame.noise_pct == pytest.approx(5.0)
 
 
-def test_the_report_is_plain_json_and_says_what_the_lines_say() -> None:
+def test_the_report_is_json_with_the_values_of_the_text_lines() -> None:
     found = noisy(11)
     said = json.loads(json.dumps(report(found, offsets()), allow_nan=False))
     assert said["schema"] == "evaluation/1"

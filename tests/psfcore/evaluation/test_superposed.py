@@ -16,13 +16,13 @@ from tests.psfcore.small_transits import (
 )
 
 
-def test_maps_of_clean_images_are_what_noise_alone_makes() -> None:
+def test_maps_for_the_true_psf_are_those_of_noise_alone() -> None:
     maps = [noisy(seed).superposed for seed in SEEDS]
     ratio = [m.mape_mean_pct / m.mape_noise_mean_pct for m in maps]
     assert np.abs(np.subtract(ratio, 1)).max() < 0.1
     assert np.mean(ratio) == pytest.approx(1, abs=0.03)
     assert np.mean([m.mpe_rms_pct / m.mpe_noise_rms_pct for m in maps]) == pytest.approx(1, abs=0.08)
-    # Hand-made: E|N(0, s)| = s sqrt(2 / pi), s of a pixel's own photons and readout.
+    # By hand: E|N(0, s)| = s sqrt(2 / pi), s of a pixel's own photons and readout.
     noise = sky().plan.noise
     by_hand = [
         100 * np.sqrt(2 / np.pi * noise.variance(f.simulated, t.exposure_s)).mean() / f.observed_dn_s
@@ -31,7 +31,7 @@ def test_maps_of_clean_images_are_what_noise_alone_makes() -> None:
     assert maps[0].mape_noise_mean_pct == pytest.approx(np.mean(by_hand), rel=0.08)
 
 
-def test_maps_of_a_wrong_psf_are_not() -> None:
+def test_maps_for_a_wrong_psf_exceed_noise() -> None:
     wrong = evaluate(observed(sky(), 11).transit, lambda _: kernel_with(1.25 * SCATTER.total)).superposed
     assert wrong.mape_mean_pct > 1.15 * wrong.mape_noise_mean_pct
     assert wrong.mpe_rms_pct > 1.5 * wrong.mpe_noise_rms_pct
@@ -51,6 +51,6 @@ def test_errors_are_mapped_to_the_nearest_pixel_and_averaged_where_discs_are_dar
     assert np.isnan(maps.mpe_pct).sum() == 81 - 3
     assert (maps.mape_mean_pct, maps.mape_largest_pct) == (8 / 3, 3.0)
     assert maps.mpe_rms_pct == pytest.approx(np.sqrt(19 / 3))
-    for _ in range(3):  # a place that fewer than half of the images show is no place of the map
+    for _ in range(3):  # the map omits a position that fewer than half of the images show
         laid.add(Place(30.0, 20.0, 3.0), (rows[:1], columns[:1]), np.array([0.0]), [np.array([0.0])])
     assert np.isfinite(laid.superposed().mpe_pct).sum() == 1

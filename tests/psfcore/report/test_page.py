@@ -47,7 +47,7 @@ def test_the_page_shows_every_part_and_every_image() -> None:
     assert all(limit[1:] in text for limit in whole_json()["fit"]["limits"])
 
 
-def test_a_given_psf_is_judged_and_the_page_says_what_is_not_shown_and_why() -> None:
+def test_the_page_of_a_given_psf_lists_what_it_does_not_show_and_why() -> None:
     report = given()
     assert report.given and not report.held_out and not report.fitted_to_these
     residuals = np.array([f.residual_pct / f.noise_pct for f in report.evaluation.frames])
@@ -55,7 +55,7 @@ def test_a_given_psf_is_judged_and_the_page_says_what_is_not_shown_and_why() -> 
     html = page_of(report, PROVENANCE).html()
     check_stands_alone(html)
     text = next(t for t in read_page(html) if t.name == "body").text
-    assert "Not shown: other shapes of scatter; a PSF was given, and nothing was fitted." in text
+    assert "Not shown: other shapes of scatter, because the PSF was given, and no fit was made." in text
     assert "Not shown: errors of the PSF's curve and profile" in text
     assert "fit" not in report_json(report, PROVENANCE)
 

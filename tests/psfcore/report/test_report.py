@@ -43,7 +43,7 @@ def told() -> list[tuple[str, int, int]]:
 
 @cache
 def whole() -> PsfReport:
-    """The report on twelve small images, its progress in told()."""
+    """The report on twelve small images. Its progress is in told()."""
     transit = observed(sky()).transit
     with QUICK:
         return make_report(transit, untouched(transit), seed=5, progress=lambda *step: told().append(step))
@@ -57,7 +57,7 @@ def whole_json() -> dict[str, Any]:
 
 @cache
 def given() -> PsfReport:
-    """The report on the true PSF, taken from a file, as it were."""
+    """The report on the true PSF, as if it came from a file."""
     transit = dataclasses.replace(observed(sky()).transit, sha256={"000.fits": "ab" * 32})
     psf = make_psf(total_kernel(small_transits.SCATTER, DIFFRACTION, 256), name="true")
     return make_report(transit, untouched(transit), psf=psf)
@@ -69,8 +69,8 @@ def test_the_parameters_are_the_truth_within_their_errors() -> None:
         assert abs(parameter["value"] - TRUE_VALUES[name]) < 4 * parameter["sigma"], name
 
 
-def test_each_image_is_judged_with_the_psf_of_the_fold_that_holds_it_out() -> None:
-    """By hand for one fold: the step of the images that may be fitted, and the light that its PSF puts there."""
+def test_each_image_is_evaluated_with_the_psf_of_the_fold_that_holds_it_out() -> None:
+    """By hand for one fold: the step of its fitted images, and the light that its PSF scatters into the discs."""
     from psfcore.evaluation.evaluation import evaluate
 
     report = whole()
@@ -88,7 +88,7 @@ def test_each_image_is_judged_with_the_psf_of_the_fold_that_holds_it_out() -> No
     assert any(abs(got[f.file] - f.residual_pct) > 1e-3 for f in within.frames), "not held out"
 
 
-def test_progress_counts_the_whole_and_never_goes_back() -> None:
+def test_progress_covers_all_stages_and_never_decreases() -> None:
     whole()
     shares = [step / steps for _, step, steps in told()]
     assert len(shares) > 50 and shares[0] < 0.1 and 0.8 < shares[-1] <= 1
@@ -105,38 +105,40 @@ def test_the_json_holds_the_numbers_of_the_page() -> None:
     assert found["inputs"]["noise"]["photon_gain_dn"] > 0 and found["seed"] == 5
 
 
-def test_a_psf_that_was_fitted_to_these_images_is_no_test_of_itself() -> None:
+def test_a_given_psf_fitted_to_these_images_is_not_tested_independently() -> None:
     transit = dataclasses.replace(observed(sky()).transit, sha256={"000.fits": "ab" * 32})
     kernel = total_kernel(small_transits.SCATTER, DIFFRACTION, 256)
     history = [
         "psf_id: 1",
         f"inputs_sha256: {{'000.fits': '{'ab' * 16}",
         f"{'ab' * 16}'}}",
-    ]  # broken, as FITS does
+    ]  # broken into lines, as in a FITS header
     report = make_report(
         transit, untouched(transit), psf=make_psf(kernel, provenance={"history": history}), seed=2
     )
-    assert report.fitted_to_these and "no test of it" in report.sentence
+    assert report.fitted_to_these and "not an independent test" in report.sentence
 
 
 @pytest.mark.slow
-def test_too_few_images_to_hold_some_out_are_judged_with_their_own_fit_and_it_says_so() -> None:
+def test_too_few_images_for_folds_are_evaluated_with_their_own_fit_and_the_page_says_so() -> None:
     transit = observed(sky()).transit
     few = dataclasses.replace(transit, frames=transit.frames[:4] + transit.frames[6:7])
     with QUICK:
         report = make_report(few, untouched(few), dark_offsets=False)
     assert not report.held_out and report.cross is None
     said = {missing.what: missing.why for missing in report.missing}
-    assert "at least 6 images" in said["a test on images held out"]
-    assert said["what wrong dark levels do"] == "it was not asked for"
+    assert "at least 6 images" in said["a test on held-out images"]
+    assert said["the effect of wrong dark levels"] == "it was not requested"
     html = page_of(report, PROVENANCE).html()
     check_stands_alone(html)
-    assert "which is no test" in html
+    assert "this is not an independent test" in html
 
 
 def test_a_psf_of_another_scale_is_refused() -> None:
     transit = dataclasses.replace(observed(sky()).transit, plate_scale_arcsec=0.5)
     psf = make_psf(DIFFRACTION, plate_scale_arcsec=1.0)
-    with pytest.raises(DataError, match=r"expected images of 1 arcsec/px .* got 0.5") as caught:
+    with pytest.raises(
+        DataError, match=r"expected images with the plate scale of PSF .* 1 arcsec/px; got 0.5"
+    ) as caught:
         make_report(transit, untouched(transit), psf=psf)
     assert caught.value.code == "plate-scale-mismatch"

@@ -28,7 +28,7 @@ def test_percentiles_are_a_gaussians() -> None:
     assert list(LIMITS) == sorted(LIMITS)
 
 
-def test_free_fit_and_formula_do_not_part_where_the_truth_is_the_formula() -> None:
+def test_free_fit_and_formula_agree_if_the_formula_is_true() -> None:
     found = in_bands().shells
     assert found is not None
     assert not found.largest.parts
@@ -40,14 +40,14 @@ def test_free_fit_and_formula_do_not_part_where_the_truth_is_the_formula() -> No
 
 
 def made(extra: float, sigma: float, seed: int) -> FoldShells:
-    """A draw whose free fit has `extra` more light in its fourth shell, give or take a little."""
+    """A sample whose free fit has `extra` more light in its fourth shell, with a small random difference."""
     law = np.full(shells().size, 0.4 / shells().size)
     free = law.copy()
     free[3] += extra + 1e-4 * np.random.default_rng(seed).standard_normal()
     return FoldShells(tuple(free), tuple(law), (sigma,) * shells().size)
 
 
-def test_an_excess_is_told_with_the_larger_of_its_errors() -> None:
+def test_an_excess_has_the_larger_of_its_two_errors() -> None:
     found = shell_bands([made(0.05, 0.01, seed) for seed in range(200)])
     near = found.near_centre
     assert near.points == pytest.approx(5.0, abs=0.01) and near.sigma == pytest.approx(1.0)
@@ -61,14 +61,14 @@ def test_an_excess_is_told_with_the_larger_of_its_errors() -> None:
     np.testing.assert_allclose(beyond[4:], 0.0, atol=1e-9)
 
 
-def test_a_shape_that_is_stretched_has_no_shells() -> None:
+def test_a_stretched_shape_has_no_shells() -> None:
     start = SHAPES["stretched"].coordinates(solved().inversion.values)
     solution = invert(observed(sky()).transit, SHAPES["stretched"], start=start)
     found = bands(shared_fits(solution, bootstrap_samples(IMAGES, runs=1)), solution.inversion.radii_px)
     assert found.shells is None and found.to_json()["shells"] is None
 
 
-def test_the_picture_has_a_row_more_with_a_free_fit(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_the_plot_has_a_second_row_with_a_free_fit(tmp_path) -> None:  # type: ignore[no-untyped-def]
     heights = []
     for fits in (shared(), tuple(dataclasses.replace(fit, shells=None) for fit in shared())):
         path = tmp_path / "p.png"

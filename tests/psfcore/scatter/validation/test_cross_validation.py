@@ -34,7 +34,7 @@ def in_bands() -> Bands:
     return bands(shared(), solved().inversion.radii_px)
 
 
-def test_a_draw_holds_its_block_and_guard_out_and_keeps_the_blocks_sizes() -> None:
+def test_a_sample_excludes_its_block_and_guard_and_keeps_the_sizes_of_blocks() -> None:
     parts = folds(IMAGES)
     for draw in bootstrap_samples(IMAGES, runs=3):
         fitted = set(parts[draw.fold].fitted)
@@ -44,8 +44,8 @@ def test_a_draw_holds_its_block_and_guard_out_and_keeps_the_blocks_sizes() -> No
         bootstrap_samples(5)
 
 
-def test_an_exact_fold_is_what_a_fit_from_the_start_finds() -> None:
-    """Begun at the shared step it ends, within what a fit settles to, where `invert` ends with the same counts."""
+def test_an_exact_fold_agrees_with_a_fit_from_the_start() -> None:
+    """Started at the shared step, it converges to the result of `invert` with the same counts."""
     draw = bootstrap_samples(IMAGES, runs=1)[1]
     slow = invert(observed(sky()).transit, counts=draw.counts)
     found = exact_fit(solved(), draw)
@@ -55,7 +55,7 @@ def test_an_exact_fold_is_what_a_fit_from_the_start_finds() -> None:
     assert set(found.held_out_pct) == set(draw.held_out)
 
 
-def test_the_solution_is_as_it_was_after_its_folds() -> None:
+def test_folds_do_not_change_the_solution() -> None:
     before = [scene.copy() for scene in solved().sky.scenes]
     places = list(solved().sky.found)
     exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[0])
@@ -63,8 +63,8 @@ def test_the_solution_is_as_it_was_after_its_folds() -> None:
     assert places == solved().sky.found
 
 
-def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So a worker's lease outlasts what is done in silence, and a cancel is seen."""
+def test_a_fold_reports_progress_before_every_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So a worker can renew its lease between images, and notices a cancellation."""
     since_report, most = 0, 0
     undo = Optics.invert
 
@@ -91,7 +91,7 @@ def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("stage", ["images held out", "settling"])
-def test_a_fold_stops_where_its_report_says_so(stage: str) -> None:
+def test_a_progress_callback_can_stop_a_fold(stage: str) -> None:
     class Stop(Exception):
         pass
 
@@ -118,13 +118,13 @@ def test_both_schemes_agree() -> None:
     )
 
 
-def test_all_images_once_take_no_step() -> None:
+def test_with_all_images_once_the_step_is_zero() -> None:
     everything = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(1,) * IMAGES)
     moved = np.abs(shared_step(solved(), everything))
     assert (moved < 0.05 * np.sqrt(np.diag(solved().inversion.covariance))).all()
 
 
-def test_a_draw_of_nothing_is_refused() -> None:
+def test_an_empty_sample_is_refused() -> None:
     nothing = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(0,) * IMAGES)
     with pytest.raises(DataError, match=r"transit-says-too-little.*run 0, fold 0"):
         shared_fits(solved(), (nothing,))

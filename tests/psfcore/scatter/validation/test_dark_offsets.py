@@ -21,7 +21,7 @@ from tests.psfcore.small_transits import (
 )
 
 
-def test_an_offset_is_a_readout_s() -> None:
+def test_an_offset_is_divided_by_the_exposure() -> None:
     transit = observed(sky()).transit
     for before, after in zip(transit.frames, with_offset(transit, -3.0).frames, strict=True):
         np.testing.assert_allclose(
@@ -29,7 +29,7 @@ def test_an_offset_is_a_readout_s() -> None:
         )
 
 
-def test_light_in_the_disc_that_is_none_is_taken_for_scatter() -> None:
+def test_a_positive_offset_is_fitted_as_more_scatter() -> None:
     study = offsets()
     low, high = study.offsets
     assert (low.offset_dn, high.offset_dn) == (-5.0, 5.0)
@@ -38,7 +38,7 @@ def test_light_in_the_disc_that_is_none_is_taken_for_scatter() -> None:
     assert high.values["total"] > study.nominal["total"] > low.values["total"]
     assert study.radii_px[0] == 1 and study.radii_px[-1] == SIZE_PX - 1
     assert study.curve_radii_px[0] == 0.5
-    # Outside the central pixel the curve is the total.
+    # Outside the central pixel, the curve is the total.
     for offset in study.offsets:
         change = offset.values["total"] - study.nominal["total"]
         assert offset.curve_change_points[0] == pytest.approx(100 * change, rel=1e-6)
@@ -47,7 +47,7 @@ def test_light_in_the_disc_that_is_none_is_taken_for_scatter() -> None:
     assert 0.5 < study.largest_curve_change_points < 4
 
 
-def test_weights_change_as_the_formula_says() -> None:
+def test_weights_change_as_the_fitted_formulas_do() -> None:
     study = offsets()
     nominal, other = ({**v} for v in (study.nominal, study.offsets[1].values))
     kernels = [SOFTENED_POWER_LAW.kernel(SOFTENED_POWER_LAW.coordinates(v), 512) for v in (other, nominal)]

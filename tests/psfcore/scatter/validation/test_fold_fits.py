@@ -33,7 +33,7 @@ def held_out() -> FoldKernels:
     return fold_kernels(observed(sky()).transit, start=solved().inversion.coordinates)
 
 
-def test_a_fold_s_psf_knows_nothing_of_what_it_holds_out() -> None:
+def test_the_psf_of_a_fold_does_not_depend_on_held_out_images() -> None:
     transit, fold = observed(sky()).transit, folds(IMAGES)[3]
     start = solved().inversion.coordinates
     hidden = set(range(IMAGES)) - set(fold.fitted)
@@ -60,7 +60,7 @@ def test_every_image_has_the_psf_of_the_fold_that_holds_it_out() -> None:
     assert 0.2 < rms(against) < 2.5
 
 
-def test_a_few_images_make_no_folds_and_a_fold_that_fails_is_named() -> None:
+def test_too_few_images_are_refused_and_the_error_names_the_fold() -> None:
     transit = noise_free(sky())
     with pytest.raises(DataError, match=r"too-few-frames.*at least 6 images.*got 5"):
         fold_kernels(dataclasses.replace(transit, frames=transit.frames[:5]))
@@ -70,11 +70,11 @@ def test_a_few_images_make_no_folds_and_a_fold_that_fails_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_held_out_discs_of_clean_transits_are_met() -> None:
-    """Against the simulator's discs without noise: mean within 1 %, rms within 2 %, at every pointing.
+def test_held_out_discs_of_clean_transits_are_predicted() -> None:
+    """Relative to simulated discs without noise: mean within 1 % and rms within 2 % at every pointing.
 
-    Noise in the images that are fitted moves the mean of a limb pointing by 0.6 to 0.7 %, one standard error, so
-    that a single transit's may be just beyond 1 %: three together may not.
+    Noise in the fitted images changes the mean of a limb pointing by 0.6 to 0.7 %, one standard error. The mean of a
+    single transit may therefore slightly exceed 1 %, but not the mean of three.
     """
     off: dict[int, list[float]] = {1: [], 2: [], 3: []}
     for seed in (0, 1, 2):
