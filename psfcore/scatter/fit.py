@@ -262,9 +262,9 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeig
     for step, n in enumerate(solution.part):
         progress("free shells", step, len(solution.part))
         frame, dark = solution.transit.frames[n], solution.sky.dark[n]
-        lit = solution.blanked_scene(n)
-        diffracted = diffract.convolve(lit)
-        expected = pick(solution.optics.convolve(lit), dark)
+        blanked = solution.blanked_scene(n)
+        diffracted = diffract.convolve(blanked)
+        expected = pick(solution.optics.convolve(blanked), dark)
         distance = disc_distance(solution.transit.shape, solution.sky.found[n].place)[dark]
         parts.append(
             Equations(

@@ -178,9 +178,9 @@ def pixel_weight(transit: Transit, n: int, expected: Vector) -> Vector:
     return np.asarray(1 / transit.noise.variance(level, transit.frames[n].exposure_s))
 
 
-def jacobian_row(optics: Optics, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
+def jacobian_row(optics: Optics, slope: Blur, blanked: Lanes, dark: Pixels) -> Vector:
     """Eq. (4) with the opposite sign: change of the expected dark pixels with one coordinate."""
-    changed = slope.convolve(lit)
+    changed = slope.convolve(blanked)
     scene = optics.invert_once(changed)
     put(scene, dark, 0.0)
     return pick(changed, dark) - pick(optics.convolve(scene), dark)

@@ -163,14 +163,14 @@ class Solver:
         dark, observed = sky.dark[n], sky.observed[n]
         scene = optics.invert(observed, sky.scenes[n], steps=WARM_STEPS)  # step (d)
         sky.scenes[n] = scene
-        lit = scene.copy()
-        put(lit, dark, 0.0)  # step (f)
-        expected = pick(optics.convolve(lit), dark)
+        blanked = scene.copy()
+        put(blanked, dark, 0.0)  # step (f)
+        expected = pick(optics.convolve(blanked), dark)
         residual = pick(observed, dark) - expected  # Eq. (1)
         if kept is not None:
             return _Measured(residual, expected, kept)
         weight = pixel_weight(sky.transit, n, expected)
-        jacobian = np.array([jacobian_row(optics, blur, lit, dark) for blur in model.slope_blurs])
+        jacobian = np.array([jacobian_row(optics, blur, blanked, dark) for blur in model.slope_blurs])
         weighted = jacobian * weight
         return _Measured(residual, expected, _Slopes(weight, weighted, weighted @ jacobian.T))
 
