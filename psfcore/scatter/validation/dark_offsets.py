@@ -91,8 +91,8 @@ def dark_offset_study(
     """
     if nominal is None:
         nominal = invert(transit, shape, threads=threads, progress=progress).inversion
-    curves_of = _WeightsAndCurves(transit, nominal.shape, threads)
-    before = curves_of.of(nominal.coordinates)
+    curves = _WeightsAndCurves(transit, nominal.shape, threads)
+    before = curves.at(nominal.coordinates)
     found = []
     for offset_dn in offsets_dn:
 
@@ -106,7 +106,7 @@ def dark_offset_study(
             threads=threads,
             progress=report,
         ).inversion
-        weights, diffuse, total = curves_of.of(at.coordinates)
+        weights, diffuse, total = curves.at(at.coordinates)
         found.append(
             DarkOffset(
                 offset_dn=float(offset_dn),
@@ -118,7 +118,7 @@ def dark_offset_study(
                 total_curve_change_points=total - before[2],
             )
         )
-    return DarkOffsetStudy(curves_of.radii_px, curves_of.curve_radii_px, nominal.values, tuple(found))
+    return DarkOffsetStudy(curves.radii_px, curves.curve_radii_px, nominal.values, tuple(found))
 
 
 def with_offset(transit: Transit, offset_dn: float) -> Transit:
@@ -139,7 +139,7 @@ class _WeightsAndCurves:
         self.radii_px = np.unique(np.geomspace(1, farthest, _RADII).round())
         self.curve_radii_px = np.concatenate(([0.5], self.radii_px))
 
-    def of(self, coordinates: Vector) -> tuple[Vector, Vector, Vector]:
+    def at(self, coordinates: Vector) -> tuple[Vector, Vector, Vector]:
         """Mean diffuse weight at radii_px; cumulative curves of diffuse and total PSF at curve_radii_px, percent."""
         scatter = self._total.shape.kernel(coordinates, REACH_GRID_PX)
         ring, mean = radial_profile(scatter)
