@@ -127,10 +127,14 @@ def compare_shapes_by_errors(
         stretched = _fit_of(solution, name, progress)
         named[name] = stretched, _fold_kernels(stretched, samples)
     named[FREE_SHELLS] = None, _free_fold_kernels(solution, samples, progress)
-    looks = {name: _looked(solution, kernel_of, name, progress) for name, (_, kernel_of) in named.items()}
-    images = sorted(set.intersection(*(set(look) for look in looks.values())))
+    evaluations = {
+        name: _evaluated(solution, kernel_of, name, progress) for name, (_, kernel_of) in named.items()
+    }
+    images = sorted(set.intersection(*(set(evaluation) for evaluation in evaluations.values())))
     counts = _bootstrap_counts(len(images), seed)
-    found = {name: _figures([look[n] for n in images], counts) for name, look in looks.items()}
+    found = {
+        name: _figures([evaluation[n] for n in images], counts) for name, evaluation in evaluations.items()
+    }
     first = found[SOFTENED_POWER_LAW.name]
     return ShapesByErrors(
         images=len(images),
@@ -200,7 +204,7 @@ def _by_image(samples: tuple[FoldSample, ...], kernels: list[Kernel]) -> KernelO
     return lambda n: kernels[fold_of[n]]
 
 
-def _looked(
+def _evaluated(
     solution: Solution, kernel_of: KernelOf, name: str, progress: Progress
 ) -> dict[int, FrameEvaluation]:
     """The evaluation of every usable image with the PSF of its fold, by index."""
@@ -208,10 +212,10 @@ def _looked(
     def said(stage: str, step: int, steps: int) -> None:
         progress(f"{name}: {stage}", step, steps)
 
-    looked = evaluate(
+    evaluation = evaluate(
         solution.transit, kernel_of, noise_realisations=0, threads=solution.threads, progress=said
     )
-    return {frame.index: frame for frame in looked.frames}
+    return {frame.index: frame for frame in evaluation.frames}
 
 
 def _bootstrap_counts(images: int, seed: int) -> Floats:

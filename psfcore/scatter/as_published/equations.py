@@ -132,16 +132,18 @@ def free_fit(
     towards: coefficients of the shells that no equation constrains. The prior is weak: a shell may double or vanish
     at the cost of one equation's misfit. Default: the prior is zero for all shells, with PRIOR_WEIGHT.
     """
-    held_at = np.zeros_like(counts) if towards is None else towards
-    light = held_at * counts
-    hold = np.full_like(counts, PRIOR_WEIGHT) if towards is None else 1 / np.maximum(light, LEAST_LIGHT)
+    prior_at = np.zeros_like(counts) if towards is None else towards
+    light = prior_at * counts
+    prior_weight = (
+        np.full_like(counts, PRIOR_WEIGHT) if towards is None else 1 / np.maximum(light, LEAST_LIGHT)
+    )
     rng = np.random.default_rng(seed)
     return _fit_subsets(
         equations,
         counts,
         rng,
         subsets,
-        lambda matrix, target: _solve_free(matrix, target, counts, held_at, hold),
+        lambda matrix, target: _solve_free(matrix, target, counts, prior_at, prior_weight),
     )
 
 
@@ -217,7 +219,7 @@ def _from_pivot(theta: Vector) -> Vector:
 
 
 def _solve_free(
-    matrix: Matrix, target: Vector, counts: Vector, towards: Vector, hold: Vector
+    matrix: Matrix, target: Vector, counts: Vector, towards: Vector, prior_weight: Vector
 ) -> tuple[Vector, float]:
     """Eq. (2) for the light n_S psf_S of each shell, with a prior for shells that no equation constrains.
 
@@ -228,11 +230,11 @@ def _solve_free(
     out = towards.copy()
     target = target - matrix[:, ~used] @ towards[~used]
     light = matrix[:, used] / counts[used]
-    held = np.concatenate((light, np.diag(hold[used])))
-    wanted = np.concatenate((target, (hold * towards * counts)[used]))
+    extended = np.concatenate((light, np.diag(prior_weight[used])))
+    extended_target = np.concatenate((target, (prior_weight * towards * counts)[used]))
     # The triangular factor of a QR factorisation has the same least-squares solution with a twentieth of the rows.
-    turned, triangle = np.linalg.qr(held)
-    solved = lsq_linear(triangle, turned.T @ wanted, bounds=(0.0, np.inf), method="trf")
+    turned, triangle = np.linalg.qr(extended)
+    solved = lsq_linear(triangle, turned.T @ extended_target, bounds=(0.0, np.inf), method="trf")
     out[used] = solved.x / counts[used]
     return out, float(np.sum((light @ solved.x - target) ** 2))
 

@@ -38,9 +38,8 @@ DARK_MARGIN_PX = 0.05
 DARK_MARGIN_SIGMAS = 1.5
 LARGEST_DARK_MARGIN_PX = 2.5
 LEAST_DARK_PIXELS = 30
-LEAST_LEVEL = (
-    0.2  # of the disc's mean: lower limit of the intensity from which a pixel's variance is computed
-)
+# Lower limit of the intensity from which a pixel's variance is computed, as a fraction of the disc's mean.
+LEAST_LEVEL = 0.2
 
 
 class TransitScenes:

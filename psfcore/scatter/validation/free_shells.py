@@ -52,10 +52,8 @@ from psfcore.scatter.total_psf import Kernel
 Matrix = NDArray[np.float64]
 
 NEAR_PX = 100.0
-NEAR_LOOSE, FAR_LOOSE = (
-    10.0,
-    1.0,
-)  # width of the prior, in units of the formula's light in the shell
+# Width of the prior, in units of the formula's light in the shell, within and beyond NEAR_PX.
+NEAR_LOOSE, FAR_LOOSE = 10.0, 1.0
 LEAST_LIGHT = 1e-5  # smallest width of the prior, as a fraction of all light
 
 
