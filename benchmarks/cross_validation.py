@@ -1,11 +1,12 @@
-"""How long a cross-validation takes, how near the quick scheme comes to the exact one, and what a lost worker costs.
+"""Time a cross-validation, compare the shared scheme with the exact one, and measure the cost of a lost worker.
 
     python -m benchmarks.cross_validation [--full]
 
-30 simulated images of 512 px. Shared scheme: 100 folds in this process. Exact scheme: ten folds by two worker
-processes of one thread each, on Redis and PostgreSQL (where this machine has none, by the two processes of a service
-with its worker beside it), then the same with one of the two killed half-way, from Redis and PostgreSQL alone.
-Times as ratios to 1 F (see tests/bench.py). 100 exact folds are reckoned from the ten; --full runs them.
+It uses 30 simulated images of 512 px. Shared scheme: 100 folds in this process. Exact scheme: ten folds by two worker
+processes of one thread each, with Redis and PostgreSQL. If this machine lacks them, the two worker processes of a local
+service compute the folds. With Redis and PostgreSQL, the exact scheme runs a second time, and one of the two workers is
+killed half-way. Times are printed as ratios to 1 F (see benchmarks/deconvolution.py). The time of 100 exact folds is
+extrapolated from the ten; --full runs all of them.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ import numpy as np
 from benchmarks.deconvolution import THREADS, reference
 from psfcore.fits.header import FitsLimits
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.validation.cross_validation import FoldFit, bands, draws, shared_fits
+from psfcore.scatter.validation.bands import bands
+from psfcore.scatter.validation.cross_validation import FoldFit, bootstrap_samples, shared_fits
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.simulate.transit_files import write
@@ -41,38 +43,41 @@ WAIT_S = 0.25
 
 
 def shared(folder: Path, f_s: float) -> tuple[FoldFit, ...]:
-    """100 folds by the shared scheme, in this process."""
+    """Compute 100 folds by the shared scheme in this process."""
     transit = read_transit(folder, FitsLimits(max_pixels=(2 * SIZE_PX) ** 2))
     start = time.perf_counter()
     solution = invert(transit, threads=THREADS)
     fitted = time.perf_counter() - start
-    fits = shared_fits(solution, draws(IMAGES, runs=RUNS))
-    told(f"shared scheme, {len(fits)} folds with free fits ({fitted:.0f} s of it the fit)", start, f_s)
+    fits = shared_fits(solution, bootstrap_samples(IMAGES, runs=RUNS))
+    told(
+        f"shared scheme, {len(fits)} folds with free fits (including {fitted:.0f} s for the fit)", start, f_s
+    )
     return fits
 
 
 def told(what: str, start: float, f_s: float) -> None:
+    """Print the time since `start`, in seconds and in units of 1 F."""
     took = time.perf_counter() - start
     print(f"{what}: {took:.0f} s = {took / f_s:.0f} F", flush=True)
 
 
 @contextmanager
 def two_workers(folder: Path) -> Iterator[Stack]:
-    """Two worker processes, by servers of their own where this machine has them."""
+    """Two worker processes with their own Redis and PostgreSQL, or a local service with two worker processes."""
     os.environ.update(ONE_THREAD_EACH)
     folder.mkdir()
     try:
         with stacks.served(folder, workers=2) as stack:
             yield stack
     except Missing as missing:
-        print(f"{missing}: a service with two processes of its own worker instead")
+        print(f"{missing}: using a local service with two worker processes instead")
         os.environ["HELIOPSF_WORKER_PROCESSES"] = "2"
         with stacks.embedded(folder) as stack:
             yield stack
 
 
 def exact(stack: Stack, transit_id: str, runs: int, seed: int, f_s: float) -> tuple[FoldFit, ...]:
-    """Folds by the exact scheme."""
+    """Compute folds by the exact scheme, and print the time."""
     start = time.perf_counter()
     job = stack.client.submit("cross-validate", transit_id=transit_id, scheme="exact", runs=runs, seed=seed)
     first: float | None = None
@@ -87,7 +92,7 @@ def exact(stack: Stack, transit_id: str, runs: int, seed: int, f_s: float) -> tu
         a_fold = (time.perf_counter() - first) / (len(folds) - done)
         whole = first - start + a_fold * (FOLDS * RUNS - done)
         print(
-            f"  {first - start:.0f} s to the first, {a_fold:.1f} s a fold from then on: "
+            f"  {first - start:.0f} s to the first fold, then {a_fold:.1f} s per fold: "
             f"{FOLDS * RUNS} folds in {whole / 60:.1f} min = {whole / f_s:.0f} F",
             flush=True,
         )
@@ -101,7 +106,7 @@ def folds_of(stack: Stack, job: dict[str, Any]) -> tuple[FoldFit, ...]:
 
 
 def compared(exactly: tuple[FoldFit, ...], quickly: tuple[FoldFit, ...]) -> None:
-    """Bands of the same folds by both schemes."""
+    """Print the differences between the bands of both schemes for the same folds."""
     radii = np.arange(len(exactly[0].curve_pct), dtype=np.float64)
     one, other = (bands(fits, radii) for fits in (exactly, quickly))
     widths = [b.curve_pct[3] - b.curve_pct[1] for b in (one, other)]
@@ -109,9 +114,9 @@ def compared(exactly: tuple[FoldFit, ...], quickly: tuple[FoldFit, ...]) -> None
     apart = np.abs(one.curve_pct[2] - other.curve_pct[2]) / half
     each = np.abs(np.subtract([f.curve_pct for f in exactly], [f.curve_pct for f in quickly])) / half
     print(
-        f"  widths of the 1 sigma bands, exact over shared: {(widths[0] / widths[1]).min():.2f} to "
-        f"{(widths[0] / widths[1]).max():.2f}; medians {apart.max():.2f} half-widths apart at most, single folds "
-        f"{np.median(each):.2f} (median) and {each.max():.2f} (at most)"
+        f"  width of the 1 sigma bands, exact / shared: {(widths[0] / widths[1]).min():.2f} to "
+        f"{(widths[0] / widths[1]).max():.2f}; differences in half-widths: medians at most {apart.max():.2f}, single "
+        f"folds {np.median(each):.2f} (median) and {each.max():.2f} (largest)"
     )
     print(
         f"  held-out rms {one.held_out['rms_pct']:.3f} % exact, {other.held_out['rms_pct']:.3f} % shared",
@@ -119,15 +124,15 @@ def compared(exactly: tuple[FoldFit, ...], quickly: tuple[FoldFit, ...]) -> None
     )
     if one.shells is not None and other.shells is not None:
         print(
-            f"  free fit less formula near the centre: {one.shells.near_centre.points:+.2f} exact, "
+            f"  free fit minus formula near the centre: {one.shells.near_centre.points:+.2f} exact, "
             f"{other.shells.near_centre.points:+.2f} shared, +- {other.shells.near_centre.sigma:.2f} points"
         )
 
 
 def with_one_killed(stack: Stack, transit_id: str, undisturbed: tuple[FoldFit, ...], f_s: float) -> None:
-    """Other folds, the worker that helps killed when half of them are done; none may be lost or counted twice."""
+    """Compute other folds, and kill the helping worker half-way. No fold may be lost or computed twice."""
     if not stack.workers:
-        print("one worker killed half-way: not measured without Redis and PostgreSQL")
+        print("one worker killed half-way: not measured, because it requires Redis and PostgreSQL")
         return
     parts = Parts(stack)
     before = parts.done()
@@ -137,17 +142,17 @@ def with_one_killed(stack: Stack, transit_id: str, undisturbed: tuple[FoldFit, .
         time.sleep(WAIT_S)
     kill_worker_of(stack, job["id"], own=False)
     found = folds_of(stack, stack.client.wait(job))
-    told(f"the same with one of the two killed when {FOLDS // 2} were done", start, f_s)
+    told(f"exact scheme, one of two workers killed after {FOLDS // 2} folds", start, f_s)
     expected = [(fit.run, fit.fold) for fit in undisturbed]
     assert [(fit.run, fit.fold) for fit in found] == expected
     assert parts.done() - before == FOLDS
     parts.close()
-    print("  no fold was lost, none counted twice", flush=True)
+    print("  no fold was lost, and none was computed twice", flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--full", action="store_true", help="run 100 exact folds too")
+    parser.add_argument("--full", action="store_true", help="also run 100 exact folds")
     asked = parser.parse_args()
     f_s = reference()
     print(f"1 F = {f_s:.3f} s", flush=True)

@@ -1,11 +1,11 @@
-"""How long a fit takes, and that the quick way gives what the straightforward one gives.
+"""Time a fit, and compare the fast solver with a simple reference solver.
 
     python -m benchmarks.fit [--full] [--folder DIR]
 
-Quick: 30 images of 512 px, as a ratio to 1 F (see tests/bench.py), and nine images of 256 px solved a second time the
-straightforward way: SciPy's transforms in float64, every scene from scratch in thirty steps, slopes by finite
-differences of the whole model, all images in every round. --full: 126 images of 2048 px (4 GB are written into DIR
-or the temporary folder, once), with its peak memory.
+By default it fits 30 images of 512 px and prints the time as a ratio to 1 F (see benchmarks/deconvolution.py). It also
+fits nine images of 256 px a second time with the reference solver: SciPy transforms in float64, every scene from the
+start in thirty steps, slopes by finite differences of the whole model, and all images in every round. --full also fits
+126 images of 2048 px and prints the peak memory. Its first run writes 4 GB into DIR (default: the temporary folder).
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from benchmarks.peers import peak_gib
 from psfcore.convolution.convolver import Convolver
 from psfcore.fits.header import FitsLimits
 from psfcore.psf import cumulative_curve
-from psfcore.scatter.fit import fit_transit, sentence
+from psfcore.scatter.fit import fit_transit
 from psfcore.scatter.inversion import LEAST_LEVEL, Solution, invert
+from psfcore.scatter.report import fit_sentence
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
@@ -39,7 +40,7 @@ STRAIGHT_ROUNDS = 4
 
 
 def fit_of_512(f_s: float) -> None:
-    """30 images of 512 px, everything that `heliopsf psf fit` computes."""
+    """Fit 30 images of 512 px, with all results of `heliopsf psf fit`."""
     transit = simulate(default_plan(30, 512), drawn_truth(1), diffraction(1024), 1, threads=THREADS).transit
     fit_transit(simulate(default_plan(9, 128), drawn_truth(1), diffraction(256), 1).transit)  # compiles
     start = time.perf_counter()
@@ -48,37 +49,39 @@ def fit_of_512(f_s: float) -> None:
     print(f"fit of 30 images of 512 px: {took:.1f} s = {took / f_s:.0f} F", flush=True)
 
 
-def against_straightforward() -> None:
-    """The curve of nine images of 256 px both ways."""
+def compare_with_reference() -> None:
+    """Compare the cumulative curves of both solvers for nine images of 256 px."""
     simulated = simulate(
         default_plan(9, 256, brightness=3.0), drawn_truth(2), diffraction(512), 2, threads=THREADS
     )
     solution = invert(simulated.transit, threads=THREADS)
     start = time.perf_counter()
-    curve = straightforward(solution)
+    curve = reference_curve(solution)
     took = time.perf_counter() - start
     worst = np.abs(curve - solution.inversion.curve_pct).max()
     print(
-        f"quick against straightforward, 9 images of 256 px: the curves differ by {worst:.4f} points at most "
-        f"(stated error {solution.inversion.curve_sigma.min():.2f} or more; the straightforward way took {took:.0f} s)",
+        f"fast and reference solver, 9 images of 256 px: the curves differ by at most {worst:.4f} points "
+        f"(smallest stated error {solution.inversion.curve_sigma.min():.2f}; the reference solver took {took:.0f} s)",
         flush=True,
     )
 
 
-def straightforward(solution: Solution) -> NDArray[np.float64]:
-    """The cumulative curve where Eq. (2) of `inversion` is least, from its start, with the same dark pixels."""
+def reference_curve(solution: Solution) -> NDArray[np.float64]:
+    """The cumulative curve at the minimum of Eq. (2) of the inversion, with the same start and dark pixels."""
     transit, inversion = solution.transit, solution.inversion
     total = TotalPsf(transit.diffraction, inversion.shape, transit.shape, threads=THREADS)
 
     def expected(at: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        see = Convolver(total.kernel(at), transit.shape, dtype=np.float64, threads=THREADS)
+        convolver = Convolver(total.kernel(at), transit.shape, dtype=np.float64, threads=THREADS)
         out = []
         for n in solution.part:
             x = transit.frames[n].pixels.astype(np.float64)
-            for _ in range(SCENE_STEPS):  # Richardson's iteration: the PSF's transform lies between 0.3 and 1
-                x = x + (transit.frames[n].pixels - see.apply(x))
+            for _ in range(
+                SCENE_STEPS
+            ):  # Richardson's iteration; the transform of the PSF is between 0.3 and 1
+                x = x + (transit.frames[n].pixels - convolver.apply(x))
             x[solution.sky.dark[n]] = 0.0
-            out.append(np.asarray(see.apply(x))[solution.sky.dark[n]])
+            out.append(np.asarray(convolver.apply(x))[solution.sky.dark[n]])
         return out
 
     at = inversion.shape.start
@@ -96,15 +99,15 @@ def straightforward(solution: Solution) -> NDArray[np.float64]:
             frame = transit.frames[n]
             level = np.maximum(here[k], LEAST_LEVEL * here[k].mean())
             weight = 1 / transit.noise.variance(level, frame.exposure_s)
-            answers = np.array([slope[k] for slope in slopes])
-            normal += (answers * weight) @ answers.T
-            score += (answers * weight) @ (frame.pixels[solution.sky.dark[n]] - here[k])
+            jacobian = np.array([slope[k] for slope in slopes])
+            normal += (jacobian * weight) @ jacobian.T
+            score += (jacobian * weight) @ (frame.pixels[solution.sky.dark[n]] - here[k])
         at = at + np.linalg.solve(normal, score)
     return cumulative_curve(total.kernel(at), total.radii_px)
 
 
 def full_size(folder: Path, f_s: float) -> None:
-    """126 images of 2048 px, in a process of its own for its memory."""
+    """Fit 126 images of 2048 px in a separate process, which measures its own memory."""
     where = folder / "heliopsf-bench-126x2048"
     if not (where / "transit.json").is_file():
         plan = default_plan(126, 2048)
@@ -121,12 +124,13 @@ def full_size(folder: Path, f_s: float) -> None:
 
 
 def one(folder: Path) -> None:
+    """Fit the transit in a folder; print its time, peak memory and sentence."""
     start = time.perf_counter()
     transit = read_transit(folder, FitsLimits(max_pixels=4096 * 4096))
     found = fit_transit(transit, threads=THREADS)
     print(time.perf_counter() - start)
     print(f"{peak_gib():.2f}")
-    print(sentence(found))
+    print(fit_sentence(found))
 
 
 def main() -> None:
@@ -141,7 +145,7 @@ def main() -> None:
     f_s = reference()
     print(f"1 F = {f_s:.3f} s", flush=True)
     fit_of_512(f_s)
-    against_straightforward()
+    compare_with_reference()
     if asked.full:
         full_size(asked.folder, f_s)
 

@@ -1,8 +1,9 @@
-"""`python -m benchmarks.ring_sums [--quick]`: the sums of images over shells, by three ways, as ratios to 1 F.
+"""`python -m benchmarks.ring_sums [--quick]`: time three methods for sums of images over shells, as ratios to 1 F.
 
-51,660 targets, 410 round each of 126 places along a transit in 2048 px images, and the published 50 shells; also
-shells cut into 12 sectors, and fine shells. 1 F is that of `benchmarks.deconvolution`. Plain look-up and one convolution a shell
-take too long for all: they are timed on a part, scaled, and compared with the running sums on that part.
+There are 51,660 targets: 410 about each of 126 positions along a transit in 2048 px images. Sums are over the 50
+published shells, over the same shells divided into 12 sectors, and over fine shells. 1 F is defined in
+`benchmarks.deconvolution`. A plain look-up and one convolution per shell are too slow for all targets. They are timed on
+a part, scaled, and compared with the running sums on that part.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ KINDS = (
 
 
 def transit_targets() -> list[NDArray[np.int64]]:
-    """The 410 pixels nearest to each of 126 places on a line across the image."""
+    """The 410 pixels nearest to each of 126 positions on a straight line across the image."""
     dy, dx = np.indices((31, 31)) - 15
     nearest = np.argsort((dy**2 + dx**2).ravel(), kind="stable")[:TARGETS_AN_IMAGE]
     disc = np.column_stack((dy.ravel()[nearest], dx.ravel()[nearest]))
@@ -40,11 +41,12 @@ def report(what: str, took_s: float, f_s: float, note: str = "") -> None:
 
 
 def of_part(sums: NDArray[np.float64], expected: NDArray[np.float64]) -> str:
-    return f"largest difference {np.abs(sums / expected - 1).max():.1e} of a shell's sum"
+    """The largest relative difference between two methods, as text."""
+    return f"largest relative difference {np.abs(sums / expected - 1).max():.1e}"
 
 
 def ring_sums_bench(*, quick: bool = False) -> None:
-    """Print the table; `quick`: a tenth of the images for the running sums, scaled, and one shell for the FFT."""
+    """Print the table. quick: use a tenth of the images for the running sums, and one shell for the FFT."""
     f_s = reference()
     print(f"1 F = {f_s:.3f} s, {THREADS} threads, {IMAGES * TARGETS_AN_IMAGE} targets")
     rng = np.random.default_rng(0)
@@ -55,7 +57,7 @@ def ring_sums_bench(*, quick: bool = False) -> None:
     scaled = f"{len(used)} images, scaled" if quick else ""
     for name, edges, sectors in KINDS:
         segments = Segments(tuple(edges), sectors)
-        report(f"{name} ({segments.size}): to prepare", seconds(lambda s=segments: s.runs), f_s)
+        report(f"{name} ({segments.size}): preparation", seconds(lambda s=segments: s.runs), f_s)
 
         def one(n: int, segments: Segments = segments, threads: int = 1) -> NDArray[np.float64]:
             return segment_sums(images[n % len(images)], targets[n], segments, threads=threads)
@@ -68,7 +70,7 @@ def ring_sums_bench(*, quick: bool = False) -> None:
         report("  running sums, one thread", scale * seconds(lambda o=one: [o(n) for n in used]), f_s, scaled)
         took = scale * seconds(lambda o=one: [o(n, threads=THREADS) for n in used])
         report(f"  running sums, {THREADS} threads on each image", took, f_s, scaled)
-        report(f"  running sums, {THREADS} images at a time", scale * seconds(side_by_side), f_s, scaled)
+        report(f"  running sums, {THREADS} images in parallel", scale * seconds(side_by_side), f_s, scaled)
     segments = Segments(tuple(KINDS[0][1]))
     sums = segment_sums(images[0], targets[0], segments)
     some = slice(0, TARGETS_AN_IMAGE, 100 if quick else 40)

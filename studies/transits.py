@@ -34,7 +34,8 @@ from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter.as_published.published import AS_PUBLISHED, invert_as_published
 from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.shapes import SHAPES, stretch_of
-from psfcore.scatter.validation.cross_validation import bands, draws, shared_fits
+from psfcore.scatter.validation.bands import bands
+from psfcore.scatter.validation.cross_validation import bootstrap_samples, shared_fits
 from psfcore.simulate.bound import photon_bound
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
@@ -108,7 +109,7 @@ def banded(seed: int, size: int, images: int) -> dict[str, Any]:
     kernel, truth = diffraction(min(2 * size, REACH_GRID_PX)), drawn_truth(seed)
     solution = invert(simulate(default_plan(images, size), truth, kernel, seed).transit)
     radii = solution.inversion.radii_px
-    found = bands(shared_fits(solution, draws(images, seed=seed)), radii)
+    found = bands(shared_fits(solution, bootstrap_samples(images, seed=seed)), radii)
     true_curve = cumulative_curve(total_kernel(truth, kernel, REACH_GRID_PX), radii)
     return {
         "radii": radii.tolist(),
@@ -122,7 +123,9 @@ def shaped(seed: int, size: int, images: int) -> dict[str, Any]:
     """One seed: shapes by their held-out errors, and the free fit beside the power law in a cross-validation."""
     kernel, truth = diffraction(min(2 * size, REACH_GRID_PX)), drawn_truth(seed)
     solution = invert(simulate(default_plan(images, size), truth, kernel, seed).transit)
-    found = bands(shared_fits(solution, draws(images, seed=seed)), solution.inversion.radii_px).shells
+    found = bands(
+        shared_fits(solution, bootstrap_samples(images, seed=seed)), solution.inversion.radii_px
+    ).shells
     assert found is not None
     return {
         "seed": seed,

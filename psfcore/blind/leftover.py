@@ -94,9 +94,9 @@ class LinearEstimator:
         rows, columns = np.nonzero(fully_dark(shape, frame.place, DARK_MARGIN_PX))
         dark = (rows, columns)
         observed = self._optics.lanes(frame.pixels)
-        scene = self._optics.undo(observed)
+        scene = self._optics.invert(observed)
         lit = _blanked(scene, dark)
-        expected = pick(self._optics.see(lit), dark)
+        expected = pick(self._optics.convolve(lit), dark)
         level = np.maximum(expected, _LEAST_LEVEL * expected.mean())
         return _Discs(
             dark=dark,
@@ -108,15 +108,15 @@ class LinearEstimator:
 
     def _answer(self, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
         """A column of A: the PSF's change seen, and the change of the scene that it brings, seen."""
-        changed = slope.see(lit)
-        scene = _blanked(self._optics.undo_once(changed), dark)
-        return pick(changed, dark) - pick(self._optics.see(scene), dark)
+        changed = slope.convolve(lit)
+        scene = _blanked(self._optics.invert_once(changed), dark)
+        return pick(changed, dark) - pick(self._optics.convolve(scene), dark)
 
     def _residual(self, n: int, pixels: Plane) -> tuple[Vector, Vector]:
         disc = self._discs[n]
         observed = self._optics.lanes(pixels)
-        scene = self._optics.undo(observed, disc.scene, steps=_WARM_STEPS)
-        expected = pick(self._optics.see(_blanked(scene, disc.dark)), disc.dark)
+        scene = self._optics.invert(observed, disc.scene, steps=_WARM_STEPS)
+        expected = pick(self._optics.convolve(_blanked(scene, disc.dark)), disc.dark)
         return pick(observed, disc.dark) - expected, expected
 
     def _refitted(self, residuals: Mapping[int, Vector]) -> dict[int, Vector]:

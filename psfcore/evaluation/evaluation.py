@@ -1,20 +1,20 @@
-"""How good a PSF is: the light that it puts into the occulter, beside the light observed there.
+"""Evaluate a PSF: simulate the light that it scatters into the occulter, and compare it with the observed light.
 
 Hofmeister et al., The point-spread function of HRI_EUV, sections "Accuracy and robustness" and "Evaluation". With H
 a total PSF on the field, y an image and D its pixels that are fully dark:
 
     x = H^-1 y,   s = H (1 - D) x                              Eq. (1)
-    PE = (s - y) / mean over D of y, a pixel of D at a time    Eq. (2)
+    PE = (s - y) / mean over D of y, for each pixel of D       Eq. (2)
     residual = mean over D of PE                               Eq. (3)
 
-Departures from the paper: its formula of the PE divides by the sum over the occulted pixels, its prose and figures
-need the mean, which is used here; only what is fully dark is blanked; the scene is reconstructed linearly. The
-residual at the centre is the mean PE within CENTRE_PX: its denominator is that of the whole disc too, because the
-mean of a dozen pixels of a dozen photons each, as a denominator, would push errors up by their noise squared.
+Differences from the paper: its formula of the PE divides by the sum over the occulted pixels, but its text and figures
+require the mean, which is used here. Only fully dark pixels are set to zero. The scene is reconstructed by a linear
+method. The residual at the centre is the mean PE within CENTRE_PX, so its denominator is the mean of the whole disc: a
+mean of a dozen pixels with a dozen photons each would be too noisy as a denominator and would bias the residual high.
 
-Noise is that of the image's photons and readout, carried through Eq. (1): exactly where it is a standard error of a
-mean (`noise_transfer`), and by drawing more noise at the intensity observed, and simulated in D, for single pixels.
-That of the PSF is not among it.
+Errors contain the photon and read noise of the image, propagated through Eq. (1). For means they are exact
+(`noise_transfer`). For single pixels they come from noise realisations at the observed intensity, and in D at the
+simulated intensity. They do not contain the error of the PSF.
 
 | symbol | name | unit |
 |---|---|---|
@@ -44,17 +44,18 @@ from psfcore.transit.transit import Frame, Kernel, Transit
 Vector = NDArray[np.float64]
 Plane = NDArray[np.float64]
 
-LEAST_DEPTH = 0.2  # less than the inversion's: a PSF without scatter expects far more to be missing than is
+# Lower than the limit of the inversion, because a PSF without scatter predicts a much darker disc than observed.
+LEAST_DEPTH = 0.2
 SLICE_HALF_PX = 20
 SLICES_A_POINTING = 3
-DRAWS = 4
-UNDO_STEPS = 6
+NOISE_REALISATIONS = 4
+INVERSION_STEPS = 6
 _SCENES_KEPT = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A PSF, or one a fold, on all images of a transit. left_out: images that took no part, with the reason."""
+    """One PSF, or one per fold, evaluated on all images of a transit. left_out: images not evaluated, with reasons."""
 
     transit: Transit
     frames: tuple[FrameEvaluation, ...]
@@ -66,50 +67,52 @@ def evaluate(
     transit: Transit,
     psf_for_frame: Callable[[int], Kernel],
     *,
-    draws: int = DRAWS,
+    noise_realisations: int = NOISE_REALISATIONS,
     seed: int = 1,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evaluation:
-    """Simulate the light in every occulter of a transit and compare it with what was observed.
+    """Simulate the light in every occulter of a transit, and compare it with the observed light.
 
-    psf_for_frame: the total PSF [y, x] for a frame's index, centre at [n // 2, n // 2]; frames that are given the
-    same array share its preparation. An image's neighbours in time, which show where its occulter is, are
-    reconstructed with its own PSF too, so that a fold's images never meet another fold's PSF. draws: of noise, for
-    what noise alone does to the superposed maps; from `seed`.
+    psf_for_frame: the total PSF [y, x] for the index of a frame, centre at [n // 2, n // 2]. Frames with the same array
+    object share its preparation. The neighbours in time of an image, which help to locate its occulter, are
+    reconstructed with the PSF of that image. So an image of one fold never depends on the PSF of another fold.
+    noise_realisations: how many show the effect of noise alone on the superposed maps. seed: of these.
 
-    Raises DataError "no-occulter" where no image has one that can be looked at.
+    Raises DataError "no-occulter" if no image can be evaluated.
     """
     kernels = [psf_for_frame(n) for n in range(len(transit.frames))]
-    superposition = Superposition(max(frame.place.radius_px for frame in transit.frames), draws)
+    superposition = Superposition(max(frame.place.radius_px for frame in transit.frames), noise_realisations)
     sliced = _sliced(transit.frames)
     done: dict[int, FrameEvaluation] = {}
     left_out: dict[str, str] = {}
     for indices in _sharing(kernels):
-        look = _Look(transit, kernels[indices[0]], threads)
+        simulator = _FrameSimulator(transit, kernels[indices[0]], threads)
         for n in indices:
             progress("evaluating", len(done) + len(left_out), len(kernels))
             frame = transit.frames[n]
-            found, dark = look.find(n)
+            found, dark = simulator.find(n)
             reason = _reason(frame, found, dark)
             if reason is not None:
                 left_out[frame.file] = reason
                 continue
-            simulated = look.simulated(n, dark)
-            done[n] = _compared(look, n, found, dark, simulated, sliced=n in sliced)
+            simulated = simulator.simulated(n, dark)
+            done[n] = _compared(simulator, n, found, dark, simulated, sliced=n in sliced)
             rng = np.random.default_rng([seed, n])
-            noise = [look.noise_alone(n, dark, simulated, rng) for _ in range(draws)]
+            noise = [simulator.noise_alone(n, dark, simulated, rng) for _ in range(noise_realisations)]
             share = 100 / done[n].observed_dn_s
             superposition.add(found.place, dark, done[n].pe_pct, [share * r for r in noise])
     if not done:
         reasons = "; ".join(f"{file}: {why}" for file, why in list(left_out.items())[:3])
-        raise DataError("no-occulter", f"expected an image with an occulter in it; got none ({reasons})")
+        raise DataError(
+            "no-occulter", f"expected at least one image with a usable occulter; got none ({reasons})"
+        )
     frames = tuple(done[n] for n in sorted(done))
     return Evaluation(transit, frames, left_out, superposition.superposed())
 
 
 def _sharing(kernels: Sequence[Kernel]) -> list[list[int]]:
-    """Indices of the frames that share a kernel, in the order of their first."""
+    """Groups of frame indices with the same kernel, ordered by their first frame."""
     groups: dict[int, list[int]] = {}
     for n, kernel in enumerate(kernels):
         groups.setdefault(id(kernel), []).append(n)
@@ -117,7 +120,7 @@ def _sharing(kernels: Sequence[Kernel]) -> list[list[int]]:
 
 
 def _sliced(frames: Sequence[Frame]) -> set[int]:
-    """Frames whose slices are kept: SLICES_A_POINTING spread evenly over the images of each pointing."""
+    """Frames whose slices are kept: SLICES_A_POINTING per pointing, evenly spaced in its images."""
     chosen: set[int] = set()
     for fov in {frame.fov for frame in frames}:
         here = [n for n, frame in enumerate(frames) if frame.fov == fov]
@@ -126,8 +129,8 @@ def _sliced(frames: Sequence[Frame]) -> set[int]:
     return chosen
 
 
-class _Look:
-    """The frames of a transit as seen with one PSF."""
+class _FrameSimulator:
+    """Simulates the frames of a transit with one PSF."""
 
     def __init__(self, transit: Transit, kernel: Kernel, threads: int) -> None:
         self.transit, self.kernel = transit, kernel
@@ -135,7 +138,7 @@ class _Look:
         self._scenes = _Scenes(transit, self.optics)
 
     def find(self, n: int) -> tuple[FoundPlace, Pixels]:
-        """Where the occulter of frame n is, and which pixels are fully dark."""
+        """The position of the occulter of frame n, and its fully dark pixels."""
         frames = self.transit.frames
         places = [frame.place for frame in frames]
         found = find_occulter(n, frames, self._scenes, places, self.kernel, self.transit.noise)
@@ -145,24 +148,24 @@ class _Look:
         """s of Eq. (1), [y, x]."""
         scene = self._scenes[n].copy()
         scene[dark] = 0.0
-        return self.optics.field(self.optics.see(self.optics.lanes(scene)))
+        return self.optics.field(self.optics.convolve(self.optics.lanes(scene)))
 
     def noise_alone(
         self, n: int, dark: Pixels, simulated: NDArray[np.float32], rng: np.random.Generator
     ) -> Vector:
-        """One more draw of a frame's noise through Eq. (1): s - y in D, DN/s, where the PSF is right."""
+        """s - y in D, DN/s, for one realisation of a frame's noise and a perfect PSF, by Eq. (1)."""
         frame, optics = self.transit.frames[n], self.optics
         expected = frame.pixels.astype(np.float64)
         expected[dark] = simulated[dark]
         expected = np.maximum(expected, 0.0)
-        drawn = self.transit.noise.observe(expected, frame.exposure_s, rng) - expected
-        scene = optics.undo_once(optics.lanes(drawn))
+        noise = self.transit.noise.observe(expected, frame.exposure_s, rng) - expected
+        scene = optics.invert_once(optics.lanes(noise))
         put(scene, dark, 0.0)
-        return pick(optics.see(scene), dark) - drawn[dark]
+        return pick(optics.convolve(scene), dark) - noise[dark]
 
 
 class _Scenes(Sequence[NDArray[np.float32]]):
-    """Reconstructed frames [y, x], each when it is asked for; the last few are kept."""
+    """Reconstructed frames [y, x]. Each is computed on access, and the most recent ones are cached."""
 
     def __init__(self, transit: Transit, optics: Optics) -> None:
         self._transit, self._optics = transit, optics
@@ -175,28 +178,28 @@ class _Scenes(Sequence[NDArray[np.float32]]):
         scene = self._kept.pop(index, None)
         if scene is None:
             observed = self._optics.lanes(self._transit.frames[index].pixels)
-            scene = self._optics.field(self._optics.undo(observed, steps=UNDO_STEPS))
+            scene = self._optics.field(self._optics.invert(observed, steps=INVERSION_STEPS))
             if len(self._kept) >= _SCENES_KEPT:
                 self._kept.pop(next(iter(self._kept)))
-        self._kept[index] = scene  # last asked for, last to go
+        self._kept[index] = scene  # the most recent scene is dropped last
         return scene
 
 
 def _reason(frame: Frame, found: FoundPlace, dark: Pixels) -> str | None:
-    """Why an image takes no part, or None."""
+    """Why an image cannot be evaluated; None if it can."""
     where = f"({frame.place.x_px:g}, {frame.place.y_px:g}) px"
     if not found.within_reach or found.depth + DOUBT_SIGMAS * found.depth_sigma < LEAST_DEPTH:
-        return f"expected an occulter at {where}; found none there"
+        return f"expected an occulter at {where}; found no occulter there"
     if dark[0].size < LEAST_DARK_PIXELS:
         return f"expected at least {LEAST_DARK_PIXELS} fully dark pixels; got {dark[0].size}"
     observed = float(frame.pixels[dark].mean(dtype=np.float64))
     if observed <= 0:
-        return f"expected some light in the occulter at {where}; got {observed:.3g} DN/s in the mean"
+        return f"expected a positive mean intensity in the occulter at {where}; got {observed:.3g} DN/s"
     return None
 
 
 def _compared(
-    look: _Look,
+    simulator: _FrameSimulator,
     n: int,
     found: FoundPlace,
     dark: Pixels,
@@ -204,8 +207,8 @@ def _compared(
     *,
     sliced: bool,
 ) -> FrameEvaluation:
-    frame = look.transit.frames[n]
-    noise, centre_noise = _standard_errors(look.optics, frame, dark, found, look.transit.noise)
+    frame = simulator.transit.frames[n]
+    noise, centre_noise = _standard_errors(simulator.optics, frame, dark, found, simulator.transit.noise)
     along_x, along_y = _slices(frame, found, dark, simulated) if sliced else (None, None)
     return FrameEvaluation(
         index=n,
@@ -226,7 +229,7 @@ def _compared(
 def _standard_errors(
     optics: Optics, frame: Frame, dark: Pixels, found: FoundPlace, noise: Noise
 ) -> tuple[float, float]:
-    """Of the mean of s - y over the dark pixels, and over those at the centre (nan where there is none)."""
+    """Standard errors of the mean of s - y: over the dark pixels, and over those at the centre (nan without any)."""
     at = at_centre(dark, found)
     templates = [np.full(at.size, 1 / at.size), at / max(int(np.count_nonzero(at)), 1)]
     disc, centre = np.sqrt(np.diag(noise_covariance(optics, frame, dark, templates, noise)))
@@ -236,7 +239,7 @@ def _standard_errors(
 def _slices(
     frame: Frame, found: FoundPlace, dark: Pixels, simulated: NDArray[np.float32]
 ) -> tuple[Slice, Slice]:
-    """The row and the column nearest to the occulter's centre, cut to the field."""
+    """The row and the column nearest to the centre of the occulter, cropped to the field."""
     is_dark = np.zeros(simulated.shape, bool)
     is_dark[dark] = True
     y, x = round(found.place.y_px), round(found.place.x_px)

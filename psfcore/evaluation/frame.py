@@ -1,4 +1,7 @@
-"""One image under evaluation: the light in its occulter as observed and as simulated. See `evaluation`.
+"""The evaluation of one image: observed and simulated light in its occulter.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Evaluation". The equations of
+`psfcore.evaluation.evaluation` apply.
 
 | symbol | name | unit |
 |---|---|---|
@@ -24,9 +27,9 @@ CENTRE_PX = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """A row or a column through the middle of an occulter: offsets from its centre (px), intensities in DN/s.
+    """A row or a column through the centre of an occulter: offsets from the centre (px), intensities (DN/s).
 
-    dark: which of its pixels are fully dark.
+    dark: mask of its fully dark pixels.
     """
 
     offset_px: Vector
@@ -37,11 +40,11 @@ class Slice:
 
 @dataclass(frozen=True, eq=False)
 class FrameEvaluation:
-    """One image: the light in its occulter as observed and as simulated, DN/s.
+    """Observed and simulated light in the occulter of one image, DN/s.
 
-    observed, simulated: of the dark pixels, in the order of `dark`. noise, centre_noise: standard errors of the mean
-    of their difference, over all of them and at the centre; nan where the centre is not among them. along_x,
-    along_y: slices, of some images.
+    observed, simulated: of the dark pixels, in the order of `dark`. noise_dn_s, centre_noise_dn_s: standard errors of
+    the mean difference, over all dark pixels and over those at the centre; nan if none is at the centre. along_x,
+    along_y: slices; None for most images.
     """
 
     index: int
@@ -59,37 +62,37 @@ class FrameEvaluation:
 
     @property
     def observed_dn_s(self) -> float:
-        """Mean over the dark pixels."""
+        """Mean observed intensity of the dark pixels."""
         return float(self.observed.mean())
 
     @property
     def simulated_dn_s(self) -> float:
-        """Mean over the dark pixels."""
+        """Mean simulated intensity of the dark pixels."""
         return float(self.simulated.mean())
 
     @property
     def error_dn_s(self) -> float:
-        """Simulated minus observed, mean over the dark pixels."""
+        """Mean of simulated minus observed intensity of the dark pixels."""
         return self.simulated_dn_s - self.observed_dn_s
 
     @property
     def pe_pct(self) -> Vector:
-        """PE, percent, a dark pixel at a time."""
+        """PE of each dark pixel, percent, Eq. (2)."""
         return 100 * (self.simulated - self.observed) / self.observed_dn_s
 
     @property
     def residual_pct(self) -> float:
-        """Mean PE over the dark pixels, percent."""
+        """Mean PE over the dark pixels, percent, Eq. (3)."""
         return 100 * self.error_dn_s / self.observed_dn_s
 
     @property
     def noise_pct(self) -> float:
-        """Standard error of the residual."""
+        """Standard error of the residual, percent."""
         return 100 * self.noise_dn_s / self.observed_dn_s
 
     @property
     def centre_dn_s(self) -> tuple[float, float]:
-        """Observed and simulated mean at the centre; nan where no dark pixel lies there."""
+        """Mean observed and mean simulated intensity at the centre; nan if no dark pixel is there."""
         at = at_centre(self.dark, self.found)
         if not at.any():
             return float("nan"), float("nan")
@@ -103,16 +106,16 @@ class FrameEvaluation:
 
     @property
     def centre_noise_pct(self) -> float:
-        """Standard error of the PE at the centre."""
+        """Standard error of the mean PE at the centre, percent."""
         return 100 * self.centre_noise_dn_s / self.observed_dn_s
 
     def residual_against_pct(self, plane: NDArray[np.floating]) -> float:
-        """The residual with an image [y, x] in place of the observed one: one without noise, where there is one."""
+        """The residual relative to another image [y, x], for example a simulated image without noise, percent."""
         wanted = float(np.mean(plane[self.dark], dtype=np.float64))
         return 100 * (self.simulated_dn_s - wanted) / wanted
 
 
 def at_centre(dark: Pixels, found: FoundPlace) -> NDArray[np.bool_]:
-    """Which of the dark pixels lie within CENTRE_PX of the occulter's centre."""
+    """Mask of the dark pixels within CENTRE_PX of the centre of the occulter."""
     place = found.place
     return np.asarray(np.hypot(dark[0] - place.y_px, dark[1] - place.x_px) <= CENTRE_PX)

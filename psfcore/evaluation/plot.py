@@ -1,4 +1,4 @@
-"""An evaluation as a picture: slices through discs, errors by place in the disc, by time and by detector place."""
+"""Plot an evaluation: slices through discs, and errors by position in the disc, by time and by detector position."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _OBSERVED, _SIMULATED = "#444444", "#c2402f"
 _POINTINGS = ("#1b4f8a", "#c2402f", "#2b8a6e", "#7b3fa0", "#8a6d00", "#5b5b5b")
 _OFFSETS = ("#12407a", "#5b9bd5", "#e39a5c", "#a3301b", "#6f4a9e", "#5b5b5b")
 _SLICES = 3
-_MANY_IMAGES = 60  # from which on points are drawn smaller
+_MANY_IMAGES = 60  # with this many images or more, markers are smaller
 _TITLE_LETTERS = 190
 
 
 def evaluation_png(
     evaluation: Evaluation, path: str | Path, *, title: str, study: DarkOffsetStudy | None = None
 ) -> None:
-    """Three rows of panels, and a fourth of dark offsets where they were tried. title: what was evaluated."""
+    """Three rows of panels, and a fourth with the dark offsets of `study`. title: names what was evaluated."""
     rows = 3 if study is None else 4
     figure = Figure(
         figsize=(16.0, 3.7 * rows + 0.9),
@@ -41,7 +41,7 @@ def evaluation_png(
         facecolor="white",
         layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, hspace=0.03, wspace=0.03),
     )
-    # The layout makes room for one title: its first line is empty, and the name stands there in bold.
+    # The layout reserves space for one title. Its first line is empty, and the name fills that line in bold.
     words = "\n".join(textwrap.wrap(sentence(evaluation), _TITLE_LETTERS))
     figure.suptitle(f"\n{words}", fontsize=11, color=INK, x=0.012, ha="left", linespacing=1.5)
     figure.text(0.012, 0.992, title, fontsize=14, color=INK, weight="bold", va="top")
@@ -75,7 +75,7 @@ def evaluation_png(
 
 
 def tidy(charts: Sequence[Any]) -> None:
-    """A light grid behind what is drawn, and no frame above it and to the right."""
+    """Draw a light grid behind the data, and remove the top and right spines."""
     for axes in charts:
         axes.set_axisbelow(True)
         axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
@@ -84,17 +84,19 @@ def tidy(charts: Sequence[Any]) -> None:
 
 
 def sentence(evaluation: Evaluation) -> str:
+    """A summary of the evaluation in two sentences."""
     whole, maps = summaries(evaluation)[-1], evaluation.superposed
     return (
-        f"{whole.images} images: simulated minus observed light in the occulter {whole.mean_pct:+.2f} % in the mean, "
-        f"{whole.rms_pct:.2f} % rms (noise of the images {whole.noise_pct:.2f} %), at most {whole.largest_pct:.2f} %. "
-        f"By pixel of the disc: MPE {maps.mpe_rms_pct:.2f} % rms (noise alone {maps.mpe_noise_rms_pct:.2f} %), "
-        f"MAPE {maps.mape_mean_pct:.2f} % (noise alone {maps.mape_noise_mean_pct:.2f} %)."
+        f"Residuals of {whole.images} images (simulated minus observed light in the occulter): mean "
+        f"{whole.mean_pct:+.2f} %, rms {whole.rms_pct:.2f} % (noise alone {whole.noise_pct:.2f} %), largest "
+        f"{whole.largest_pct:.2f} %. Errors per pixel of the disc: MPE {maps.mpe_rms_pct:.2f} % rms (noise alone "
+        f"{maps.mpe_noise_rms_pct:.2f} %), MAPE {maps.mape_mean_pct:.2f} % (noise alone "
+        f"{maps.mape_noise_mean_pct:.2f} %)."
     )
 
 
 def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
-    """One image a pointing, the middle one of those whose slices were kept; at most so many."""
+    """One image per pointing, the middle one of those with slices; at most `most` images."""
     kept = [f for f in evaluation.frames if f.along_x is not None]
     fovs = sorted({f.fov for f in kept})
     by_fov = [[f for f in kept if f.fov == fov] for fov in fovs]
@@ -102,7 +104,7 @@ def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
 
 
 def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
-    """Observed and simulated along x, and along y where there is room: its points are hollow."""
+    """Observed and simulated intensity along x (circles, solid line) and along y (squares, dashed line)."""
     assert frame.along_x is not None and frame.along_y is not None
     dark = frame.along_x.dark
     if dark.any():
@@ -110,14 +112,14 @@ def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
         axes.axvspan(inside.min() - 0.5, inside.max() + 0.5, color="#eeeeee", linewidth=0, zorder=0)
     _draw_slice(axes, frame.along_x, "along x", "o", _OBSERVED, "-", _SIMULATED)
     _draw_slice(axes, frame.along_y, "along y", "s", "#7d9cc0", (0, (4, 2)), "#1b4f8a")
-    # The disc is what is looked at: light outside may be a hundred times as bright.
+    # The axis is scaled to the disc, because light outside may be a hundred times brighter.
     middle = np.concatenate([s.observed[np.abs(s.offset_px) <= 14] for s in (frame.along_x, frame.along_y)])
     inner = np.concatenate([s.simulated[s.dark] for s in (frame.along_x, frame.along_y)])
     top = min(float(middle.max()), 4 * float(inner.max(initial=1e-9)))
     axes.set(
         xlim=(-20.5, 20.5),
         ylim=(min(0.0, float(middle.min())) - 0.05 * top, 1.45 * top),
-        xlabel="Offset from the occulter's centre (px)",
+        xlabel="Offset from the centre of the occulter (px)",
         ylabel="Intensity (DN/s)",
         title=f"Pointing {frame.fov}: {frame.file:.24}, {frame.time_s / 60:.0f} min",
     )
@@ -146,7 +148,7 @@ def _draw_slice(axes: Any, along: Slice, name: str, marker: str, face: str, dash
 
 
 def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
-    """Light at the centre by time, observed and simulated."""
+    """Observed and simulated light at the centre, by time."""
     minutes = minutes_of(frames)
     observed, simulated = np.array([f.centre_dn_s for f in frames]).T
     error = np.array([f.centre_noise_dn_s for f in frames])
@@ -155,20 +157,20 @@ def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     known = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in (observed, simulated)])
     if known.size:
         axes.set(yscale="log", ylim=(0.6 * known.min(), 2.5 * known.max()))
-    axes.set(xlabel="Time (min)", ylabel="Intensity (DN/s)", title="Light at the centre")
+    axes.set(xlabel="Time (min)", ylabel="Intensity (DN/s)", title="Light at the centre of the occulter")
     axes.legend(fontsize=9, loc="upper left", frameon=False)
 
 
 def draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
-    """MPE and its noise on one scale, MAPE and what noise alone gives on another."""
+    """Maps of the MPE and the MAPE, each beside the map of noise alone on the same scale."""
     mpe_top = max(maps.mpe_largest_pct, 1e-3)
     mape_top = max(float(np.nanmax([maps.mape_pct, maps.noise_mape_pct])), 1e-3)
     half = maps.half_px + 0.5
     for axes, values, title, limits, colours in (
         (panels[0], maps.mpe_pct, "MPE", (-mpe_top, mpe_top), CHANGE.with_extremes(bad="white")),
-        (panels[1], maps.noise_mpe_pct, "σ of the MPE from noise alone", (0.0, mpe_top), "viridis"),
+        (panels[1], maps.noise_mpe_pct, "σ of the MPE, noise alone", (0.0, mpe_top), "viridis"),
         (panels[2], maps.mape_pct, "MAPE", (0.0, mape_top), "viridis"),
-        (panels[3], maps.noise_mape_pct, "MAPE from noise alone", (0.0, mape_top), "viridis"),
+        (panels[3], maps.noise_mape_pct, "MAPE, noise alone", (0.0, mape_top), "viridis"),
     ):
         drawn = axes.imshow(
             values,
@@ -187,21 +189,23 @@ def draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
 def draw_residuals(
     axes: Any, frames: Sequence[FrameEvaluation], where: Vector, label: str, title: str
 ) -> None:
-    """Residuals with their noise, coloured by pointing."""
+    """Residuals with their noise, coloured by pointing. where: abscissa of each image; label: of that axis."""
     values = np.array([f.residual_pct for f in frames])
     noise = np.array([f.noise_pct for f in frames])
     draw_errors(axes, frames, where, values, noise)
-    axes.set(xlabel=label, ylabel="Simulated - observed (% of observed)", title=f"Residual {title}")
+    axes.set(xlabel=label, ylabel="Residual: simulated - observed (%)", title=f"Residual {title}")
 
 
 def draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
-    """Absolute errors by detector x: of bright discs and faint ones, so that the scale is linear only about 0."""
+    """Absolute errors by detector x. The scale is linear near 0 and logarithmic beyond, for bright and faint discs."""
     values = np.array([f.error_dn_s for f in frames])
     noise = np.array([f.noise_dn_s for f in frames])
     where = np.array([f.found.place.x_px for f in frames])
     draw_errors(axes, frames, where, values, noise)
     span = np.abs(values) + noise
-    linear = 10.0 ** np.ceil(np.log10(max(float(np.median(span)), 1e-6)))  # so that a label stands at its end
+    linear = 10.0 ** np.ceil(
+        np.log10(max(float(np.median(span)), 1e-6))
+    )  # a power of ten, so that its end has a tick label
     top = 4 * max(float(span.max()), linear)
     axes.set_yscale("symlog", linthresh=linear, linscale=1.0)
     axes.set(
@@ -215,7 +219,7 @@ def draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
 def draw_errors(
     axes: Any, frames: Sequence[FrameEvaluation], where: Vector, values: Vector, noise: Vector
 ) -> None:
-    """Errors of images with their noise, coloured by pointing; nan where an image has none."""
+    """Errors of images with their noise, coloured by pointing. Values of nan are not drawn."""
     fovs = np.array([f.fov for f in frames])
     axes.axhline(0, color="#555555", linewidth=1.0)
     for n, fov in enumerate(sorted(set(fovs.tolist()))):
@@ -238,7 +242,7 @@ def draw_errors(
 
 
 def draw_offsets(panels: Sequence[Any], study: DarkOffsetStudy) -> None:
-    """What offsets do to the weights, relative, and to the light beyond a distance, points."""
+    """Relative change of the weights by dark offsets, and change of the cumulative curves in percentage points."""
     weights, curve = panels
     for axes in panels:
         axes.axhline(0, color="#555555", linewidth=1.0)
@@ -248,14 +252,15 @@ def draw_offsets(panels: Sequence[Any], study: DarkOffsetStudy) -> None:
         weights.plot(study.radii_px, offset.weight_change_pct, label=name, **style)
         curve.plot(study.curve_radii_px, offset.curve_change_points, label=f"{name}, diffuse", **style)
         curve.plot(study.curve_radii_px, offset.total_curve_change_points, linestyle=(0, (1, 1.5)), **style)
-    curve.plot([], [], color="#777777", linestyle=(0, (1, 1.5)), label="total PSF, dotted")
+    curve.plot([], [], color="#777777", linestyle=(0, (1, 1.5)), label="total PSF (dotted)")
     weights.set(
         ylabel="Change of the diffuse weight (%)",
-        title=f"Dark offsets: weights, at most {study.largest_weight_change_pct:.1f} %",
+        title=f"Dark offsets: weights change by at most {study.largest_weight_change_pct:.1f} %",
     )
     curve.set(
-        ylabel="Change of the light beyond (points)",
-        title=f"Dark offsets: light beyond a distance, at most {study.largest_curve_change_points:.2f} points",
+        ylabel="Change of 1 - encircled energy (points)",
+        title="Dark offsets: 1 - encircled energy changes by at most "
+        f"{study.largest_curve_change_points:.2f} points",
     )
     for axes in panels:
         axes.set(xscale="log", xlabel="Distance (px)")
@@ -263,7 +268,7 @@ def draw_offsets(panels: Sequence[Any], study: DarkOffsetStudy) -> None:
 
 
 def minutes_of(frames: Sequence[FrameEvaluation]) -> Vector:
-    """When each image was taken, minutes from the first of the transit."""
+    """Time of each image in minutes from the first image of the transit."""
     return np.array([f.time_s for f in frames]) / 60
 
 

@@ -1,15 +1,18 @@
-"""An evaluation in numbers and in words: pointing by pointing, with the noise that is expected, and by detector place.
+"""Summarise an evaluation: errors per pointing with the expected noise, and trends over the detector.
+
+Hofmeister et al., The point-spread function of HRI_EUV, section "Evaluation".
 
     slope = sum w (u - <u>) e / sum w (u - <u>)^2,   <u> = sum w u / sum w,   w = 1 / noise^2    Eq. (1)
     its error = (sum w (u - <u>)^2)^(-1/2) max(1, chi2 / (N - 2))^(1/2)                          Eq. (2)
 
-Where errors scatter by more than noise about the line, the slope is as unsure as they show, Eq. (2). The occulter's
-x and y move together along its track: slopes against each are of the same images, and are not independent.
+If the errors scatter about the fitted line by more than noise, Eq. (2) increases the error of the slope accordingly.
+The occulter's x and y change together along its track. Slopes along x and y come from the same images and are not
+independent.
 
 | symbol | name | unit |
 |---|---|---|
 | u | detector x or y of the occulter | px |
-| e | residual, or absolute error | %, DN/s |
+| e | residual, or simulated - observed | %, DN/s |
 """
 
 from __future__ import annotations
@@ -30,16 +33,17 @@ from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 Vector = NDArray[np.float64]
 
 SCHEMA = "evaluation/1"
-TREND_PX = 100.0  # slopes are per so many pixels
+TREND_PX = 100.0  # slopes are given per this number of pixels
 LEAST_TREND_FRAMES = 3
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Errors of some images, percent of the observed mean unless the name says otherwise; fov None: of all.
+    """Errors of the images of one pointing, percent of the observed mean unless the name has another unit.
 
-    mean_noise, noise: standard error of the mean, and rms over images, as noise in the images makes them. gap: rms
-    with the noise taken out in quadrature. centre_...: of the PE at the centre.
+    fov: the pointing; None: all pointings. mean_noise_pct: standard error of the mean from image noise. noise_pct: rms
+    that image noise alone gives. gap_pct: rms with the noise subtracted in quadrature. centre_...: of the mean PE at the
+    centre.
     """
 
     fov: int | None
@@ -59,7 +63,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Slope:
-    """Change over TREND_PX pixels, and its standard error."""
+    """Change per TREND_PX pixels, and its standard error."""
 
     per_100_px: float
     sigma: float
@@ -67,7 +71,7 @@ class Slope:
 
 @dataclass(frozen=True)
 class Trend:
-    """How errors of a pointing change with the occulter's place on the detector."""
+    """Trend of the errors of one pointing with the position of the occulter on the detector."""
 
     fov: int
     against: Literal["x", "y"]
@@ -77,14 +81,14 @@ class Trend:
 
 
 def summaries(evaluation: Evaluation) -> tuple[Summary, ...]:
-    """One of each pointing, in order, and last that of all images."""
+    """One summary per pointing, in order, and a last one for all images."""
     fovs = sorted({frame.fov for frame in evaluation.frames})
     parts = [summary_of([f for f in evaluation.frames if f.fov == fov], fov) for fov in fovs]
     return (*parts, summary_of(evaluation.frames, None))
 
 
 def summary_of(frames: Sequence[FrameEvaluation], fov: int | None) -> Summary:
-    """The errors of some images."""
+    """Summary of the errors of these images."""
     residual, noise = _each(frames, "residual_pct"), _each(frames, "noise_pct")
     error = _each(frames, "error_dn_s")
     centre, centre_noise = _each(frames, "centre_pct"), _each(frames, "centre_noise_pct")
@@ -107,7 +111,7 @@ def summary_of(frames: Sequence[FrameEvaluation], fov: int | None) -> Summary:
 
 
 def trends(evaluation: Evaluation) -> tuple[Trend, ...]:
-    """Slopes against x and y of every pointing with at least LEAST_TREND_FRAMES images whose places differ."""
+    """Slopes along x and y, for pointings with at least LEAST_TREND_FRAMES images at different positions."""
     found = []
     for fov in sorted({frame.fov for frame in evaluation.frames}):
         frames = [f for f in evaluation.frames if f.fov == fov]
@@ -124,7 +128,7 @@ def trends(evaluation: Evaluation) -> tuple[Trend, ...]:
 
 
 def slope_of(where_px: Vector, error: Vector, noise: Vector) -> Slope:
-    """Eq. (1) and (2), over TREND_PX pixels."""
+    """Eq. (1) and (2), per TREND_PX pixels."""
     weight = noise**-2.0
     u = where_px - np.sum(weight * where_px) / weight.sum()
     spread = float(np.sum(weight * u**2))
@@ -146,7 +150,7 @@ def _rms(values: Vector) -> float:
 
 
 def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict[str, Any]:
-    """JSON-able: summaries, trends, one image a line, maps, slices and, where given, what dark offsets do."""
+    """The evaluation as JSON: summaries, trends, every image, maps, slices and the dark offsets of `study`."""
     *pointings, whole = (_plain(asdict(summary)) for summary in summaries(evaluation))
     out: dict[str, Any] = {
         "schema": SCHEMA,
@@ -253,7 +257,7 @@ def _rows(values: Vector) -> list[list[float | None]]:
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Without what is no number in JSON."""
+    """Replace nan and infinity, which JSON lacks, by None."""
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
 
@@ -261,29 +265,29 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def lines(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> list[str]:
-    """A short table for people."""
+    """A short table in plain text."""
     maps = evaluation.superposed
-    out = ["simulated minus observed light in the occulter, percent of what was observed:"]
+    out = ["residuals: simulated minus observed light in the occulter, percent of the observed mean"]
     out += [_line(summary) for summary in summaries(evaluation)]
     out.append(
-        f"by pixel of the disc: MPE {maps.mpe_rms_pct:.2f} % rms, {maps.mpe_largest_pct:.2f} % at most "
+        f"errors per pixel of the disc: MPE {maps.mpe_rms_pct:.2f} % rms, largest {maps.mpe_largest_pct:.2f} % "
         f"(noise alone {maps.mpe_noise_rms_pct:.2f} % rms); MAPE {maps.mape_mean_pct:.2f} % "
         f"(noise alone {maps.mape_noise_mean_pct:.2f} %)"
     )
     out += [
-        f"pointing {t.fov} along {t.against}: {t.relative_pct.per_100_px:+.2f} +- {t.relative_pct.sigma:.2f} %, "
-        f"{t.absolute_dn_s.per_100_px:+.3g} +- {t.absolute_dn_s.sigma:.2g} DN/s in {TREND_PX:g} px"
+        f"trend of pointing {t.fov} along {t.against}, per {TREND_PX:g} px: {t.relative_pct.per_100_px:+.2f} +- "
+        f"{t.relative_pct.sigma:.2f} %, {t.absolute_dn_s.per_100_px:+.3g} +- {t.absolute_dn_s.sigma:.2g} DN/s"
         for t in trends(evaluation)
     ]
     if study is not None:
         tried = ", ".join(f"{o.offset_dn:+g}" for o in study.offsets)
         out.append(
-            f"dark offsets of {tried} DN: diffuse weights change by at most "
-            f"{study.largest_weight_change_pct:.1f} %, the light beyond any distance by at most "
-            f"{study.largest_curve_change_points:.2f} points"
+            f"dark offsets of {tried} DN change diffuse weights by at most "
+            f"{study.largest_weight_change_pct:.1f} %, and the diffuse light beyond any distance by at most "
+            f"{study.largest_curve_change_points:.2f} percentage points"
         )
     if evaluation.left_out:
-        out.append(f"left out: {len(evaluation.left_out)} images")
+        out.append(f"images that could not be evaluated: {len(evaluation.left_out)}")
         out += [f"  {file}: {reason}" for file, reason in evaluation.left_out.items()]
     return out
 
@@ -292,6 +296,6 @@ def _line(of: Summary) -> str:
     name = "all pointings" if of.fov is None else f"pointing {of.fov}"
     centre = "" if math.isnan(of.centre_mean_pct) else f"; centre {of.centre_mean_pct:+.2f} %"
     return (
-        f"{name}: {of.images} images, mean {of.mean_pct:+.2f} % (noise {of.mean_noise_pct:.2f}), "
-        f"rms {of.rms_pct:.2f} % (noise {of.noise_pct:.2f}), at most {of.largest_pct:.2f} %{centre}"
+        f"{name}: {of.images} images, mean {of.mean_pct:+.2f} % (noise {of.mean_noise_pct:.2f} %), "
+        f"rms {of.rms_pct:.2f} % (noise {of.noise_pct:.2f} %), largest {of.largest_pct:.2f} %{centre}"
     )

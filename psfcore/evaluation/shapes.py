@@ -1,15 +1,20 @@
-"""Shapes of scatter compared by the errors that each leaves in images which it was not fitted to.
+"""Compare shapes of scatter by their errors on held-out images.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness": the isotropic fit, one
-stretched along x and one stretched along any direction, by the MPE and MAPE of all occulters laid on one another;
-here also free shells. Each shape is fitted to all images, each fold's PSF is one step from there (Eq. (1) of
+Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", compares three shapes by the
+MPE and MAPE of all superposed occulters: isotropic, stretched along x, and stretched along any direction. Free shells
+are added here. Each shape is fitted to all images. The PSF of a fold is one step from that fit (Eq. (1) of
 `psfcore.scatter.validation.cross_validation`), and every image is simulated with the PSF of the fold that holds it out.
 
-Errors are those of drawing the images again with repetition. All shapes see the same images, so that their
-differences are known far better than the figures themselves. Images that follow one another share a fold: where an
-error lasts over several images, the errors here are too small.
+Errors come from a bootstrap of the images. All shapes use the same images, so their differences are much better known
+than the figures themselves. Consecutive images share a fold. If an error persists over several images, the bootstrap
+errors are too small.
 
-    MPE rms = rms over the disc of the mean over images of PE,   MAPE mean = mean over the disc of the mean of |PE|
+    MPE rms = rms over the disc of (mean over images of PE)                     Eq. (1)
+    MAPE mean = mean over the disc of (mean over images of |PE|)                Eq. (2)
+
+| symbol | name | unit |
+|---|---|---|
+| MPE rms, MAPE mean | mpe_rms_pct, mape_mean_pct | % of the observed mean |
 """
 
 from __future__ import annotations
@@ -27,7 +32,7 @@ from psfcore.evaluation.frame import FrameEvaluation
 from psfcore.evaluation.superposed import LEAST_SHARE
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
-from psfcore.scatter.validation.cross_validation import Draw, shared_step
+from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
 from psfcore.scatter.validation.free_shells import free_kernel, free_shares, law_light
 from psfcore.transit.blocks import folds
 from psfcore.transit.transit import Kernel
@@ -36,17 +41,17 @@ Floats = NDArray[np.float64]
 
 FREE_SHELLS = "free-shells"
 STRETCHED = ("stretched-along-x", "stretched")
-RESAMPLES = 1000
+BOOTSTRAP_SAMPLES = 1000
 FIGURES = ("residual_mean_pct", "residual_rms_pct", "mpe_rms_pct", "mape_mean_pct")
 KernelOf = Callable[[int], Kernel]
 
 
 @dataclass(frozen=True)
 class ShapeErrors:
-    """What one shape leaves: FIGURES by name, each a value and its error, percent of the observed mean.
+    """Held-out errors of one shape: FIGURES by name, each with its value and error, percent of the observed mean.
 
-    minus_first: the same for this shape's figures less those of the softened power law. parameters: of the fit to all
-    images, value and error; none for free shells.
+    minus_first: the same for the difference from the softened power law. parameters: of the fit to all images, value
+    and error; empty for free shells.
     """
 
     name: str
@@ -66,7 +71,7 @@ class ShapeErrors:
 
 @dataclass(frozen=True)
 class ShapesByErrors:
-    """All shapes on the same images, the softened power law first."""
+    """All shapes on the same images; the softened power law is first."""
 
     images: int
     folds: int
@@ -77,17 +82,17 @@ class ShapesByErrors:
         return {
             "images": self.images,
             "folds": self.folds,
-            "resamples": RESAMPLES,
+            "resamples": BOOTSTRAP_SAMPLES,
             "shapes": [shape.to_json() for shape in self.shapes],
         }
 
     def lines(self) -> list[str]:
-        """A short table for people."""
-        head = f"{'held-out errors of shapes (%)':<30}{'residual rms':>16}{'MPE rms':>16}{'MAPE mean':>16}"
+        """A short table in plain text."""
+        head = f"{'errors on held-out images (%)':<30}{'residual rms':>16}{'MPE rms':>16}{'MAPE mean':>16}"
         out = [head]
         for shape in self.shapes:
             out.append(f"  {shape.name:<28}" + "".join(_cell(shape.figures[k]) for k in FIGURES[1:]))
-        out.append(f"less those of {self.shapes[0].name}")
+        out.append(f"difference from {self.shapes[0].name}")
         for shape in self.shapes[1:]:
             out.append(f"  {shape.name:<28}" + "".join(_cell(shape.minus_first[k], "+") for k in FIGURES[1:]))
         return out
@@ -104,32 +109,36 @@ def _named(figures: dict[str, tuple[float, float]]) -> dict[str, dict[str, float
 def compare_shapes_by_errors(
     solution: Solution, *, seed: int = 1, progress: Progress = lambda stage, step, steps: None
 ) -> ShapesByErrors:
-    """The softened power law that `solution` fitted to all images, both stretched ones, and free shells.
+    """Compare the softened power law of `solution` with both stretched shapes and with free shells.
 
-    seed: of the images drawn again. Raises DataError "unknown-shape" where `solution` is of another shape,
-    "too-few-frames" where there are too few images for two folds, and as `inversion.invert` and `evaluate`.
+    seed: of the bootstrap. Raises DataError "unknown-shape" if `solution` has another shape, "too-few-frames" if there
+    are too few images for two folds, and as `invert` and `evaluate` do.
     """
     if solution.inversion.shape.name != SOFTENED_POWER_LAW.name:
         raise DataError(
             "unknown-shape",
             f"expected a fit of {SOFTENED_POWER_LAW.name}; got {solution.inversion.shape.name}",
         )
-    draws = _fold_draws(len(solution.transit.frames))
+    samples = _fold_samples(len(solution.transit.frames))
     named: dict[str, tuple[Solution | None, KernelOf]] = {
-        SOFTENED_POWER_LAW.name: (solution, _fold_kernels(solution, draws))
+        SOFTENED_POWER_LAW.name: (solution, _fold_kernels(solution, samples))
     }
     for name in STRETCHED:
         stretched = _fit_of(solution, name, progress)
-        named[name] = stretched, _fold_kernels(stretched, draws)
-    named[FREE_SHELLS] = None, _free_fold_kernels(solution, draws, progress)
-    looks = {name: _looked(solution, kernel_of, name, progress) for name, (_, kernel_of) in named.items()}
-    images = sorted(set.intersection(*(set(look) for look in looks.values())))
-    drawn = _drawn_again(len(images), seed)
-    found = {name: _figures([look[n] for n in images], drawn) for name, look in looks.items()}
+        named[name] = stretched, _fold_kernels(stretched, samples)
+    named[FREE_SHELLS] = None, _free_fold_kernels(solution, samples, progress)
+    evaluations = {
+        name: _evaluated(solution, kernel_of, name, progress) for name, (_, kernel_of) in named.items()
+    }
+    images = sorted(set.intersection(*(set(evaluation) for evaluation in evaluations.values())))
+    counts = _bootstrap_counts(len(images), seed)
+    found = {
+        name: _figures([evaluation[n] for n in images], counts) for name, evaluation in evaluations.items()
+    }
     first = found[SOFTENED_POWER_LAW.name]
     return ShapesByErrors(
         images=len(images),
-        folds=len(draws),
+        folds=len(samples),
         shapes=tuple(
             ShapeErrors(
                 name=name,
@@ -143,7 +152,7 @@ def compare_shapes_by_errors(
 
 
 def _fit_of(solution: Solution, name: str, progress: Progress) -> Solution:
-    """Another shape fitted to all images, from where the power law's fit ended."""
+    """Another shape fitted to all images, starting from the fit of the power law."""
     shape = SHAPES[name]
 
     def said(stage: str, step: int, steps: int) -> None:
@@ -158,73 +167,75 @@ def _parameters(solution: Solution) -> dict[str, tuple[float, float]]:
     return {name: (values[name], sigma[name]) for name in values}
 
 
-def _fold_draws(images: int) -> tuple[Draw, ...]:
-    """One draw a fold, of each of its images once."""
+def _fold_samples(images: int) -> tuple[FoldSample, ...]:
+    """One sample per fold without bootstrap: each fitted image counts once."""
     parts = folds(images)
     if not parts:
-        raise DataError("too-few-frames", f"expected at least 6 images, to hold some out; got {images}")
+        raise DataError("too-few-frames", f"expected at least 6 images for held-out folds; got {images}")
     return tuple(
-        Draw(0, k, tuple(int(n in fold.fitted) for n in range(images)), fold.held_out)
+        FoldSample(0, k, tuple(int(n in fold.fitted) for n in range(images)), fold.held_out)
         for k, fold in enumerate(parts)
     )
 
 
-def _fold_kernels(solution: Solution, draws: tuple[Draw, ...]) -> KernelOf:
-    """The total PSF [y, x] of the fold that holds an image out."""
+def _fold_kernels(solution: Solution, samples: tuple[FoldSample, ...]) -> KernelOf:
+    """For each image, the total PSF [y, x] of the fold that holds it out."""
     at = solution.inversion.coordinates
-    kernels = [solution.total.kernel(at + shared_step(solution, draw)) for draw in draws]
-    return _by_image(draws, kernels)
+    kernels = [solution.total.kernel(at + shared_step(solution, sample)) for sample in samples]
+    return _by_image(samples, kernels)
 
 
-def _free_fold_kernels(solution: Solution, draws: tuple[Draw, ...], progress: Progress) -> KernelOf:
-    """The same of free shells."""
+def _free_fold_kernels(solution: Solution, samples: tuple[FoldSample, ...], progress: Progress) -> KernelOf:
+    """The same for free shells."""
     shape, diffraction = solution.inversion.shape, solution.transit.diffraction
     shares = free_shares(solution, solution.inversion.coordinates, progress=progress)
     kernels = []
-    for draw in draws:
-        at = solution.inversion.coordinates + shared_step(solution, draw)
-        free = shares.fit(draw.counts, law_light(shape, at))
+    for sample in samples:
+        at = solution.inversion.coordinates + shared_step(solution, sample)
+        free = shares.fit(sample.counts, law_light(shape, at))
         kernels.append(
             free_kernel(free, shape, at, diffraction, solution.total.size, threads=solution.threads)
         )
-    return _by_image(draws, kernels)
+    return _by_image(samples, kernels)
 
 
-def _by_image(draws: tuple[Draw, ...], kernels: list[Kernel]) -> KernelOf:
-    fold_of = {n: draw.fold for draw in draws for n in draw.held_out}
+def _by_image(samples: tuple[FoldSample, ...], kernels: list[Kernel]) -> KernelOf:
+    fold_of = {n: sample.fold for sample in samples for n in sample.held_out}
     return lambda n: kernels[fold_of[n]]
 
 
-def _looked(
+def _evaluated(
     solution: Solution, kernel_of: KernelOf, name: str, progress: Progress
 ) -> dict[int, FrameEvaluation]:
-    """Every image that can be looked at with its fold's PSF, by index."""
+    """The evaluation of every usable image with the PSF of its fold, by index."""
 
     def said(stage: str, step: int, steps: int) -> None:
         progress(f"{name}: {stage}", step, steps)
 
-    looked = evaluate(solution.transit, kernel_of, draws=0, threads=solution.threads, progress=said)
-    return {frame.index: frame for frame in looked.frames}
+    evaluation = evaluate(
+        solution.transit, kernel_of, noise_realisations=0, threads=solution.threads, progress=said
+    )
+    return {frame.index: frame for frame in evaluation.frames}
 
 
-def _drawn_again(images: int, seed: int) -> Floats:
-    """How often each image counts, (1 + RESAMPLES, images): first all of them once."""
+def _bootstrap_counts(images: int, seed: int) -> Floats:
+    """How often each image counts, (1 + BOOTSTRAP_SAMPLES, images). In the first row, each image counts once."""
     rng = np.random.default_rng(seed)
-    drawn = rng.multinomial(images, np.full(images, 1 / images), RESAMPLES)
-    return np.concatenate((np.ones((1, images)), drawn))
+    counts = rng.multinomial(images, np.full(images, 1 / images), BOOTSTRAP_SAMPLES)
+    return np.concatenate((np.ones((1, images)), counts))
 
 
-def _figures(frames: list[FrameEvaluation], drawn: Floats) -> Floats:
-    """FIGURES of all images and of each resample: (FIGURES, 1 + RESAMPLES)."""
+def _figures(frames: list[FrameEvaluation], counts: Floats) -> Floats:
+    """FIGURES of all images and of each bootstrap sample: (FIGURES, 1 + BOOTSTRAP_SAMPLES)."""
     maps = _maps(frames)
     dark = np.isfinite(maps)
     shown = dark.sum(axis=0) >= LEAST_SHARE * len(frames)
     pe, dark = np.nan_to_num(maps[:, shown]), dark[:, shown]
-    # A place that no image of a resample shows counts as one without error, in one resample of very many.
-    count = np.maximum(drawn @ dark, 1)
-    mpe, mape = drawn @ pe / count, drawn @ np.abs(pe) / count
+    # In rare samples no image shows a position. Its error then counts as 0.
+    count = np.maximum(counts @ dark, 1)
+    mpe, mape = counts @ pe / count, counts @ np.abs(pe) / count
     residual = np.array([frame.residual_pct for frame in frames])
-    share = drawn / len(frames)
+    share = counts / len(frames)
     return np.array(
         [
             share @ residual,
@@ -236,7 +247,7 @@ def _figures(frames: list[FrameEvaluation], drawn: Floats) -> Floats:
 
 
 def _maps(frames: list[FrameEvaluation]) -> Floats:
-    """PE of each image by the offset from the occulter's centre, to the nearest pixel, nan where it is not dark."""
+    """PE of each image by offset from the centre of the occulter, to the nearest pixel; nan where it is not dark."""
     half = int(np.ceil(max(frame.found.place.radius_px for frame in frames))) + 1
     maps = np.full((len(frames), 2 * half + 1, 2 * half + 1), np.nan)
     for of, frame in zip(maps, frames, strict=True):

@@ -1,13 +1,16 @@
-"""Errors of simulated scatter by their place in the occulter: all images of it laid on one another.
+"""Maps of the errors of simulated scatter by position in the occulter, with all discs superposed.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". Discs are registered to
-the nearest whole pixel: nothing is interpolated, so that noise stays what it is, and places are blurred by up to
-half a pixel on each axis.
+Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". Discs are aligned to the
+nearest whole pixel. No interpolation changes the noise, and positions are blurred by up to half a pixel per axis.
 
     MPE = mean over images of PE,   MAPE = mean over images of |PE|         Eq. (1)
 
-What noise alone gives is the same of draws of noise, a draw at a time: |noise| does not average out, so that MAPE
-says little without it.
+The same maps are computed from noise realisations, for comparison. |noise| does not average out, so the MAPE can only
+be interpreted relative to the MAPE of noise alone.
+
+| symbol | name | unit |
+|---|---|---|
+| MPE, MAPE | mpe_pct, mape_pct | % of the disc's mean |
 """
 
 from __future__ import annotations
@@ -25,15 +28,15 @@ from psfcore.transit.transit import Place
 Vector = NDArray[np.float64]
 Map = NDArray[np.float64]
 
-LEAST_SHARE = 0.5  # of the images, in which a place is dark, for it to be on the maps
+LEAST_SHARE = 0.5  # a position is on the maps if it is dark in at least this fraction of the images
 
 
 @dataclass(frozen=True, eq=False)
 class Superposed:
-    """Maps [y, x] by the offset from the occulter's centre, which is at [half_px, half_px]; nan off the disc.
+    """Maps [y, x] by offset from the centre of the occulter, which is at [half_px, half_px]; nan outside the disc.
 
-    images: how many discs were laid on one another; count: how many are dark at a place. noise_mpe_pct: standard
-    error of the MPE that noise alone makes; noise_mape_pct: the MAPE that it makes.
+    images: number of superposed discs. count: number of discs that are dark at a position. noise_mpe_pct: standard
+    error of the MPE from noise alone. noise_mape_pct: MAPE of noise alone.
     """
 
     images: int
@@ -45,7 +48,7 @@ class Superposed:
 
     @property
     def half_px(self) -> int:
-        """Index of the centre."""
+        """Index of the centre in both axes."""
         return self.count.shape[0] // 2
 
     @property
@@ -55,7 +58,7 @@ class Superposed:
 
     @property
     def mpe_noise_rms_pct(self) -> float:
-        """What noise alone makes of it."""
+        """Expected rms of the MPE from noise alone."""
         return _rms(self.noise_mpe_pct)
 
     @property
@@ -70,7 +73,7 @@ class Superposed:
 
     @property
     def mape_noise_mean_pct(self) -> float:
-        """What noise alone makes of it."""
+        """Expected mean of the MAPE from noise alone."""
         return float(np.nanmean(self.noise_mape_pct))
 
     @property
@@ -80,40 +83,43 @@ class Superposed:
 
 
 class Superposition:
-    """Sums over the images laid on one another so far. draws: of noise, with every image."""
+    """Running sums over superposed images. noise_realisations: their number for every image."""
 
-    def __init__(self, radius_px: float, draws: int) -> None:
+    def __init__(self, radius_px: float, noise_realisations: int) -> None:
         self._half = math.ceil(radius_px) + 1
         shape = (2 * self._half + 1, 2 * self._half + 1)
         self._images = 0
         self._count = np.zeros(shape, np.int64)
         self._pe, self._ape = np.zeros(shape), np.zeros(shape)
-        self._noise_pe, self._noise_ape = np.zeros((draws, *shape)), np.zeros((draws, *shape))
+        self._noise_pe, self._noise_ape = (
+            np.zeros((noise_realisations, *shape)),
+            np.zeros((noise_realisations, *shape)),
+        )
 
     def add(self, place: Place, dark: Pixels, pe_pct: Vector, noise_pe_pct: Sequence[Vector]) -> None:
-        """One more image: the PE of its dark pixels, and that of each draw of noise."""
+        """Add an image: the PE of its dark pixels, and the PE of each noise realisation."""
         at = dark[0] - round(place.y_px) + self._half, dark[1] - round(place.x_px) + self._half
         self._images += 1
         self._count[at] += 1
         self._pe[at] += pe_pct
         self._ape[at] += np.abs(pe_pct)
-        for draw, noise in enumerate(noise_pe_pct):
-            self._noise_pe[draw][at] += noise
-            self._noise_ape[draw][at] += np.abs(noise)
+        for k, noise in enumerate(noise_pe_pct):
+            self._noise_pe[k][at] += noise
+            self._noise_ape[k][at] += np.abs(noise)
 
     def superposed(self) -> Superposed:
-        """Eq. (1), where at least LEAST_SHARE of the images are dark."""
+        """The maps of Eq. (1), at positions that are dark in at least LEAST_SHARE of the images."""
         shown = self._count >= max(LEAST_SHARE * self._images, 1)
         count = np.where(shown, self._count, np.nan)
-        draws = max(len(self._noise_pe), 1)
-        noise_mpe = np.sqrt(np.sum((self._noise_pe / count) ** 2, axis=0) / draws)
+        realisations = max(len(self._noise_pe), 1)
+        noise_mpe = np.sqrt(np.sum((self._noise_pe / count) ** 2, axis=0) / realisations)
         return Superposed(
             images=self._images,
             count=self._count,
             mpe_pct=self._pe / count,  # Eq. (1)
             mape_pct=self._ape / count,  # Eq. (1)
             noise_mpe_pct=noise_mpe,
-            noise_mape_pct=np.sum(self._noise_ape, axis=0) / draws / count,
+            noise_mape_pct=np.sum(self._noise_ape, axis=0) / realisations / count,
         )
 
 

@@ -128,7 +128,7 @@ class _Point(View):
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
         """dH of the point, the weight being that of its place."""
         point = slope.lanes(self.scenes[n] if weight is None else self.scenes[n] * weight)
-        return slope.field(slope.see(point))
+        return slope.field(slope.convolve(point))
 
 
 def _point(added: Corrected, total: TotalPsf, kernel: Kernel) -> View:

@@ -100,7 +100,7 @@ class View:
         """Every image as the model sees it [y, x], DN/s."""
         optics = self.solution.optics
         return _Fields(
-            len(self.solution.transit.frames), lambda n: optics.field(optics.see(self.lit_scene(n)))
+            len(self.solution.transit.frames), lambda n: optics.field(optics.convolve(self.lit_scene(n)))
         )
 
     def behind(self, n: int) -> Field | None:
@@ -126,7 +126,7 @@ class View:
         if behind is None:
             return seen
         hidden = behind * coverage(solution.transit.shape, solution.sky.found[n].place)
-        return seen + optics.field(optics.see(optics.lanes(hidden.astype(np.float32))))
+        return seen + optics.field(optics.convolve(optics.lanes(hidden.astype(np.float32))))
 
     @cached_property
     def lit(self) -> list[Field]:
@@ -230,7 +230,7 @@ class View:
         lit = self.lit_scene(n)
         if weight is not None:
             lit = lit * slope.lanes(weight)
-        return slope.field(slope.see(lit))
+        return slope.field(slope.convolve(lit))
 
 
 def _ratio(one: float, other: float) -> float:

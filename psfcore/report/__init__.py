@@ -1,1 +1,1 @@
-"""A report on a transit and its PSF, as a paper shows it: numbers, figures and one page."""
+"""The report on a transit and its PSF: numbers, figures and one HTML page, as in a publication."""

@@ -1,14 +1,11 @@
-"""A report on a PSF as one page: every number with its error, every figure with how to read it."""
+"""The HTML page of a report on a PSF: every number with its error, every figure with a guide to reading it."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-import numpy as np
-
 from psfcore.drawing.page import (
-    DASH,
     Bullets,
     Details,
     Figure,
@@ -21,309 +18,40 @@ from psfcore.drawing.page import (
     provenance_values,
     with_error,
 )
-from psfcore.evaluation.evaluation import DRAWS, UNDO_STEPS, Evaluation
+from psfcore.evaluation.evaluation import INVERSION_STEPS, NOISE_REALISATIONS, Evaluation
 from psfcore.evaluation.frame import CENTRE_PX, FrameEvaluation
 from psfcore.evaluation.report import TREND_PX, Summary, summaries, trends
 from psfcore.evaluation.superposed import Superposed
 from psfcore.psf import REACH_GRID_PX
+from psfcore.report.fit_sections import found_sections, light_sections, uncertainty_sections
 from psfcore.report.plot import (
-    beyond_of,
-    curves_png,
     intensities_png,
     maps_png,
-    offsets_png,
-    profile_png,
     residuals_png,
     slices_png,
-    totals_png,
-    weights_png,
 )
-from psfcore.report.report import CrossValidated, PsfReport, inputs_of
-from psfcore.scatter.fit import RADII_PX, TransitFit
+from psfcore.report.report import PsfReport, inputs_of
 from psfcore.scatter.inversion import CONVERGED_POINTS, DARK_MARGIN_PX, DARK_MARGIN_SIGMAS, LEAST_DARK_PIXELS
-from psfcore.scatter.samples import SCATTER
-from psfcore.scatter.validation.cross_validation import RUNS, Excess, ShellBands
-from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
-from psfcore.tables.make import TOTAL
-from psfcore.transit.blocks import folds
 
 
 def page_of(report: PsfReport, provenance: dict[str, Any]) -> Page:
-    """The page. provenance: what made the report, as names and texts, numbers or further such."""
-    of = report.transit.instrument or "a transit"
-    title = f"PSF of {of}" if report.fit is not None else f"PSF {report.psf.name} on {of}"
+    """The page of a report. provenance: software and request, as nested names and values."""
+    of = report.transit.instrument or "an unnamed instrument"
+    title = f"PSF of {of}" if report.fit is not None else f"PSF {report.psf.name} on a transit of {of}"
     sections = [
-        Section("What was found", _found(report)),
-        Section("Light by distance", _light(report)),
+        Section("Results", found_sections(report)),
+        Section("Light by distance from the source", light_sections(report)),
     ]
     if report.fit is not None:
-        sections.append(Section("How sure it is", _sure(report, report.fit)))
+        sections.append(Section("Uncertainties", uncertainty_sections(report, report.fit)))
     sections += [
-        Section("Against what was observed", _observed(report.evaluation, report.how_judged)),
-        Section("What these data cannot say", (Bullets(_limits(report)),)),
-        Section("Every image", _images(report)),
-        Section("What it was made of", _made_of(report, provenance)),
+        Section("Comparison with the observations", _observed(report.evaluation, report.how_judged)),
+        Section("Limits of these data", (Bullets(_limits(report)),)),
+        Section("Images", _images(report)),
+        Section("Inputs and software", _made_of(report, provenance)),
     ]
-    footer = f"heliopsf {provenance.get('software_version', '')}. After Hofmeister et al., A Point-Spread Function for the Extreme Ultraviolet High-Resolution Imager on board Solar Orbiter."
+    footer = f"heliopsf {provenance.get('software_version', '')}. Method: Hofmeister et al., A Point-Spread Function for the Extreme Ultraviolet High-Resolution Imager on board Solar Orbiter."
     return Page(title, report.sentence, sections, footer)
-
-
-# --- the PSF ----------------------------------------------------------------------------------------------
-
-
-def _found(report: PsfReport) -> list[Part]:
-    parts: list[Part] = []
-    if report.fit is not None:
-        fit = report.fit
-        values, sigma = fit.inversion.values, fit.value_sigma
-        parts.append(
-            f"Diffuse scatter of the shape “{fit.inversion.shape.name}”, a weight proportional to (b + r)^-c at r px "
-            "from a point, convolved with the known diffraction. Errors are one standard deviation: noise of every "
-            "pixel, carried through the whole fit"
-            + (
-                f", times {math.sqrt(fit.overdispersion):.2f} because the discs scatter by that much more than noise."
-                if fit.overdispersion > 1
-                else "."
-            )
-        )
-        parts.append(
-            Values(
-                [
-                    *(
-                        Value(p.name, values[p.name], sigma[p.name], p.unit, p.meaning)
-                        for p in fit.inversion.shape.parameters
-                    ),
-                    Value(
-                        "chi2 a pixel",
-                        fit.inversion.chi2_per_pixel,
-                        _chi2_error(fit),
-                        meaning="1 is expected where noise is all that is left; its error is that of chance",
-                    ),
-                    Value(
-                        "overdispersion",
-                        fit.overdispersion,
-                        meaning="of the disc means' chi2, 1 where chance could do it; taken into all errors",
-                    ),
-                ]
-            )
-        )
-    else:
-        psf = report.psf
-        parts.append("This PSF was given. It is shown and judged as it is; nothing about it was fitted here.")
-        parts.append(
-            Values(
-                [
-                    Value("name", psf.name),
-                    Value("version", psf.version),
-                    Value("status", psf.status),
-                    Value(
-                        "sum",
-                        psf.total,
-                        meaning=f"of all weights on {' x '.join(map(str, psf.kernel.shape))} px",
-                    ),
-                ]
-            )
-        )
-    parts.append(_curve_table(report))
-    return parts
-
-
-def _chi2_error(fit: TransitFit) -> float:
-    pixels = sum(frame.dark[0].size for frame in fit.inversion.frames)
-    return math.sqrt(2 / pixels)
-
-
-def _curve_table(report: PsfReport) -> Table:
-    """Light beyond some radii, by component, and the folds' bands where they reach."""
-    names = [name for name in (TOTAL, SCATTER) if name in report.tables["encircled"]]
-    header = ["R (px)", *(f"{'total' if name == TOTAL else 'diffuse'} beyond R (%)" for name in names)]
-    if report.cross is not None:
-        header += ["folds: median (%)", "1 sigma (%)", "2 sigma (%)"]
-    curves = {name: beyond_of(report.tables, name) for name in names}
-    rows = []
-    for radius in (r for r in RADII_PX if r < report.tables["reach_px"]):
-        row = [f"{radius:g}"]
-        for name in names:
-            at, beyond, sigma = curves[name]
-            row.append(with_error(float(np.interp(radius, at, beyond)), float(np.interp(radius, at, sigma))))
-        if report.cross is not None:
-            row += _bands_at(report.cross, radius)
-        rows.append(row)
-    if report.cross is not None:
-        how = "Folds: total PSF, median and the range that holds 68.3 and 95.5 % of the fits."
-    else:
-        how = "" if report.fit or report.psf.fitted else "The PSF's file holds no errors."
-    return Table(
-        header, rows, f"Light that lands farther than R from its point, percent of all light. {how}".rstrip()
-    )
-
-
-def _bands_at(cross: CrossValidated, radius: float) -> list[str]:
-    found = np.flatnonzero(cross.bands.radii_px == radius)
-    if found.size == 0:
-        return [DASH] * 3
-    low_2, low_1, median, high_1, high_2 = cross.bands.curve_pct[:, found[0]]
-    return [f"{median:.2f}", f"{low_1:.2f} to {high_1:.2f}", f"{low_2:.2f} to {high_2:.2f}"]
-
-
-def _light(report: PsfReport) -> list[Part]:
-    field = max(report.transit.shape)
-    beyond = (
-        f" Shaded: beyond the field of {field} px, where the shape alone speaks."
-        if field < REACH_GRID_PX / 2
-        else ""
-    )
-    parts: list[Part] = []
-    if report.fit is not None:
-        caption = (
-            "Light beyond a distance R, in percent of all light: of the total PSF (left) and of its diffuse part "
-            "(right); below, the same less the fit to all images, in percent points. Lines, and bars below: the fit "
-            "to all images and its own error. Blue bands: the fits of the cross-validation, from the smallest radius "
-            "at which they were looked at to the largest. Blue points: shells with a weight each, a fit that knows no "
-            "formula; bars are their spread over the folds, which is less than their error, because no weight goes "
-            f"below zero: the differences with their whole errors stand below Figure 3.{beyond}"
-        )
-        alt = "Two charts of cumulative light against distance with error bands, falling from about half to zero"
-    else:
-        caption = f"Light beyond a distance R, in percent of all light, of the PSF as given.{beyond}"
-        alt = "A chart of cumulative light against distance"
-    parts.append(Figure(curves_png(report), caption, alt))
-    shown = [name for name in report.tables["profile"]["mean_weight"] if name != TOTAL]
-    components = "its diffraction and its diffuse scatter" if shown else "no components are in its file"
-    parts.append(
-        Figure(
-            profile_png(report),
-            f"Mean weight of a pixel over rings one pixel wide, by distance, both axes logarithmic: the total PSF and {components}. "
-            "The centre stands at half a pixel. Shaded about a line: its standard error, where it is known.",
-            "Radial profile of the PSF and its components over many powers of ten",
-        )
-    )
-    if report.cross is not None and report.cross.bands.shells is not None:
-        parts += _free_shells(report, report.cross.bands.shells)
-    return parts
-
-
-def _free_shells(report: PsfReport, shells: ShellBands) -> list[Part]:
-    def excess(name: str, of: Excess) -> Value:
-        within = f"light of the shells less that of the formula within {of.within_px:.3g} px, of all light"
-        return Value(name, of.points, of.sigma, "points", within)
-
-    caption = (
-        "Weight of diffuse scatter by distance. Orange: the fitted shape. Blue: shells that may take any weight not "
-        "below zero, held to the formula but loosely, median and spread over the folds. Neighbours trade light with "
-        "one another, so that single shells scatter by far more than the light beyond a distance does (Figure 1); a run of shells on one side of the line would say that the formula is wrong there."
-    )
-    return [
-        Figure(
-            weights_png(report, shells), caption, "Diffuse weights by distance, fitted line and free shells"
-        ),
-        Values(
-            [
-                excess("free shells less formula, near the centre", shells.near_centre),
-                excess("free shells less formula, where they part most", shells.largest),
-            ]
-        ),
-    ]
-
-
-# --- how sure ---------------------------------------------------------------------------------------------
-
-
-def _sure(report: PsfReport, fit: TransitFit) -> list[Part]:
-    parts: list[Part] = []
-    if report.cross is not None:
-        parts += _cross_validation(report.cross, fit, len(folds(len(fit.transit.frames))))
-    if fit.shapes:
-        parts += _shapes(fit)
-    if report.study is not None:
-        parts += _dark_offsets(report.study, fit)
-    return parts
-
-
-def _cross_validation(cross: CrossValidated, fit: TransitFit, blocks: int) -> list[Part]:
-    values, sigma = fit.inversion.values, fit.value_sigma
-    rows = []
-    for p in fit.inversion.shape.parameters:
-        low_2, low_1, median, high_1, high_2 = cross.bands.values[p.name]
-        rows.append(
-            [
-                f"{p.name} ({p.unit})" if p.unit else p.name,
-                with_error(values[p.name], sigma[p.name]),
-                f"{median:.4g}",
-                f"{low_1:.4g} to {high_1:.4g}",
-                f"{low_2:.4g} to {high_2:.4g}",
-            ]
-        )
-    return [
-        f"Each of {blocks} sequential blocks of images was held out, with a guard on both sides, and the images of the "
-        f"other blocks were drawn again with repetition, in {RUNS} runs: {len(cross.fits)} fits. They share the "
-        "reconstructions of the fit to all images and differ from it to first order.",
-        Table(
-            ["parameter", "fit, with its error", "folds: median", "1 sigma", "2 sigma"],
-            rows,
-            "Parameters as fitted to all images, and over the folds. A band much wider than the error says that images differ by more than noise.",
-        ),
-        Figure(
-            totals_png(cross, fit),
-            "How much light is scattered diffusely, by fold: the wider, the less the images agree. Orange: the fit to all images with its error.",
-            "Histogram of diffusely scattered light over the folds",
-        ),
-    ]
-
-
-def _shapes(fit: TransitFit) -> list[Part]:
-    rows = []
-    for shape in fit.shapes:
-        added = "; ".join(
-            f"{name} {with_error(value, sigma)}" for name, (value, sigma) in shape.added.items()
-        )
-        held_out = DASH if shape.held_out_gain is None else f"{shape.held_out_gain:+.1f}"
-        rows.append([shape.name, added, f"{shape.gain:.1f}", str(len(shape.added)), held_out])
-    return [
-        Table(
-            ["shape", "what it adds", "delta chi2", "parameters", "delta chi2, held out"],
-            rows,
-            "Other shapes of scatter, each the fitted one with parameters more, to first order. Delta chi2: by how much it "
-            "describes all images better; chance gives as much as it has parameters, give or take the square root of twice that. "
-            "Held out: the same on images that were not fitted; below zero, what it adds is noise.",
-        )
-    ]
-
-
-def _dark_offsets(study: DarkOffsetStudy, fit: TransitFit) -> list[Part]:
-    names = fit.inversion.shape.names
-    sigma = fit.value_sigma
-
-    def points(curve: Any, radius: float) -> str:
-        return f"{float(np.interp(radius, study.curve_radii_px, curve)):+.2f}"
-
-    rows = []
-    for offset in study.offsets:
-        moved = [f"{offset.values[n] - study.nominal[n]:+.3g}" for n in names]
-        row = [f"{offset.offset_dn:+g}", *moved, f"{np.abs(offset.weight_change_pct).max():.1f}"]
-        row += [points(offset.total_curve_change_points, r) for r in (0.5, 10.0, 100.0)]
-        rows.append([*row, str(offset.images)])
-    errors = ", ".join(f"{n} {sigma[n]:.2g}" for n in names)
-    return [
-        Table(
-            [
-                "offset (DN)",
-                *(f"change of {n}" for n in names),
-                "largest change of a weight (%)",
-                *(f"light beyond {r} px (points)" for r in ("0.5", "10", "100")),
-                "images",
-            ],
-            rows,
-            f"The fit repeated with an offset added to every readout. Errors of the fit itself, to compare with: {errors}. "
-            "Light: of the total PSF; diffuse weights are compared within the field.",
-        ),
-        Figure(
-            offsets_png(study),
-            "What a wrong dark level does, by distance: relative change of the diffuse weights (left), change in percent points of the light "
-            "beyond a distance, diffuse as lines and total as dots (right).",
-            "Changes of weights and of cumulative light for four dark offsets",
-        ),
-    ]
 
 
 # --- observed and simulated -------------------------------------------------------------------------------
@@ -331,8 +59,9 @@ def _dark_offsets(study: DarkOffsetStudy, fit: TransitFit) -> list[Part]:
 
 def _observed(evaluation: Evaluation, how: str) -> list[Part]:
     parts: list[Part] = [
-        f"{how}. Light in every occulter as the PSF puts it there, less what was observed, over the observed mean of "
-        f"the disc. Centre: pixels within {CENTRE_PX:g} px of the occulter's. Noise is that of photons and readout.",
+        f"{how}. The residual of an image is the mean light that the PSF scatters into the occulter, minus the mean "
+        "observed light, divided by the mean observed light, over all fully dark pixels. The centre consists of the "
+        f"pixels within {CENTRE_PX:g} px of the occulter's centre. Noise is photon and read noise.",
         Table(
             [
                 "pointing",
@@ -345,42 +74,47 @@ def _observed(evaluation: Evaluation, how: str) -> list[Part]:
                 "mean (DN/s)",
             ],
             [_summary_row(s, evaluation) for s in summaries(evaluation)],
-            "Residuals by pointing, and last of all images. Mean: with the error that noise gives it; rms: with that of so many images. "
-            "Noise: the rms that noise alone would give. Largest: of one image.",
+            "Residuals by pointing; the last row is for all images. Mean: with its error from image noise. Rms: with its "
+            "sampling error for this number of images. Noise: the rms expected from noise alone. Largest: the residual "
+            "of the image with the largest absolute value.",
         ),
         Figure(
             slices_png(evaluation),
-            "A row (circles, full line) and a column (squares, dashed) through the middle of an occulter: observed as points, simulated as lines, "
-            "one image a pointing. Grey: pixels that are fully dark. Outside them the Sun is seen.",
-            "Observed and simulated light along slices through occulters",
+            "Intensity along a row (circles, solid line) and a column (squares, dashed line) through the centre of an "
+            "occulter, for one image per pointing. Points are observed, lines are simulated. Grey: fully dark pixels. "
+            "Outside the grey area, sunlight reaches the pixels directly.",
+            "Observed and simulated intensity along slices through occulters",
         ),
         Figure(
             residuals_png(evaluation),
-            "Residuals of disc means (top) and centres (bottom), against time, detector x and detector y, coloured by pointing; bars are noise, one standard deviation. "
-            "About one bar in three should miss zero.",
-            "Six charts of residuals scattered about zero",
+            "Residuals of disc means (top) and of disc centres (bottom) by time, detector x and detector y, coloured by "
+            "pointing. Bars show one standard deviation of the noise. If noise alone causes the residuals, about one "
+            "bar in three does not include zero.",
+            "Six charts of residuals about zero, by time and detector position",
         ),
     ]
     parts += _trends(evaluation)
     parts.append(
         Figure(
             intensities_png(evaluation),
-            "The light itself. Left: at the centre of the occulter by time, observed with its noise and simulated. Right: simulated less observed in DN/s by detector x; "
-            "linear about zero and logarithmic beyond.",
-            "Intensities in the occulter by time and absolute errors by place",
+            "Left: observed intensity at the centre of the occulter, with its noise, and simulated intensity, by time. "
+            "Right: simulated minus observed mean intensity in DN/s, by detector x. The vertical axis is linear near "
+            "zero and logarithmic beyond.",
+            "Intensities in the occulter by time, and absolute errors by detector position",
         )
     )
     maps = evaluation.superposed
     parts += [
         _map_values(maps),
-        Figure(maps_png(maps), _MAPS_CAPTION, "Four maps of errors by place in the disc"),
+        Figure(maps_png(maps), _MAPS_CAPTION, "Four maps of errors by position in the disc"),
     ]
     return parts
 
 
 _MAPS_CAPTION = (
-    "All discs laid on one another, to the nearest pixel. MPE: mean error of a pixel over the images; MAPE: mean of its absolute value. "
-    "Beside each what noise alone gives, on the same scale: where a map on the left looks as the one on the right, nothing but noise is seen."
+    "All discs superposed, aligned to the nearest pixel. MPE: mean over the images of the percentage error of a pixel. "
+    "MAPE: mean of its absolute value. Beside each map is the same map for noise alone, on the same scale. If a map "
+    "resembles its noise map, noise explains the errors."
 )
 
 
@@ -415,8 +149,8 @@ def _trends(evaluation: Evaluation) -> list[Part]:
         for t in found
     ]
     caption = (
-        f"Slopes of residuals along the detector, over {TREND_PX:g} px. The occulter's x and y move together along its track: slopes "
-        "against each are of the same images."
+        f"Slopes of the residuals along the detector axes, per {TREND_PX:g} px. The occulter's x and y change together "
+        "along its track. Slopes along x and y come from the same images and are not independent."
     )
     return [
         Table(
@@ -424,8 +158,8 @@ def _trends(evaluation: Evaluation) -> list[Part]:
                 "pointing",
                 "along",
                 "images",
-                f"slope (% in {TREND_PX:g} px)",
-                f"slope (DN/s in {TREND_PX:g} px)",
+                f"slope (% per {TREND_PX:g} px)",
+                f"slope (DN/s per {TREND_PX:g} px)",
             ],
             rows,
             caption,
@@ -434,7 +168,7 @@ def _trends(evaluation: Evaluation) -> list[Part]:
 
 
 def _map_values(maps: Superposed) -> Values:
-    noise = "what noise alone gives"
+    noise = "noise alone"
     return Values(
         [
             Value(
@@ -444,10 +178,10 @@ def _map_values(maps: Superposed) -> Values:
                 meaning=f"{noise}: {maps.mpe_noise_rms_pct:.2f} %",
             ),
             Value(
-                "MPE, largest of a pixel",
+                "MPE, largest of any pixel",
                 f"{maps.mpe_largest_pct:.2f}",
                 unit="%",
-                meaning=f"noise of a pixel: {maps.mpe_noise_rms_pct:.2f} % rms",
+                meaning=f"noise alone, rms over the pixels: {maps.mpe_noise_rms_pct:.2f} %",
             ),
             Value(
                 "MAPE, mean over the disc",
@@ -464,12 +198,16 @@ def _map_values(maps: Superposed) -> Values:
 
 def _limits(report: PsfReport) -> list[str]:
     said = list(report.fit.limits) if report.fit is not None else []
-    said += [f"Not shown: {missing.what}; {missing.why}" for missing in report.missing]
+    said += [f"Not shown: {missing.what}, because {missing.why}" for missing in report.missing]
     if report.given and report.fitted_to_these:
-        said.append("the PSF was fitted to these very images: how well it fits them is no test of it")
+        said.append(
+            "the PSF was fitted to these images, so its agreement with them is not an independent test"
+        )
     if report.evaluation.left_out:
-        said.append(f"{len(report.evaluation.left_out)} images could not be judged; they are listed below")
-    return [one[:1].upper() + one[1:] + "." for one in said] or ["Nothing beyond the errors that are stated."]
+        said.append(f"images that could not be evaluated, listed below: {len(report.evaluation.left_out)}")
+    return [one[:1].upper() + one[1:] + "." for one in said] or [
+        "There are no limits beyond the stated errors."
+    ]
 
 
 def _images(report: PsfReport) -> list[Part]:
@@ -482,15 +220,18 @@ def _images(report: PsfReport) -> list[Part]:
     table = Table(
         header,
         [_image_row(frame, exposure_s[frame.file]) for frame in frames],
-        "Every image that was judged: when, where its occulter was found, how dark it was and how dark it should be. Errors are those of noise.",
+        "Every evaluated image: its time and exposure, the fitted position of its occulter, the number of fully dark "
+        "pixels, and the mean observed and simulated intensity there. Errors are from noise.",
     )
     parts: list[Part] = [Details(f"All {len(frames)} images", (table,))]
     left_out = report.evaluation.left_out
     if left_out:
         why = Table(
-            ["file", "why"], [[file, reason] for file, reason in left_out.items()], "Images left out."
+            ["file", "reason"],
+            [[file, reason] for file, reason in left_out.items()],
+            "Images that could not be evaluated.",
         )
-        parts.append(Details(f"{len(left_out)} images left out", (why,)))
+        parts.append(Details(f"Images that could not be evaluated: {len(left_out)}", (why,)))
     return parts
 
 
@@ -519,18 +260,18 @@ def _made_of(report: PsfReport, provenance: dict[str, Any]) -> list[Part]:
         [
             Value("images", f"{inputs['images']} of {' x '.join(map(str, inputs['shape']))} px"),
             Value("exposures", exposures, unit="s"),
-            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN a detected photon, as given"),
-            Value("readout noise", noise.read_noise_dn, unit="DN", meaning="rms, as given"),
+            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN per detected photon, as given"),
+            Value("read noise", noise.read_noise_dn, unit="DN", meaning="rms, as given"),
             Value(
-                "images with pixels filled in",
+                "images with filled pixels",
                 f"{len(prepared['frames'])}",
-                meaning="saturated, or without a value",
+                meaning="the pixels were saturated or had no value",
             ),
-            Value("seed", f"{report.seed}", meaning="of all draws"),
+            Value("seed", f"{report.seed}", meaning="of all random samples"),
         ]
     )
     files = Table(
-        ["file", "SHA-256"], list(report.transit.sha256.items()), "Input files, by the hash of their bytes."
+        ["file", "SHA-256"], list(report.transit.sha256.items()), "Input files, with the hash of their bytes."
     )
     return [
         data,
@@ -542,12 +283,16 @@ def _made_of(report: PsfReport, provenance: dict[str, Any]) -> list[Part]:
 
 def _algorithm(report: PsfReport) -> list[Value]:
     values = [
-        Value("steps of a reconstruction", f"{UNDO_STEPS}", meaning="linear, for the evaluation"),
-        Value("draws of noise", f"{DRAWS}", meaning="for what noise alone does to the maps"),
+        Value(
+            "steps of a reconstruction", f"{INVERSION_STEPS}", meaning="linear iterations, for the evaluation"
+        ),
+        Value(
+            "noise realisations", f"{NOISE_REALISATIONS}", meaning="per image, for the maps of noise alone"
+        ),
         Value(
             "fully dark pixels",
-            f"{DARK_MARGIN_PX:g} px and {DARK_MARGIN_SIGMAS:g} sigma of the place",
-            meaning=f"margin inside the occulter's edge; at least {LEAST_DARK_PIXELS} pixels an image",
+            f"{DARK_MARGIN_PX:g} px and {DARK_MARGIN_SIGMAS:g} sigma of the position",
+            meaning=f"margin inside the edge of the occulter; at least {LEAST_DARK_PIXELS} pixels per image",
         ),
     ]
     if report.fit is not None:
@@ -559,13 +304,16 @@ def _algorithm(report: PsfReport) -> list[Value]:
                 meaning="converged" if report.fit.inversion.converged else "not converged",
             ),
             Value(
-                "taken as converged",
+                "convergence limit",
                 f"{CONVERGED_POINTS:g}",
-                unit="points",
-                meaning="largest move of the cumulative curve in a round",
+                unit="percentage points",
+                meaning="largest change of 1 - encircled energy in a round",
             ),
             Value(
-                "reach that light is counted to", f"{REACH_GRID_PX}", unit="px", meaning="edge of the square"
+                "grid on which light is counted",
+                f"{REACH_GRID_PX}",
+                unit="px",
+                meaning="side of the square about the source",
             ),
         ]
     return values

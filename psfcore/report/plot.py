@@ -1,4 +1,4 @@
-"""The figures of a report on a PSF, each as PNG: made for a page about ten inches wide."""
+"""Figures of a report on a PSF, as PNG, for a page about ten inches wide."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from psfcore.psf import REACH_GRID_PX
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.samples import DIFFRACTION, SCATTER
-from psfcore.scatter.validation.cross_validation import ShellBands
+from psfcore.scatter.validation.bands import ShellBands
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 from psfcore.tables.make import TOTAL
 
@@ -44,7 +44,7 @@ _FREE, _BAND = "#1f6fb4", "#4f8cc4"
 
 
 def curves_png(report: PsfReport) -> bytes:
-    """Light beyond each distance, of the total PSF and, where it was fitted, of its diffuse scatter; how sure below."""
+    """1 - encircled energy of the total PSF and, for a fit, of its diffuse scatter, with the uncertainties below."""
     if report.fit is None:
         figure, (total,) = _figure(5.6, 3.9, 1)
         _draw_curve(total, report, TOTAL)
@@ -70,17 +70,17 @@ def curves_png(report: PsfReport) -> bytes:
 
 
 def _draw_curve(axes: Any, report: PsfReport, name: str) -> None:
-    """A component's curve as it was found."""
+    """The cumulative curve of a component, with its error."""
     radii, beyond, sigma = beyond_of(report.tables, name)
     axes.fill_between(radii, beyond - sigma, beyond + sigma, color=_COLOURS[name], alpha=0.3, linewidth=0)
     axes.plot(radii, beyond, color=_COLOURS[name], linewidth=1.5, label=_NAMES[name])
     axes.set(xscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX), ylim=(0, None))
-    axes.set(xlabel="Distance R (px)", ylabel="Light beyond R (%)", title=_title(name))
+    axes.set(xlabel="Distance R (px)", ylabel="1 - encircled energy (%)", title=_title(name))
     _plain_ticks(axes)
 
 
 def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
-    """About a component's curve: the bands of the folds, and the fit's own error as bars."""
+    """Differences from the fitted curve of a component: bands of the folds, and the error of the fit as bars."""
     radii, _, sigma = beyond_of(report.tables, name)
     found = _folds_of(report, name)
     if found is not None:
@@ -99,12 +99,12 @@ def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
         **_points(_COLOURS[name], 3.0),
     )
     axes.set(xscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX))
-    axes.set(xlabel="Distance R (px)", ylabel="Light beyond R, less the fit's (points)")
+    axes.set(xlabel="Distance R (px)", ylabel="Difference from the fit (points)")
     _plain_ticks(axes)
 
 
 def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]] | None:
-    """Radii, and the folds' limits of a component's curve there less the curve; none where they are not known."""
+    """Radii, and the limits of the folds minus the fitted curve of a component; None if there are no folds."""
     if report.cross is None:
         return None
     bands = report.cross.bands
@@ -119,16 +119,16 @@ def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]
 
 
 def _from(report: PsfReport, name: str, edges: Vector) -> Vector:
-    """A component's light from each distance on, that of pixels at the very distance included."""
+    """The light of a component at each distance and beyond. Pixels exactly at the distance are included."""
     radii, beyond, _ = beyond_of(report.tables, name)
     just_below = edges * (1 - 1e-9)
     within = np.maximum(np.searchsorted(radii, just_below) - 1, 0)
-    exact = just_below <= report.tables["exact_to_px"]  # a staircase there
+    exact = just_below <= report.tables["exact_to_px"]  # there the curve is a step function
     return np.asarray(np.where(exact, beyond[within], np.interp(just_below, radii, beyond)))
 
 
 def _draw_free(curve: Any, spread: Any, report: PsfReport, shells: ShellBands) -> None:
-    """Light beyond the inner edge of each shell that begins within the field: medians and spreads over the folds."""
+    """Diffuse light of the free shells beyond their inner edges, within the field: median and spread over the folds."""
     edges = shells.edges_px[:-1]
     shown = (edges >= 1) & (edges < max(report.transit.shape))
     low_2, low_1, median, high_1, high_2 = shells.free_beyond_pct[:, shown]
@@ -148,12 +148,12 @@ def _title(name: str) -> str:
 
 
 def beyond_of(tables: dict[str, Any], name: str) -> tuple[Vector, Vector, Vector]:
-    """Radii from half a pixel on, a component's light beyond them in percent, and its standard error (0: none known)."""
+    """Radii from half a pixel, 100 (1 - encircled energy) of a component, and its standard error (0: not known)."""
     radii = np.array(tables["radii_px"])
     encircled = np.array(tables["encircled"][name])
     changes = np.array(tables["encircled_changes"].get(name, np.zeros((1, radii.size))))
     near = radii < _NEAREST_PX
-    # Half a pixel holds what the centre does: the curve begins there.
+    # The curve begins at half a pixel, which encloses the central pixel alone.
     shown = np.concatenate(([np.flatnonzero(near)[-1]], np.flatnonzero(~near)))
     r = np.where(near[shown], _NEAREST_PX, radii[shown])
     beyond = 100 * np.maximum(1 - encircled[shown], 0.0)
@@ -161,14 +161,14 @@ def beyond_of(tables: dict[str, Any], name: str) -> tuple[Vector, Vector, Vector
 
 
 def _mark_field(axes: Any, report: PsfReport) -> None:
-    """Where the field ends: farther out the shape alone speaks."""
+    """Shade distances beyond the field, where the PSF is an extrapolation of the fitted shape."""
     field = max(report.transit.shape)
     if field < _FARTHEST_PX:
         axes.axvspan(field, _FARTHEST_PX, color="#efefef", zorder=0, linewidth=0, label="beyond the field")
 
 
 def profile_png(report: PsfReport) -> bytes:
-    """Mean weight of a pixel by radius: diffraction, diffuse scatter and total; errors where they are known."""
+    """Mean weight per pixel by radius: diffraction, diffuse scatter and total PSF, with known errors."""
     figure, (axes,) = _figure(7.2, 4.4, 1)
     profile = report.tables["profile"]
     radius = np.array(profile["radius_px"])
@@ -200,7 +200,7 @@ def profile_png(report: PsfReport) -> bytes:
 
 
 def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
-    """Diffuse weights by distance: the fitted shape, and shells that know no formula."""
+    """Diffuse weights by distance: the fitted shape, and free shells."""
     figure, (axes,) = _figure(7.2, 4.4, 1)
     shown = shells.edges_px[:-1] < max(report.transit.shape)
     edges = shells.edges_px[: np.count_nonzero(shown) + 1]
@@ -225,23 +225,23 @@ def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
 
 
 def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
-    """How the total of diffuse light spreads over the folds."""
+    """Histogram of the total diffuse scatter over the folds."""
     figure, (axes,) = _figure(6.4, 3.4, 1)
     totals = 100 * cross.bands.totals
     found, sigma = 100 * fit.inversion.values["total"], 100 * fit.value_sigma["total"]
     axes.axvspan(
-        found - sigma, found + sigma, color="#c77f00", alpha=0.2, linewidth=0, label="its error, ±1 σ"
+        found - sigma, found + sigma, color="#c77f00", alpha=0.2, linewidth=0, label="error of that fit, ±1 σ"
     )
     axes.hist(totals, bins=min(25, max(5, totals.size // 4)), color=_BAND, label="folds")
     axes.axvline(found, color="#c77f00", linewidth=1.6, label="fit to all images")
-    axes.set(xlabel="Diffusely scattered light (% of all light)", ylabel="Fits")
+    axes.set(xlabel="Diffusely scattered light (% of all light)", ylabel="Number of fits")
     axes.legend(fontsize=9, frameon=False)
     tidy([axes])
     return _png(figure)
 
 
 def slices_png(evaluation: Evaluation) -> bytes:
-    """Rows and columns through the middle of occulters: one image a pointing, at most six."""
+    """Slices through the centres of occulters: one image per pointing, at most six."""
     shown = shown_slices(evaluation, MOST_SLICES)
     across = min(len(shown), 3)
     rows = -(-len(shown) // across)
@@ -257,14 +257,14 @@ def slices_png(evaluation: Evaluation) -> bytes:
 
 
 def maps_png(maps: Superposed) -> bytes:
-    """MPE and MAPE by place in the disc, and what noise alone gives, on the same scales."""
+    """Maps of MPE and MAPE in the disc, with the maps of noise alone on the same scales."""
     figure, panels = _figure(8.2, 6.8, 2, 2)
     draw_maps(figure, panels, maps)
     return _png(figure)
 
 
 def residuals_png(evaluation: Evaluation) -> bytes:
-    """Residuals of disc means and of centres against time and the detector's axes, by pointing."""
+    """Residuals of disc means and of centres by time, detector x and detector y, coloured by pointing."""
     frames = evaluation.frames
     figure, charts = _figure(WIDTH_IN, 6.2, 3, 2)
     where = {
@@ -282,7 +282,7 @@ def residuals_png(evaluation: Evaluation) -> bytes:
             axes.legend().remove()
             axes.set(xlabel=label if row else "")
             if column == 0:
-                axes.set_ylabel(f"{name}: simulated - observed (%)")
+                axes.set_ylabel(f"{name}: residual (%)")
     handles, labels = charts[0].get_legend_handles_labels()
     figure.legend(
         handles, labels, title="pointing", loc="outside upper center", ncols=8, fontsize=9, frameon=False
@@ -292,7 +292,7 @@ def residuals_png(evaluation: Evaluation) -> bytes:
 
 
 def intensities_png(evaluation: Evaluation) -> bytes:
-    """The light itself: at the centre by time, and the absolute error by detector x."""
+    """Light at the centre of the occulter by time, and absolute error of the disc mean by detector x."""
     figure, charts = _figure(WIDTH_IN, 3.9, 2)
     draw_centres(charts[0], evaluation.frames)
     draw_absolute(charts[1], evaluation.frames)
@@ -301,11 +301,11 @@ def intensities_png(evaluation: Evaluation) -> bytes:
 
 
 def offsets_png(study: DarkOffsetStudy) -> bytes:
-    """What wrong dark levels do to weights and to the light beyond a distance."""
+    """Effect of wrong dark levels on diffuse weights and on cumulative curves."""
     figure, charts = _figure(WIDTH_IN, 4.2, 2)
     draw_offsets(charts, study)
     charts[0].set_title("Diffuse weights")
-    charts[1].set_title("Light beyond a distance")
+    charts[1].set_title("1 - encircled energy")
     for axes in charts:
         axes.legend(fontsize=7.5, frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
         _plain_ticks(axes)
@@ -321,14 +321,14 @@ def _figure(
     *,
     heights: tuple[float, ...] | None = None,
 ) -> tuple[Any, list[Any]]:
-    """A figure and its charts, row after row. heights: of the rows, relative."""
+    """A figure and its charts, row by row. heights: relative heights of the rows."""
     figure = Figure(figsize=(width_in, height_in), dpi=PLOT_DPI, facecolor="white", layout="constrained")
     charts = figure.subplots(rows, across, squeeze=False, height_ratios=heights)
     return figure, list(np.ravel(charts))
 
 
 def _plain_ticks(axes: Any) -> None:
-    """1, 10, 100 instead of powers of ten."""
+    """Label ticks as 1, 10, 100 instead of powers of ten."""
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 

@@ -1,12 +1,18 @@
-"""What a paper shows of a PSF and of the transit that it comes from, found with one inversion.
+"""Make a report on a PSF and its transit, with the results that a publication shows, from one inversion.
 
 Hofmeister et al., The point-spread function of HRI_EUV, sections "Inversion results", "Accuracy and robustness" and
-"Evaluation". The inversion of all images is made once. About it the folds differ by a small step, which the images'
-shares of its normal equations give (`psfcore.scatter.validation.cross_validation`, the shared scheme): the folds of the
-cross-validation, their images drawn again, and those that every image is held out with for its evaluation, all of
-their images taken once. Only the dark offsets are fitted anew, from where the inversion ended.
+"Evaluation". All images are inverted once. Every fold differs from this solution by a small step, which the
+contributions of the images to the normal equations give (the shared scheme, Eq. (1) of
+`psfcore.scatter.validation.cross_validation`). This holds for the folds of the cross-validation, whose images are
+bootstrap samples, and for the folds that hold out each image for its evaluation, whose images count once each. Only the
+fits with dark offsets are new fits, and they start from the solution.
 
-A PSF that is given instead is evaluated as it is; what only a fit can say is missing then, and the report says so.
+A given PSF is evaluated without a fit. The report then lists the results that only a fit can provide as missing.
+
+| symbol | name |
+|---|---|
+| y, s, PE, residual | PsfReport.evaluation, as in `psfcore.evaluation.evaluation` |
+| 1 - encircled energy | PsfReport.tables["encircled"] |
 """
 
 from __future__ import annotations
@@ -20,15 +26,14 @@ from psfcore.evaluation.evaluation import Evaluation, evaluate
 from psfcore.evaluation.plot import sentence as evaluation_sentence
 from psfcore.evaluation.report import report as evaluation_json
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
-from psfcore.scatter.fit import TransitFit, fit_transit, psf_of
-from psfcore.scatter.fit import report as fit_json
+from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.scatter.inversion import Progress, Solution
+from psfcore.scatter.report import fit_json
+from psfcore.scatter.validation.bands import Bands, bands
 from psfcore.scatter.validation.cross_validation import (
-    Bands,
-    Draw,
     FoldFit,
-    bands,
-    draws,
+    FoldSample,
+    bootstrap_samples,
     shared_fits,
     shared_step,
 )
@@ -46,12 +51,12 @@ STAGES = {
     "dark offsets": 63.0,
     "tables": 6.0,
 }  # relative costs
-OFFSET_VISITS = 8.5  # of a frame in a fit with a dark offset, as a rule
+OFFSET_VISITS = 8.5  # typical number of passes over each frame in a fit with a dark offset
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidated:
-    """Fits with images held out and drawn again: all of them, and what holds over all."""
+    """All fits of a cross-validation, and the bands over them."""
 
     fits: tuple[FoldFit, ...]
     bands: Bands
@@ -59,7 +64,7 @@ class CrossValidated:
 
 @dataclass(frozen=True)
 class Missing:
-    """What a report does not show, and why."""
+    """A result that a report does not show, and the reason."""
 
     what: str
     why: str
@@ -67,10 +72,11 @@ class Missing:
 
 @dataclass(frozen=True, eq=False)
 class PsfReport:
-    """A transit, a PSF and all that was found about them.
+    """A transit, a PSF and all results about them.
 
-    tables: of the PSF (`psfcore.tables.make`). held_out: whether every image was judged with a PSF fitted without it.
-    given: the PSF came from elsewhere, and nothing was fitted; fitted_to_these: its history names these images.
+    tables: of the PSF (`psfcore.tables.make`). fit, cross, study: None if the PSF was given, or if `missing` has the
+    reason. held_out: whether every image was evaluated with a PSF fitted without it. fitted_to_these: the PSF was
+    fitted to these images, here or according to its history.
     """
 
     transit: Transit
@@ -88,12 +94,12 @@ class PsfReport:
 
     @property
     def given(self) -> bool:
-        """Whether the PSF came from elsewhere."""
+        """Whether the PSF was given, not fitted here."""
         return self.fit is None
 
     @property
     def sentence(self) -> str:
-        """What a person reads first."""
+        """The summary at the top of the report."""
         judged = evaluation_sentence(self.evaluation)
         if self.fit is not None:
             return fit_json(self.fit)["sentence"] + f" {self.how_judged}. {judged}"
@@ -101,13 +107,17 @@ class PsfReport:
 
     @property
     def how_judged(self) -> str:
-        """Whether the evaluation is a test."""
+        """Which PSF each image was evaluated with, and whether that is an independent test."""
         if self.held_out:
-            return "Each image judged with a PSF fitted without it and its neighbours"
+            return "Each image was evaluated with a PSF that was fitted without this image and its neighbours"
+        if self.given and self.fitted_to_these:
+            return (
+                "Each image was evaluated with the given PSF, which was fitted to these images; this is not an "
+                "independent test"
+            )
         if self.given:
-            test = ", to which it was fitted: no test of it" if self.fitted_to_these else ""
-            return f"Each image judged with the PSF as it was given{test}"
-        return "Each image judged with the PSF that was fitted to it too, which is no test"
+            return "Each image was evaluated with the given PSF"
+        return "Each image was evaluated with the PSF fitted to all images; this is not an independent test"
 
 
 def make_report(
@@ -120,21 +130,24 @@ def make_report(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> PsfReport:
-    """Fit a transit and show how good the fit is; or, where a PSF is given, show how good that one is.
+    """Fit a transit and evaluate the fit, or evaluate a given PSF.
 
-    dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: of all draws.
-    Raises DataError "plate-scale-mismatch", and as `fit_transit` and `evaluate` do.
+    dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: of all random samples (bootstrap,
+    subsets of equations, noise realisations). Raises DataError "plate-scale-mismatch", and as `fit_transit` and
+    `evaluate` do.
     """
     wanted = [s for s in STAGES if psf is None or s in ("evaluating", "tables")]
     if not dark_offsets and psf is None:
         wanted.remove("dark offsets")
-    stages = _Stages(progress, {name: STAGES[name] for name in wanted})
+    stages = _ReportProgress(progress, {name: STAGES[name] for name in wanted})
     if psf is not None:
         _check_scale(transit, psf)
         return _on_a_given(transit, prepared, psf, seed, threads, stages)
     missing: list[Missing] = []
     fit = fit_transit(transit, seed=seed, threads=threads, progress=stages.of("fit"))
-    made = psf_of(fit, name=f"{transit.instrument or 'transit'}-fitted", version="this report", provenance={})
+    made = fitted_psf(
+        fit, name=f"{transit.instrument or 'transit'}-fitted", version="this report", provenance={}
+    )
     cross = _cross_validated(fit, seed, missing, stages.of("folds"))
     kernels = _held_out_kernels(fit.solution, missing)
     evaluation = evaluate(
@@ -148,7 +161,7 @@ def make_report(
     if dark_offsets:
         study = _offsets(fit, threads, missing, stages)
     else:
-        missing.append(Missing("what wrong dark levels do", "it was not asked for"))
+        missing.append(Missing("the effect of wrong dark levels", "it was not requested"))
     return PsfReport(
         transit=transit,
         prepared=prepared,
@@ -166,22 +179,22 @@ def make_report(
 
 
 def _on_a_given(
-    transit: Transit, prepared: Prepared, psf: Psf, seed: int, threads: int, stages: _Stages
+    transit: Transit, prepared: Prepared, psf: Psf, seed: int, threads: int, stages: _ReportProgress
 ) -> PsfReport:
-    """The report on a PSF that nobody fits here."""
+    """The report on a given PSF, without a fit."""
     evaluation = evaluate(
         transit, lambda _index: psf.kernel, seed=seed, threads=threads, progress=stages.of("evaluating")
     )
-    why = "a PSF was given, and nothing was fitted"
+    why = "the PSF was given, and no fit was made"
     lacking = (
-        "parameters and their cross-validation",
+        "the parameters and their cross-validation",
         "scatter without a formula (free shells)",
         "other shapes of scatter",
-        "what wrong dark levels do to a fit",
+        "the effect of wrong dark levels on a fit",
     )
     missing = [Missing(what, why) for what in lacking]
     if psf.fitted is None:
-        missing.append(Missing("errors of the PSF's curve and profile", "the PSF's file holds none"))
+        missing.append(Missing("errors of the PSF's curve and profile", "the PSF file contains none"))
     return PsfReport(
         transit=transit,
         prepared=prepared,
@@ -199,22 +212,23 @@ def _on_a_given(
 
 
 def _check_scale(transit: Transit, psf: Psf) -> None:
-    """Raise DataError "plate-scale-mismatch" where both scales are known and differ by over 1 %."""
+    """Raise DataError "plate-scale-mismatch" if both scales are known and differ by more than 1 %."""
     seen, wanted = transit.plate_scale_arcsec, psf.plate_scale_arcsec
     if seen is not None and wanted is not None and abs(seen / wanted - 1) > PLATE_SCALE_TOLERANCE:
         raise DataError(
             "plate-scale-mismatch",
-            f"expected images of {wanted:g} arcsec/px as PSF {psf.name} has it; got {seen:g} arcsec/px",
+            f"expected images with the plate scale of PSF {psf.name}, {wanted:g} arcsec/px; got {seen:g} arcsec/px; "
+            "choose a PSF of the same instrument and binning",
         )
 
 
 def _names_images(psf: Psf, transit: Transit) -> bool:
-    """Whether a PSF's history holds the SHA-256 of one of a transit's images. Its lines were broken anywhere."""
+    """Whether a PSF's history contains the SHA-256 of an image of a transit. FITS may break its lines anywhere."""
     history = "".join(str(line) for line in psf.provenance.get("history", ()))
     return any(transit.sha256.get(frame.file, "-") in history for frame in transit.frames)
 
 
-def _tables(psf: Psf, threads: int, stages: _Stages) -> dict[str, Any]:
+def _tables(psf: Psf, threads: int, stages: _ReportProgress) -> dict[str, Any]:
     stages.of("tables")("tables of the PSF", 0, 1)
     return tables_of(psf, threads=threads)
 
@@ -222,37 +236,39 @@ def _tables(psf: Psf, threads: int, stages: _Stages) -> dict[str, Any]:
 def _cross_validated(
     fit: TransitFit, seed: int, missing: list[Missing], progress: Progress
 ) -> CrossValidated | None:
-    """All draws of all runs, by the shared scheme; none, and the reason, where the images do not suffice."""
+    """The cross-validation by the shared scheme. If the images do not suffice: None, with the reason in `missing`."""
     try:
-        fits = shared_fits(fit.solution, draws(len(fit.transit.frames), seed=seed), progress=progress)
+        fits = shared_fits(
+            fit.solution, bootstrap_samples(len(fit.transit.frames), seed=seed), progress=progress
+        )
     except DataError as error:
-        what = "the cross-validation, and scatter without a formula beside it"
+        what = "the cross-validation, and its comparison with scatter without a formula"
         missing.append(Missing(what, error.message))
         return None
     return CrossValidated(fits, bands(fits, fit.solution.total.radii_px))
 
 
 def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[int], Kernel] | None:
-    """For an image's index the total PSF of the fold that holds it out, its neighbours kept out by the guard."""
+    """For each image, the total PSF of the fold that holds it out; the guard also excludes its neighbours."""
     images = len(solution.transit.frames)
     parts = folds(images)
     kernels = []
     try:
         if not parts:
-            raise DataError("too-few-images", f"expected at least 6 images to hold some out; got {images}")
+            raise DataError("too-few-images", f"expected at least 6 images for held-out folds; got {images}")
         for k, fold in enumerate(parts):
             once = tuple(int(n in set(fold.fitted)) for n in range(images))
-            step = shared_step(solution, Draw(0, k, once, fold.held_out))
+            step = shared_step(solution, FoldSample(0, k, once, fold.held_out))
             kernels.append(solution.total.kernel(solution.inversion.coordinates + step))
     except DataError as error:
-        missing.append(Missing("a test on images held out", error.message))
+        missing.append(Missing("a test on held-out images", error.message))
         return None
     which = {n: k for k, fold in enumerate(parts) for n in fold.held_out}
     return lambda index: kernels[which[index]]
 
 
 def _offsets(
-    fit: TransitFit, threads: int, missing: list[Missing], stages: _Stages
+    fit: TransitFit, threads: int, missing: list[Missing], stages: _ReportProgress
 ) -> DarkOffsetStudy | None:
     visits = len(fit.transit.frames) * len(OFFSETS_DN) * OFFSET_VISITS
     try:
@@ -263,12 +279,12 @@ def _offsets(
             progress=stages.counted("dark offsets", visits),
         )
     except DataError as error:
-        missing.append(Missing("what wrong dark levels do", error.message))
+        missing.append(Missing("the effect of wrong dark levels", error.message))
         return None
 
 
-class _Stages:
-    """Progress of the whole out of that of its stages; it never goes back."""
+class _ReportProgress:
+    """Progress of the whole report, computed from the progress of its stages. It never decreases."""
 
     SCALE = 1000
 
@@ -277,7 +293,7 @@ class _Stages:
         self._furthest = 0
 
     def of(self, name: str) -> Progress:
-        """Progress of a stage that says how far it is."""
+        """Progress of a stage that reports its own step and number of steps."""
 
         def report(stage: str, step: int, steps: int) -> None:
             self._say(name, stage, step / max(steps, 1))
@@ -285,7 +301,7 @@ class _Stages:
         return report
 
     def counted(self, name: str, visits: float) -> Progress:
-        """Progress of a stage that starts anew many times: its calls are counted."""
+        """Progress of a stage with several fits, each of which starts at 0: calls are counted instead."""
         calls = 0
 
         def report(stage: str, _step: int, _steps: int) -> None:
@@ -310,7 +326,7 @@ class _Stages:
 
 
 def report_json(report: PsfReport, provenance: dict[str, Any]) -> dict[str, Any]:
-    """All numbers of a report. provenance: what made it, which this package does not know."""
+    """All numbers of a report as JSON. provenance: software and request, as the caller knows them."""
     out: dict[str, Any] = {
         "schema": SCHEMA,
         "sentence": report.sentence,
@@ -340,7 +356,7 @@ def report_json(report: PsfReport, provenance: dict[str, Any]) -> dict[str, Any]
 
 
 def inputs_of(report: PsfReport) -> dict[str, Any]:
-    """What the report was made of: files with their SHA-256, noise, and what was done to pixels without a value."""
+    """The inputs of a report: files with their SHA-256, noise figures, and counts of filled pixels."""
     transit = report.transit
     return {
         "instrument": transit.instrument,

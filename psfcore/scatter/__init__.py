@@ -1,1 +1,1 @@
-"""Diffuse scattering by the mirrors."""
+"""Diffuse scatter by the mirrors: its shapes, its fit to a transit, and tests of the fit."""

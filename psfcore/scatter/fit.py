@@ -1,12 +1,20 @@
-"""From a transit to a total PSF with its errors, its doubts and its history: the whole way, for people and services.
+"""Fit a transit completely: the total PSF with its errors, its limits and the alternatives beside it.
 
-The default is the inversion with the four biases of the published fit mended (`inversion`); beside it stand a free
-fit without a formula, other shapes judged on held-out images, the first guess, and, where asked for, the published
-recipe to the letter with what each of its four biases does (`published`).
+Hofmeister et al., The point-spread function of HRI_EUV, sections "The inversion algorithm" and "Inversion results".
+The default is `psfcore.scatter.inversion`, which corrects the four biases of the published fit. Beside it stand:
+- a free fit of shells without a formula,
+- other shapes, tested on held-out images,
+- the first guess,
+- on request, the published recipe unchanged, and with each of its four biases corrected alone (`published`).
 
-Errors: photon and readout noise of every pixel, carried through (`inversion`). Where the discs scatter by more than
-that from image to image, by a factor f in chi2 beyond what chance allows, all errors are multiplied by sqrt(f) and
-the report says so: something is not modelled, and the errors of a mean do not shrink below what it leaves.
+Errors come from the photon and read noise of every pixel, propagated through the fit. If the disc means scatter from
+image to image by more than this noise, by a factor f in chi2 that chance does not explain, all errors are multiplied
+by sqrt(f) and the report says so. The excess shows an effect that the model lacks, and averaging does not remove it.
+
+| symbol | name | unit |
+|---|---|---|
+| f | TransitFit.overdispersion | - |
+| C(R) | Curve.pct: 100 (1 - encircled energy) at radius R | % |
 """
 
 from __future__ import annotations
@@ -27,15 +35,19 @@ from psfcore.psf import (
     cumulative_curve,
     encircled_energy,
 )
-from psfcore.scatter.as_published.equations import Drawn, Lines, free_fit
-from psfcore.scatter.as_published.published import AS_PUBLISHED, MENDED_ALONE, Published, invert_as_published
+from psfcore.scatter.as_published.equations import Equations, SubsetFits, free_fit
+from psfcore.scatter.as_published.published import (
+    AS_PUBLISHED,
+    CORRECTED_ALONE,
+    Published,
+    invert_as_published,
+)
 from psfcore.scatter.as_published.ring_sums import segment_sums
 from psfcore.scatter.as_published.segments import Segments, shells_as_published
 from psfcore.scatter.inversion import Inversion, Progress, Solution, invert
 from psfcore.scatter.optics import Blur, pick
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named, stretch_of
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
-from psfcore.scatter.validation.cross_validation import ONE_SIGMA, TWO_SIGMA
 from psfcore.scatter.validation.shape_comparison import ComparedShape, compare_shapes
 from psfcore.transit.first_guess import FirstGuess, first_guess
 from psfcore.transit.occulter import disc_distance
@@ -43,16 +55,19 @@ from psfcore.transit.transit import Transit
 
 Kernel = NDArray[np.float64]
 
-SCHEMA = "psf-fit/1"
 RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
-ALONE_DRAWS = 30  # of each bias mended alone: differences between recipes that share their draws
-WORST_CHI2 = 1.5  # a pixel; that of 10,000 pixels is known to 0.014
-OPEN_POINTS = 3.0  # an error of the curve from which a radius is said to be open
+# Recipes with one bias corrected share their subsets with the published one, so few subsets show the difference.
+ALONE_SUBSETS = 30
+WORST_CHI2 = 1.5  # per pixel; for 10,000 pixels chi2 per pixel is known to 0.014
+OPEN_POINTS = 3.0  # a larger error of the curve at a radius is reported as a limit
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A cumulative curve C(R) in percent with its standard error, at radii in px."""
+    """A cumulative curve C(R) = 100 (1 - encircled energy), percent, with its standard error, at radii in px.
+
+    C(R) is the percentage of all light that lands farther than R from its source: "light beyond R".
+    """
 
     radii_px: Vector
     pct: Vector
@@ -60,29 +75,37 @@ class Curve:
 
 
 @dataclass(frozen=True, eq=False)
-class FreeShells:
-    """Scatter without a formula: weights by shell (draws kept, shells) on `segments`, and the light beyond each edge.
+class ShellWeightFits:
+    """Scatter fitted shell by shell, without a formula, to subsets of equations.
 
-    Where no pixel decides, a shell is held at the fitted shape: its spread there says nothing.
+    segments: the shells. fits: their subset fits, with weights (subsets kept, shells). A shell that no pixel constrains stays
+    at the fitted shape, so its spread there contains no information. `psfcore.scatter.validation.free_shells` has
+    another free fit: one linear least-squares problem of all dark pixels, about the fitted shape.
     """
 
     segments: Segments
-    drawn: Drawn
+    fits: SubsetFits
 
     def weights_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
-        """Percentiles over the draws of the weight of a pixel of each shell: (percentiles, shells)."""
-        return np.asarray(np.percentile(self.drawn.fits, percentiles, axis=0))
+        """Percentiles over the subsets of the weight per pixel in each shell, (percentiles, shells)."""
+        return np.asarray(np.percentile(self.fits.fits, percentiles, axis=0))
 
     def beyond_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
-        """Percentiles over the draws of the diffuse light beyond each shell's inner edge, percent."""
-        light = self.drawn.fits * self.segments.counts
+        """Percentiles over the subsets of the diffuse light beyond the inner edge of each shell, percent."""
+        light = self.fits.fits * self.segments.counts
         beyond = 100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1]
         return np.asarray(np.percentile(beyond, percentiles, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
 class TransitFit:
-    """Everything that a transit says of a PSF."""
+    """The complete fit of a transit.
+
+    kernel, scatter: total PSF and scatter kernel [y, x] on the full reach. curve, diffuse_curve: their cumulative
+    curves. free: None for shapes that are not isotropic. shapes: empty unless the softened power law was fitted.
+    published, published_alone: the published recipe and its corrected variants, if requested. limits: sentences about
+    what these data do not determine.
+    """
 
     transit: Transit
     solution: Solution
@@ -92,7 +115,7 @@ class TransitFit:
     kernel: Kernel
     scatter: Kernel
     first_guess: FirstGuess
-    free: FreeShells | None
+    free: ShellWeightFits | None
     shapes: tuple[ComparedShape, ...]
     published: Published | None
     published_alone: dict[str, Published]
@@ -100,7 +123,7 @@ class TransitFit:
 
     @property
     def inversion(self) -> Inversion:
-        """The fit of the shape."""
+        """The fit of the shape, without overdispersion in its errors."""
         return self.solution.inversion
 
     @property
@@ -111,7 +134,7 @@ class TransitFit:
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """Of the shape's coordinates, overdispersion included."""
+        """Covariance of the shape's coordinates, overdispersion included."""
         return self.inversion.covariance * self.overdispersion
 
 
@@ -124,17 +147,17 @@ def fit_transit(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> TransitFit:
-    """Fit a transit. as_published: the published recipe too, and each of its biases mended alone.
+    """Fit a transit. as_published: also run the published recipe, and each correction of one bias alone.
 
-    Raises DataError as `inversion.invert`, "unknown-shape".
+    Raises DataError "unknown-shape", and as `invert` does.
     """
     wanted = shape_named(shape)
     guess = first_guess(transit)
-    progress = _Whole(
+    progress = _FitProgress(
         progress,
         len(transit.frames),
         compared=wanted is SOFTENED_POWER_LAW,
-        published=1 + len(MENDED_ALONE) if as_published else 0,
+        published=1 + len(CORRECTED_ALONE) if as_published else 0,
     )
     solution = invert(transit, wanted, threads=threads, progress=progress)
     factor = overdispersion(solution.inversion)
@@ -146,9 +169,9 @@ def fit_transit(
         published = invert_as_published(transit, AS_PUBLISHED, seed=seed, threads=threads, progress=progress)
         alone = {
             name: invert_as_published(
-                transit, choices, seed=seed, draws=ALONE_DRAWS, threads=threads, progress=progress
+                transit, choices, seed=seed, subsets=ALONE_SUBSETS, threads=threads, progress=progress
             )
-            for name, choices in MENDED_ALONE.items()
+            for name, choices in CORRECTED_ALONE.items()
         }
     return TransitFit(
         transit=transit,
@@ -167,10 +190,10 @@ def fit_transit(
     )
 
 
-class _Whole:
-    """Progress of the whole fit out of that of its stages: each call of a stage is a visit to one frame.
+class _FitProgress:
+    """Progress of the whole fit, computed from the progress of its stages. Each call of a stage is one frame.
 
-    The rounds that a fit will take are a guess; the total grows where there are more.
+    The number of rounds is an estimate. The total grows if a fit needs more.
     """
 
     _COST: ClassVar[dict[str, float]] = {"reconstructing": 1.0, "errors": 1.2, "comparing": 2.5, "free": 1.0}
@@ -194,9 +217,9 @@ class _Whole:
 
 
 def overdispersion(inversion: Inversion) -> float:
-    """By how much the discs' means scatter beyond noise, as a factor on chi2; 1 where chance could do it.
+    """Scatter of the disc means relative to noise, as a factor on chi2; 1 if chance explains the scatter.
 
-    Chance: two standard deviations of a chi2 with as many degrees of freedom as images less parameters.
+    Chance means two standard deviations of chi2, whose degrees of freedom are images minus parameters.
     """
     freedom = len(inversion.frames) - inversion.coordinates.size
     if freedom < 1:
@@ -215,7 +238,7 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
     diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float64, threads=threads)
     scatter = shape.kernel(at, REACH_GRID_PX)
     kernel = np.maximum(diffract.apply(scatter), 0.0)
-    # Slopes need no more than single precision, which takes half the time.
+    # Single precision is sufficient for slopes and takes half the time.
     diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float32, threads=threads)
     total_slopes, diffuse_slopes = [], []
     for k in range(at.size):
@@ -231,20 +254,20 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
     return kernel, scatter, curve(kernel, total_slopes), curve(scatter, diffuse_slopes)
 
 
-def _free_shells(solution: Solution, seed: int, progress: Progress) -> FreeShells:
-    """The free fit on the reconstructed scenes, its biases mended, held at the fitted shape where nothing decides."""
+def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeightFits:
+    """Free fit to the reconstructed scenes, biases corrected; unconstrained shells stay at the fitted shape."""
     segments = Segments(tuple(shells_as_published()))
     diffract = Blur(solution.transit.diffraction, solution.transit.shape, threads=solution.threads)
     parts = []
     for step, n in enumerate(solution.part):
         progress("free shells", step, len(solution.part))
         frame, dark = solution.transit.frames[n], solution.sky.dark[n]
-        lit = solution.lit(n)
-        diffracted = diffract.see(lit)
-        expected = pick(solution.optics.see(lit), dark)
+        blanked = solution.blanked_scene(n)
+        diffracted = diffract.convolve(blanked)
+        expected = pick(solution.optics.convolve(blanked), dark)
         distance = disc_distance(solution.transit.shape, solution.sky.found[n].place)[dark]
         parts.append(
-            Lines(
+            Equations(
                 observed=pick(solution.sky.observed[n], dark),
                 ring_sums=segment_sums(
                     diffract.field(diffracted), np.stack(dark, axis=1), segments, threads=solution.threads
@@ -257,51 +280,57 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> FreeShell
     shape, at = solution.inversion.shape, solution.inversion.coordinates
     towards = segments.mean_of_map(shape.kernel(at, REACH_GRID_PX))
     counts = segments.counts.astype(np.float64)
-    return FreeShells(segments, free_fit(Lines.joined(parts), counts, seed=seed, towards=towards))
+    return ShellWeightFits(segments, free_fit(Equations.joined(parts), counts, seed=seed, towards=towards))
 
 
 def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
-    """What these data cannot say, or where the fit is not to be trusted, in words."""
+    """Sentences about what these data do not determine, and about signs that the fit is unreliable."""
     inversion, out = solution.inversion, []
     if not inversion.converged:
-        out.append(f"the fit had not settled after {len(inversion.rounds)} rounds")
+        out.append(f"the fit did not converge in {len(inversion.rounds)} rounds")
     pointings = {frame.fov for frame in inversion.frames}
     if inversion.left_out:
         out.append(
-            f"{len(inversion.left_out)} images took no part: " + "; ".join(sorted(inversion.left_out)[:5])
+            f"the fit did not use {len(inversion.left_out)} image{'s' if len(inversion.left_out) > 1 else ''}: "
+            + "; ".join(sorted(inversion.left_out)[:5])
         )
     if len(pointings) < 3:
         out.append(
-            f"{len(pointings)} pointing{'s' if len(pointings) > 1 else ''}: scatter over short and long distances "
-            "can hardly be told apart; the errors hold for the fitted shape alone"
+            f"with {len(pointings)} pointing{'s' if len(pointings) > 1 else ''}, the data hardly distinguish scatter "
+            "over short distances from scatter over long distances; the errors assume the fitted shape"
         )
     open_at = [r for r, s in zip(curve.radii_px, curve.sigma, strict=True) if s > OPEN_POINTS]
     if open_at:
         radii = ", ".join(f"{r:g}" for r in open_at)
-        out.append(f"the light beyond {radii} px is open to more than {OPEN_POINTS:g} points")
+        out.append(
+            f"the light beyond {radii} px has a standard error of more than {OPEN_POINTS:g} percentage points"
+        )
     if factor > 1:
         out.append(
-            f"the discs scatter {math.sqrt(factor):.1f} times as much as noise allows: an effect is not modelled, "
-            "and all errors are larger by that factor"
+            f"the disc means scatter {math.sqrt(factor):.1f} times as much as noise explains: the model lacks an "
+            "effect, and all errors are multiplied by that factor"
         )
     if inversion.chi2_per_pixel > WORST_CHI2:
         out.append(
-            f"the model does not describe the occulted pixels: chi2 {inversion.chi2_per_pixel:.2f} a pixel where 1 is "
-            "expected; the noise figures are wrong, or the discs are not what transit.json says"
+            f"the model does not describe the occulted pixels: chi2 per pixel is {inversion.chi2_per_pixel:.2f}, "
+            "expected 1; check the noise figures, and the positions and radii of the discs in transit.json"
         )
     short = min(solution.transit.shape)
     if short < REACH_GRID_PX:
         out.append(
-            f"the field is {short} px: what the PSF holds beyond that distance follows from the shape alone"
+            f"the field is {short} px wide: beyond that distance the PSF is an extrapolation of the fitted shape"
         )
     unsettled = [f.file for f in inversion.frames if not f.found.settled]
     if unsettled:
-        out.append(f"the occulter's place is not settled in {len(unsettled)} images")
+        out.append(
+            f"the position of the occulter did not converge in {len(unsettled)} "
+            f"image{'s' if len(unsettled) > 1 else ''}"
+        )
     return tuple(out)
 
 
-def psf_of(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
-    """The PSF of a fit on the full reach, its components DIFFRACTION and SCATTER beside it."""
+def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
+    """The PSF of a fit on the full reach, with its components DIFFRACTION and SCATTER."""
     return Psf(
         kernel=fit.kernel,
         name=name,
@@ -321,137 +350,3 @@ def psf_of(fit: TransitFit, *, name: str, version: str, provenance: dict[str, An
             covariance=tuple(tuple(row) for row in fit.covariance.tolist()),
         ),
     )
-
-
-def report(fit: TransitFit) -> dict[str, Any]:
-    """The fit as JSON: numbers with errors, one frame a line, what was tried beside it, and what it cannot say."""
-    inversion = fit.inversion
-    values, sigma = inversion.values, fit.value_sigma
-    out: dict[str, Any] = {
-        "schema": SCHEMA,
-        "sentence": sentence(fit),
-        "shape": inversion.shape.name,
-        "parameters": {
-            p.name: {"value": values[p.name], "sigma": sigma[p.name], "unit": p.unit, "meaning": p.meaning}
-            for p in inversion.shape.parameters
-        },
-        "coordinates": {
-            "scales": [p.scale for p in inversion.shape.parameters],
-            "values": inversion.coordinates.tolist(),
-            "covariance": fit.covariance.tolist(),
-        },
-        "curve": _curve_json(fit.curve),
-        "diffuse_curve": _curve_json(fit.diffuse_curve),
-        "chi2_per_pixel": inversion.chi2_per_pixel,
-        "overdispersion": fit.overdispersion,
-        "converged": inversion.converged,
-        "rounds": [
-            {
-                "frames": r.frames,
-                "parameters": r.values,
-                "curve_pct": list(r.curve_pct),
-                "moved_points": r.moved_points,
-                "chi2_per_pixel": r.chi2_per_pixel,
-            }
-            for r in inversion.rounds
-        ],
-        "frames": [
-            {
-                "file": f.file,
-                "fov": f.fov,
-                "x": f.found.place.x_px,
-                "y": f.found.place.y_px,
-                "r": f.found.place.radius_px,
-                "x_sigma": f.found.sigma_x_px,
-                "y_sigma": f.found.sigma_y_px,
-                "neighbours": f.found.neighbours,
-                "dark_pixels": int(f.dark[0].size),
-                "observed_dn_s": f.observed,
-                "expected_dn_s": f.expected,
-                "noise_dn_s": f.noise,
-                "residual_pct": f.residual_pct,
-            }
-            for f in inversion.frames
-        ],
-        "left_out": inversion.left_out,
-        "limits": list(fit.limits),
-        "first_guess": fit.first_guess.to_json(),
-        "inputs_sha256": fit.transit.sha256,
-    }
-    if "stretch_p" in values:
-        stretch, angle = stretch_of(values)
-        out["stretch"] = {"stretch": stretch, "angle_deg": angle}
-    out["shapes"] = [
-        {
-            "name": s.name,
-            "added": {name: {"value": v, "sigma": e} for name, (v, e) in s.added.items()},
-            "delta_chi2": s.gain,
-            "delta_chi2_held_out": s.held_out_gain,
-        }
-        for s in fit.shapes
-    ]
-    if fit.free is not None:
-        out["free_shells"] = _free_json(fit.free)
-    if fit.published is not None:
-        out["as_published"] = _published_json(fit)
-    return out
-
-
-def sentence(fit: TransitFit) -> str:
-    """What a person reads first."""
-    values, sigma, curve = fit.inversion.values, fit.value_sigma, fit.curve
-    at = {r: (c, s) for r, c, s in zip(curve.radii_px, curve.pct, curve.sigma, strict=True)}
-    beyond = ", ".join(f"{at[r][0]:.2f} ± {at[r][1]:.2f} % beyond {r:g} px" for r in (10.0, 100.0))
-    return (
-        f"{100 * values['total']:.2f} ± {100 * sigma['total']:.2f} % of the light is scattered diffusely; scattered "
-        f"and diffracted together {at[0.5][0]:.2f} ± {at[0.5][1]:.2f} % leaves its pixel, {beyond} "
-        f"({len(fit.inversion.frames)} images, chi2 {fit.inversion.chi2_per_pixel:.3f} a pixel)."
-    )
-
-
-def _curve_json(curve: Curve) -> dict[str, list[float]]:
-    return {
-        "radii_px": curve.radii_px.tolist(),
-        "light_beyond_pct": curve.pct.tolist(),
-        "sigma": curve.sigma.tolist(),
-    }
-
-
-def _free_json(free: FreeShells) -> dict[str, Any]:
-    percentiles = (50.0, *ONE_SIGMA, *TWO_SIGMA)
-    names = ("median", "minus_1_sigma", "plus_1_sigma", "minus_2_sigma", "plus_2_sigma")
-    weights, beyond = free.weights_pct(percentiles), free.beyond_pct(percentiles)
-    return {
-        "edges_px": list(free.segments.edges_px),
-        "weight": dict(zip(names, weights.tolist(), strict=True)),
-        "diffuse_light_beyond_inner_edge_pct": dict(zip(names, beyond.tolist(), strict=True)),
-    }
-
-
-def _published_json(fit: TransitFit) -> dict[str, Any]:
-    published = fit.published
-    assert published is not None
-    here = dict(zip(fit.curve.radii_px, fit.curve.pct, strict=True))
-
-    def one(p: Published) -> dict[str, Any]:
-        return {
-            "a": p.a,
-            "b_px": p.b_px,
-            "c": p.c,
-            "total": p.total,
-            "counted_on_grid_px": p.grid_px,
-            "lines": p.lines,
-            "radii_px": p.radii_px.tolist(),
-            "light_beyond_pct": p.curve_pct.tolist(),
-            "minus_default_points": [c - here[r] for r, c in zip(p.radii_px, p.curve_pct, strict=True)],
-            "rounds": [{"fit": r.fit, "curve_pct": list(r.curve_pct)} for r in p.rounds],
-        }
-
-    return {
-        "whole": one(published) | {"spread_of_draws": published.spread},
-        "one_bias_mended": {
-            name: one(p) | {"minus_published_points": (p.curve_pct - published.curve_pct).tolist()}
-            for name, p in fit.published_alone.items()
-            if p.radii_px.size == published.radii_px.size
-        },
-    }

@@ -1,4 +1,4 @@
-"""A fit to a transit as a picture: what was found, how sure it is, and what every image says of it."""
+"""Plot a fit to a transit: the PSF with its errors, the residuals of every image, and the convergence."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from psfcore.drawing.plots import INK
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.as_published.published import Published
-from psfcore.scatter.fit import ONE_SIGMA, TWO_SIGMA, Curve, FreeShells, TransitFit, sentence
+from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
 from psfcore.scatter.inversion import CONVERGED_POINTS
+from psfcore.scatter.report import fit_sentence
+from psfcore.scatter.validation.bands import ONE_SIGMA, TWO_SIGMA
 from psfcore.transit.first_guess import ESTIMATORS
 
 Vector = NDArray[np.float64]
@@ -27,12 +29,12 @@ _DIFFUSE, _TOTAL, _FREE, _PUBLISHED = "#c77f00", "#111111", "#1f6fb4", "#b3261e"
 _POINTINGS = ("#1b4f8a", "#c2402f", "#2b8a6e", "#7b3fa0", "#8a6d00", "#5b5b5b")
 _ESTIMATOR_STYLES = {"image_mean": "o", "image_median": "s", "shell": "^"}
 _NEAREST_PX, _FARTHEST_PX = 0.5, REACH_GRID_PX / 2
-_MANY_IMAGES = 60  # from which on points are drawn smaller
+_MANY_IMAGES = 60  # with this many images or more, markers are smaller
 _TITLE_LETTERS = 175
 
 
 def fit_png(fit: TransitFit, path: str | Path) -> None:
-    """Six panels: weight and light by distance, residuals by time and by place, convergence, first guess."""
+    """Six panels: weight and light by distance, residuals by time and position, convergence, first guess."""
     figure = Figure(
         figsize=(15.6, 10.2),
         dpi=100,
@@ -40,8 +42,8 @@ def fit_png(fit: TransitFit, path: str | Path) -> None:
         layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1, hspace=0.04),
     )
     name = f"{fit.transit.instrument or 'Transit'}: {fit.inversion.shape.name.replace('-', ' ')}"
-    words = "\n".join(textwrap.wrap(sentence(fit), _TITLE_LETTERS))
-    # The layout makes room for one title: its first line is empty, and the name stands there in bold.
+    words = "\n".join(textwrap.wrap(fit_sentence(fit), _TITLE_LETTERS))
+    # The layout reserves space for one title. Its first line is empty, and the name fills that line in bold.
     figure.suptitle(f"\n{words}", fontsize=11, color=INK, x=0.012, ha="left", linespacing=1.5)
     figure.text(0.012, 0.987, name, fontsize=14, color=INK, weight="bold", va="top")
     (weight, light, guess), (by_time, by_place, rounds) = figure.subplots(2, 3)
@@ -50,7 +52,7 @@ def fit_png(fit: TransitFit, path: str | Path) -> None:
     _draw_first_guess(guess, fit)
     _draw_residuals(by_time, fit, _minutes(fit), "Time from the first image (min)", "Residuals by time")
     across = np.array([f.found.place.x_px for f in fit.inversion.frames])
-    _draw_residuals(by_place, fit, across, "Detector x of the occulter (px)", "Residuals by place")
+    _draw_residuals(by_place, fit, across, "Detector x of the occulter (px)", "Residuals by position")
     _draw_rounds(rounds, fit)
     for axes in (weight, light, guess, by_time, by_place, rounds):
         axes.set_axisbelow(True)
@@ -61,7 +63,7 @@ def fit_png(fit: TransitFit, path: str | Path) -> None:
 
 
 def _draw_weights(axes: Any, fit: TransitFit) -> None:
-    """Weight of a pixel by distance: the fitted shape with its error, free shells, the published law."""
+    """Weight per pixel by distance: the fitted shape with its error, free shells, the published power law."""
     radius, weight, sigma_of_log = _fitted_weights(fit)
     if fit.free is not None:
         _draw_free_weights(axes, fit.free, max(fit.transit.shape))
@@ -98,7 +100,7 @@ def _draw_weights(axes: Any, fit: TransitFit) -> None:
 
 
 def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
-    """Distance (px), mean weight over rings and the standard error of its logarithm, to first order."""
+    """Distance (px), mean weight over rings, and the first-order standard error of its logarithm."""
     shape, at = fit.inversion.shape, fit.inversion.coordinates
 
     def rings(kernel: Vector) -> tuple[Vector, Vector]:
@@ -113,8 +115,8 @@ def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
     return radius, weight, np.sqrt(np.maximum(variance, 0.0))
 
 
-def _draw_free_weights(axes: Any, free: FreeShells, field_px: int) -> None:
-    """Median and spread of shells that begin within the field: farther ones are held, and say nothing."""
+def _draw_free_weights(axes: Any, free: ShellWeightFits, field_px: int) -> None:
+    """Median and spread of the shells that begin within the field. No pixel constrains those farther out."""
     edges, shown = _shells_within(free, field_px)
     for percentiles, alpha, label in (
         (TWO_SIGMA, 0.14, "free shells, ±2 σ"),
@@ -128,20 +130,20 @@ def _draw_free_weights(axes: Any, free: FreeShells, field_px: int) -> None:
     axes.stairs(median, edges, baseline=None, color=_FREE, linewidth=1.1, label="free shells, median")
 
 
-def _shells_within(free: FreeShells, field_px: int) -> tuple[Vector, NDArray[np.bool_]]:
-    """Edges of the shells that begin within the field, one more than shells, and which they are."""
+def _shells_within(free: ShellWeightFits, field_px: int) -> tuple[Vector, NDArray[np.bool_]]:
+    """Edges (n + 1) of the n shells that begin within the field, and a mask of those shells."""
     edges = np.array(free.segments.edges_px)
     shown = edges[:-1] < field_px
     return edges[: np.count_nonzero(shown) + 1], shown
 
 
 def _stepped(low: Vector, high: Vector) -> tuple[Vector, Vector]:
-    """With the last value once more, as steps from edge to edge need it; above 0, for a logarithmic axis."""
+    """Repeat the last value, which steps from edge to edge need, and keep values above 0 for the logarithmic axis."""
     return np.maximum(np.append(low, low[-1]), 1e-30), np.maximum(np.append(high, high[-1]), 1e-30)
 
 
 def _draw_light(axes: Any, fit: TransitFit) -> None:
-    """Light beyond each distance: total and diffuse, with errors; the published beside them."""
+    """Light beyond each distance: total and diffuse, with errors, and the published recipe's."""
     radii = np.geomspace(_NEAREST_PX, _FARTHEST_PX, 300)
     for kernel, curve, colour, name in (
         (fit.kernel, fit.curve, _TOTAL, "total"),
@@ -156,12 +158,12 @@ def _draw_light(axes: Any, fit: TransitFit) -> None:
         _draw_published_light(axes, fit.published)
     axes.set(xscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX), ylim=(0, None))
     _mark_field(axes, fit)
-    axes.set(xlabel="Distance (px)", ylabel="Light beyond the distance (%)", title="Light beyond a distance")
+    axes.set(xlabel="Distance (px)", ylabel="1 - encircled energy (%)", title="Light beyond a distance")
     axes.legend(fontsize=9, loc="upper right", frameon=False)
 
 
 def _sigma_at(curve: Curve, radii: Vector) -> Vector:
-    """The curve's error between its radii."""
+    """The standard error of a curve, interpolated between its radii."""
     return np.asarray(np.interp(np.log(radii), np.log(curve.radii_px), curve.sigma))
 
 
@@ -183,7 +185,7 @@ def _draw_published_light(axes: Any, published: Published) -> None:
 
 
 def _draw_residuals(axes: Any, fit: TransitFit, where: Vector, label: str, title: str) -> None:
-    """Simulated minus observed of every image with its noise, coloured by pointing."""
+    """Residual of every image with its noise, coloured by pointing."""
     frames = fit.inversion.frames
     residual = np.array([f.residual_pct for f in frames])
     noise = np.array([100 * f.noise / abs(f.observed) for f in frames])
@@ -195,35 +197,39 @@ def _draw_residuals(axes: Any, fit: TransitFit, where: Vector, label: str, title
         style = _points(_POINTINGS[n % len(_POINTINGS)], size)
         axes.errorbar(where[here], residual[here], noise[here], label=f"pointing {fov}", **style)
     top = 1.12 * float((np.abs(residual) + noise).max(initial=1e-3))
-    axes.set(ylim=(-top, 1.3 * top), xlabel=label, ylabel="Simulated - observed (% of observed)", title=title)
+    axes.set(ylim=(-top, 1.3 * top), xlabel=label, ylabel="Residual: simulated - observed (%)", title=title)
     axes.legend(fontsize=9, loc="upper right", frameon=False, ncols=3, columnspacing=1.0, handletextpad=0.3)
 
 
 def _minutes(fit: TransitFit) -> Vector:
-    """When each image that took part was taken, minutes from the first."""
+    """Time of each fitted image, in minutes from the first image of the transit."""
     time_s = {frame.file: frame.time_s for frame in fit.transit.frames}
     return np.array([time_s[f.file] for f in fit.inversion.frames]) / 60
 
 
 def _draw_rounds(axes: Any, fit: TransitFit) -> None:
-    """How far the curve moved in each round; filled where all images took part."""
+    """Largest change of the curve in each round. Markers are filled for rounds with all images."""
     rounds = fit.inversion.rounds
     number = np.arange(1, len(rounds) + 1)
     moved = np.array([max(r.moved_points, 1e-6) for r in rounds])
     whole = np.array([r.frames == max((s.frames for s in rounds), default=0) for r in rounds], dtype=bool)
     axes.plot(number, moved, color="#999999", linewidth=1.2, zorder=1)
-    for here, face, name in ((whole, _TOTAL, "all images"), (~whole, "white", "some images, to begin with")):
+    for here, face, name in ((whole, _TOTAL, "all images"), (~whole, "white", "some images (pilot rounds)")):
         if here.any():
             axes.scatter(number[here], moved[here], s=44, c=face, edgecolors=_TOTAL, zorder=2, label=name)
     axes.axhline(
-        CONVERGED_POINTS, color=_PUBLISHED, linewidth=1.2, linestyle=(0, (5, 2)), label="taken as converged"
+        CONVERGED_POINTS, color=_PUBLISHED, linewidth=1.2, linestyle=(0, (5, 2)), label="convergence limit"
     )
     axes.set_yscale("log")
     low, high = min(moved.min(initial=1.0), CONVERGED_POINTS), max(moved.max(initial=0.1), CONVERGED_POINTS)
     axes.set(xlim=(0.5, len(rounds) + 0.5), ylim=(low / 3, high * 12))
     axes.set_xticks(_whole_ticks(number))
     settled = "converged" if fit.inversion.converged else "not converged"
-    axes.set(xlabel="Round", ylabel="Curve moved by (points)", title=f"Convergence ({settled})")
+    axes.set(
+        xlabel="Round",
+        ylabel="Largest change of the curve (percentage points)",
+        title=f"Convergence ({settled})",
+    )
     axes.legend(fontsize=9, loc="upper right", frameon=False)
 
 
@@ -232,9 +238,9 @@ def _whole_ticks(number: NDArray[np.intp]) -> Sequence[int]:
 
 
 def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
-    """Light from farther than the disc's radius by estimator and pointing, and what the fit has there.
+    """First guess of the light beyond the disc's radius, by estimator and pointing, and the value of the fit.
 
-    Ratios that are not above 0 have no place on a logarithmic axis.
+    A logarithmic axis cannot show ratios of 0 or less, so they are omitted.
     """
     guess = fit.first_guess
     time_min = np.array([f.time_s for f in guess.frames]) / 60
@@ -249,7 +255,7 @@ def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
                 time_min[here], ratios[name][here], marker, color=colour, markersize=size, markeredgewidth=0
             )
     for name, marker in _ESTIMATOR_STYLES.items():
-        label = "over " + name.replace("_", " ")
+        label = "relative to " + name.replace("_", " ")
         axes.plot([], [], marker, color="#777777", markersize=5, label=label)
     fitted = float(cumulative_curve(fit.kernel, [guess.radius_px])[0])
     axes.axhline(
@@ -257,7 +263,7 @@ def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
         color=_TOTAL,
         linewidth=1.4,
         linestyle=(0, (5, 2)),
-        label=f"fit, beyond {guess.radius_px:.1f} px",
+        label=f"fit: light beyond {guess.radius_px:.1f} px",
     )
     shown = np.concatenate([r[np.isfinite(r) & (r > 0)] for r in ratios.values()] + [[fitted]])
     low, high = np.log(shown.min()), np.log(shown.max())
@@ -266,14 +272,14 @@ def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set(
         xlabel="Time from the first image (min)",
-        ylabel="Middle of the disc over the Sun (%)",
-        title="First guess, as if the Sun were even",
+        ylabel="Disc centre / solar intensity (%)",
+        title="First guess, assuming a uniform Sun",
     )
     axes.legend(fontsize=9, loc="upper left", frameon=False, ncols=2, columnspacing=1.2, handletextpad=0.4)
 
 
 def _mark_field(axes: Any, fit: TransitFit) -> None:
-    """Where the field ends: farther out the shape alone speaks."""
+    """Shade distances beyond the field, where the PSF is an extrapolation of the fitted shape."""
     field = max(fit.transit.shape)
     if field < _FARTHEST_PX:
         axes.axvspan(field, _FARTHEST_PX, color="#f0f0f0", zorder=0, linewidth=0, label="beyond the field")

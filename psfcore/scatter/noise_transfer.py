@@ -1,17 +1,17 @@
-"""What the noise of all of a frame's pixels does to what is read off its occulter.
+"""Propagate the noise of all pixels of a frame into the residuals of its dark pixels.
 
-With y = H x + n a frame, D its fully dark pixels and G the inverse of H, the light that a PSF leaves unexplained in
-the disc is r = D [y - H (1 - D) G y]. A template t of the dark pixels has
+For a frame y = H x + n with fully dark pixels D, and G the inverse of H, the residual in the disc is
+r = D [y - H (1 - D) G y]. The sum of the residual weighted by a template t is
 
-    t . r = b . n + what there is without noise,   b = t - G^T (1 - D) H^T t          Eq. (1)
+    t . r = b . n + (t . r without noise),   b = t - G^T (1 - D) H^T t                Eq. (1)
     cov(t_1 . r, t_2 . r) = sum over all pixels of b_1 b_2 var(n)                     Eq. (2)
 
-the disc's own noise, and that of the scene which scatters into it.
+The two terms of b are the noise of the disc itself, and the noise of the scene that scatters into the disc.
 
 | symbol | name | unit |
 |---|---|---|
 | t | template: a weight for each dark pixel | - |
-| n | noise of photons and readout | DN/s |
+| n | photon and read noise | DN/s |
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ Vector = NDArray[np.float64]
 def noise_covariance(
     optics: Optics, frame: Frame, dark: Pixels, templates: Sequence[Vector], noise: Noise
 ) -> NDArray[np.float64]:
-    """Eq. (2): covariance (templates, templates) of each template's sum over the dark pixels, in (DN/s)^2."""
+    """Eq. (2): covariance (templates, templates) of the weighted sums over the dark pixels, in (DN/s)^2."""
     spread = []
     for template in templates:
         here = np.zeros(optics.engine.lanes_shape, np.float32)
         put(here, dark, template)
-        scattered = optics.see_back(here)
+        scattered = optics.correlate(here)
         put(scattered, dark, 0.0)
-        here -= optics.undo_once(scattered, adjoint=True)  # Eq. (1)
+        here -= optics.invert_once(scattered, adjoint=True)  # Eq. (1)
         spread.append(optics.field(here).ravel())
     b = np.array(spread, dtype=np.float32)
-    # Linear in the observed value, so its own noise averages out.
+    # The variance is linear in the observed value, so the noise of that value averages out.
     variance = noise.variance(frame.pixels.astype(np.float64), frame.exposure_s).ravel()
     return np.asarray((b * variance.astype(np.float32)) @ b.T, dtype=np.float64)  # Eq. (2)

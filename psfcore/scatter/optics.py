@@ -1,11 +1,17 @@
-"""A PSF on one field: see through it, undo it, and how both change with its parameters.
+"""Convolution with a PSF on one field, its inverse, and the derivative of both.
 
-    undo:   x <- x + G (y - H x)                            Eq. (1), G the inverse on the periodic plane
-    scene:  d x / d q = -G (dH / dq) x                      Eq. (2)
+    inverse:     x <- x + G (y - H x)                       Eq. (1), G the inverse on the periodic plane
+    derivative:  d x / d q = -G (dH / dq) x                 Eq. (2)
 
-The core of HRI_EUV's PSF holds 0.43 of its light, so that Eq. (1) settles in about five steps; it is linear and
-has no bias on faint pixels, where Richardson-Lucy has one. Fields stay in the engine's own order (its "lanes")
-from step to step; single pixels are picked out of it.
+The core of HRI_EUV's PSF holds 0.43 of the light, so Eq. (1) converges in about five steps. It is linear and has no
+bias on faint pixels, unlike Richardson-Lucy. Fields stay in the engine's own order (its "lanes") between steps, and
+single pixels are read and written there.
+
+| symbol | name |
+|---|---|
+| H, H^T | Blur.convolve, Blur.correlate |
+| G, G^T | Optics.invert_once |
+| x, y | lanes of the scene, lanes of the observation |
 """
 
 from __future__ import annotations
@@ -23,9 +29,9 @@ STEPS = 5
 
 
 class Blur:
-    """Convolution with a kernel on one field, cut to it, in float32.
+    """Convolution with a kernel on one field, cropped to the field, in float32.
 
-    kernel: [y, x], centre at [n // 2, n // 2]; of any sign. Beyond the field it is dark.
+    kernel: [y, x], centre at [n // 2, n // 2]; its values may have any sign. The field is dark beyond its edges.
     """
 
     def __init__(
@@ -39,15 +45,15 @@ class Blur:
         return self.engine.to_lanes(field)
 
     def field(self, lanes: Lanes) -> NDArray[np.float32]:
-        """The field [y, x] of lanes."""
+        """The field [y, x] from the engine's order."""
         return self.engine.from_lanes(lanes)
 
-    def see(self, lanes: Lanes) -> Lanes:
-        """H x."""
+    def convolve(self, lanes: Lanes) -> Lanes:
+        """H x: the field convolved with the kernel."""
         return self._through(lanes, self.engine.transfer)
 
-    def see_back(self, lanes: Lanes) -> Lanes:
-        """H^T y."""
+    def correlate(self, lanes: Lanes) -> Lanes:
+        """H^T y: the field correlated with the kernel, the adjoint of `convolve`."""
         return self._through(lanes, self.engine.transfer, conjugate=True)
 
     def _through(self, lanes: Lanes, transfer: NDArray[np.float32], *, conjugate: bool = False) -> Lanes:
@@ -55,7 +61,7 @@ class Blur:
         self.engine.rows_forward(lanes)
         self.engine.multiply_columns(transfer, conjugate=conjugate)
         self.engine.rows_inverse(out)
-        if self._partly_filled:  # the last block also holds what fell beyond the field's last row
+        if self._partly_filled:  # the last block also contains light that fell beyond the last row
             rows = self.engine.field_shape[0] % BLOCK_ROWS
             out[-1, :, 0, min(rows, LANES) :] = 0.0
             out[-1, :, 1, max(rows - LANES, 0) :] = 0.0
@@ -63,7 +69,7 @@ class Blur:
 
 
 class Optics(Blur):
-    """A blur by a PSF, and its approximate inverse."""
+    """Convolution with a PSF, and its approximate inverse."""
 
     def __init__(
         self, psf_kernel: NDArray[np.float64], field_shape: tuple[int, int], *, threads: int = 1
@@ -71,27 +77,27 @@ class Optics(Blur):
         super().__init__(psf_kernel, field_shape, threads=threads)
         self._inverse = inverse_filter(self.engine)
 
-    def undo_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
-        """G y; G^T y where adjoint."""
+    def invert_once(self, lanes: Lanes, *, adjoint: bool = False) -> Lanes:
+        """G y, or G^T y if `adjoint`."""
         return self._through(lanes, self._inverse, conjugate=adjoint)
 
-    def undo(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
-        """The scene x behind an observation, Eq. (1), from a start (none: the observation)."""
+    def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
+        """The scene x of an observation by `steps` of Eq. (1). start: first estimate; default: the observation."""
         x = observed.copy() if start is None else start.copy()
         for _ in range(steps):
-            residual = self.see(x)
+            residual = self.convolve(x)
             np.subtract(observed, residual, out=residual)
-            x += self.undo_once(residual)  # Eq. (1)
+            x += self.invert_once(residual)  # Eq. (1)
         return x
 
 
 def pick(lanes: Lanes, pixels: Pixels) -> NDArray[np.float64]:
-    """The values of single pixels (rows, columns) in lanes."""
+    """Read single pixels (rows, columns) from lanes."""
     return np.asarray(lanes[_index(pixels)], dtype=np.float64)
 
 
 def put(lanes: Lanes, pixels: Pixels, values: NDArray[np.floating] | float) -> None:
-    """Set single pixels in lanes."""
+    """Set single pixels (rows, columns) in lanes."""
     lanes[_index(pixels)] = values
 
 

@@ -4,7 +4,7 @@ Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse sc
 
     s(r) = a / (b + r)^c  for r > 0,   s(0) = 1 - total,   total = sum over r > 0 on the full reach    Eq. (1)
 
-The amplitude is derived from the total and never given: `total` means the 2048 px grid, to 1448 px.
+The amplitude follows from the total. `total` refers to the 2048 px grid, which reaches to 1448 px.
 
 | symbol | name | unit |
 |---|---|---|
@@ -23,16 +23,16 @@ from psfcore.psf import REACH_GRID_PX, squared_radii
 
 
 def amplitude_for_total(b_px: float, c: float, total: float, *, reach_grid_px: int = REACH_GRID_PX) -> float:
-    """a of Eq. (1) for which the light at r > 0 on a grid of `reach_grid_px` a side sums to `total`."""
+    """The amplitude a of Eq. (1) for which the weights at r > 0 on a `reach_grid_px` square sum to `total`."""
     shape = _falloff(b_px, c, reach_grid_px)
     centre = reach_grid_px // 2
     return float(total / (shape.sum() - shape[centre, centre]))
 
 
 def scatter_kernel(b_px: float, c: float, total: float, size: int) -> NDArray[np.float64]:
-    """Eq. (1) on (size, size), centre at [size // 2, size // 2] holding 1 - total.
+    """Eq. (1) on (size, size); the centre at [size // 2, size // 2] holds 1 - total.
 
-    Sums to 1 for size 2048 and to less on a smaller array.
+    The sum is 1 for size 2048, and less on a smaller array.
     """
     kernel = amplitude_for_total(b_px, c, total) * _falloff(b_px, c, size)  # Eq. (1)
     kernel[size // 2, size // 2] = 1 - total

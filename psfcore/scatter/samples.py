@@ -1,7 +1,7 @@
-"""PSFs that a fitted PSF might be instead: what its covariance allows.
+"""Sample PSFs that represent the uncertainty of a fitted PSF.
 
-The sigma points of a covariance (Julier and Uhlmann 1997): two PSFs a parameter, whose mean and spread are those of
-the fit. A deconvolution with each of them gives the part of its error that comes from the PSF.
+The samples are the sigma points of the covariance (Julier and Uhlmann 1997): two PSFs per parameter, with the mean
+and the covariance of the fit. A deconvolution with each of them gives the part of the error that comes from the PSF.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ DIFFRACTION, SCATTER = "DIFFRACTION", "SCATTER"
 
 
 def possible_psfs(psf: Psf, *, threads: int = 1) -> list[Psf]:
-    """The sigma points of a fitted PSF, two a parameter, on its own array and without components.
+    """The sigma points of a fitted PSF, two per parameter, on its own array and without components.
 
-    Raises DataError "psf-not-fitted" where the PSF does not say how well it is known.
+    Raises DataError "psf-not-fitted" if the PSF has no covariance.
     """
     if psf.fitted is None or DIFFRACTION not in psf.components:
         raise DataError(
             "psf-not-fitted",
-            f"expected a PSF fitted to a transit; {psf.name} {psf.version} has no covariance",
+            f"expected a PSF with a covariance from a fit to a transit; got {psf.name} {psf.version} without one",
         )
     fitted, size = psf.fitted, psf.kernel.shape[0]
     shape = shape_named(fitted.shape)

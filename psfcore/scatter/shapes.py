@@ -1,6 +1,7 @@
-"""Shapes of diffuse scatter that a transit can be fitted with.
+"""Shapes of diffuse scatter that can be fitted to a transit.
 
-Every shape is a falloff f(dx, dy), light at the centre going to (dx, dy), and is scaled on the full reach:
+Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light", for Eq. (2). Every shape
+is a falloff f(d) of light from the centre to the offset d = (dx, dy). It is scaled on the full reach:
 
     s(d) = total f(d) / sum over d != 0 of f   for d != 0,   s(0) = 1 - total        Eq. (1)
 
@@ -11,10 +12,10 @@ Every shape is a falloff f(dx, dy), light at the centre going to (dx, dy), and i
     two power laws                Eq. (2) + a second, (b_2 + r)^-c                     Eq. (6)
     core                          Eq. (2) + a Gaussian                                 Eq. (7)
 
-In Eq. (3) a stretch by 1 + s along the angle t has ln(1 + s) = hypot(p, q), 2 t = atan2(q, p): two numbers
-that are smooth where nothing is stretched, as an angle is not. In Eq. (6) and (7) the share is of the total.
+In Eq. (3) a stretch by 1 + s along the angle t has ln(1 + s) = hypot(p, q) and 2 t = atan2(q, p). The two numbers p
+and q are smooth at zero stretch, where an angle is not defined. The shares in Eq. (6) and (7) are fractions of `total`.
 
-A fit moves in coordinates that know no bounds: the logarithm of a positive number, the logit of a share.
+A fit works in unbounded coordinates: the logarithm of a positive number, the logit of a fraction.
 
 | symbol | name | unit |
 |---|---|---|
@@ -42,7 +43,7 @@ Values = Mapping[str, float]
 Kernel = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
-DIFFERENCE = 1e-3  # of a coordinate, for central differences
+DIFFERENCE = 1e-3  # step of a coordinate for central differences
 HALO_B_PX = 120.0
 KNEE_PX = 100.0
 CORE_PX = 1.5
@@ -50,7 +51,7 @@ CORE_PX = 1.5
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a shape: where a fit starts, and in what coordinate it moves."""
+    """A parameter of a shape: the start of a fit, the scale of its coordinate and the largest step of a round."""
 
     name: str
     unit: str
@@ -60,7 +61,7 @@ class Parameter:
     meaning: str
 
     def coordinate(self, value: float) -> float:
-        """The unbounded coordinate of a value."""
+        """The unbounded coordinate that corresponds to a value."""
         if self.scale == "log":
             return math.log(value)
         return math.log(value / (1 - value)) if self.scale == "logit" else value
@@ -79,13 +80,13 @@ class Parameter:
         return value * (1 - value) if self.scale == "logit" else 1.0
 
 
-Falloff = Callable[[Values, int], Kernel]  # unnormalised, on a square of that size
-Radial = Callable[[Vector], Vector]  # the same of radii (px)
+Falloff = Callable[[Values, int], Kernel]  # not normalised, on a square of that size
+Radial = Callable[[Vector], Vector]  # not normalised, as a function of radii (px)
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape of scatter: its parameters, and its falloff: of radii alone where it is isotropic, else on a square."""
+    """A shape of scatter. radial: falloff by radius, for isotropic shapes; falloff: on a square, for all others."""
 
     name: str
     parameters: tuple[Parameter, ...]
@@ -94,39 +95,39 @@ class Shape:
 
     def __post_init__(self) -> None:
         if (self.radial is None) == (self.falloff is None):
-            raise ValueError(f"{self.name}: expected a falloff either of radii or on a square")
+            raise ValueError(f"{self.name}: expected either `radial` or `falloff`; got both or neither")
 
     @property
     def isotropic(self) -> bool:
-        """Whether it is the same in all directions."""
+        """Whether the scatter is the same in all directions."""
         return self.radial is not None
 
     @property
     def start(self) -> Vector:
-        """Coordinates where a fit starts."""
+        """Coordinates at which a fit starts."""
         return np.array([p.coordinate(p.start) for p in self.parameters])
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters, in order."""
+        """Parameter names, in order."""
         return tuple(p.name for p in self.parameters)
 
     def values(self, coordinates: Vector) -> dict[str, float]:
-        """Values by name at these coordinates."""
+        """Parameter values by name at these coordinates."""
         return {p.name: p.value(float(q)) for p, q in zip(self.parameters, coordinates, strict=True)}
 
     def coordinates(self, values: Values) -> Vector:
-        """Coordinates of these values; a parameter that is not among them is at its start."""
+        """Coordinates of these values. A parameter without a value takes its start."""
         return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
 
     def shortened(self, step: Vector) -> tuple[Vector, bool]:
-        """A step of the coordinates, shortened to the largest that each parameter may take; whether it is whole."""
+        """A step shortened until no parameter exceeds its largest step, and whether it kept its full length."""
         largest = np.array([p.largest_step for p in self.parameters])
         too_far = float((np.abs(step) / largest).max())
         return (step, True) if too_far <= 1 else (step / too_far, False)
 
     def kernel(self, coordinates: Vector, size: int) -> Kernel:
-        """Scatter kernel [y, x] of Eq. (1) on (size, size), centre at [size // 2, size // 2]."""
+        """The scatter kernel [y, x] of Eq. (1) on (size, size), centre at [size // 2, size // 2]."""
         values = self.values(coordinates)
         if self.radial is not None:
             return _scaled_by_radius(self.radial(values), values["total"], size)
@@ -150,9 +151,11 @@ class Shape:
         return np.asarray((ahead - behind) / (2 * DIFFERENCE))
 
 
-B = Parameter("b_px", "px", 6.0, "log", 0.5, "radius within which the power law is softened")
+B = Parameter("b_px", "px", 6.0, "log", 0.5, "radius within which the power law flattens")
 C = Parameter("c", "", 2.5, "linear", 0.3, "exponent of the power law")
-TOTAL = Parameter("total", "", 0.4, "logit", 0.4, "share of light that is scattered, on the full reach")
+TOTAL = Parameter(
+    "total", "", 0.4, "logit", 0.4, "fraction of the light that is scattered, on the full reach"
+)
 _POWER_LAW = (B, C, TOTAL)
 
 
@@ -255,7 +258,7 @@ SHAPES: dict[str, Shape] = {
                     0.0,
                     "linear",
                     0.1,
-                    f"share of a second one, softened at {HALO_B_PX:g} px",
+                    f"fraction of the scatter in a second power law, softened at {HALO_B_PX:g} px",
                 ),
             ),
             _two,
@@ -264,7 +267,14 @@ SHAPES: dict[str, Shape] = {
             "core",
             (
                 *_POWER_LAW,
-                Parameter("core_share", "", 0.0, "linear", 0.1, f"share of a Gaussian of {CORE_PX:g} px"),
+                Parameter(
+                    "core_share",
+                    "",
+                    0.0,
+                    "linear",
+                    0.1,
+                    f"fraction of the scatter in a Gaussian with a sigma of {CORE_PX:g} px",
+                ),
             ),
             _core,
         ),
@@ -273,21 +283,23 @@ SHAPES: dict[str, Shape] = {
 
 
 def shape_named(name: str) -> Shape:
-    """The shape of that name; DataError "unknown-shape" where there is none."""
+    """The shape with this name. Raises DataError "unknown-shape"."""
     if name not in SHAPES:
-        raise DataError("unknown-shape", f"expected one of {', '.join(SHAPES)}; got {name!r:.40}")
+        raise DataError(
+            "unknown-shape", f"expected a shape of scatter: {', '.join(SHAPES)}; got {name!r:.40}"
+        )
     return SHAPES[name]
 
 
 def stretch_of(values: Values) -> tuple[float, float]:
-    """(stretch s, angle t in degrees from +x towards +y, -90 to 90) of Eq. (3)."""
+    """Stretch s and angle t of Eq. (3); t in degrees from +x towards +y, -90 to 90."""
     p, q = values.get("stretch_p", 0.0), values.get("stretch_q", 0.0)
     return math.expm1(math.hypot(p, q)), math.degrees(math.atan2(q, p)) / 2
 
 
 @cache
 def _radii(size: int) -> tuple[Vector, Vector]:
-    """Distinct radii of a square's pixels from its centre, the centre first, and how many pixels have each."""
+    """Distinct radii of the pixels of a square, the centre first, and the number of pixels at each radius."""
     squares, count = np.unique(squared_radii((size, size)), return_counts=True)
     return np.sqrt(squares), count.astype(np.float64)
 
@@ -302,12 +314,12 @@ def _radius_index(size: int) -> NDArray[np.int32]:
 
 
 def _by_radius(size: int, falloff: Radial) -> Kernel:
-    """An isotropic falloff on a square, worked out once a radius."""
+    """An isotropic falloff on a square. It is evaluated once per distinct radius."""
     return np.asarray(falloff(_radii(size)[0])[_radius_index(size)])
 
 
 def _scaled_by_radius(falloff: Radial, total: float, size: int) -> Kernel:
-    """Eq. (1) of an isotropic falloff on a square: beyond it nothing but the sum over the full reach is asked for."""
+    """Eq. (1) for an isotropic falloff on a square. Beyond the square, only the sum over the full reach is needed."""
     r, count = _radii(REACH_GRID_PX)
     whole = float((falloff(r) * count)[1:].sum())
     scaled = falloff(_radii(size)[0]) * (total / whole)
@@ -317,10 +329,10 @@ def _scaled_by_radius(falloff: Radial, total: float, size: int) -> Kernel:
 
 @compiled()
 def _power_law_of_ellipses(size, b, c, p, q):  # type: ignore[no-untyped-def]
-    """Eq. (2) of the radius of Eq. (3) on (size, size)."""
+    """Eq. (2) with the radius of Eq. (3), on (size, size)."""
     out = np.empty((size, size))
     s = math.hypot(p, q)
-    # exp(-S) for a symmetric matrix without trace: cosh(s) - S sinh(s) / s
+    # For a symmetric matrix S without trace, exp(-S) = cosh(s) - S sinh(s) / s.
     grow = math.cosh(s)
     shrink = math.sinh(s) / s if s > 1e-12 else 1.0
     xx, yy, xy = grow - p * shrink, grow + p * shrink, -q * shrink

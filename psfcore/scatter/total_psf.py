@@ -1,7 +1,7 @@
-"""The total PSF: scatter convolved with diffraction, and how it changes with the scatter's parameters.
+"""The total PSF: the scatter kernel convolved with the diffraction PSF, and its derivatives.
 
-Scattered light is diffracted too, so the two convolve; on the full reach both sum to 1 and so does their
-convolution, but for the little that leaves the grid.
+Scattered light is diffracted too, so the total PSF is the convolution of the two. On the full reach both sum to 1.
+Their convolution then sums to 1 too, except for a small amount of light that leaves the grid.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 
 
 class TotalPsf:
-    """Total PSFs of one diffraction pattern on the square that a field can see, at most the full reach.
+    """Total PSFs with one diffraction PSF, on a square of twice the field's size, at most the full reach.
 
     diffraction: weights [y, x], sum 1 on its own grid. field_shape: (ny, nx) of the images.
     """
@@ -35,7 +35,7 @@ class TotalPsf:
         return self.diffracted(self.shape.kernel(coordinates, self.size))
 
     def diffracted(self, scatter: Kernel) -> Kernel:
-        """Scattered light [y, x] on the square, seen through the diffraction."""
+        """A scatter kernel [y, x] on the square, convolved with the diffraction PSF."""
         return np.asarray(self._convolver.apply(scatter), dtype=np.float64)
 
     def slope(self, coordinates: Vector, k: int) -> Kernel:
@@ -43,14 +43,14 @@ class TotalPsf:
         return self.diffracted(self.shape.slope(coordinates, k, self.size))
 
     def slopes(self, coordinates: Vector) -> list[Kernel]:
-        """d kernel / d coordinate, one array [y, x] a coordinate."""
+        """d kernel / d coordinate, one array [y, x] per coordinate."""
         return [self.slope(coordinates, k) for k in range(coordinates.size)]
 
     @property
     def radii_px(self) -> Vector:
-        """The curve's radii that lie on the square."""
+        """The radii of CURVE_RADII_PX that lie on the square."""
         return np.array([r for r in CURVE_RADII_PX if r < self.size // 2])
 
     def curve_slopes(self, slopes: list[Kernel]) -> NDArray[np.float64]:
-        """d C(R) / d coordinate in percent: (radii, coordinates)."""
+        """d C(R) / d coordinate in percent, (radii, coordinates), with C(R) = 100 (1 - encircled energy)."""
         return np.stack([-100 * encircled_energy(slope, self.radii_px) for slope in slopes], axis=1)

@@ -103,14 +103,14 @@ def faint() -> Transit:
 def recipe(choices: Choices) -> tuple[Published, list[str]]:
     """What the published recipe finds in the faint ones, and the stages that it told of."""
     seen: list[str] = []
-    found = invert_as_published(faint(), choices, draws=3, progress=lambda stage, *_: seen.append(stage))
+    found = invert_as_published(faint(), choices, subsets=3, progress=lambda stage, *_: seen.append(stage))
     return found, seen
 
 
 @cache
 def fitted() -> TransitFit:
     """The whole fit of the noisy transit; its free shells from 20 draws, which are quicker than 100."""
-    with patch.object(fit, "free_fit", partial(free_fit, draws=20)):
+    with patch.object(fit, "free_fit", partial(free_fit, subsets=20)):
         return fit_transit(observed(sky()).transit)
 
 

@@ -15,14 +15,11 @@ import numpy as np
 from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
+from psfcore.scatter.validation.bands import NEAR_CENTRE_PX, PARTING_SIGMAS, Bands, bands
 from psfcore.scatter.validation.cross_validation import (
-    NEAR_CENTRE_PX,
-    PARTING_SIGMAS,
-    Bands,
-    Draw,
     FoldFit,
-    bands,
-    draws,
+    FoldSample,
+    bootstrap_samples,
     exact_fit,
     shared_fits,
 )
@@ -46,7 +43,7 @@ def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
     if context.catalogue.get(ReportRow, identity, context.owner) is not None:
         return identity
     transit = load_transit(context, request)[0]
-    wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
+    wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
     solution = _solution(context, request, transit)
     if request.scheme == "shared":
         fits = shared_fits(solution, wanted, progress=context.report)
@@ -65,7 +62,7 @@ def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> 
         return
     context.catalogue.parts.release(part)  # reading and fitting a transit takes longer than a lease may last
     transit = load_transit(context, request)[0]
-    wanted = draws(len(transit.frames), runs=request.runs, seed=request.seed)
+    wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
     solution = _solution(context, request, transit)
     while (
         part := context.catalogue.parts.take(context.owner, identity, context.settings.lease_s)
@@ -81,7 +78,7 @@ def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit
 
 
 def _exact(
-    context: Context, identity: str, solution: Solution, wanted: tuple[Draw, ...]
+    context: Context, identity: str, solution: Solution, wanted: tuple[FoldSample, ...]
 ) -> tuple[FoldFit, ...]:
     """Every fold a fit of its own, done here or by whoever helps."""
     catalogue, owner = context.catalogue, context.owner
@@ -99,7 +96,9 @@ def _exact(
         _one(context, solution, wanted, part, done=len(done))
 
 
-def _one(context: Context, solution: Solution, wanted: tuple[Draw, ...], part: Part, *, done: int) -> None:
+def _one(
+    context: Context, solution: Solution, wanted: tuple[FoldSample, ...], part: Part, *, done: int
+) -> None:
     """One fold; what it raises gives the fold back."""
     try:
         fit = exact_fit(solution, wanted[part.number], progress=_alive(context, part, done, len(wanted)))

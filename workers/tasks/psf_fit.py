@@ -8,8 +8,9 @@ from typing import Any
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.noise import Noise
-from psfcore.scatter.fit import TransitFit, fit_transit, psf_of, report
+from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.scatter.fit_plot import fit_png
+from psfcore.scatter.report import fit_json
 from psfcore.transit.archive import unpack
 from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
@@ -95,8 +96,8 @@ def _save(
         **provenance_of(context, request),
     }
     name = f"{fit.transit.instrument or 'transit'}-fitted"
-    psf = psf_of(fit, name=name, version=f"0.1.0+{identity[:8]}", provenance=provenance)
-    said = report(fit) | {"prepared": prepared.to_json(), "provenance": provenance}
+    psf = fitted_psf(fit, name=name, version=f"0.1.0+{identity[:8]}", provenance=provenance)
+    said = fit_json(fit) | {"prepared": prepared.to_json(), "provenance": provenance}
     with (
         context.store.temporary() as file,
         context.store.temporary() as picture,

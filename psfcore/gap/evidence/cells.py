@@ -79,11 +79,11 @@ def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
     for weight in weights:
         cell = np.zeros(optics.engine.lanes_shape, np.float32)
         put(cell, dark, weight)
-        scattered = optics.see_back(cell)
+        scattered = optics.correlate(cell)
         put(scattered, dark, 0.0)
-        once = optics.undo_once(scattered, adjoint=True)
+        once = optics.invert_once(scattered, adjoint=True)
         cell -= 2 * once
-        cell += optics.undo_once(optics.see_back(once), adjoint=True)
+        cell += optics.invert_once(optics.correlate(once), adjoint=True)
         out.append(optics.field(cell))
     return np.array(out)
 

@@ -164,7 +164,7 @@ def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
     lit = view.lit_scene(n)
-    slopes = (slope.field(slope.see(lit)) for slope in view.slopes)
+    slopes = (slope.field(slope.convolve(lit)) for slope in view.slopes)
     shown = [k for k, change in enumerate(changes) if change.disc]
     fields = itertools.chain(slopes, (changes[k].change(n, view.expected) for k in shown))
     rows = [*range(len(view.slopes)), *(len(view.slopes) + k for k in shown)]
@@ -190,7 +190,7 @@ class _Distance:
         solution = view.solution
         dark = solution.sky.dark[n]
         lit = view.lit_scene(n)
-        there = self._blur.field(self._blur.see(lit))[dark].mean()
+        there = self._blur.field(self._blur.convolve(lit))[dark].mean()
         return float(there / max(float(view.expected[n][dark].mean()), 1e-9))
 
 

@@ -37,7 +37,7 @@ def simulated(view: View, seed: int) -> Transit:
     frames = []
     for n, frame in enumerate(transit.frames):
         lit = view.pointing_scene(n) * view.uncovered(n)
-        seen = optics.field(optics.see(optics.lanes(lit.astype(np.float32)))).astype(np.float64)
+        seen = optics.field(optics.convolve(optics.lanes(lit.astype(np.float32)))).astype(np.float64)
         rng = np.random.default_rng([seed, n])
         pixels = transit.noise.observe(seen, frame.exposure_s, rng)
         frames.append(replace(frame, pixels=pixels.astype(np.float32)))

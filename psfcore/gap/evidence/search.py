@@ -78,7 +78,7 @@ class PlaceSearch:
         self._nearest_px = NEAREST_RADII * float(np.mean([f.place.radius_px for f in solution.sky.found]))
         frames = solution.inversion.frames
         self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
-        answers = np.array([f.answer for f in frames]) / self._sigma[:, None]
+        answers = np.array([f.mean_jacobian for f in frames]) / self._sigma[:, None]
         residual = np.array([f.observed - f.expected for f in frames]) / self._sigma
         in_cells = np.array([self._near.of_kernel(slope) for slope in view.slope_kernels]).T
         self._of_means = _Left(answers, residual)

@@ -187,7 +187,7 @@ def _lit_occulter(view: View) -> Sequence[Change]:
         dy, dx = np.ogrid[: shape[0], : shape[1]]
         squared = ((dx - place.x_px) ** 2 + (dy - place.y_px) ** 2) / place.radius_px**2
         lit = coverage(shape, place) * np.minimum(squared, 1.0) ** power
-        return optics.field(optics.see(optics.lanes(lit.astype(np.float32))))
+        return optics.field(optics.convolve(optics.lanes(lit.astype(np.float32))))
 
     return [Change(lambda n, images, k=k: disc(n, k), lit=False) for k in (0, 1)]  # type: ignore[misc]
 

@@ -93,7 +93,7 @@ def _motion(view: View) -> Sequence[Change]:
         )
         lost = (sum(along) / MOTION_PARTS - coverage(shape, here)) * hidden
         optics = solution.optics
-        return optics.field(optics.see(optics.lanes((-lost).astype(np.float32))))
+        return optics.field(optics.convolve(optics.lanes((-lost).astype(np.float32))))
 
     return [Change(lambda n, _, px=px: change(n, px), lit=False) for px in MOTIONS_PX]  # type: ignore[misc]
 

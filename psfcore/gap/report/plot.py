@@ -344,7 +344,7 @@ def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> NDAr
     """Image n as the model sees it [y, x], DN/s; with_answer: with what the added effects do to it."""
     raw = found.solution.transit.frames[n].pixels
     solution = found.corrected[0].solution if with_answer else found.solution
-    seen = solution.optics.field(solution.optics.see(solution.lit(n)))
+    seen = solution.optics.field(solution.optics.convolve(solution.blanked_scene(n)))
     # The images that the effects were taken out of say what they do to them.
     return np.asarray(seen, np.float64) + (raw - solution.transit.frames[n].pixels)
 

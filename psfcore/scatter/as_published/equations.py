@@ -1,26 +1,27 @@
-"""The system of equations of the inversion, and its fits: steps (g) to (i) of the paper.
+"""The system of equations of the published inversion, and the fits to it: steps (g) to (i) of the paper.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm":
 
     I_o = sum over S of psf_S A_S + (1 - sum over S of n_S psf_S) B      Eq. (1)
 
-one line for each pixel chosen, I_o observed. Every line is divided by its scale, and the coefficients are fitted to
-many draws of lines: 1000 from occulted pixels, the same number from each shell of the selection mask, and 100 from
-lit pixels near the edge. The 30 worst of 100 fits are dropped and the others averaged.
+There is one equation per selected pixel, with I_o its observed intensity. Every equation is divided by its scale. The
+coefficients are fitted to many random subsets of the equations: 1000 of occulted pixels, with the same number from each
+shell of the selection mask, and 100 of unocculted pixels near the edge of the disc. A subset has no repetitions: it is
+not a bootstrap sample. The 30 worst of 100 fits are dropped, and the others are averaged.
 
     free fit        psf_S >= 0, by the Trust Region Reflective algorithm             Eq. (2)
-    power law       psf_S = a / (b + r)^c, averaged over S, by the same               Eq. (3)
+    power law       psf_S = a / (b + r)^c, averaged over S, same algorithm            Eq. (3)
 
 | symbol | name | unit |
 |---|---|---|
-| A_S | ring_sums: the scene summed over segment S round the pixel | DN/s px^2 |
-| B | unscattered: the scene through diffraction | DN/s |
+| A_S | ring_sums: the scene summed over segment S about the pixel | DN/s px^2 |
+| B | unscattered: the scene convolved with the diffraction PSF | DN/s |
 | n_S | counts: pixels of S | px^2 |
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,23 +33,24 @@ from psfcore.errors import DataError
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Solve = Callable[[Matrix, Vector], tuple[Vector, float]]
 
-DRAWS = 100
-KEPT_DRAWS = 70
-OCCULTED_LINES = 1000
-LIT_LINES = 100
-LIT = -1
+SUBSETS = 100
+KEPT_SUBSETS = 70
+OCCULTED_EQUATIONS = 1000
+UNOCCULTED_EQUATIONS = 100
+UNOCCULTED = -1
 LEAST_LIGHT = 1e-5
-HOLD = 10.0  # times a line's worth of misfit is what a shell with all of the light costs
+PRIOR_WEIGHT = 10.0  # misfit, in units of one equation's, of a shell that contains all light
 PIVOT_PX = 15.0
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
-    """Lines of Eq. (1): observed, unscattered and scale (n,), ring_sums (n, segments).
+class Equations:
+    """Equations (1) of n pixels: observed, unscattered and scale (n,), ring_sums (n, segments).
 
-    stratum: the shell of the selection mask that a pixel lies in (0 outermost), LIT for a lit one. scale: what a
-    line is divided by.
+    stratum: the shell of the selection mask that contains the pixel (0: outermost), or UNOCCULTED. scale: divisor of
+    the equation.
     """
 
     observed: Vector
@@ -61,9 +63,9 @@ class Lines:
         return int(self.observed.size)
 
     @staticmethod
-    def joined(parts: Sequence[Lines]) -> Lines:
-        """All lines of several frames."""
-        return Lines(
+    def joined(parts: Sequence[Equations]) -> Equations:
+        """The equations of several frames, concatenated."""
+        return Equations(
             *(
                 np.concatenate([getattr(part, name) for part in parts])
                 for name in ("observed", "ring_sums", "unscattered", "scale", "stratum")
@@ -72,21 +74,21 @@ class Lines:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """Fits to draws of lines: coefficients (draws kept, n), the worst dropped, and their cost a line."""
+class SubsetFits:
+    """Fits to subsets of equations, without the worst: coefficients (subsets kept, n), and cost per equation."""
 
     fits: Matrix
     cost: Vector
 
     @property
     def mean(self) -> Vector:
-        """The average of the draws kept."""
+        """Mean coefficients over the kept subsets."""
         return np.asarray(self.fits.mean(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
-class PowerLawDrawn:
-    """The average of fits of Eq. (3) to draws of lines, and the fits: a, b (px) and c, (draws kept, 3)."""
+class PowerLawSubsetFits:
+    """Mean a, b (px) and c of fits of Eq. (3) to subsets of equations, and the single fits (subsets kept, 3)."""
 
     a: float
     b_px: float
@@ -100,17 +102,22 @@ class PowerLawDrawn:
         return np.array([self.a, self.b_px, self.c])
 
 
-def draw(lines: Lines, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Indices of one draw: as many occulted lines from each stratum, and lit ones; without repetition within one.
+def choose_subset(equations: Equations, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Indices of one random subset without repetition: equal numbers from each occulted stratum, and unocculted ones.
 
-    A stratum that holds fewer lines than its share gives all it has.
+    A stratum with fewer equations than its share contributes all of them. Raises DataError "no-lines" if there is no
+    equation of an occulted pixel.
     """
-    strata = np.unique(lines.stratum[lines.stratum != LIT])
+    strata = np.unique(equations.stratum[equations.stratum != UNOCCULTED])
     if strata.size == 0:
-        raise DataError("no-lines", "expected occulted pixels to draw lines from; got none")
-    share = -(-OCCULTED_LINES // strata.size)
-    chosen = [_some(np.flatnonzero(lines.stratum == stratum), share, rng) for stratum in strata]
-    return np.concatenate([*chosen, _some(np.flatnonzero(lines.stratum == LIT), LIT_LINES, rng)])
+        raise DataError(
+            "no-lines", "expected equations of occulted pixels; got none; check the position of the occulter"
+        )
+    share = -(-OCCULTED_EQUATIONS // strata.size)
+    chosen = [_some(np.flatnonzero(equations.stratum == stratum), share, rng) for stratum in strata]
+    return np.concatenate(
+        [*chosen, _some(np.flatnonzero(equations.stratum == UNOCCULTED), UNOCCULTED_EQUATIONS, rng)]
+    )
 
 
 def _some(of: NDArray[np.intp], number: int, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -118,34 +125,40 @@ def _some(of: NDArray[np.intp], number: int, rng: np.random.Generator) -> NDArra
 
 
 def free_fit(
-    lines: Lines, counts: Vector, *, seed: int, draws: int = DRAWS, towards: Vector | None = None
-) -> Drawn:
-    """Eq. (2): coefficients (draws kept, segments), per px^2.
+    equations: Equations, counts: Vector, *, seed: int, subsets: int = SUBSETS, towards: Vector | None = None
+) -> SubsetFits:
+    """Eq. (2): coefficients (subsets kept, segments), per px^2.
 
-    towards: the coefficients that hold where no line decides, each loosely enough to double or vanish at the price
-    of one line's misfit; none: all are held to nothing, by HOLD.
+    towards: coefficients of the shells that no equation constrains. The prior is weak: a shell may double or vanish
+    at the cost of one equation's misfit. Default: the prior is zero for all shells, with PRIOR_WEIGHT.
     """
-    held_at = np.zeros_like(counts) if towards is None else towards
-    light = held_at * counts
-    hold = np.full_like(counts, HOLD) if towards is None else 1 / np.maximum(light, LEAST_LIGHT)
+    prior_at = np.zeros_like(counts) if towards is None else towards
+    light = prior_at * counts
+    prior_weight = (
+        np.full_like(counts, PRIOR_WEIGHT) if towards is None else 1 / np.maximum(light, LEAST_LIGHT)
+    )
     rng = np.random.default_rng(seed)
-    return _drawn(
-        lines, counts, rng, draws, lambda matrix, target: _solve_free(matrix, target, counts, held_at, hold)
+    return _fit_subsets(
+        equations,
+        counts,
+        rng,
+        subsets,
+        lambda matrix, target: _solve_free(matrix, target, counts, prior_at, prior_weight),
     )
 
 
 def power_law_fit(
-    lines: Lines,
+    equations: Equations,
     counts: Vector,
     radii: Sequence[tuple[Vector, Vector]],
     start: Vector,
     *,
     seed: int,
-    draws: int = DRAWS,
-) -> PowerLawDrawn:
+    subsets: int = SUBSETS,
+) -> PowerLawSubsetFits:
     """Eq. (3), a, b (px) and c.
 
-    radii: for each segment the distances of its pixels and how many have each. start: a, b, c.
+    radii: for each segment, the distances of its pixels and the number of pixels at each. start: a, b, c.
     """
     rng = np.random.default_rng(seed)
     mean = SegmentMean(radii)
@@ -154,7 +167,7 @@ def power_law_fit(
         def misfit(theta: Vector) -> Vector:
             return np.asarray(matrix @ mean(theta) - target)
 
-        # ln a at a distance where the data fix it, not at r = 0: a, b and c trade along a narrow valley.
+        # a, b and c are strongly correlated. The weight at PIVOT_PX replaces a, because the data determine it there.
         solved = least_squares(
             misfit,
             _to_pivot(start),
@@ -164,16 +177,20 @@ def power_law_fit(
         )
         return solved.x, float(2 * solved.cost)
 
-    drawn = _drawn(lines, counts, rng, draws, solve)
-    # Averaged where a fit's errors are near to Gaussian: a itself spans decades from draw to draw.
-    a, b, c = _from_pivot(drawn.mean)
-    return PowerLawDrawn(
-        float(a), float(b), float(c), fits=np.array([_from_pivot(fit) for fit in drawn.fits]), cost=drawn.cost
+    fitted = _fit_subsets(equations, counts, rng, subsets, solve)
+    # The mean is taken in coordinates with nearly Gaussian errors; a itself varies by decades between subsets.
+    a, b, c = _from_pivot(fitted.mean)
+    return PowerLawSubsetFits(
+        float(a),
+        float(b),
+        float(c),
+        fits=np.array([_from_pivot(fit) for fit in fitted.fits]),
+        cost=fitted.cost,
     )
 
 
 class SegmentMean:
-    """Eq. (3) averaged over the pixels of each segment, of (ln of the weight at PIVOT_PX, ln b, c)."""
+    """Eq. (3) averaged over the pixels of each segment, as a function of (ln weight at PIVOT_PX, ln b, c)."""
 
     def __init__(self, radii: Sequence[tuple[Vector, Vector]]) -> None:
         self._radius = np.concatenate([r for r, _ in radii])
@@ -202,37 +219,39 @@ def _from_pivot(theta: Vector) -> Vector:
 
 
 def _solve_free(
-    matrix: Matrix, target: Vector, counts: Vector, towards: Vector, hold: Vector
+    matrix: Matrix, target: Vector, counts: Vector, towards: Vector, prior_weight: Vector
 ) -> tuple[Vector, float]:
-    """Eq. (2) in the light n_S psf_S of each shell, held where no line decides.
+    """Eq. (2) for the light n_S psf_S of each shell, with a prior for shells that no equation constrains.
 
-    A departure: no occulted pixel is near enough to the edge to tell the innermost shells from the centre, and
-    without a hold the system gives them more light than there is (1.3 in the first round on simulated transits).
+    Difference from the paper: no occulted pixel is close enough to the edge to separate the innermost shells from the
+    centre. Without a prior, the system assigns them more than all light (1.3 in the first round on simulated transits).
     """
     used = (counts > 0) & (np.linalg.norm(matrix, axis=0) > 0)
     out = towards.copy()
     target = target - matrix[:, ~used] @ towards[~used]
     light = matrix[:, used] / counts[used]
-    held = np.concatenate((light, np.diag(hold[used])))
-    wanted = np.concatenate((target, (hold * towards * counts)[used]))
-    # The triangle of a QR factorisation has the same least-squares solution in a twentieth of the lines.
-    turned, triangle = np.linalg.qr(held)
-    solved = lsq_linear(triangle, turned.T @ wanted, bounds=(0.0, np.inf), method="trf")
+    extended = np.concatenate((light, np.diag(prior_weight[used])))
+    extended_target = np.concatenate((target, (prior_weight * towards * counts)[used]))
+    # The triangular factor of a QR factorisation has the same least-squares solution with a twentieth of the rows.
+    turned, triangle = np.linalg.qr(extended)
+    solved = lsq_linear(triangle, turned.T @ extended_target, bounds=(0.0, np.inf), method="trf")
     out[used] = solved.x / counts[used]
     return out, float(np.sum((light @ solved.x - target) ** 2))
 
 
-def _drawn(lines: Lines, counts: Vector, rng: np.random.Generator, draws: int, solve) -> Drawn:  # type: ignore[no-untyped-def]
-    """Fit many draws, drop the worst, keep the share that the paper keeps."""
-    matrix = (lines.ring_sums - lines.unscattered[:, None] * counts) / lines.scale[:, None]
-    target = (lines.observed - lines.unscattered) / lines.scale
+def _fit_subsets(
+    equations: Equations, counts: Vector, rng: np.random.Generator, subsets: int, solve: Solve
+) -> SubsetFits:
+    """Fit many random subsets, and keep the same fraction of the best fits as the paper."""
+    matrix = (equations.ring_sums - equations.unscattered[:, None] * counts) / equations.scale[:, None]
+    target = (equations.observed - equations.unscattered) / equations.scale
     fits, cost = [], []
-    # So small are these factorisations that threads cost more than they bring, and most where the cores are busy.
+    # These factorisations are so small that threads slow them down, most of all when the cores are busy.
     with threadpool_limits(limits=1, user_api="blas"):
-        for _ in range(draws):
-            chosen = draw(lines, rng)
+        for _ in range(subsets):
+            chosen = choose_subset(equations, rng)
             fit, misfit = solve(matrix[chosen], target[chosen])
             fits.append(fit)
             cost.append(misfit / chosen.size)
-    best = np.argsort(cost, kind="stable")[: max(1, draws * KEPT_DRAWS // DRAWS)]
-    return Drawn(np.array(fits)[best], np.array(cost)[best])
+    best = np.argsort(cost, kind="stable")[: max(1, subsets * KEPT_SUBSETS // SUBSETS)]
+    return SubsetFits(np.array(fits)[best], np.array(cost)[best])

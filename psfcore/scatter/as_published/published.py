@@ -1,10 +1,16 @@
-"""The inversion as published, to the letter, and with each of its four biases mended alone.
+"""The inversion exactly as published, and with each of its four biases corrected alone.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j): six
-rounds of Richardson-Lucy, an occulter found and blanked, lines drawn and fitted; three rounds with free shells, three
-with a softened power law. Where the text leaves a choice, what was taken stands beside the constant.
+Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j), in six
+rounds. Each round deconvolves the images with Richardson-Lucy, locates the occulters and sets their discs to zero, and
+fits subsets of equations: three rounds with free shells, then three with a softened power law. Where the text of the
+paper leaves a choice, a comment at the constant gives the choice made here.
 
-What the choices are, and what mending one does, is `Choices`.
+`Choices` describes the four biases and their corrections.
+
+| symbol | name | unit |
+|---|---|---|
+| a, b, c | Published.a, b_px, c | px^c, px, - |
+| A_S, B | Equations.ring_sums, Equations.unscattered | DN/s px^2, DN/s |
 """
 
 from __future__ import annotations
@@ -23,7 +29,14 @@ from psfcore.deconvolve.methods.richardson_lucy import deconvolve
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import CENTRE_TOLERANCE, REACH_GRID_PX, Psf, crop_or_pad, cumulative_curve, squared_radii
-from psfcore.scatter.as_published.equations import LIT, Drawn, Lines, PowerLawDrawn, free_fit, power_law_fit
+from psfcore.scatter.as_published.equations import (
+    UNOCCULTED,
+    Equations,
+    PowerLawSubsetFits,
+    SubsetFits,
+    free_fit,
+    power_law_fit,
+)
 from psfcore.scatter.as_published.ring_sums import segment_sums
 from psfcore.scatter.as_published.segments import Segments, shells_as_published
 from psfcore.scatter.total_psf import CURVE_RADII_PX
@@ -38,23 +51,25 @@ LUCY_STEPS = 20
 FREE_ROUNDS = 3
 POWER_LAW_ROUNDS = 3
 SHRUNK_PX = 1.0
-LIT_WITHIN_PX = 5.0
-LIT_A_FRAME = 10
+UNOCCULTED_WITHIN_PX = 5.0
+UNOCCULTED_A_FRAME = 10
 LEAST_LEVEL_DN_S = 1e-3
-# Lines are divided by their observed value. Where a pixel holds a few photons some are zero or less, and would weigh
-# without bound: no line is divided by less than this share of its disc's mean.
+# Each equation is divided by its observed value. In discs of a few photons some values are zero or less, and their
+# weight would be unlimited. Therefore no equation is divided by less than this fraction of its disc's mean.
 LEAST_OF_MEAN = 0.5
 
 
 @dataclass(frozen=True)
 class Choices:
-    """Where the published fit is biased, each True as published, False mended.
+    """The four biases of the published fit: True as published, False corrected.
 
-    weighed_by_observed: each line divided by its own noisy intensity, which pulls faint discs low; mended, by the
-    noise expected of the disc's mean. added: scatter is added to the diffraction, Eq. (1) of `equations`; mended, the
-    two convolve: the ring sums are those of the diffracted scene. counted_on_array: the light that is not scattered
-    is one less what falls on the array of the known PSF; mended, on the full reach. whole_disc_blanked: all
-    pixels within the radius; mended, only those that are fully dark.
+    weighed_by_observed: each equation is divided by its own noisy intensity, which biases faint discs low. Corrected:
+    by the noise expected at the disc's mean.
+    added: scatter is added to the diffraction, Eq. (1) of `equations`. Corrected: the two are convolved, so the ring
+    sums are those of the diffracted scene.
+    counted_on_array: the unscattered light is 1 minus the scatter on the array of the known PSF. Corrected: 1 minus
+    the scatter on the full reach.
+    whole_disc_blanked: all pixels within the radius are set to zero. Corrected: only the fully dark ones.
     """
 
     weighed_by_observed: bool = True
@@ -64,18 +79,18 @@ class Choices:
 
 
 AS_PUBLISHED = Choices()
-MENDED_ALONE = {
+CORRECTED_ALONE = {
     "weights from the expected intensity": replace(AS_PUBLISHED, weighed_by_observed=False),
     "scatter and diffraction convolved": replace(AS_PUBLISHED, added=False),
     "light counted on the full reach": replace(AS_PUBLISHED, counted_on_array=False),
     "only fully dark pixels blanked": replace(AS_PUBLISHED, whole_disc_blanked=False),
 }
-ALL_MENDED = Choices(False, False, False, False)
+ALL_CORRECTED = Choices(False, False, False, False)
 
 
 @dataclass(frozen=True)
 class PublishedRound:
-    """One round: free shells or power law, and the total PSF's cumulative curve after it (percent)."""
+    """One round. fit: free shells or power law; curve_pct: cumulative curve of the total PSF after it, percent."""
 
     fit: str
     curve_pct: tuple[float, ...]
@@ -83,12 +98,12 @@ class PublishedRound:
 
 @dataclass(frozen=True, eq=False)
 class Published:
-    """What the published recipe finds.
+    """The result of the published recipe.
 
-    a, b_px, c: the power law of the last round, with the spread of its draws, none where fewer than two draws were
-    kept. total: scattered light on the array
-    it was counted on, a grid of grid_px. free: draws of the last free fit, on `segments`. curve_pct at radii_px: of
-    the final total PSF, scatter convolved with diffraction.
+    a, b_px, c: the power law of the last round. spread: their standard deviations over the subsets, None if fewer
+    than two subsets were kept. total: scattered light on a grid of grid_px. free: the subset fits of the last round
+    with free shells, on `segments`. curve_pct: cumulative curve of the final total PSF at radii_px, where scatter is
+    convolved with diffraction. equations: their number in the last round.
     """
 
     a: float
@@ -97,12 +112,12 @@ class Published:
     spread: dict[str, float] | None
     total: float
     grid_px: int
-    free: Drawn
+    free: SubsetFits
     segments: Segments
     radii_px: Vector
     curve_pct: Vector
     rounds: tuple[PublishedRound, ...]
-    lines: int
+    equations: int
 
     @property
     def scatter(self) -> Kernel:
@@ -115,24 +130,27 @@ def invert_as_published(
     choices: Choices = AS_PUBLISHED,
     *,
     seed: int = 1,
-    draws: int = 100,
+    subsets: int = 100,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Published:
-    """Steps (a) to (j). Raises DataError "no-lines" where no pixel is occulted, "no-scatter" where what is found is
-    no scatter: more than all light, or a PSF that is not brightest at its centre."""
-    recipe = _Recipe(transit, choices, seed, draws, threads, progress)
+    """Run steps (a) to (j).
+
+    Raises DataError "no-lines" if no pixel is occulted, and "no-scatter" if the fit is not physical: more scatter than
+    light, or a PSF whose maximum is not at its centre.
+    """
+    recipe = _Recipe(transit, choices, seed, subsets, threads, progress)
     return recipe.run()
 
 
 class _Recipe:
     def __init__(
-        self, transit: Transit, choices: Choices, seed: int, draws: int, threads: int, progress: Progress
+        self, transit: Transit, choices: Choices, seed: int, subsets: int, threads: int, progress: Progress
     ) -> None:
-        self.transit, self.choices, self.seed, self.draws = transit, choices, seed, draws
+        self.transit, self.choices, self.seed, self.subsets = transit, choices, seed, subsets
         self.threads, self.progress = threads, progress
         field = max(transit.shape)
-        # "Out to the edge of the PSF": the array of the known part, which in the paper is as large as the images.
+        # "Out to the edge of the PSF" means the array of the known PSF, which in the paper is as large as the images.
         self.grid = (
             min(transit.diffraction.shape[0], REACH_GRID_PX) if choices.counted_on_array else REACH_GRID_PX
         )
@@ -150,18 +168,23 @@ class _Recipe:
         kernel = crop_or_pad(self.transit.diffraction, self.psf_size)
         rounds = []
         law = np.array([0.15, 6.0, 2.5])
-        free: Drawn | None = None
+        free: SubsetFits | None = None
         count = 0
         for n in range(FREE_ROUNDS + POWER_LAW_ROUNDS):
-            lines = self._lines(kernel, n)
-            count = len(lines)
+            equations = self._equations(kernel, n)
+            count = len(equations)
             counts = self.segments.counts.astype(np.float64)
             if n < FREE_ROUNDS:
-                free = free_fit(lines, counts, seed=self.seed * 100 + n, draws=self.draws)
+                free = free_fit(equations, counts, seed=self.seed * 100 + n, subsets=self.subsets)
                 scatter, name = self._free_kernel(free.mean), "free shells"
             else:
                 fitted = power_law_fit(
-                    lines, counts, self.radius_of_segment, law, seed=self.seed * 100 + n, draws=self.draws
+                    equations,
+                    counts,
+                    self.radius_of_segment,
+                    law,
+                    seed=self.seed * 100 + n,
+                    subsets=self.subsets,
                 )
                 law, name = fitted.law, "softened power law"
                 scatter = _power_law_kernel(law, self.grid)
@@ -169,7 +192,8 @@ class _Recipe:
             if not centre > 0:
                 raise DataError(
                     "no-scatter",
-                    f"round {n + 1}: expected {name} that scatter less than all light; got {100 * (1 - centre):.3g} %",
+                    f"round {n + 1}, {name}: expected scatter of less than 100 % of the light; got "
+                    f"{100 * (1 - centre):.3g} %",
                 )
             kernel = np.maximum(self.to_total.apply(crop_or_pad(scatter, self.psf_size)), 0.0)
             _check_brightest_at_centre(kernel, f"round {n + 1}: {name}")
@@ -188,11 +212,11 @@ class _Recipe:
             radii_px=self.radii,
             curve_pct=np.array(rounds[-1].curve_pct),
             rounds=tuple(rounds),
-            lines=count,
+            equations=count,
         )
 
-    def _lines(self, kernel: Kernel, n: int) -> Lines:
-        """Steps (d) to (h) for all frames."""
+    def _equations(self, kernel: Kernel, n: int) -> Equations:
+        """Steps (d) to (h) for all frames: their equations."""
         frames = self.transit.frames
         scenes = self._deconvolved(kernel, n)
         rng = np.random.default_rng([self.seed, n])
@@ -202,15 +226,18 @@ class _Recipe:
             found = find_occulter(
                 k, frames, scenes, [f.place for f in frames], kernel, self.transit.noise
             )  # step (e)
-            part = self._frame_lines(frame, scenes[k], found, rng)
+            part = self._equations_of_frame(frame, scenes[k], found, rng)
             if part is not None:
                 parts.append(part)
         if not parts:
-            raise DataError("no-lines", "expected occulted pixels in the images; got none")
-        return Lines.joined(parts)
+            raise DataError(
+                "no-lines",
+                "expected occulted pixels in the images; got none; check the positions of the discs in transit.json",
+            )
+        return Equations.joined(parts)
 
     def _deconvolved(self, kernel: Kernel, n: int) -> list[NDArray[np.float32]]:
-        """Step (d)."""
+        """Step (d): the scenes of all frames by Richardson-Lucy."""
         psf = Psf(kernel, name="round", version=str(n), instrument=None, status="draft")
         conditions = Conditions(edges="zero", margin_px=0, threads=self.threads, engine_for=EngineCache())
         scenes = []
@@ -226,10 +253,10 @@ class _Recipe:
             scenes.append(deconvolve(image, psf, conditions, steps=LUCY_STEPS).pixels.astype(np.float32))
         return scenes
 
-    def _frame_lines(
+    def _equations_of_frame(
         self, frame: Frame, scene: NDArray[np.float32], found: FoundPlace, rng: np.random.Generator
-    ) -> Lines | None:
-        """Steps (f) to (h) for one frame; None where no pixel of it is occulted."""
+    ) -> Equations | None:
+        """Steps (f) to (h) for one frame; None if none of its pixels is occulted."""
         shape, place = self.transit.shape, found.place
         distance = disc_distance(shape, place)
         within = distance <= place.radius_px
@@ -241,17 +268,17 @@ class _Recipe:
         rows, columns = np.nonzero(occulted)
         if rows.size == 0:
             return None
-        lit = np.flatnonzero((~within & (distance <= place.radius_px + LIT_WITHIN_PX)).ravel())
-        lit = rng.choice(lit, min(LIT_A_FRAME, lit.size), replace=False)
+        outside = np.flatnonzero((~within & (distance <= place.radius_px + UNOCCULTED_WITHIN_PX)).ravel())
+        outside = rng.choice(outside, min(UNOCCULTED_A_FRAME, outside.size), replace=False)
         targets = np.concatenate(
-            (np.stack((rows, columns), axis=1), np.stack(np.unravel_index(lit, shape), axis=1))
+            (np.stack((rows, columns), axis=1), np.stack(np.unravel_index(outside, shape), axis=1))
         )
         stratum = np.floor(place.radius_px - SHRUNK_PX - distance[rows, columns]).astype(np.int64)  # step (g)
-        stratum = np.concatenate((np.maximum(stratum, 0), np.full(lit.size, LIT)))
+        stratum = np.concatenate((np.maximum(stratum, 0), np.full(outside.size, UNOCCULTED)))
         observed = frame.pixels[targets[:, 0], targets[:, 1]].astype(np.float64)
         diffracted = self.diffract.apply(true)
         summed = true if self.choices.added else diffracted
-        return Lines(
+        return Equations(
             observed=observed,
             ring_sums=segment_sums(summed, targets, self.segments, threads=self.threads),
             unscattered=diffracted[targets[:, 0], targets[:, 1]].astype(np.float64),
@@ -260,9 +287,9 @@ class _Recipe:
         )  # step (h)
 
     def _scale(self, frame: Frame, observed: Vector, stratum: NDArray[np.int64]) -> Vector:
-        """What each line is divided by."""
+        """The divisor of each equation."""
         level = np.empty_like(observed)
-        for here in (stratum == LIT, stratum != LIT):
+        for here in (stratum == UNOCCULTED, stratum != UNOCCULTED):
             level[here] = max(float(observed[here].mean()), LEAST_LEVEL_DN_S) if here.any() else 1.0
         if self.choices.weighed_by_observed:
             return np.maximum(observed, LEAST_OF_MEAN * level)
@@ -276,20 +303,20 @@ class _Recipe:
 
 
 def _check_brightest_at_centre(kernel: Kernel, found: str) -> None:
-    """A PSF that is fainter at its centre than beside it is no smear of a point: no image can be freed of it."""
+    """Raise DataError "no-scatter" if the centre is not the maximum: such a PSF is not physical."""
     middle = (kernel.shape[0] // 2, kernel.shape[1] // 2)
     if kernel[middle] < kernel.max() * (1 - CENTRE_TOLERANCE):
         y, x = np.unravel_index(int(kernel.argmax()), kernel.shape)
         distance = np.hypot(y - middle[0], x - middle[1])
         raise DataError(
             "no-scatter",
-            f"{found}: expected a PSF that is brightest at its centre; got {kernel[middle]:.3g} of the light there "
-            f"and {kernel.max():.3g} in a pixel {distance:.3g} px from it",
+            f"{found}: expected a PSF with its maximum at the centre; got {kernel[middle]:.3g} of the light there "
+            f"and {kernel.max():.3g} in a pixel at a distance of {distance:.3g} px",
         )
 
 
-def _spread(fitted: PowerLawDrawn) -> dict[str, float] | None:
-    """Standard deviations of a, b and c over the draws; none of fewer than two."""
+def _spread(fitted: PowerLawSubsetFits) -> dict[str, float] | None:
+    """Standard deviations of a, b and c over the subsets; None for fewer than two subsets."""
     if len(fitted.fits) < 2:
         return None
     return dict(zip(("a", "b_px", "c"), fitted.fits.std(axis=0, ddof=1).tolist(), strict=True))
@@ -304,7 +331,7 @@ def _power_law_kernel(law: Vector, size: int) -> Kernel:
 
 
 def _radii_of(segments: Segments) -> list[tuple[Vector, Vector]]:
-    """For each segment the distances of its pixels and how many have each; far ones thinned to rings 0.1 px wide."""
+    """For each segment, the distances of its pixels and their numbers; at most 40 mean distances per segment."""
     squares, count = np.unique(
         squared_radii((segments.reach_grid_px, segments.reach_grid_px)), return_counts=True
     )

@@ -1,17 +1,18 @@
-"""Sums of an image over the segments of the PSF round many targets.
+"""Sums of an image over the segments of the PSF about many target pixels.
 
 Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", step (h):
 
     A_S[r] = sum over dr in S of I[r - dr]                                                   Eq. (1)
 
-for targets r, with I = 0 beyond the image. A segment is a few runs of neighbouring pixels in each row, so with running
-sums along the image's rows each run costs one difference, whatever its length:
+for targets r, with I = 0 beyond the image. In each row, a segment consists of a few runs of adjacent pixels. With
+running sums along the rows of the image, each run costs one difference, independent of its length:
 
     P[y, i] = sum over x < i of I[y, x]                                                      Eq. (2)
     sum over dx_start <= dx < dx_stop of I[y, x - dx] = P[y, x - dx_start + 1] - P[y, x - dx_stop + 1]    Eq. (3)
 
-Targets come in strips of up to 24 neighbours of a row, which read neighbours of P and are summed as vectors. Rows of
-the image are taken four at a time, whose running sums stay in cache while all strips use them.
+Targets are grouped into strips of up to 24 adjacent pixels of a row. They read adjacent values of P, so the sums of a
+strip are vector operations. Image rows are processed four at a time, and their running sums stay in the cache while all
+strips use them.
 
 | symbol | name |
 |---|---|
@@ -36,8 +37,8 @@ from psfcore.scatter.as_published.segments import Runs, Segments
 
 LANES = 24
 _ROWS = 4
-_VECTOR = 4  # a strip is as many lanes as whole vectors hold
-_LARGEST_SUMS = 2**20  # numbers held by one thread while it works: 8 MiB
+_VECTOR = 4  # the number of lanes of a strip is a multiple of this
+_LARGEST_SUMS = 2**20  # numbers that one thread keeps at a time: 8 MiB
 
 Sums = NDArray[np.float64]
 
@@ -45,12 +46,11 @@ Sums = NDArray[np.float64]
 def segment_sums(
     image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments, *, threads: int = 1
 ) -> Sums:
-    """A_S, Eq. (1), (n, segments.size) in the image's unit times px^2, exact but for float64's rounding.
+    """A_S, Eq. (1), (n, segments.size), in the image's unit times px^2, exact to float64 rounding.
 
-    image: [y, x], float32 or float64. targets: (n, 2), (y, x) on the image, in any order. Light beyond the image
-    counts as dark. threads: each takes a part of the targets; the result is the same for any number.
-    Raises DataError "image-nonfinite" when a pixel is NaN or infinite, ValueError when the image has not two axes or a
-    target lies off it.
+    image: [y, x], float32 or float64; dark beyond its edges. targets: (n, 2), (y, x) on the image, in any order.
+    threads: share the targets; the result does not depend on their number. Raises DataError "image-nonfinite" if a
+    pixel is NaN or infinite, and ValueError if the image does not have two axes or a target lies outside it.
     """
     _check(image, targets)
     out = np.zeros((len(targets), segments.size))
@@ -82,7 +82,7 @@ def segment_sums(
 def ring_sums(
     image: NDArray[np.floating], targets: NDArray[np.integer], edges_px: ArrayLike, *, threads: int = 1
 ) -> Sums:
-    """A_S of plain rings, (n, shells): `segment_sums` for `Segments(edges_px)`, which is kept for the next image."""
+    """A_S of rings without sectors, (n, shells): `segment_sums` for `Segments(edges_px)`, cached for the next image."""
     return segment_sums(image, targets, _rings(tuple(np.asarray(edges_px, float).tolist())), threads=threads)
 
 
@@ -93,18 +93,20 @@ def _rings(edges_px: tuple[float, ...]) -> Segments:
 
 def _check(image: NDArray[np.floating], targets: NDArray[np.integer]) -> None:
     if image.ndim != 2:
-        raise ValueError(f"expected an image on two axes, got shape {image.shape}")
+        raise ValueError(f"expected an image with two axes; got shape {image.shape}")
     if targets.ndim != 2 or targets.shape[1] != 2 or not np.issubdtype(targets.dtype, np.integer):
-        raise ValueError(f"expected whole-numbered targets (n, 2), got {targets.shape} of {targets.dtype}")
+        raise ValueError(f"expected integer targets of shape (n, 2); got {targets.shape} of {targets.dtype}")
     if not ((targets >= 0) & (targets < image.shape)).all():
-        raise ValueError(f"expected targets (y, x) on the image of {image.shape}, got one off it")
+        raise ValueError(f"expected targets (y, x) inside the image of {image.shape}; got one outside it")
     if not np.isfinite(image).all():
         bad = int(np.count_nonzero(~np.isfinite(image)))
-        raise DataError("image-nonfinite", f"expected finite pixels; got {bad} that are NaN or infinite")
+        raise DataError(
+            "image-nonfinite", f"expected finite pixels; got {bad} NaN or infinite; fill or mask them first"
+        )
 
 
 def _parts(strips: int, threads: int, largest: int) -> list[slice]:
-    """Strips shared out evenly: a part for each thread, or more where its sums would outgrow the cache."""
+    """Slices of about equal numbers of strips: one per thread, or more to keep the sums of each in the cache."""
     count = min(strips, threads * -(-strips // (threads * largest)))
     bounds = [strips * k // count for k in range(count + 1)]
     return [slice(start, stop) for start, stop in pairwise(bounds)]
@@ -112,7 +114,7 @@ def _parts(strips: int, threads: int, largest: int) -> list[slice]:
 
 @compiled()
 def _strips(targets):  # type: ignore[no-untyped-def]
-    """Strip of each target, and (y, x) of each strip's first pixel; targets are sorted by y, then x."""
+    """Strip of each target, and (y, x) of the first pixel of each strip. Targets are sorted by y, then x."""
     strip = np.empty(len(targets), np.int64)
     first = np.empty((len(targets), 2), np.int64)
     count = 0
@@ -126,7 +128,7 @@ def _strips(targets):  # type: ignore[no-untyped-def]
 
 
 def _places(strip_yx: NDArray[np.int64], runs: Runs) -> range:
-    """Places of P that any strip reads. The same for all parts: where P begins decides how it is rounded."""
+    """Indices of P that the strips read. All threads use the same range, because its start determines the rounding."""
     first = strip_yx[:, 1].min() - runs.dx_stop.max() + 1
     last = strip_yx[:, 1].max() + LANES - runs.dx_start.min()
     return range(int(first), int(last) + 1)
@@ -135,7 +137,7 @@ def _places(strip_yx: NDArray[np.int64], runs: Runs) -> range:
 def _sum_strips(
     image: NDArray[np.floating], strip_yx: NDArray[np.int64], runs: Runs, places: range, sums: Sums
 ) -> None:
-    """Eq. (1) for strips, added to `sums`, (strips, segments, lanes)."""
+    """Add Eq. (1) for strips to `sums`, (strips, segments, lanes)."""
     running = np.zeros((_ROWS, len(places)))
     of_row = (runs.first_dy, runs.row, runs.dx_start, runs.dx_stop, runs.segment)
     _accumulate(image, strip_yx, *of_row, places.start, running, sums)
@@ -143,9 +145,9 @@ def _sum_strips(
 
 @compiled()
 def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
-    """Eq. (2) for four rows from `top` on, at places from `first` on; constant beyond the image's columns.
+    """Eq. (2) for four rows from `top`, at indices from `first`; constant beyond the columns of the image.
 
-    A row beyond the last is the last again. The four sums wait for each other's additions, not for their own.
+    Beyond the last row, the last row is used again. Four independent sums hide the latency of each addition.
     """
     ny, nx = image.shape
     places = running.shape[1]
@@ -183,8 +185,8 @@ def _accumulate(image, strip_yx, first_dy, row, dx_start, dx_stop, segment, firs
                     continue
                 p = running[k]
                 for i in range(row[j], row[j + 1]):
-                    # Eq. (3) for neighbouring targets: unsigned indices and a number of lanes that the compiler
-                    # does not know let it make vectors of them.
+                    # Eq. (3) for adjacent targets. The compiler vectorises this loop only with unsigned indices and
+                    # a number of lanes that is unknown at compile time.
                     high, low = np.uint64(base - dx_start[i]), np.uint64(base - dx_stop[i])
                     a = np.uint64(segment[i]) * np.uint64(lanes)
                     for w in range(lanes):

@@ -1,16 +1,17 @@
-"""The PSF cut into segments, one coefficient each.
+"""Segments of the PSF: shells or sectors, each with one coefficient.
 
-Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", step (c): concentric shells, which
-may be cut into angular sectors. A segment S is a set of offsets dr = target - source: light at a source falls on
-target = source + dr. A pixel belongs to shell k when edges[k] <= r < edges[k + 1], to sector m when its angle from
-+x to +y lies in [m, m + 1) of 360 / sectors degrees; segment = shell * sectors + sector. The central pixel belongs
-to none: its weight is what the segments leave.
+Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", step (c): concentric shells,
+optionally divided into angular sectors. A segment S is a set of offsets dr = target - source: light from a source
+falls on target = source + dr. A pixel belongs to shell k if edges[k] <= r < edges[k + 1], and to sector m if its angle
+from +x towards +y lies in [m, m + 1) times 360 / sectors degrees; segment = shell * sectors + sector. The central pixel
+belongs to no segment: its weight is 1 minus the light of all segments.
 
     n_S = number of pixels of S on the reach grid                                            Eq. (1)
     psf_S = (1 / n_S) sum over dr in S of f(dr)                                              Eq. (2)
 
-Departure: the paper's first ten shells are not printed but for their number and their end, 5 px. Pixel distances below
-5 px take only twelve values, and shells of equal width would leave four of ten empty: here each holds one or two.
+Difference from the paper: it prints only the number of the innermost shells, ten, and their outer edge, 5 px. Pixel
+distances below 5 px have only twelve values, so four of ten shells of equal width would be empty. Here each of the ten
+shells contains one or two of these distances.
 
 | symbol | name | unit |
 |---|---|---|
@@ -31,39 +32,40 @@ from numpy.typing import NDArray
 
 from psfcore.psf import REACH_GRID_PX, squared_radii
 
-# Just beyond the corner of the reach grid, 1448.15 px from its centre.
+# Just beyond the corner of the reach grid, which is 1448.15 px from its centre.
 FULL_REACH_PX = 1449.0
 _PUBLISHED_CORE_PX = (0.5, 1.2, 1.7, 2.1, 2.5, 2.9, 3.1, 3.4, 3.8, 4.2, 5.0)
 _PUBLISHED_TAIL = 35
-_EXACT_PX = 32.0  # nearer pixels are taken one by one
-_CELL = 1 / 16  # a cell's side, of the radius
+_EXACT_PX = 32.0  # within this radius every pixel is evaluated
+_CELL = 1 / 16  # side of a cell over its radius
 _RING_EXACT_PX = 64.0
-_RING = 1 / 2048  # a thin ring's width, of the radius
+_RING = 1 / 2048  # width of a thin ring over its radius
 
 Floats = NDArray[np.float64]
 KernelFunction = Callable[[Floats, Floats], Floats]
 
 
 def shells_as_published(reach_px: float = FULL_REACH_PX) -> Floats:
-    """Edges (51,) in px of the paper's 50 shells: 10 to 5 px, 5 to 10 px, 35 growing exponentially to `reach_px`.
+    """Edges (51,) in px of the paper's 50 shells.
 
-    Raises ValueError when `reach_px` is not above 10.
+    Ten shells reach to 5 px, five to 10 px, and 35 with exponentially growing widths to `reach_px`. Raises ValueError
+    if `reach_px` is not above 10.
     """
     if not reach_px > 10:
-        raise ValueError(f"expected a reach above 10 px, got {reach_px}")
+        raise ValueError(f"expected a reach above 10 px; got {reach_px}")
     tail = 10.0 * (reach_px / 10.0) ** (np.arange(_PUBLISHED_TAIL + 1) / _PUBLISHED_TAIL)
     tail[-1] = reach_px
     return np.concatenate((_PUBLISHED_CORE_PX, np.arange(6.0, 10.0), tail))
 
 
 def fine_shells(reach_px: float = FULL_REACH_PX, growth: float = 0.03) -> Floats:
-    """Edges in px, from 0.5 to `reach_px`, of shells as wide as `growth` times their radius but at least about 1 px.
+    """Edges in px, from 0.5 to `reach_px`, of shells of width `growth` times the radius, but at least about 1 px.
 
-    Shells of 1 px first, then shells that grow, a little wider than asked where that makes them end at `reach_px`.
-    Raises ValueError when `reach_px` is not above 1.5 or `growth` not above 0.
+    The inner shells are 1 px wide. The outer ones grow, and are slightly wider than requested so that the last one
+    ends at `reach_px`. Raises ValueError if `reach_px` is not above 1.5, or `growth` not above 0.
     """
     if not (reach_px > 1.5 and growth > 0):
-        raise ValueError(f"expected a reach above 1.5 px and a growth above 0, got {reach_px} and {growth}")
+        raise ValueError(f"expected a reach above 1.5 px and a growth above 0; got {reach_px} and {growth}")
     turn = 0.5 + np.floor(max(min(1 / growth, reach_px - 1) - 0.5, 0))
     narrow = np.arange(0.5, turn)
     most = min(np.log(reach_px / turn) / np.log1p(growth), reach_px - turn)
@@ -75,9 +77,9 @@ def fine_shells(reach_px: float = FULL_REACH_PX, growth: float = 0.03) -> Floats
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Segments row by row: run i holds the offsets dx_start[i] <= dx < dx_stop[i] of `segment[i]`.
+    """Segments row by row: run i contains the offsets dx_start[i] <= dx < dx_stop[i] of `segment[i]`.
 
-    Runs of dy are those from row[dy - first_dy] to row[dy - first_dy + 1], in the order of dx.
+    The runs of a row dy have the indices row[dy - first_dy] to row[dy - first_dy + 1], in the order of dx.
     """
 
     first_dy: int
@@ -89,7 +91,7 @@ class Runs:
 
 @dataclass(frozen=True, eq=False)
 class _Nodes:
-    """Places (dx, dy) in px and how many pixels each stands for, sorted by segment."""
+    """Points (dx, dy) in px and the number of pixels that each represents, sorted by segment."""
 
     dx: Floats
     dy: Floats
@@ -99,10 +101,10 @@ class _Nodes:
 
 @dataclass(frozen=True)
 class Segments:
-    """Shells by their edges (px, rising, the first above 0), each cut into `sectors` (1: isotropic).
+    """Shells with the given edges (px, increasing, the first above 0), each divided into `sectors` (1: isotropic).
 
-    Only pixels of the reach grid count, (reach_grid_px, reach_grid_px) round [n // 2, n // 2].
-    Raises ValueError when the edges do not rise from above 0, or there is no sector.
+    Only pixels of the reach grid count: (reach_grid_px, reach_grid_px) with centre [n // 2, n // 2]. Raises ValueError
+    if the edges do not increase from above 0, or if `sectors` is below 1.
     """
 
     edges_px: tuple[float, ...]
@@ -112,30 +114,31 @@ class Segments:
     def __post_init__(self) -> None:
         edges = np.asarray(self.edges_px, dtype=np.float64)
         if edges.ndim != 1 or edges.size < 2 or not (edges[0] > 0 and (np.diff(edges) > 0).all()):
-            raise ValueError(f"expected two or more edges that rise from above 0, got {self.edges_px}")
+            raise ValueError(f"expected two or more edges that increase from above 0; got {self.edges_px}")
         if self.sectors < 1:
-            raise ValueError(f"expected at least one sector, got {self.sectors}")
+            raise ValueError(f"expected at least one sector; got {self.sectors}")
         object.__setattr__(self, "edges_px", tuple(edges.tolist()))
 
     @property
     def shells(self) -> int:
+        """Number of shells."""
         return len(self.edges_px) - 1
 
     @property
     def size(self) -> int:
-        """How many segments there are, empty ones included."""
+        """Number of segments, including empty ones."""
         return self.shells * self.sectors
 
     @cached_property
     def counts(self) -> NDArray[np.int64]:
-        """n_S, Eq. (1), (size,); 0 where a sector is too narrow to hold a pixel."""
+        """n_S, Eq. (1), (size,); 0 for a sector too narrow to contain a pixel."""
         label = self._reach_map.ravel()
         return np.bincount(label + 1, minlength=self.size + 1)[1:]
 
     def label_map(self, size: int) -> NDArray[np.int32]:
-        """Segment of each pixel [y, x] of (size, size) round [size // 2, size // 2]; -1 at the centre and beyond.
+        """Segment of each pixel [y, x] of (size, size) with centre [size // 2, size // 2].
 
-        Pixels off the reach grid are beyond.
+        The value is -1 at the centre, outside all shells, and outside the reach grid.
         """
         whole = self._reach_map
         out = np.full((size, size), -1, dtype=np.int32)
@@ -147,31 +150,33 @@ class Segments:
         return out
 
     def mean_of(self, kernel_function: KernelFunction) -> Floats:
-        """psf_S of a smooth kernel, Eq. (2), (size,); 0 where a segment is empty.
+        """psf_S of a smooth kernel, Eq. (2), (size,); 0 for empty segments.
 
-        kernel_function: weights at offsets (dx, dy), two arrays in px of one shape. Beyond 32 px, cells of about a
-        sixteenth of the radius are stood for by four places with the mean and the covariance of their pixels: for
-        power laws, stretched or not, within 1e-5 of the mean over pixels (tested), which `mean_of_map` gives.
+        kernel_function: weights at offsets (dx, dy), two arrays in px of the same shape. Beyond 32 px, four points
+        represent each cell of about a sixteenth of the radius. They have the mean and the covariance of its pixels.
+        For power laws, also stretched ones, the result is within 1e-5 of the mean over pixels (tested), which
+        `mean_of_map` computes.
         """
         nodes = self._nodes
         return self._mean(nodes, kernel_function(nodes.dx, nodes.dy))
 
     def mean_of_radial(self, radial_function: Callable[[Floats], Floats]) -> Floats:
-        """psf_S, Eq. (2), of a kernel of the distance r alone, an array in px; (size,), 0 where a segment is empty.
+        """psf_S, Eq. (2), of an isotropic kernel, (size,); 0 for empty segments.
 
-        Exact to 64 px, beyond by rings of r / 2048: within 1e-6 of the mean over pixels (tested).
+        radial_function: weights at distances, an array in px. The mean is exact to 64 px. Beyond, rings of width
+        r / 2048 give it to 1e-6 of the mean over pixels (tested).
         """
         nodes = self._ring_nodes
         return self._mean(nodes, radial_function(nodes.dx))
 
     def mean_of_map(self, kernel: Floats) -> Floats:
-        """psf_S, Eq. (2), of any kernel [y, x] on the reach grid, (size,); 0 where a segment is empty.
+        """psf_S, Eq. (2), of any kernel [y, x] on the reach grid, (size,); 0 for empty segments.
 
-        Raises ValueError when `kernel` does not have the shape of the reach grid.
+        Raises ValueError if `kernel` does not have the shape of the reach grid.
         """
         label = self._reach_map
         if kernel.shape != label.shape:
-            raise ValueError(f"expected a kernel of {label.shape}, got {kernel.shape}")
+            raise ValueError(f"expected a kernel of shape {label.shape}, the reach grid; got {kernel.shape}")
         sums = np.bincount(label.ravel() + 1, weights=kernel.ravel(), minlength=self.size + 1)[1:]
         return np.asarray(sums / np.maximum(self.counts, 1))
 
@@ -180,12 +185,12 @@ class Segments:
         """The segments row by row, for sums along rows."""
         label = self._reach_map
         centre = self.reach_grid_px // 2
-        # A row begins and ends outside all segments.
+        # The padding makes every row begin and end outside all segments.
         walled = np.pad(label, ((0, 0), (1, 1)), constant_values=-1)
         row, place = np.nonzero(walled[:, 1:] != walled[:, :-1])
         segment = walled[row, place + 1]
         inside = segment >= 0
-        # A run ends where the next change of its row is; a change to "none" starts no run.
+        # A run ends at the next change in its row. A change to -1 (no segment) starts no run.
         stop = np.append(place[1:], 0)
         counted = np.bincount(row[inside], minlength=label.shape[0])
         return Runs(
@@ -202,7 +207,7 @@ class Segments:
 
     @cached_property
     def _shell_of_square(self) -> NDArray[np.int32]:
-        """Shell by r^2 (px^2, whole numbers); -1 at the centre and beyond."""
+        """Shell by r^2 (px^2, integers); -1 at the centre and outside all shells."""
         corner = 2 * (self.reach_grid_px // 2) ** 2
         return _between(self.edges_px, np.sqrt(np.arange(corner + 1)))
 
@@ -217,7 +222,7 @@ class Segments:
         return label.astype(np.int32)
 
     def _ring_of_square(self, exact_px: float, width: float) -> NDArray[np.int64]:
-        """Ring by r^2: one for each distance below `exact_px`, then `width` times r wide, none in two shells."""
+        """Ring by r^2: one per distance below `exact_px`, then of width `width` times r. No ring crosses a shell's edge."""
         squares = np.arange(self._shell_of_square.size)
         wide = np.floor(np.log(np.maximum(squares, 1)) / (2 * width)).astype(np.int64)
         new = (np.diff(wide, prepend=0) != 0) | (np.diff(self._shell_of_square, prepend=0) != 0)
@@ -225,7 +230,7 @@ class Segments:
 
     @cached_property
     def _ring_nodes(self) -> _Nodes:
-        """One node for pixels of a segment at one distance or, farther out, in a thin ring, at their mean distance."""
+        """One node per segment and distance; farther out, one per segment and thin ring, at its mean distance."""
         squares, label = squared_radii((self.reach_grid_px, self.reach_grid_px)), self._reach_map
         ring = self._ring_of_square(_RING_EXACT_PX, _RING)
         inside = label >= 0
@@ -239,7 +244,7 @@ class Segments:
 
     @cached_property
     def _nodes(self) -> _Nodes:
-        """Every pixel near the centre; farther out four places for each cell of pixels."""
+        """Every pixel near the centre; farther out, four points per cell of pixels."""
         shape = (self.reach_grid_px, self.reach_grid_px)
         squares, label = squared_radii(shape), self._reach_map
         parts = self.sectors * int(np.ceil(2 * np.pi / _CELL / self.sectors))
@@ -260,24 +265,24 @@ class Segments:
 
 
 def _between(edges_px: tuple[float, ...], radius_px: Floats) -> NDArray[np.int32]:
-    """Shell of each distance; -1 outside all."""
+    """Shell of each distance; -1 outside all shells."""
     shell = np.searchsorted(edges_px, radius_px, side="right") - 1
     return np.where(shell < len(edges_px) - 1, shell, -1).astype(np.int32)
 
 
 def _sector(shape: tuple[int, int], sectors: int) -> NDArray[np.int32]:
-    """Sector [y, x] by the angle from +x to +y round [ny // 2, nx // 2]."""
+    """Sector [y, x] by the angle from +x towards +y about [ny // 2, nx // 2]."""
     dy = np.arange(shape[0], dtype=np.float64) - shape[0] // 2
     dx = np.arange(shape[1], dtype=np.float64) - shape[1] // 2
     turn = np.arctan2(dy[:, None], dx[None, :]) / (2 * np.pi) % 1.0
-    # A pixel on a boundary belongs to the sector that begins there, whatever the rounding of its angle.
+    # The offset makes a pixel on a boundary belong to the sector that begins there, despite rounding of its angle.
     return (np.floor(turn * sectors + 1e-9).astype(np.int32)) % sectors
 
 
 def _four_places(
     dx: Floats, dy: Floats, cell: NDArray[np.int64]
 ) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
-    """dx, dy, weight and cell of four equal places with number, mean and covariance of each cell's pixels."""
+    """dx, dy, weight and cell of four points of equal weight, with the mean and covariance of each cell's pixels."""
     counted = np.bincount(cell)
     held = np.flatnonzero(counted)
     n = counted[held].astype(np.float64)
@@ -286,12 +291,12 @@ def _four_places(
         return np.asarray(np.bincount(cell, weights=value)[held] / n)
 
     x, y = mean(dx), mean(dy)
-    # Offsets from the cell's own middle, so that no large squares cancel.
+    # Offsets are relative to the centre of the cell, which avoids the cancellation of large squares.
     middle_x, middle_y = np.zeros(counted.size), np.zeros(counted.size)
     middle_x[held], middle_y[held] = x, y
     ex, ey = dx - middle_x[cell], dy - middle_y[cell]
     xx, xy, yy = mean(ex * ex), mean(ex * ey), mean(ey * ey)
-    # Axes of the covariance; places at sqrt(2) standard deviations along each, to both sides.
+    # The points lie at +- sqrt(2) standard deviations along the two axes of the covariance.
     spread = np.hypot((xx - yy) / 2, xy)
     long, short = np.sqrt(xx + yy + 2 * spread), np.sqrt(np.maximum(xx + yy - 2 * spread, 0.0))
     angle = np.arctan2(2 * xy, xx - yy) / 2

@@ -1,4 +1,4 @@
-"""A picture of a cross-validation: free fit and formula with bands, totals of all fits, held-out residuals."""
+"""Plot a cross-validation: free fit and formula with their bands, totals of all fits, held-out residuals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from psfcore.drawing.plots import INK
 from psfcore.scatter.shapes import Vector
-from psfcore.scatter.validation.cross_validation import Bands, FoldFit, ShellBands
+from psfcore.scatter.validation.bands import Bands, ShellBands
+from psfcore.scatter.validation.cross_validation import FoldFit
 
 FORMULA, FREE = "#2f6db0", "#2b8a4e"
 _POINTINGS = ("#1b4f91", "#c73e2b", "#2b8a6e", "#e0a100", "#7b3fa0")
@@ -20,9 +21,9 @@ _POINTINGS = ("#1b4f91", "#c73e2b", "#2b8a6e", "#e0a100", "#7b3fa0")
 def cross_validation_png(
     bands: Bands, fits: tuple[FoldFit, ...], fov_of: list[int], path: str | Path
 ) -> None:
-    """Light beyond each distance, totals of all fits and held-out residuals; above them, where there is a free fit,
-    weights, diffuse light and excess of the free fit and of the formula. Bands are of 1 and 2 sigma.
+    """Cumulative curve, totals of all fits and held-out residuals, with bands of 1 and 2 sigma.
 
+    If there is a free fit, an upper row shows its weights, diffuse light and excess, compared with the formula.
     fov_of: the pointing of each image.
     """
     rows = 1 if bands.shells is None else 2
@@ -52,11 +53,11 @@ def cross_validation_png(
 
 
 def draw_weights(axes: Axes, shells: ShellBands) -> None:
-    """Weight of a pixel by distance."""
+    """Weight per pixel by distance."""
     radius = np.sqrt(shells.edges_px[1:] * shells.edges_px[:-1])
     lowest = 0.1 * float(shells.law_weight.min())
     _band(axes, radius, shells.law_weight, FORMULA, "formula")
-    # A free shell that holds nothing has no place on a logarithmic axis: its median is not drawn.
+    # A logarithmic axis cannot show a shell without light, so its median is not drawn.
     free = np.maximum(shells.free_weight, lowest)
     free[2, shells.free_weight[2] < lowest] = np.nan
     _band(axes, radius, free, FREE, "free fit", marker="o", line="")
@@ -65,14 +66,14 @@ def draw_weights(axes: Axes, shells: ShellBands) -> None:
         yscale="log",
         ylim=(lowest, None),
         xlabel="Distance (px)",
-        ylabel="Weight of a pixel",
+        ylabel="Weight per pixel",
         title="Diffuse scatter",
     )
     axes.legend(frameon=False)
 
 
 def draw_diffuse_light(axes: Axes, shells: ShellBands) -> None:
-    """Diffuse light beyond each distance."""
+    """1 - encircled energy of the diffuse scatter, percent of all light."""
     for name, limits, colour in (
         ("free fit", shells.free_beyond_pct, FREE),
         ("formula", shells.law_beyond_pct, FORMULA),
@@ -82,17 +83,17 @@ def draw_diffuse_light(axes: Axes, shells: ShellBands) -> None:
         xscale="log",
         ylim=(0, None),
         xlabel="Distance (px)",
-        ylabel="Light beyond the distance (%)",
+        ylabel="1 - encircled energy (%)",
         title="Diffuse scatter",
     )
     axes.legend(frameon=False)
 
 
 def draw_excess(axes: Axes, shells: ShellBands) -> None:
-    """Light of the free fit less that of the formula, within each distance, with its error."""
+    """Light of the free fit minus light of the formula within each distance, with its error."""
     radius, sigma = shells.edges_px[1:], shells.excess_sigma
     axes.fill_between(
-        radius, -sigma, sigma, color="#bbbbbb", alpha=0.5, linewidth=0, label="error, images and hold"
+        radius, -sigma, sigma, color="#bbbbbb", alpha=0.5, linewidth=0, label="error: image noise and prior"
     )
     _band(axes, radius, shells.excess_pct, FREE, "all fits")
     axes.axhline(0.0, color=INK, linewidth=0.8)
@@ -100,19 +101,19 @@ def draw_excess(axes: Axes, shells: ShellBands) -> None:
     axes.set(
         xscale="log",
         xlabel="Distance (px)",
-        ylabel="Free fit less formula, light within (%)",
+        ylabel="Light within distance: free - formula (%)",
         title=f"Within {near.within_px:g} px: {near.points:+.1f} ± {near.sigma:.1f} %",
     )
     axes.legend(frameon=False)
 
 
 def draw_curve(axes: Axes, bands: Bands) -> None:
-    """Light of the total PSF beyond each distance."""
+    """1 - encircled energy of the total PSF, percent."""
     _band(axes, bands.radii_px, bands.curve_pct, FORMULA, "median", marker="o")
     axes.set(
         xscale="log",
         xlabel="Distance (px)",
-        ylabel="Light beyond the distance (%)",
+        ylabel="1 - encircled energy (%)",
         title="Total PSF",
         ylim=(0, None),
     )
@@ -120,13 +121,15 @@ def draw_curve(axes: Axes, bands: Bands) -> None:
 
 
 def draw_totals(axes: Axes, bands: Bands) -> None:
-    """Histogram of the diffuse totals of all fits."""
+    """Histogram of the total scattered light of all fits."""
     axes.hist(100 * bands.totals, bins=min(25, max(5, bands.totals.size // 4)), color=FORMULA)
-    axes.set(xlabel="Diffusely scattered light (%)", ylabel="Fits", title="Totals of all fits")
+    axes.set(
+        xlabel="Diffusely scattered light (%)", ylabel="Number of fits", title="Scattered light, all fits"
+    )
 
 
 def draw_held_out(axes: Axes, bands: Bands, fov_of: list[int]) -> None:
-    """Residuals of images held out, by image."""
+    """Residuals of the held-out images."""
     images = np.array(list(bands.held_out_pct))
     residual = np.array(list(bands.held_out_pct.values()))
     fov = np.array([fov_of[n] for n in images])
@@ -135,14 +138,14 @@ def draw_held_out(axes: Axes, bands: Bands, fov_of: list[int]) -> None:
         colour = _POINTINGS[k % len(_POINTINGS)]
         axes.plot(images[here], residual[here], "o", color=colour, markersize=4, label=f"pointing {pointing}")
     axes.axhline(0.0, color=INK, linewidth=0.8)
-    axes.set(xlabel="Image", ylabel="Simulated - observed (% of observed)", title="Images held out")
+    axes.set(xlabel="Image", ylabel="Residual: simulated - observed (%)", title="Held-out images")
     axes.legend(frameon=False, ncols=3)
 
 
 def _band(
     axes: Axes, x: Vector, limits: Vector, colour: str, name: str, *, marker: str = "", line: str = "-"
 ) -> None:
-    """Median, 1 and 2 sigma."""
+    """The median and the bands of 1 and 2 sigma."""
     low_2, low_1, median, high_1, high_2 = limits
     axes.fill_between(x, low_2, high_2, color=colour, alpha=0.18, linewidth=0)
     axes.fill_between(x, low_1, high_1, color=colour, alpha=0.32, linewidth=0)

@@ -1,12 +1,17 @@
-"""What a wrong dark level does to a fitted PSF: the fit repeated with an offset added to every readout.
+"""Effect of a wrong dark level on a fitted PSF: repeat the fit with an offset added to every readout.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", its last experiment. An
-offset of o DN adds o / t to a frame of exposure t, DN/s: most to the short exposures, and most of all where the
-occulter is far off the limb and holds a few tens of counts.
+offset of o DN adds o / t DN/s to a frame of exposure t, Eq. (1). The effect is largest for short exposures with the
+occulter far off the limb, where the disc contains a few tens of counts.
 
-Weights are those of diffuse scatter by distance (means over rings one pixel wide), and are compared within the
-field: farther out the formula alone speaks. Curves are light beyond a distance, of diffuse scatter as the paper has
-it, and of the total PSF.
+Weights are the diffuse weights by distance, as means over rings one pixel wide. They are compared within the field,
+because the PSF farther out is an extrapolation of the formula. Curves are 100 (1 - encircled energy), of the diffuse
+scatter as in the paper, and of the total PSF.
+
+| symbol | name | unit |
+|---|---|---|
+| o | offset_dn | DN |
+| t | frame.exposure_s | s |
 """
 
 from __future__ import annotations
@@ -28,10 +33,11 @@ _RADII = 48
 
 @dataclass(frozen=True, eq=False)
 class DarkOffset:
-    """The fit with one offset beside the nominal one, by distance.
+    """The fit with one offset, compared with the nominal fit.
 
-    weight_change_pct: of a pixel's diffuse weight, relative, at radii_px. curve_change_points, total_curve_change_points:
-    of the diffuse and of the total PSF's light beyond curve_radii_px.
+    weight_change_pct: relative change of the diffuse weight per pixel at radii_px, percent. curve_change_points,
+    total_curve_change_points: change of the cumulative curves of the diffuse scatter and of the total PSF at
+    curve_radii_px, in percentage points. images: number of fitted images.
     """
 
     offset_dn: float
@@ -45,7 +51,8 @@ class DarkOffset:
 
 @dataclass(frozen=True, eq=False)
 class DarkOffsetStudy:
-    """What dark offsets do to the PSF of a transit. largest_...: largest size over all distances and offsets."""
+    """Effects of dark offsets on the PSF of a transit. largest_...: largest absolute change over all distances and
+    offsets."""
 
     radii_px: Vector
     curve_radii_px: Vector
@@ -54,17 +61,17 @@ class DarkOffsetStudy:
 
     @property
     def largest_weight_change_pct(self) -> float:
-        """Relative, of a pixel's diffuse weight."""
+        """Largest relative change of the diffuse weight per pixel, percent."""
         return max(float(np.abs(o.weight_change_pct).max()) for o in self.offsets)
 
     @property
     def largest_curve_change_points(self) -> float:
-        """Of the diffuse light beyond any distance."""
+        """Largest change of the cumulative curve of the diffuse scatter, percentage points."""
         return max(float(np.abs(o.curve_change_points).max()) for o in self.offsets)
 
     @property
     def largest_total_curve_change_points(self) -> float:
-        """Of the total PSF's light beyond any distance."""
+        """Largest change of the cumulative curve of the total PSF, percentage points."""
         return max(float(np.abs(o.total_curve_change_points).max()) for o in self.offsets)
 
 
@@ -77,15 +84,15 @@ def dark_offset_study(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> DarkOffsetStudy:
-    """Repeat the fit of a transit with each offset, started where the nominal fit ended.
+    """Repeat the fit of a transit with each offset, starting from the nominal fit.
 
-    nominal: the fit without an offset, where it is there already; its shape counts then. Raises DataError as
-    `inversion.invert`.
+    nominal: the fit without an offset, with its own shape; default: a new fit of `shape`. Raises DataError as `invert`
+    does.
     """
     if nominal is None:
         nominal = invert(transit, shape, threads=threads, progress=progress).inversion
-    looks = _Looks(transit, nominal.shape, threads)
-    before = looks.of(nominal.coordinates)
+    curves = _WeightsAndCurves(transit, nominal.shape, threads)
+    before = curves.at(nominal.coordinates)
     found = []
     for offset_dn in offsets_dn:
 
@@ -99,7 +106,7 @@ def dark_offset_study(
             threads=threads,
             progress=report,
         ).inversion
-        weights, diffuse, total = looks.of(at.coordinates)
+        weights, diffuse, total = curves.at(at.coordinates)
         found.append(
             DarkOffset(
                 offset_dn=float(offset_dn),
@@ -111,11 +118,11 @@ def dark_offset_study(
                 total_curve_change_points=total - before[2],
             )
         )
-    return DarkOffsetStudy(looks.radii_px, looks.curve_radii_px, nominal.values, tuple(found))
+    return DarkOffsetStudy(curves.radii_px, curves.curve_radii_px, nominal.values, tuple(found))
 
 
 def with_offset(transit: Transit, offset_dn: float) -> Transit:
-    """The transit with offset_dn added to every pixel of every readout."""
+    """The transit with offset_dn added to every pixel of every readout, Eq. (1)."""
     frames = tuple(
         replace(frame, pixels=frame.pixels + np.float32(offset_dn / frame.exposure_s))
         for frame in transit.frames
@@ -123,8 +130,8 @@ def with_offset(transit: Transit, offset_dn: float) -> Transit:
     return replace(transit, frames=frames)
 
 
-class _Looks:
-    """Weights and curves of a shape by distance."""
+class _WeightsAndCurves:
+    """Weights and cumulative curves of a shape by distance."""
 
     def __init__(self, transit: Transit, shape: Shape, threads: int) -> None:
         self._total = TotalPsf(transit.diffraction, shape, transit.shape, threads=threads)
@@ -132,8 +139,8 @@ class _Looks:
         self.radii_px = np.unique(np.geomspace(1, farthest, _RADII).round())
         self.curve_radii_px = np.concatenate(([0.5], self.radii_px))
 
-    def of(self, coordinates: Vector) -> tuple[Vector, Vector, Vector]:
-        """Mean weight at radii_px; diffuse and total light beyond curve_radii_px, percent."""
+    def at(self, coordinates: Vector) -> tuple[Vector, Vector, Vector]:
+        """Mean diffuse weight at radii_px; cumulative curves of diffuse and total PSF at curve_radii_px, percent."""
         scatter = self._total.shape.kernel(coordinates, REACH_GRID_PX)
         ring, mean = radial_profile(scatter)
         return (

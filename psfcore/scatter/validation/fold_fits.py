@@ -1,8 +1,8 @@
-"""Fits of a transit without some of its images, so that a PSF is judged on images that it was not fitted to.
+"""Fit a transit without some of its images, to test the PSF on held-out images.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", without the resampling:
-each sequential block of images (`psfcore.transit.blocks`) is held out in turn, and a guard on both of its sides.
-A fold's fit sees its own images alone: also the places of its occulters are found without those held out.
+Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", without the bootstrap. Each
+sequential block of images (`psfcore.transit.blocks`) is held out in turn, with a guard on both sides. The fit of a fold
+uses only its own images: the held-out ones do not help to locate occulters either.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from psfcore.transit.transit import Transit
 
 
 @dataclass(frozen=True, eq=False)
-class FoldFit:
-    """The fit of one fold: its inversion, and the total PSF [y, x] on what the field can see."""
+class FoldInversion:
+    """The fit of one fold. kernel: its total PSF [y, x], on a square of twice the field's size."""
 
     fold: Fold
     inversion: Inversion
@@ -29,12 +29,12 @@ class FoldFit:
 
 @dataclass(frozen=True, eq=False)
 class FoldKernels:
-    """A total PSF for every image of a transit, fitted without it. Called with an image's index, it gives the PSF."""
+    """Total PSFs by image, each fitted without that image. A call with the index of an image returns its PSF."""
 
-    fits: tuple[FoldFit, ...]
+    fits: tuple[FoldInversion, ...]
 
     def __call__(self, index: int) -> Kernel:
-        """The PSF of the fold that holds image `index` out."""
+        """The total PSF of the fold that holds out image `index`."""
         return next(fit.kernel for fit in self.fits if index in fit.fold.held_out)
 
 
@@ -46,18 +46,19 @@ def fold_kernels(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> FoldKernels:
-    """Fit a shape of scatter once a fold. start: coordinates, as those of the fit to all images; none: the shape's own.
+    """Fit a shape of scatter once per fold.
 
-    Raises DataError "too-few-frames" where there are too few images for two folds, and as `inversion.invert`.
+    start: coordinates, for example of the fit to all images; default: the start of the shape. Raises DataError
+    "too-few-frames" if there are too few images for two folds, and as `invert` does.
     """
     parts = folds(len(transit.frames))
     if not parts:
         raise DataError(
-            "too-few-frames", f"expected at least 6 images, to hold some out; got {len(transit.frames)}"
+            "too-few-frames", f"expected at least 6 images for held-out folds; got {len(transit.frames)}"
         )
     fits = []
     for number, fold in enumerate(parts, start=1):
-        stage = _Stage(progress, number, len(parts))
+        stage = _FoldProgress(progress, number, len(parts))
         fits.append(fit_fold(transit, fold, shape, start=start, threads=threads, progress=stage))
     return FoldKernels(tuple(fits))
 
@@ -70,14 +71,14 @@ def fit_fold(
     start: Vector | None = None,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
-) -> FoldFit:
-    """The fit of one fold. Raises DataError as `inversion.invert`, the images held out named first."""
+) -> FoldInversion:
+    """Fit one fold. Raises DataError as `invert` does; the message first names the held-out images."""
     part = replace(transit, frames=tuple(transit.frames[n] for n in fold.fitted))
     try:
         solution = invert(part, shape, start=start, threads=threads, progress=progress)
     except DataError as error:
         raise DataError(error.code, f"without {_named(transit, fold.held_out)}: {error.message}") from error
-    return FoldFit(fold, solution.inversion, solution.total.kernel(solution.inversion.coordinates))
+    return FoldInversion(fold, solution.inversion, solution.total.kernel(solution.inversion.coordinates))
 
 
 def _named(transit: Transit, images: Sequence[int]) -> str:
@@ -85,8 +86,8 @@ def _named(transit: Transit, images: Sequence[int]) -> str:
     return first if first == last else f"{first} to {last}"
 
 
-class _Stage:
-    """Progress of one fold among all: each counts as much as another."""
+class _FoldProgress:
+    """Progress over all folds, which count equally."""
 
     def __init__(self, progress: Progress, number: int, of: int) -> None:
         self._progress, self._number, self._of = progress, number, of

@@ -1,29 +1,33 @@
-"""Scatter without a formula, beside the formula that was fitted: what every shell holds more or less than it.
+"""Fit scatter without a formula: the difference in light between each shell and the fitted formula.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Results": a free fit beside the power law's, for all
-draws of a cross-validation. About a fitted PSF both are steps of one and the same problem, Eq. (4) of `inversion`.
-With d the light of each shell beyond that of the formula, and H, G, D and r as there,
+Hofmeister et al., The point-spread function of HRI_EUV, section "Results", which compares a free fit with the power law
+for all samples of the cross-validation. Near a fitted PSF both are steps of the same problem, Eq. (4) of
+`psfcore.scatter.inversion.inversion`, which also defines H, G, D and r. For d, the light of each shell minus the
+formula's,
 
     r = D [H D G c d + noise],   c_S = A_S / n_S - B                              Eq. (1)
     minimise over d >= -l   sum w (r - J d)^2 + sum ((d - d_f) / s)^2,   J = D H D G c   Eq. (2)
 
-c_S, what light that goes from the centre to shell S changes in the image, with A_S and B of the diffracted scene.
-Eq. (1) has the scene answer too, as Eq. (4) there: its D [c - H (1 - D) G c] is D H D G c where H G = 1, and G c are
-ring sums of G B. So all shells cost the ring sums of one image, and one small product. Beside the slopes themselves J
-is good to a few percent, and to a tenth for discs near the field's edge; r is exact.
+c_S is the change of the image when light moves from the centre to shell S, with A_S and B of the diffracted scene. Eq.
+(1) includes the response of the scene, as Eq. (4) does there: D [c - H (1 - D) G c] equals D H D G c if H G = 1, and
+G c consists of ring sums of G B. All shells therefore cost the ring sums of one image and one small matrix product.
+Compared with the exact derivatives, J is accurate to a few percent, and to a tenth for discs near the edge of the
+field; r is exact.
 
-Images add up: a draw's fit is made of the sums of its images' J^T w J and J^T w r.
+Images are additive: the fit of a bootstrap sample uses sums of the J^T w J and J^T w r of its images.
 
-Departures: all dark pixels count by their noise, not a thousand drawn ones by their shell; every shell is held to the
-formula, by s. Near it is held so loosely that the images decide, far out so that they hardly can. Without a hold the
-innermost shells and the centre cannot be told apart, and the light beyond the field is anything.
+Differences from the paper: all dark pixels count with their noise weights, instead of a thousand pixels selected by
+shell. A Gaussian prior of width s about the formula constrains every shell. Near the centre the prior is so wide that
+the images determine the shells; far out it is narrow, and the images add little. Without the prior the innermost shells
+cannot be separated from the centre, and the light beyond the field is undetermined.
 
 | symbol | name | unit |
 |---|---|---|
-| d | step: light of a shell beyond that of the formula | of all light |
-| d_f, l | towards, law_light: the formula's after and before the draw's own step | of all light |
+| d | step: light of a shell minus that of the formula | fraction of all light |
+| d_f | towards: change of the formula's light by the sample's own step | fraction of all light |
+| l | law_light: light of the formula before that step | fraction of all light |
 | A_S, B, n_S | ring sums, unscattered, counts | DN/s, DN/s, px |
-| s | looseness | of all light |
+| s | looseness: width of the prior | fraction of all light |
 """
 
 from __future__ import annotations
@@ -48,18 +52,16 @@ from psfcore.scatter.total_psf import Kernel
 Matrix = NDArray[np.float64]
 
 NEAR_PX = 100.0
-NEAR_LOOSE, FAR_LOOSE = (
-    10.0,
-    1.0,
-)  # times the formula's light of a shell: one sigma of what it may hold beyond
-LEAST_LIGHT = 1e-5  # that a shell may hold beyond the formula at one sigma, however little that gives it
+# Width of the prior, in units of the formula's light in the shell, within and beyond NEAR_PX.
+NEAR_LOOSE, FAR_LOOSE = 10.0, 1.0
+LEAST_LIGHT = 1e-5  # smallest width of the prior, as a fraction of all light
 
 
 @dataclass(frozen=True, eq=False)
 class FreeLight:
-    """A free fit: light of each shell, of all light, and its covariance (shells, shells), the hold's part included.
+    """A free fit. light: of each shell, as a fraction of all light; law_light: the same of the formula.
 
-    law_light: the formula's.
+    covariance: of light, (shells, shells), with the prior included.
     """
 
     light: Vector
@@ -69,9 +71,10 @@ class FreeLight:
 
 @dataclass(frozen=True, eq=False)
 class FreeShares:
-    """What each image says of the shells about one PSF: J^T w J (images, shells, shells) and J^T w r, Eq. (2).
+    """Contributions of each image to the normal equations of the shells near one PSF, Eq. (2).
 
-    frames: the images' indices. law_light: of the PSF's formula.
+    normal: J^T w J, (images, shells, shells). score: J^T w r, (images, shells). frames: indices of the images.
+    law_light: light of each shell by the formula of the PSF.
     """
 
     frames: tuple[int, ...]
@@ -80,9 +83,9 @@ class FreeShares:
     score: Matrix
 
     def fit(self, counts: Sequence[int], law_light: Vector) -> FreeLight:
-        """Eq. (2) with each image as often as counts (of all images by index) says, held to law_light."""
+        """Solve Eq. (2). counts: how often each image of the transit counts; law_light: centre of the prior."""
         times = np.array([counts[n] for n in self.frames], dtype=np.float64)
-        looseness = loosely(self.law_light)
+        looseness = looseness_of(self.law_light)
         towards = law_light - self.law_light
         normal = np.einsum("n,nij->ij", times, self.normal) + np.diag(looseness**-2)
         score = times @ self.score + towards / looseness**2
@@ -94,17 +97,17 @@ class FreeShares:
 
 @cache
 def shells() -> Segments:
-    """The paper's 50 shells, on the full reach."""
+    """The 50 shells of the paper, on the full reach."""
     return Segments(tuple(shells_as_published()))
 
 
 def law_light(shape: Shape, coordinates: Vector) -> Vector:
-    """Light of each shell by the formula, of all light."""
+    """Light of each shell by the formula, as a fraction of all light."""
     return shells().mean_of_map(shape.kernel(coordinates, REACH_GRID_PX)) * shells().counts
 
 
-def loosely(light: Vector) -> Vector:
-    """By how much each shell may differ from the formula, at one sigma of the hold."""
+def looseness_of(light: Vector) -> Vector:
+    """Width s of the prior of each shell."""
     edges = np.array(shells().edges_px)
     near = edges[1:] <= NEAR_PX
     return np.maximum(np.where(near, NEAR_LOOSE, FAR_LOOSE) * light, LEAST_LIGHT)
@@ -116,7 +119,7 @@ def free_shares(
     *,
     progress: Progress = lambda stage, step, steps: None,
 ) -> FreeShares:
-    """What the images that took part say of the shells, about the PSF at these coordinates of its formula."""
+    """Contributions of the fitted images to the normal equations of the shells, near the PSF at these coordinates."""
     diffract = Blur(of.transit.diffraction, of.transit.shape, threads=of.threads)
     kernel = of.total.kernel(coordinates)
     counts = shells().counts
@@ -125,11 +128,11 @@ def free_shares(
         progress("free shells", step, len(of.part))
         residual, expected = of.residual(n)
         rows, columns = dark = of.sky.dark[n]
-        undone = of.optics.undo_once(diffract.see(of.lit(n)))  # G B
-        sums = segment_sums(diffract.field(undone), np.stack(dark, axis=1), shells(), threads=of.threads)
+        inverted = of.optics.invert_once(diffract.convolve(of.blanked_scene(n)))  # G B
+        sums = segment_sums(diffract.field(inverted), np.stack(dark, axis=1), shells(), threads=of.threads)
         middle = kernel.shape[0] // 2
         within = kernel[middle + rows[:, None] - rows[None, :], middle + columns[:, None] - columns[None, :]]
-        slopes = within @ (sums / counts - pick(undone, dark)[:, None])  # Eq. (1)
+        slopes = within @ (sums / counts - pick(inverted, dark)[:, None])  # Eq. (1)
         weighted = slopes.T * of.weight(n, expected)
         normals.append(weighted @ slopes)
         scores.append(weighted @ residual)
@@ -144,7 +147,7 @@ def free_shares(
 def free_kernel(
     free: FreeLight, shape: Shape, coordinates: Vector, diffraction: Kernel, size: int, *, threads: int = 1
 ) -> Kernel:
-    """The total PSF [y, x] of a free fit on (size, size): the formula, scaled in each shell to the light found there."""
+    """The total PSF [y, x] of a free fit on (size, size): the formula, scaled in each shell to the fitted light."""
     ratio = np.divide(free.light, free.law_light, out=np.ones_like(free.light), where=free.law_light > 0)
     label = shells().label_map(size)
     scatter = shape.kernel(coordinates, size) * np.where(label >= 0, ratio[np.maximum(label, 0)], 1.0)

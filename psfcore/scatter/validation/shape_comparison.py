@@ -1,14 +1,20 @@
-"""Other shapes of scatter beside the one that was fitted: what each adds, on images that took no part.
+"""Compare other shapes of scatter with the fitted one, on held-out images.
 
-Every shape holds the softened power law and one or two parameters more, zero where it adds nothing. About the
-solution all are linear, so one look at each frame gives the normal equations of all of them; a fold's fit and its
-score on the images held out are then sums of matrices:
+Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". Every shape contains the
+softened power law and one or two additional parameters, which are zero for the power law itself. Near the solution all
+shapes are linear in their parameters. One pass over the frames therefore gives the normal equations of all shapes, and
+the fit of a fold and its gain on held-out images are sums of matrices:
 
     q_f = q + A_f^-1 v_f,   A_f, v_f summed over the fitted frames of fold f             Eq. (1)
     gain = sum over f of 2 d . v_h - d . A_h d,   d = q_f - q, summed over held-out frames   Eq. (2)
 
-Reported is the gain over that of the softened power law refitted in the same folds. It can be below zero: a
-parameter that fits noise does harm where it was not fitted.
+The reported gain is the difference from the softened power law, refitted in the same folds. It can be negative: a
+parameter that fits noise makes the prediction of held-out images worse.
+
+| symbol | name |
+|---|---|
+| A_f, v_f | normal, score: sums over the fitted frames |
+| A_h, v_h | normal, score: sums over the held-out frames |
 """
 
 from __future__ import annotations
@@ -32,10 +38,10 @@ BASE = len(SOFTENED_POWER_LAW.parameters)
 
 @dataclass(frozen=True)
 class ComparedShape:
-    """What one shape adds to the softened power law, to first order.
+    """Improvement of one shape over the softened power law, to first order.
 
-    added: value and standard error of each further parameter. gain: chi2 less on all frames. held_out_gain: on
-    frames that were not fitted; none where there are too few for folds.
+    added: value and standard error of each additional parameter. gain: decrease of chi2 on all frames. held_out_gain:
+    decrease on held-out frames; None if there are too few frames for folds.
     """
 
     name: str
@@ -45,14 +51,17 @@ class ComparedShape:
 
     @property
     def significance(self) -> float:
-        """Gain over the number of parameters added."""
+        """Gain divided by the number of additional parameters."""
         return self.gain / len(self.added)
 
 
 def compare_shapes(
     solution: Solution, *, progress: Progress = lambda stage, step, steps: None
 ) -> tuple[ComparedShape, ...]:
-    """All shapes but the softened power law, which `solution` must be of (DataError "unknown-shape")."""
+    """Compare all other shapes with the softened power law.
+
+    Raises DataError "unknown-shape" if `solution` is not a fit of the softened power law.
+    """
     base = solution.inversion.shape
     if base.name != SOFTENED_POWER_LAW.name:
         raise DataError("unknown-shape", f"expected a fit of {SOFTENED_POWER_LAW.name}; got {base.name}")
@@ -73,16 +82,16 @@ def compare_shapes(
     for step, n in enumerate(solution.part):
         progress("comparing shapes", step, len(solution.part))
         residual, expected = solution.residual(n)
-        answers = np.array([solution.answer(n, blur) for blur in blurs])
-        weighted = answers * solution.weight(n, expected)
-        normals.append(weighted @ answers.T)
+        jacobian = np.array([solution.jacobian(n, blur) for blur in blurs])
+        weighted = jacobian * solution.weight(n, expected)
+        normals.append(weighted @ jacobian.T)
         scores.append(weighted @ residual)
     normal, score = np.array(normals), np.array(scores)
     return tuple(_compared(shape, columns[shape.name], normal, score) for shape in shapes)
 
 
 def _slope(solution: Solution, shape: Shape, parameter: int) -> Blur:
-    """The change of the total PSF with one parameter of a shape, where the shape is still the power law."""
+    """Derivative of the total PSF by one parameter of a shape, at the solution of the power law."""
     total = TotalPsf(solution.transit.diffraction, shape, solution.transit.shape, threads=solution.threads)
     at = shape.coordinates(solution.inversion.values)
     return Blur(total.slope(at, parameter), solution.transit.shape, threads=solution.threads)
@@ -90,7 +99,7 @@ def _slope(solution: Solution, shape: Shape, parameter: int) -> Blur:
 
 def _compared(shape: Shape, extra: list[int], normal: Matrix, score: Matrix) -> ComparedShape:
     every = [*range(BASE), *extra]
-    whole, alone = _Part(normal, score, every), _Part(normal, score, list(range(BASE)))
+    whole, alone = _ParameterSubset(normal, score, every), _ParameterSubset(normal, score, list(range(BASE)))
     step, covariance = whole.solved()
     sigma = np.sqrt(np.diag(covariance))
     gains = []
@@ -109,19 +118,19 @@ def _compared(shape: Shape, extra: list[int], normal: Matrix, score: Matrix) -> 
     )
 
 
-class _Part:
-    """The normal equations of some of the parameters."""
+class _ParameterSubset:
+    """The normal equations of a subset of the parameters."""
 
     def __init__(self, normal: Matrix, score: Matrix, columns: list[int]) -> None:
         self._normal = normal[:, columns][:, :, columns]
         self._score = score[:, columns]
 
     def solved(self) -> tuple[Vector, Matrix]:
-        """Step and covariance over all frames."""
+        """Step and covariance from all frames."""
         covariance = np.linalg.inv(self._normal.sum(axis=0))
         return covariance @ self._score.sum(axis=0), covariance
 
     def gain(self, fitted: list[int], held: list[int]) -> float:
-        """Eq. (1) and (2) for one fold."""
+        """Eq. (1) and (2) for one fold: the gain on the held-out frames."""
         step = np.linalg.solve(self._normal[fitted].sum(axis=0), self._score[fitted].sum(axis=0))
         return float(2 * step @ self._score[held].sum(axis=0) - step @ self._normal[held].sum(axis=0) @ step)

@@ -1,4 +1,4 @@
-"""Shapes compared by their held-out errors: a stretch that is there shows, one that is not does not."""
+"""Shapes compared by their held-out errors: a real stretch is visible, and no false one appears."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def compared() -> ShapesByErrors:
 
 @cache
 def compared_stretched() -> ShapesByErrors:
-    """A bright sky through scatter that is stretched much."""
+    """A bright sky with strongly stretched scatter."""
     much = ScatterTruth(6.15, 2.53, 0.411, stretch=0.4, angle_deg=-15.0)
     return compare_shapes_by_errors(invert(observed(sky(much, brightness=BRIGHT)).transit))
 
@@ -58,11 +58,11 @@ def test_shapes_do_not_differ_where_the_truth_is_isotropic() -> None:
         for name in ("mpe_rms_pct", "mape_mean_pct"):
             value, sigma = shape.minus_first[name]
             assert abs(value) < 4 * sigma
-            assert sigma < shape.figures[name][1]  # paired: better known than the figures themselves
+            assert sigma < shape.figures[name][1]  # the same images: better known than the figures themselves
 
 
 @pytest.mark.slow
-def test_a_stretch_that_is_there_is_seen_in_held_out_errors() -> None:
+def test_a_real_stretch_is_visible_in_held_out_errors() -> None:
     shapes = {shape.name: shape for shape in compared_stretched().shapes}
     value, sigma = shapes["stretched"].minus_first["mpe_rms_pct"]
     assert value < -3 * sigma
@@ -70,9 +70,9 @@ def test_a_stretch_that_is_there_is_seen_in_held_out_errors() -> None:
 
 
 def test_figures_are_those_of_the_evaluation() -> None:
-    """All images once: the superposed epoch's own maps."""
+    """With each image once, the figures agree with the superposed maps."""
     kernel = solved().total.kernel(solved().inversion.coordinates)
-    looked = evaluate(solved().transit, lambda _n: kernel, draws=0)
+    looked = evaluate(solved().transit, lambda _n: kernel, noise_realisations=0)
     mean, rms, mpe, mape = _figures(list(looked.frames), np.ones((1, len(looked.frames))))[:, 0]
     residual = np.array([frame.residual_pct for frame in looked.frames])
     assert mean == pytest.approx(residual.mean()) and rms == pytest.approx(np.sqrt((residual**2).mean()))
@@ -80,14 +80,14 @@ def test_figures_are_those_of_the_evaluation() -> None:
     assert mape == pytest.approx(looked.superposed.mape_mean_pct)
 
 
-def test_said_as_json_and_as_a_table() -> None:
+def test_it_is_written_as_json_and_as_a_table() -> None:
     said = json.loads(json.dumps(compared().to_json(), allow_nan=False))
     assert said["shapes"][2]["parameters"]["stretch_q"]["sigma"] > 0
     assert len(compared().lines()) == 2 + 4 + 3
     assert f"{compared().shapes[0].figures['mpe_rms_pct'][0]:.2f}" in compared().lines()[1]
 
 
-def test_what_cannot_be_compared_is_refused() -> None:
+def test_other_shapes_and_few_images_are_refused() -> None:
     knee = dataclasses.replace(solved().inversion, shape=SHAPES["knee"])
     with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*knee"):
         compare_shapes_by_errors(dataclasses.replace(solved(), inversion=knee))

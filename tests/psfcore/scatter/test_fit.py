@@ -1,16 +1,13 @@
-"""The whole way from a transit to a PSF, its report, its doubts and its picture."""
+"""A complete fit: curves with errors, overdispersion, limits, free shells, progress, and the PSF file."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import re
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import matplotlib.image
 import numpy as np
 import pytest
 
@@ -18,30 +15,23 @@ from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter import fit as fit_module
-from psfcore.scatter.as_published.published import AS_PUBLISHED, MENDED_ALONE, Choices, Published
 from psfcore.scatter.fit import (
-    ALONE_DRAWS,
     RADII_PX,
     TransitFit,
     fit_transit,
+    fitted_psf,
     overdispersion,
-    psf_of,
-    report,
-    sentence,
 )
-from psfcore.scatter.fit_plot import fit_png
 from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.report import fit_json
 from psfcore.scatter.shapes import SHAPES
 from psfcore.simulate.transit import observed_transit
-from psfcore.transit.transit import Transit
 from tests.psfcore.conftest import LIMITS
 from tests.psfcore.small_transits import (
     DIFFRACTION,
     IMAGES,
     fitted,
     noise_free,
-    observed,
-    recipe,
     sky,
     solved,
     true_curve,
@@ -49,7 +39,7 @@ from tests.psfcore.small_transits import (
 
 
 def fit_of(patch: pytest.MonkeyPatch, solution: Solution, **asked: Any) -> TransitFit:
-    """A fit whose inversion is known, without free shells and other shapes, which take their time."""
+    """A fit with a known inversion, without the slow fits of free shells and other shapes."""
     patch.setattr(fit_module, "invert", lambda *_, **__: solution)
     patch.setattr(fit_module, "_free_shells", lambda *_: fitted().free)
     patch.setattr(fit_module, "compare_shapes", lambda *_, **__: ())
@@ -61,7 +51,7 @@ def with_inversion(solution: Solution, **changes: Any) -> Solution:
 
 
 def stretched(solution: Solution) -> Solution:
-    """As if it had been fitted with a stretch, and one of 5 % along x were found."""
+    """The solution as if it had been fitted with a stretch, with a result of 5 % along x."""
     inversion = solution.inversion
     covariance = np.zeros((4, 4))
     covariance[:3, :3], covariance[3, 3] = inversion.covariance, 0.01**2
@@ -73,10 +63,7 @@ def stretched(solution: Solution) -> Solution:
     )
 
 
-# --- curves and errors ------------------------------------------------------------------------------------
-
-
-def test_curves_are_the_truths_within_their_errors() -> None:
+def test_curves_agree_with_the_truth_within_their_errors() -> None:
     fit = fitted()
     assert fit.curve.radii_px.tolist() == list(RADII_PX)
     pull = (fit.curve.pct - true_curve(RADII_PX)) / fit.curve.sigma
@@ -85,7 +72,7 @@ def test_curves_are_the_truths_within_their_errors() -> None:
     np.testing.assert_allclose(fit.curve.sigma[:7], fit.inversion.curve_sigma, rtol=0.02)
 
 
-def test_kernels_hold_all_light_and_the_diffuse_part_is_the_shape() -> None:
+def test_kernels_sum_to_1_and_the_diffuse_part_is_the_shape() -> None:
     fit = fitted()
     assert fit.kernel.shape == fit.scatter.shape == (REACH_GRID_PX, REACH_GRID_PX)
     assert fit.kernel.sum() == pytest.approx(1, abs=1e-4)
@@ -104,8 +91,8 @@ def test_noise_alone_is_no_overdispersion() -> None:
     assert not [line for line in fit.limits if "scatter" in line and "noise" in line]
 
 
-def test_overdispersion_is_the_chi2_of_the_means_where_chance_could_not_do_it() -> None:
-    """Nine degrees of freedom: chance does up to 1 + 2 sqrt(2 / 9)."""
+def test_overdispersion_is_the_chi2_of_the_means_unless_chance_explains_it() -> None:
+    """With nine degrees of freedom, chance explains factors up to 1 + 2 sqrt(2 / 9)."""
     inversion = solved().inversion
     edge = 1 + 2 * math.sqrt(2 / 9)
     for factor, expected in ((0.98 * edge, 1.0), (1.02 * edge, 1.02 * edge), (25.0, 25.0)):
@@ -122,17 +109,17 @@ def test_overdispersion_is_the_chi2_of_the_means_where_chance_could_not_do_it() 
 
 @cache
 def with_an_offset() -> Solution:
-    """Every pixel 15 DN too bright, which a fit knows nothing of."""
+    """A transit with all pixels 15 DN too bright, an effect that the model lacks."""
     of = sky()
     shifted = dataclasses.replace(of, plan=dataclasses.replace(of.plan, dark_offset_dn=15.0))
     return invert(observed_transit(shifted, 3).transit)
 
 
-def test_an_effect_that_is_not_modelled_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_effect_that_the_model_lacks_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     fit = fit_of(monkeypatch, with_an_offset())
     assert fit.overdispersion > 4
     words = "; ".join(fit.limits)
-    assert f"scatter {math.sqrt(fit.overdispersion):.1f} times as much as noise allows" in words
+    assert f"scatter {math.sqrt(fit.overdispersion):.1f} times as much as noise explains" in words
     np.testing.assert_allclose(fit.covariance, fit.overdispersion * fit.inversion.covariance)
     assert fit.value_sigma["c"] == pytest.approx(
         math.sqrt(fit.overdispersion) * fit.inversion.value_sigma["c"]
@@ -140,10 +127,10 @@ def test_an_effect_that_is_not_modelled_is_told(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(
         fit.curve.sigma[:7], math.sqrt(fit.overdispersion) * fit.inversion.curve_sigma, rtol=0.02
     )
-    assert report(fit)["overdispersion"] == fit.overdispersion
+    assert fit_json(fit)["overdispersion"] == fit.overdispersion
 
 
-def test_doubts_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [line for line in fitted().limits if "field is 128 px" in line]
     transit, inversion = solved().transit, solved().inversion
     one_pointing = dataclasses.replace(
@@ -159,19 +146,16 @@ def test_doubts_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     words = "; ".join(fit_of(monkeypatch, unsure).limits)
     for told in (
-        f"not settled after {len(inversion.rounds)} rounds",
-        "1 pointing:",
-        "px is open to more than 3 points",
+        f"did not converge in {len(inversion.rounds)} rounds",
+        "with 1 pointing, the data hardly distinguish",
+        "px has a standard error of more than 3 percentage points",
         "does not describe the occulted pixels",
-        "place is not settled in 1 images",
+        "position of the occulter did not converge in 1 image",
     ):
         assert told in words
 
 
-# --- free shells ------------------------------------------------------------------------------------------
-
-
-def test_free_shells_are_about_the_truth_where_the_field_tells() -> None:
+def test_free_shells_agree_with_the_truth_within_the_field() -> None:
     free = fitted().free
     assert free is not None
     truth = free.segments.mean_of_map(fitted().scatter)
@@ -184,105 +168,21 @@ def test_free_shells_are_about_the_truth_where_the_field_tells() -> None:
     beyond = free.beyond_pct((50.0,))[0]
     assert (np.diff(beyond) <= 1e-9).all()
     assert beyond[0] == pytest.approx(fitted().diffuse_curve.pct[0], abs=3)
-    held = edges[:-1] > 2 * 128  # no pixel of the field is so far from another
-    of_held = free.drawn.fits[:, held]
+    held = edges[:-1] > 2 * 128  # no two pixels of the field are that far apart
+    of_held = free.fits.fits[:, held]
     assert of_held.shape[0] == 14
     np.testing.assert_allclose(of_held, np.broadcast_to(truth[held], of_held.shape), rtol=0.2)
 
 
-# --- the report -------------------------------------------------------------------------------------------
-
-
-def as_json(fit: TransitFit) -> dict[str, Any]:
-    """What a program that reads it gets; fails where there is a number that JSON does not know."""
-    content = json.loads(json.dumps(report(fit), allow_nan=False))
-    assert isinstance(content, dict)
-    return content
-
-
-def test_a_report_is_json_and_says_what_the_fit_says() -> None:
-    fit, content = fitted(), as_json(fitted())
-    assert content["schema"] == "psf-fit/1"
-    assert content["shape"] == "softened-power-law"
-    assert content["curve"]["light_beyond_pct"] == fit.curve.pct.tolist()
-    assert content["curve"]["sigma"] == fit.curve.sigma.tolist()
-    assert content["diffuse_curve"]["radii_px"] == list(RADII_PX)
-    for name, said in content["parameters"].items():
-        assert (said["value"], said["sigma"]) == (fit.inversion.values[name], fit.value_sigma[name])
-    assert content["parameters"]["b_px"]["unit"] == "px"
-    assert content["coordinates"]["covariance"] == fit.covariance.tolist()
-    assert content["coordinates"]["scales"] == ["log", "linear", "logit"]
-    assert content["converged"] is True
-    assert [r["moved_points"] for r in content["rounds"]] == [r.moved_points for r in fit.inversion.rounds]
-    assert [f["file"] for f in content["frames"]] == [f"{n:03d}.fits" for n in range(IMAGES)]
-    one = content["frames"][5]
-    assert one["x"] == pytest.approx(observed(sky()).truth.places[5].x_px, abs=0.1)
-    assert one["residual_pct"] == pytest.approx(100 * (one["expected_dn_s"] / one["observed_dn_s"] - 1))
-    assert one["dark_pixels"] == fit.inversion.frames[5].dark[0].size
-    assert content["limits"] == list(fit.limits)
-    assert [s["name"] for s in content["shapes"]] == [s.name for s in fit.shapes]
-    assert content["shapes"][0]["added"]["stretch_p"]["sigma"] > 0
-    assert len(content["free_shells"]["weight"]["median"]) == 50
-    assert content["first_guess"]["best_fov"] == fit.first_guess.best_fov
-    assert "stretch" not in content and "as_published" not in content
-
-
-def test_the_sentence_has_the_curves_numbers() -> None:
-    fit, words = fitted(), sentence(fitted())
-    at = {r: (p, s) for r, p, s in zip(RADII_PX, fit.curve.pct, fit.curve.sigma, strict=True)}
-    found = [float(number) for number in re.findall(r"\d+\.\d+", words)]
-    total, sigma = fit.inversion.values["total"], fit.value_sigma["total"]
-    expected = [100 * total, 100 * sigma, *at[0.5], *at[10.0], *at[100.0]]
-    assert found[:8] == pytest.approx(expected, abs=0.00501)
-    assert found[8] == pytest.approx(fit.inversion.chi2_per_pixel, abs=0.000501)
-    assert f"{IMAGES} images" in words
-    assert as_json(fit)["sentence"] == words
-
-
-def test_a_stretch_is_reported_and_free_shells_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    fit = fit_of(monkeypatch, stretched(solved()), shape="stretched-along-x")
-    assert fit.free is None and fit.shapes == ()
-    content = as_json(fit)
-    assert content["stretch"] == pytest.approx({"stretch": 0.05, "angle_deg": 0.0})
-    assert content["shape"] == "stretched-along-x"
-    assert "free_shells" not in content and content["shapes"] == []
-    assert len(content["coordinates"]["covariance"]) == 4
-
-
-def test_a_shape_that_is_not_there_is_refused() -> None:
+def test_an_unknown_shape_is_refused() -> None:
     with pytest.raises(DataError, match="unknown-shape"):
         fit_transit(noise_free(sky()), shape="spiral")
 
 
-def test_the_published_recipe_stands_beside_it_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Choices, int]] = []
-
-    def published(transit: Transit, choices: Choices, *, draws: int = 100, **_: Any) -> Published:
-        asked.append((choices, draws))
-        found = recipe(AS_PUBLISHED)[0]
-        return dataclasses.replace(found, curve_pct=found.curve_pct + len(asked) - 1)
-
-    monkeypatch.setattr(fit_module, "invert_as_published", published)
-    fit = fit_of(monkeypatch, solved(), as_published=True)
-    assert asked == [(AS_PUBLISHED, 100), *((choices, ALONE_DRAWS) for choices in MENDED_ALONE.values())]
-    content = as_json(fit)["as_published"]
-    whole = content["whole"]
-    assert whole["radii_px"] == [0.5, 2, 5, 10, 20, 50]
-    np.testing.assert_allclose(
-        whole["minus_default_points"], np.array(whole["light_beyond_pct"]) - fit.curve.pct[:6]
-    )
-    assert set(whole["spread_of_draws"]) == {"a", "b_px", "c"}
-    assert [r["fit"] for r in whole["rounds"]] == ["free shells"] * 3 + ["softened power law"] * 3
-    alone = content["one_bias_mended"]
-    assert list(alone) == list(MENDED_ALONE)
-    for n, one in enumerate(alone.values(), start=1):
-        assert one["minus_published_points"] == pytest.approx([n] * 6)
-
-
-def test_progress_of_the_whole_rises_to_its_end() -> None:
-    """Of a fit with all its parts but the published: each step further than the last, none beyond the total."""
+def test_progress_of_the_whole_fit_increases_to_its_end() -> None:
+    """Every call increases the step, and no step exceeds the total (fit without the published recipe)."""
     seen: list[tuple[str, int, int]] = []
-    whole = fit_module._Whole(lambda *at: seen.append(at), 2, compared=True, published=0)
+    whole = fit_module._FitProgress(lambda *at: seen.append(at), 2, compared=True, published=0)
     stages = [
         "reconstructing",
         *[f"round {n}" for n in range(1, 9)],
@@ -301,12 +201,9 @@ def test_progress_of_the_whole_rises_to_its_end() -> None:
     assert done[-1] > 0.95
 
 
-# --- the PSF and the picture ------------------------------------------------------------------------------
-
-
 def test_a_fitted_psf_is_written_and_read(tmp_path: Path) -> None:
     fit = fitted()
-    psf = psf_of(fit, name="test", version="1.0.0", provenance={"images": IMAGES})
+    psf = fitted_psf(fit, name="test", version="1.0.0", provenance={"images": IMAGES})
     assert psf.total == pytest.approx(1, abs=1e-4)
     middle = slice(REACH_GRID_PX // 2 - 15, REACH_GRID_PX // 2 + 16)
     np.testing.assert_array_equal(psf.components["DIFFRACTION"][middle, middle], DIFFRACTION)
@@ -322,31 +219,3 @@ def test_a_fitted_psf_is_written_and_read(tmp_path: Path) -> None:
     assert read.fitted.shape == "softened-power-law"
     np.testing.assert_array_equal(read.fitted.coordinates, fit.inversion.coordinates)
     np.testing.assert_array_equal(read.fitted.covariance, fit.covariance)
-
-
-def test_a_fit_is_drawn(tmp_path: Path) -> None:
-    """With everything; and with one image of a disc below zero, no free shells and one round."""
-    whole = dataclasses.replace(fitted(), published=recipe(AS_PUBLISHED)[0])
-    image = solved().inversion.frames[4]
-    bare = dataclasses.replace(
-        fitted(),
-        free=None,
-        solution=with_inversion(
-            solved(),
-            frames=(dataclasses.replace(image, observed=-0.1 * image.observed),),
-            rounds=solved().inversion.rounds[:1],
-            converged=False,
-        ),
-    )
-    pictures = []
-    for name, fit in (("whole", whole), ("bare", bare)):
-        fit_png(fit, tmp_path / f"{name}.png")
-        pictures.append(matplotlib.image.imread(tmp_path / f"{name}.png"))
-        height, width = pictures[-1].shape[:2]
-        assert 1200 < width < 2000 and 700 < height < 1400
-        assert 20_000 < (tmp_path / f"{name}.png").stat().st_size < 400_000
-        assert 0.05 < pictures[-1][..., :3].std() < 0.4
-    drawn = [
-        int((np.abs(p[..., :3] - np.array([179, 38, 30]) / 255).max(axis=-1) < 0.02).sum()) for p in pictures
-    ]
-    assert drawn[0] > drawn[1] + 300  # the published recipe's lines

@@ -1,4 +1,4 @@
-"""Seeing through a PSF and undoing it, in the engine's order, against the plain float64 convolution."""
+"""Convolution with a PSF and its inverse, in the engine's order, compared with a plain float64 convolution."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOPSIDED = total_kernel(
 
 
 def scene(shape: tuple[int, int], seed: int = 1) -> NDArray[np.float64]:
-    """A bright field with points of light, some on its edge."""
+    """A bright field with point sources, some at its edge."""
     rng = np.random.default_rng(seed)
     return np.asarray(rng.uniform(50, 150, shape) + 2000 * (rng.random(shape) > 0.98))
 
@@ -28,23 +28,23 @@ def scene(shape: tuple[int, int], seed: int = 1) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     "kernel", [total_kernel(SCATTER, DIFFRACTION, 200), LOPSIDED], ids=["even", "lopsided"]
 )
-def test_seeing_is_the_convolution(shape: tuple[int, int], kernel: NDArray[np.float64]) -> None:
+def test_it_is_the_convolution(shape: tuple[int, int], kernel: NDArray[np.float64]) -> None:
     blur, plain, x = Blur(kernel, shape), Convolver(kernel, shape, dtype=np.float64), scene(shape)
-    seen, back = blur.see(blur.lanes(x)), blur.see_back(blur.lanes(x))
+    seen, back = blur.convolve(blur.lanes(x)), blur.correlate(blur.lanes(x))
     np.testing.assert_allclose(blur.field(seen), plain.apply(x), rtol=1e-5)
     np.testing.assert_allclose(blur.field(back), plain.adjoint(x), rtol=1e-5)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_nothing_is_left_beyond_the_fields_last_row(shape: tuple[int, int]) -> None:
-    """A field goes through twice as it would if it were cut between."""
+    """Two passes give the same result as two passes with a crop between them."""
     optics, x = Optics(LOPSIDED, shape), scene(shape)
     lanes = optics.lanes(x)
-    once = optics.see(lanes)
+    once = optics.convolve(lanes)
     np.testing.assert_array_equal(once, optics.lanes(optics.field(once)))
-    undone = optics.undo_once(lanes, adjoint=True)
+    undone = optics.invert_once(lanes, adjoint=True)
     np.testing.assert_array_equal(undone, optics.lanes(optics.field(undone)))
-    np.testing.assert_array_equal(lanes, optics.lanes(x))  # what goes in stays as it is
+    np.testing.assert_array_equal(lanes, optics.lanes(x))  # the input is not modified
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -57,35 +57,37 @@ def test_adjoints(shape: tuple[int, int]) -> None:
         return float(np.vdot(a.astype(np.float64), b.astype(np.float64)))
 
     size = np.sqrt(dot(x, x) * dot(y, y))
-    assert dot(optics.see(x), y) == pytest.approx(dot(x, optics.see_back(y)), abs=1e-6 * size)
-    assert dot(optics.undo_once(x), y) == pytest.approx(
-        dot(x, optics.undo_once(y, adjoint=True)), abs=1e-6 * size
+    assert dot(optics.convolve(x), y) == pytest.approx(dot(x, optics.correlate(y)), abs=1e-6 * size)
+    assert dot(optics.invert_once(x), y) == pytest.approx(
+        dot(x, optics.invert_once(y, adjoint=True)), abs=1e-6 * size
     )
-    assert abs(dot(optics.see(x), y) - dot(x, optics.see(y))) > 1e-4 * size  # this PSF has a direction
+    assert (
+        abs(dot(optics.convolve(x), y) - dot(x, optics.convolve(y))) > 1e-4 * size
+    )  # this PSF is not symmetric
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (100, 131)])
-def test_undoing_gives_the_scene_back(shape: tuple[int, int]) -> None:
+def test_inversion_recovers_the_scene(shape: tuple[int, int]) -> None:
     kernel = total_kernel(SCATTER, DIFFRACTION, 280)
     optics, x = Optics(kernel, shape), scene(shape)
     observed = Convolver(kernel, shape, dtype=np.float64).apply(x)
 
     def off(steps: int) -> float:
-        return float(np.abs(optics.field(optics.undo(optics.lanes(observed), steps=steps)) - x).max())
+        return float(np.abs(optics.field(optics.invert(optics.lanes(observed), steps=steps)) - x).max())
 
     assert off(0) > 500
     assert off(5) < 0.5
     assert off(8) < off(5) < off(2) < off(1)
-    nearly = optics.undo(optics.lanes(observed), optics.lanes(x + 1.0), steps=3)
+    nearly = optics.invert(optics.lanes(observed), optics.lanes(x + 1.0), steps=3)
     np.testing.assert_allclose(optics.field(nearly), x, atol=0.1)
 
 
-def test_a_kernel_of_any_sign_is_seen_through() -> None:
+def test_a_kernel_may_have_any_sign() -> None:
     kernel = scatter_kernel(6.2, 2.5, 0.42, 128) - scatter_kernel(6.1, 2.5, 0.41, 128)
     blur, plain, x = Blur(kernel, (50, 60)), Convolver(kernel, (50, 60), dtype=np.float64), scene((50, 60))
     expected = plain.apply(x)
     np.testing.assert_allclose(
-        blur.field(blur.see(blur.lanes(x))), expected, atol=1e-5 * np.abs(expected).max()
+        blur.field(blur.convolve(blur.lanes(x))), expected, atol=1e-5 * np.abs(expected).max()
     )
 
 
@@ -108,4 +110,4 @@ def test_single_pixels_are_the_right_ones(shape: tuple[int, int]) -> None:
 def test_threads_change_nothing() -> None:
     x = scene((100, 131))
     one, two = (Optics(LOPSIDED, (100, 131), threads=threads) for threads in (1, 2))
-    np.testing.assert_array_equal(one.undo(one.lanes(x)), two.undo(two.lanes(x)))
+    np.testing.assert_array_equal(one.invert(one.lanes(x)), two.invert(two.lanes(x)))

@@ -1,4 +1,4 @@
-"""Every shape of scatter holds the light that it says, where its formula says."""
+"""Every shape of scatter contains its total of light and follows its formula."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def name_of(shape: Shape) -> str:
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=name_of)
-def test_light_off_the_centre_is_the_total(shape: Shape) -> None:
+def test_light_outside_the_centre_is_the_total(shape: Shape) -> None:
     kernel = kernel_of(shape, REACH_GRID_PX, **MORE)
     assert kernel[MIDDLE, MIDDLE] == pytest.approx(1 - 0.411, abs=1e-14)
     assert kernel.sum() == pytest.approx(1, abs=1e-12)
@@ -55,7 +55,7 @@ def test_light_off_the_centre_is_the_total(shape: Shape) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=name_of)
 def test_slopes_are_those_of_the_kernel(shape: Shape) -> None:
-    """Each against two wider differences of its own coordinate, extrapolated to no width."""
+    """Compared with two wider differences, extrapolated to zero width."""
     at = shape.coordinates(LAW | MORE)
     for k in range(at.size):
         axis = np.eye(at.size)[k]
@@ -70,7 +70,7 @@ def test_slopes_are_those_of_the_kernel(shape: Shape) -> None:
 
 
 @pytest.mark.parametrize("shape", OTHERS, ids=name_of)
-def test_nothing_added_is_the_softened_power_law(shape: Shape) -> None:
+def test_with_zero_additional_parameters_it_is_the_softened_power_law(shape: Shape) -> None:
     assert all(p.start == 0 for p in shape.parameters[3:])
     np.testing.assert_allclose(kernel_of(shape, 256), kernel_of(SOFTENED_POWER_LAW, 256), rtol=1e-12)
     np.testing.assert_allclose(kernel_of(shape, 256), scatter_kernel(6.15, 2.53, 0.411, 256), rtol=1e-11)
@@ -93,7 +93,7 @@ def test_a_stretch_along_x_is_one_at_no_angle() -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [-15.0, 90.0])
-def test_a_side_is_the_simulators_dipole(angle_deg: float) -> None:
+def test_one_sided_is_the_dipole_of_the_simulator(angle_deg: float) -> None:
     turn = math.radians(angle_deg)
     found = kernel_of(SHAPES["one-sided"], 128, x_share=0.25 * math.cos(turn), y_share=0.25 * math.sin(turn))
     truth = ScatterTruth(6.15, 2.53, 0.411, dipole=0.25, angle_deg=angle_deg)
@@ -106,10 +106,10 @@ def test_a_knee_steepens_the_law_beyond_it() -> None:
     r = np.array([1, 50, 100, 200, 500])
     expected = ((1 + (r / KNEE_PX) ** 2) / (1 + 1 / KNEE_PX**2)) ** -0.2
     np.testing.assert_allclose(ratio[512 + r] / ratio[513], expected, rtol=1e-12)
-    assert ratio[513] > 1 > ratio[1012]  # what is lost far out is found near
+    assert ratio[513] > 1 > ratio[1012]  # light lost at large distances is gained at small ones
 
 
-def test_a_second_law_and_a_core_hold_their_share() -> None:
+def test_a_second_power_law_and_a_core_contain_their_fraction() -> None:
     law = kernel_of(SOFTENED_POWER_LAW, REACH_GRID_PX)
     r = np.hypot(*(np.indices(law.shape) - MIDDLE))
     wide = (HALO_B_PX + r) ** -2.53
@@ -123,8 +123,8 @@ def test_a_second_law_and_a_core_hold_their_share() -> None:
 
 
 @pytest.mark.parametrize("name", ["softened-power-law", "stretched", "two-power-laws"])
-def test_any_size_is_a_cut_of_the_same_kernel(name: str) -> None:
-    """Weights are scaled on the full reach, not on the array: not on a smaller one and not on a larger."""
+def test_any_size_is_a_crop_of_the_same_kernel(name: str) -> None:
+    """Weights are scaled on the full reach, for smaller and for larger arrays."""
     whole = kernel_of(SHAPES[name], REACH_GRID_PX, **MORE)
     for size in (65, 128):
         np.testing.assert_allclose(
@@ -137,7 +137,7 @@ def test_any_size_is_a_cut_of_the_same_kernel(name: str) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=name_of)
-def test_coordinates_and_values_are_two_ways_to_say_one_thing(shape: Shape) -> None:
+def test_coordinates_and_values_are_inverse_functions(shape: Shape) -> None:
     values = {name: (LAW | MORE)[name] for name in shape.names}
     assert shape.values(shape.coordinates(values)) == pytest.approx(values, rel=1e-14)
     at = np.linspace(-0.7, 1.9, len(shape.parameters))
@@ -154,7 +154,7 @@ def test_slope_is_the_values_over_the_coordinates(parameter: Parameter) -> None:
     assert parameter.slope(at) == pytest.approx((ahead - behind) / 2e-5, rel=1e-7)
 
 
-def test_no_coordinate_leads_where_no_scatter_is() -> None:
+def test_extreme_coordinates_stay_within_bounds() -> None:
     for at in (-30.0, 30.0):
         values = SOFTENED_POWER_LAW.values(np.array([at, 2.5, at]))
         assert values["b_px"] > 0 and 0 < values["total"] < 1
@@ -169,13 +169,13 @@ def test_stretch_and_angle_are_read_back(stretch: float, angle_deg: float) -> No
     assert stretch_of(LAW) == (0.0, 0.0)
 
 
-def test_a_shape_that_is_not_there_is_named() -> None:
+def test_an_unknown_shape_is_refused_with_the_known_ones() -> None:
     assert shape_named("knee") is SHAPES["knee"]
     with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*'spiral'"):
         shape_named("spiral")
 
 
-def test_a_step_is_shortened_along_itself_to_the_largest_that_each_may_take() -> None:
+def test_a_step_is_shortened_to_the_largest_step_of_each_parameter() -> None:
     step = np.array([4.0, 0.3, -0.4])  # eight times the largest of b
     shorter, whole = SOFTENED_POWER_LAW.shortened(step)
     assert not whole

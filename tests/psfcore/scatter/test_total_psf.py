@@ -1,4 +1,4 @@
-"""The total PSF is scatter convolved with diffraction, and its slopes are those of its kernel."""
+"""The total PSF is scatter convolved with diffraction, and its slopes are the derivatives of its kernel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ AT = SOFTENED_POWER_LAW.coordinates({"b_px": 6.15, "c": 2.53, "total": 0.411})
 
 
 def test_scatter_and_diffraction_convolve() -> None:
-    """What a field can see is that of the full reach, but for what comes back from beyond the square."""
+    """The square agrees with the full reach, except for light that is diffracted back from outside it."""
     total = TotalPsf(DIFFRACTION, SOFTENED_POWER_LAW, (100, 131))
     assert total.size == 262
     kernel = total.kernel(AT)
@@ -28,13 +28,13 @@ def test_scatter_and_diffraction_convolve() -> None:
     np.testing.assert_allclose(kernel, truth, atol=1e-7)
 
 
-def test_a_large_field_is_seen_on_the_full_reach() -> None:
+def test_a_large_field_uses_the_full_reach() -> None:
     assert TotalPsf(DIFFRACTION, SOFTENED_POWER_LAW, (1500, 10)).size == REACH_GRID_PX
 
 
 def test_a_pattern_larger_than_the_square_counts_where_it_reaches() -> None:
     wide = np.zeros((401, 401))
-    wide[200, 200], wide[200, 390] = 0.9, 0.1  # the second beyond what a field of 64 px can join
+    wide[200, 200], wide[200, 390] = 0.9, 0.1  # the second is farther than two pixels of a 64 px field
     total = TotalPsf(wide, SOFTENED_POWER_LAW, (64, 64))
     scatter = SOFTENED_POWER_LAW.kernel(AT, 128)
     np.testing.assert_allclose(total.kernel(AT), 0.9 * scatter, rtol=1e-9, atol=1e-15)
@@ -45,7 +45,7 @@ def test_a_pattern_larger_than_the_square_counts_where_it_reaches() -> None:
     [("softened-power-law", 0), ("softened-power-law", 1), ("softened-power-law", 2), ("stretched", 4)],
 )
 def test_slopes_are_differences_of_kernels(name: str, k: int) -> None:
-    """Against two wider differences, extrapolated to no width."""
+    """Compared with two wider differences, extrapolated to zero width."""
     shape = SHAPES[name]
     total = TotalPsf(DIFFRACTION, shape, (64, 64))
     at = shape.coordinates({"b_px": 6.15, "c": 2.53, "total": 0.411})

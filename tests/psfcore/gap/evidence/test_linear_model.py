@@ -64,9 +64,9 @@ def left_in_disc(solution: Solution, n: int, image: np.ndarray) -> np.ndarray:
     """r of Eq. (1) of cells, forwards."""
     optics, dark = solution.optics, solution.sky.dark[n]
     lanes = optics.lanes(np.ascontiguousarray(image, dtype=np.float32))
-    scene = optics.undo(lanes, optics.undo_once(lanes), steps=1)
+    scene = optics.invert(lanes, optics.invert_once(lanes), steps=1)
     put(scene, dark, 0.0)
-    return pick(lanes, dark) - pick(optics.see(scene), dark)
+    return pick(lanes, dark) - pick(optics.convolve(scene), dark)
 
 
 def test_cells_share_out_all_dark_pixels(solution: Solution) -> None:
@@ -97,9 +97,9 @@ def test_an_added_error_moves_the_residual_as_its_sensitivity_says(solution: Sol
     weights = cells_of(solution.sky.dark[n], place.x_px, place.y_px).weights
     optics, dark = solution.optics, solution.sky.dark[n]
     lanes = optics.lanes(solution.transit.frames[n].pixels + error)
-    scene = optics.undo(lanes, steps=8)
+    scene = optics.invert(lanes, steps=8)
     put(scene, dark, 0.0)
-    after = weights @ (pick(lanes, dark) - pick(optics.see(scene), dark))
+    after = weights @ (pick(lanes, dark) - pick(optics.convolve(scene), dark))
     expected = np.einsum("cyx,yx->c", planes, error)
     assert np.abs(expected).max() > 0.5
     assert after - found.residual == pytest.approx(expected, abs=0.05 * float(np.abs(expected).max()))

@@ -1,4 +1,4 @@
-"""Plain, slow ways to the sums of an image over segments, for tests and the bench."""
+"""Simple, slow methods for the sums of an image over segments, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from psfcore.scatter.as_published.segments import Segments
 def segment_sums_plain(
     image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments
 ) -> NDArray[np.float64]:
-    """Eq. (1) of psfcore.scatter.as_published.ring_sums, (n, segments): every pixel of the image goes where the label map says."""
+    """Eq. (1) of psfcore.scatter.as_published.ring_sums, (n, segments), by the label map."""
     ny, nx = image.shape
-    # Targets lie on the image: no offset is as long as its longer side.
+    # Targets lie on the image, so every offset is shorter than the longer side of the image.
     size = 2 * max(ny, nx) + 1
     label, middle = segments.label_map(size) + 1, size // 2
     weights = np.asarray(image, dtype=np.float64)[::-1, ::-1].ravel()
     out = np.empty((len(targets), segments.size))
     for n, (y, x) in enumerate(targets):
-        # Offsets (y, x) - source, of sources from the last to the first.
+        # Labels of the offsets (y, x) - source, for sources from the last to the first.
         seen = label[middle + y - ny + 1 : middle + y + 1, middle + x - nx + 1 : middle + x + 1]
         out[n] = np.bincount(seen.ravel(), weights=weights, minlength=segments.size + 1)[1:]
     return out
@@ -29,7 +29,7 @@ def segment_sums_plain(
 def segment_sums_fft(
     image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments, *, threads: int = 1
 ) -> NDArray[np.float64]:
-    """The same by one convolution of the whole image a segment, in float64."""
+    """The same by one convolution of the whole image per segment, in float64."""
     label = segments.label_map(segments.reach_grid_px)
     out = np.empty((len(targets), segments.size))
     for k in range(segments.size):

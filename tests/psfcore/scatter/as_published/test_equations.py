@@ -1,4 +1,4 @@
-"""The system of equations: what is drawn from it, and what its fits give back."""
+"""The system of equations: its random subsets, and the fits that recover known coefficients."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from psfcore.errors import DataError
 from psfcore.psf import squared_radii
 from psfcore.scatter.as_published import equations
 from psfcore.scatter.as_published.equations import (
-    LIT,
-    LIT_LINES,
-    OCCULTED_LINES,
+    OCCULTED_EQUATIONS,
     PIVOT_PX,
-    Lines,
+    UNOCCULTED,
+    UNOCCULTED_EQUATIONS,
+    Equations,
     SegmentMean,
-    draw,
+    choose_subset,
     free_fit,
     power_law_fit,
 )
@@ -32,20 +32,20 @@ COUNTS = SEGMENTS.counts.astype(np.float64)
 PLANTED = SEGMENTS.mean_of_radial(lambda r: A * (B + r) ** -C)
 
 
-def lines(occulted: int = 3000, strata: int = 6, noise: float = 1e-3, seed: int = 1) -> Lines:
-    """Lines of a scene of ups and downs, observed through PLANTED, with noise of a share of the intensity."""
+def made_equations(occulted: int = 3000, strata: int = 6, noise: float = 1e-3, seed: int = 1) -> Equations:
+    """Equations of a variable scene convolved with PLANTED; noise is a fraction of the intensity."""
     rng = np.random.default_rng(seed)
     n = occulted + 200
-    stratum = np.concatenate((np.arange(occulted) % strata, np.full(200, LIT)))
-    unscattered = np.where(stratum == LIT, 100.0, 5.0) * rng.uniform(0.5, 1.5, n)
+    stratum = np.concatenate((np.arange(occulted) % strata, np.full(200, UNOCCULTED)))
+    unscattered = np.where(stratum == UNOCCULTED, 100.0, 5.0) * rng.uniform(0.5, 1.5, n)
     ring_sums = COUNTS * 100 * rng.uniform(0.2, 1.8, (n, COUNTS.size))
     expected = ring_sums @ PLANTED + (1 - COUNTS @ PLANTED) * unscattered
     scale = noise * expected
-    return Lines(expected + rng.normal(0, scale), ring_sums, unscattered, scale, stratum)
+    return Equations(expected + rng.normal(0, scale), ring_sums, unscattered, scale, stratum)
 
 
-def some(of: Lines, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Lines:
-    return Lines(
+def some(of: Equations, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Equations:
+    return Equations(
         of.observed[chosen],
         of.ring_sums[chosen],
         of.unscattered[chosen],
@@ -55,7 +55,7 @@ def some(of: Lines, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Lines:
 
 
 def test_small_systems_are_solved_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many threads are given: for so small factorisations they wait for each other, and longest on busy cores."""
+    """For any limit of threads: they slow down such small factorisations, most of all on busy cores."""
     seen = []
 
     def counted(*arguments: object, **options: object) -> object:
@@ -65,50 +65,55 @@ def test_small_systems_are_solved_by_one_thread(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(equations, "lsq_linear", counted)
     with threadpool_limits(limits=2, user_api="blas"):
         before = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
-        free_fit(lines(), COUNTS, seed=1, draws=2)
+        free_fit(made_equations(), COUNTS, seed=1, subsets=2)
         after = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
     assert seen and set(seen) == {1}
     assert before == after and set(before) == {2}
 
 
-# --- draws ------------------------------------------------------------------------------------------------
+# --- subsets ----------------------------------------------------------------------------------------------
 
 
-def test_a_draw_takes_as_many_from_each_stratum_and_lit_ones() -> None:
-    chosen = draw(lines(), np.random.default_rng(0))
-    stratum = lines().stratum[chosen]
-    share = -(-OCCULTED_LINES // 6)
+def test_a_subset_has_equal_numbers_from_each_stratum_and_unocculted_ones() -> None:
+    chosen = choose_subset(made_equations(), np.random.default_rng(0))
+    stratum = made_equations().stratum[chosen]
+    share = -(-OCCULTED_EQUATIONS // 6)
     assert [int((stratum == k).sum()) for k in range(6)] == [share] * 6
-    assert (stratum == LIT).sum() == LIT_LINES
+    assert (stratum == UNOCCULTED).sum() == UNOCCULTED_EQUATIONS
     assert np.unique(chosen).size == chosen.size
 
 
-def test_a_stratum_with_few_lines_gives_all() -> None:
-    few = some(lines(), np.sort(np.concatenate((np.arange(0, 60, 6), np.flatnonzero(lines().stratum != 0)))))
-    stratum = few.stratum[draw(few, np.random.default_rng(0))]
+def test_a_stratum_with_few_equations_contributes_all() -> None:
+    few = some(
+        made_equations(),
+        np.sort(np.concatenate((np.arange(0, 60, 6), np.flatnonzero(made_equations().stratum != 0)))),
+    )
+    stratum = few.stratum[choose_subset(few, np.random.default_rng(0))]
     assert (stratum == 0).sum() == 10
-    assert (stratum == 1).sum() == -(-OCCULTED_LINES // 6)
-    without_lit = some(few, few.stratum != LIT)
-    assert (without_lit.stratum[draw(without_lit, np.random.default_rng(0))] != LIT).all()
+    assert (stratum == 1).sum() == -(-OCCULTED_EQUATIONS // 6)
+    without_lit = some(few, few.stratum != UNOCCULTED)
+    assert (without_lit.stratum[choose_subset(without_lit, np.random.default_rng(0))] != UNOCCULTED).all()
 
 
-def test_draws_differ_and_reach_every_line() -> None:
+def test_subsets_differ_and_together_contain_every_equation() -> None:
     rng = np.random.default_rng(0)
-    first, second = draw(lines(), rng), draw(lines(), rng)
+    first, second = choose_subset(made_equations(), rng), choose_subset(made_equations(), rng)
     assert set(first) != set(second)
-    reached = set().union(*(draw(lines(), rng).tolist() for _ in range(30)))
-    assert len(reached) > 0.99 * len(lines())
+    reached = set().union(*(choose_subset(made_equations(), rng).tolist() for _ in range(30)))
+    assert len(reached) > 0.99 * len(made_equations())
 
 
-def test_without_occulted_lines_there_is_nothing_to_draw() -> None:
+def test_without_occulted_equations_it_is_refused() -> None:
     with pytest.raises(DataError, match="no-lines"):
-        draw(some(lines(), lines().stratum == LIT), np.random.default_rng(0))
+        choose_subset(
+            some(made_equations(), made_equations().stratum == UNOCCULTED), np.random.default_rng(0)
+        )
 
 
-def test_lines_of_frames_are_joined_in_order() -> None:
-    whole = lines()
+def test_equations_of_frames_are_joined_in_order() -> None:
+    whole = made_equations()
     half = np.arange(len(whole)) < 1500
-    joined = Lines.joined([some(whole, half), some(whole, ~half)])
+    joined = Equations.joined([some(whole, half), some(whole, ~half)])
     for name in ("observed", "ring_sums", "unscattered", "scale", "stratum"):
         np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
 
@@ -117,77 +122,77 @@ def test_lines_of_frames_are_joined_in_order() -> None:
 
 
 def test_free_shells_are_those_planted() -> None:
-    found = free_fit(lines(), COUNTS, seed=1, draws=10)
+    found = free_fit(made_equations(), COUNTS, seed=1, subsets=10)
     assert found.fits.shape == (7, COUNTS.size)
     np.testing.assert_allclose(found.mean * COUNTS, PLANTED * COUNTS, atol=1e-3)
     spread = found.fits.std(axis=0, ddof=1)
-    assert np.abs((found.mean - PLANTED) / spread).max() < 10  # draws share their lines
+    assert np.abs((found.mean - PLANTED) / spread).max() < 10  # subsets share equations
     assert found.cost == pytest.approx(np.ones(7), abs=0.15)
     assert (np.diff(found.cost) >= 0).all()
 
 
-def test_the_worst_draws_are_dropped() -> None:
-    """One line in 1500 is wrong: draws with it cost more."""
-    bad = lines()
+def test_the_worst_subsets_are_dropped() -> None:
+    """One equation of 1500 is wrong; subsets that contain it have a higher cost."""
+    bad = made_equations()
     bad.observed[7] *= 1.5
-    found = free_fit(bad, COUNTS, seed=1, draws=20)
+    found = free_fit(bad, COUNTS, seed=1, subsets=20)
     assert found.fits.shape[0] == 14
     assert found.cost.max() < 50
     np.testing.assert_allclose(found.mean * COUNTS, PLANTED * COUNTS, atol=2e-3)
-    assert free_fit(bad, COUNTS, seed=1, draws=1).fits.shape[0] == 1
+    assert free_fit(bad, COUNTS, seed=1, subsets=1).fits.shape[0] == 1
 
 
-def test_no_shell_takes_light_away() -> None:
-    loud = lines(noise=3.0, seed=2)
-    found = free_fit(loud, COUNTS, seed=1, draws=4)
+def test_no_shell_is_negative() -> None:
+    loud = made_equations(noise=3.0, seed=2)
+    found = free_fit(loud, COUNTS, seed=1, subsets=4)
     assert found.fits.min() >= 0
-    assert (found.fits < 1e-3 * PLANTED).any()  # some would
+    assert (found.fits < 1e-3 * PLANTED).any()  # without the bound, some would be negative
 
 
 def test_one_seed_gives_one_fit() -> None:
-    once, again, other = (free_fit(lines(), COUNTS, seed=seed, draws=3).mean for seed in (1, 1, 2))
+    once, again, other = (free_fit(made_equations(), COUNTS, seed=seed, subsets=3).mean for seed in (1, 1, 2))
     np.testing.assert_array_equal(once, again)
     assert (once != other).any()
 
 
-def undecided(shell: int) -> Lines:
-    """Before a scene that is even at the shell's distance, light there and light at the centre look alike."""
-    of = lines()
+def unconstrained(shell: int) -> Equations:
+    """If the scene is uniform at the shell's distance, light in the shell and at the centre have the same effect."""
+    of = made_equations()
     of.ring_sums[:, shell] = of.unscattered * COUNTS[shell]
     observed = of.ring_sums @ PLANTED + (1 - COUNTS @ PLANTED) * of.unscattered
-    return Lines(observed, of.ring_sums, of.unscattered, of.scale, of.stratum)
+    return Equations(observed, of.ring_sums, of.unscattered, of.scale, of.stratum)
 
 
 @pytest.mark.parametrize("shell", [0, COUNTS.size - 1])
-def test_where_no_line_decides_a_shell_is_held(shell: int) -> None:
+def test_an_unconstrained_shell_stays_at_the_prior(shell: int) -> None:
     towards = 1.3 * PLANTED
-    found = free_fit(undecided(shell), COUNTS, seed=1, draws=3, towards=towards).mean
+    found = free_fit(unconstrained(shell), COUNTS, seed=1, subsets=3, towards=towards).mean
     assert found[shell] == pytest.approx(towards[shell], rel=1e-6)
     others = np.delete(np.arange(COUNTS.size), shell)
     np.testing.assert_allclose((found * COUNTS)[others], (PLANTED * COUNTS)[others], atol=1e-3)
-    assert free_fit(undecided(shell), COUNTS, seed=1, draws=3).mean[shell] == pytest.approx(0, abs=1e-9)
+    assert free_fit(unconstrained(shell), COUNTS, seed=1, subsets=3).mean[shell] == pytest.approx(0, abs=1e-9)
 
 
-def test_a_hold_gives_way_to_lines_that_decide() -> None:
-    found = free_fit(lines(), COUNTS, seed=1, draws=5, towards=1.3 * PLANTED).mean
+def test_the_equations_override_the_prior() -> None:
+    found = free_fit(made_equations(), COUNTS, seed=1, subsets=5, towards=1.3 * PLANTED).mean
     np.testing.assert_allclose(found * COUNTS, PLANTED * COUNTS, atol=1e-3)
 
 
 def test_an_empty_shell_has_no_weight_of_its_own() -> None:
-    of, counts = lines(), np.append(COUNTS, 0.0)
-    wider = Lines(
+    of, counts = made_equations(), np.append(COUNTS, 0.0)
+    wider = Equations(
         of.observed, np.column_stack((of.ring_sums, np.zeros(len(of)))), of.unscattered, of.scale, of.stratum
     )
-    found = free_fit(wider, counts, seed=1, draws=3).mean
+    found = free_fit(wider, counts, seed=1, subsets=3).mean
     assert found[-1] == 0
-    np.testing.assert_allclose(found[:-1], free_fit(of, COUNTS, seed=1, draws=3).mean, rtol=1e-9)
+    np.testing.assert_allclose(found[:-1], free_fit(of, COUNTS, seed=1, subsets=3).mean, rtol=1e-9)
 
 
 # --- the power law ----------------------------------------------------------------------------------------
 
 
 def radii_of(segments: Segments) -> list[tuple[Vector, Vector]]:
-    """The distances of each segment's pixels and how many have each, pixel by pixel."""
+    """For each segment, the distances of its pixels and the number of pixels at each."""
     size = segments.reach_grid_px
     squares, label = squared_radii((size, size)), segments.label_map(size)
     pairs = (np.unique(squares[label == k], return_counts=True) for k in range(segments.size))
@@ -210,7 +215,7 @@ def test_a_law_averaged_over_a_segment_is_its_mean(law: tuple[float, float, floa
 
 
 def test_an_empty_segment_has_no_mean() -> None:
-    """In the middle and at the end; its neighbours are as without it."""
+    """Tested in the middle and at the end; the other segments are unchanged."""
     marked = (np.array([5.0]), np.zeros(1))
     with_marked = SegmentMean([*RADII[:3], marked, *RADII[3:], marked])(theta(A, B, C))
     expected = np.insert(np.append(SegmentMean(RADII)(theta(A, B, C)), 0.0), 3, 0.0)
@@ -219,7 +224,7 @@ def test_an_empty_segment_has_no_mean() -> None:
 
 @pytest.mark.parametrize("start", [(0.15, 6.0, 2.5), (1.0, 20.0, 3.0)])
 def test_a_power_law_is_the_one_planted(start: tuple[float, float, float]) -> None:
-    found = power_law_fit(lines(), COUNTS, RADII, np.array(start), seed=1, draws=6)
+    found = power_law_fit(made_equations(), COUNTS, RADII, np.array(start), seed=1, subsets=6)
     assert found.law == pytest.approx((A, B, C), rel=0.03)
     assert (found.a, found.b_px, found.c) == tuple(found.law)
     weight = found.a * (found.b_px + PIVOT_PX) ** -found.c
@@ -228,6 +233,8 @@ def test_a_power_law_is_the_one_planted(start: tuple[float, float, float]) -> No
     assert found.cost == pytest.approx(np.ones(4), abs=0.15)
 
 
-def test_exact_lines_give_the_exact_law() -> None:
-    found = power_law_fit(lines(noise=1e-7), COUNTS, RADII, np.array([0.1, 8.0, 2.4]), seed=1, draws=2)
+def test_exact_equations_give_the_exact_law() -> None:
+    found = power_law_fit(
+        made_equations(noise=1e-7), COUNTS, RADII, np.array([0.1, 8.0, 2.4]), seed=1, subsets=2
+    )
     assert found.law == pytest.approx((A, B, C), rel=1e-5)

@@ -1,7 +1,7 @@
-"""The published recipe runs, and its biases are where they are said to be.
+"""The published recipe runs, and each of its biases has the stated cause.
 
-Its Richardson-Lucy keeps the light of a field and does not give back what scatters out of it. So that this is little,
-the scatter here is compact: a hundredth of the light goes farther than 50 px.
+Its Richardson-Lucy method conserves the light of a field and does not restore light that scatters out of it. The
+scatter in these tests is compact so that this effect is small: a hundredth of the light lands beyond 50 px.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter.as_published import published
-from psfcore.scatter.as_published.equations import LIT, Drawn, Lines
+from psfcore.scatter.as_published.equations import UNOCCULTED, Equations, SubsetFits
 from psfcore.scatter.as_published.published import (
-    ALL_MENDED,
+    ALL_CORRECTED,
     AS_PUBLISHED,
-    MENDED_ALONE,
+    CORRECTED_ALONE,
     SHRUNK_PX,
     Choices,
     Published,
@@ -33,7 +33,7 @@ IMAGES, SIZE_PX, GRID_PX = 9, 96, 95
 
 
 def off(of: Published) -> NDArray[np.float64]:
-    """The curve found less the true one, points."""
+    """Fitted minus true cumulative curve, percentage points."""
     return np.asarray(of.curve_pct - true_curve(tuple(of.radii_px.tolist()), COMPACT))
 
 
@@ -49,9 +49,9 @@ def test_the_recipe_is_followed_to_its_end() -> None:
     assert all(np.isfinite(value) for value in of.spread.values())
 
 
-@pytest.mark.parametrize("choices", [AS_PUBLISHED, ALL_MENDED], ids=["published", "mended"])
+@pytest.mark.parametrize("choices", [AS_PUBLISHED, ALL_CORRECTED], ids=["published", "corrected"])
 def test_its_law_is_its_scatter_and_its_curve(choices: Choices) -> None:
-    """a / (b + r)^c off the centre and the rest at the centre, convolved with diffraction."""
+    """a / (b + r)^c outside the centre, the remaining light at the centre, convolved with diffraction."""
     of, _ = recipe(choices)
     scatter, middle = of.scatter, of.grid_px // 2
     assert of.grid_px == (GRID_PX if choices.counted_on_array else REACH_GRID_PX)
@@ -63,27 +63,27 @@ def test_its_law_is_its_scatter_and_its_curve(choices: Choices) -> None:
         np.testing.assert_allclose(of.curve_pct, true_curve(tuple(of.radii_px.tolist()), law), atol=0.01)
 
 
-def test_all_mended_it_is_near_the_truth_and_as_published_far_from_it() -> None:
-    """Before discs of few photons: as published, those that happened to come faint weigh most."""
-    mended, bent = recipe(ALL_MENDED)[0], recipe(AS_PUBLISHED)[0]
-    assert np.abs(off(mended)).max() < 4
-    assert mended.total == pytest.approx(0.4, abs=0.05)
-    assert (off(bent)[:4] < -5).all()
-    assert (np.abs(off(mended)) < np.abs(off(bent))).all()
+def test_the_corrected_fit_is_near_the_truth_and_the_published_one_is_not() -> None:
+    """In discs of few photons, the published fit gives most weight to pixels that are faint by chance."""
+    corrected, published_fit = recipe(ALL_CORRECTED)[0], recipe(AS_PUBLISHED)[0]
+    assert np.abs(off(corrected)).max() < 4
+    assert corrected.total == pytest.approx(0.4, abs=0.05)
+    assert (off(published_fit)[:4] < -5).all()
+    assert (np.abs(off(corrected)) < np.abs(off(published_fit))).all()
 
 
 class _SeenEnough(Exception):
-    """The first round's lines are made."""
+    """Raised when the equations of the first round exist."""
 
 
-def first_lines(
+def first_equations(
     patch: pytest.MonkeyPatch, choices: Choices, *, seed: int = 1
-) -> tuple[Lines, NDArray[np.float64]]:
-    """The lines of the first round, and how many pixels each segment counts."""
-    seen: list[tuple[Lines, NDArray[np.float64]]] = []
+) -> tuple[Equations, NDArray[np.float64]]:
+    """The equations of the first round, and the number of pixels of each segment."""
+    seen: list[tuple[Equations, NDArray[np.float64]]] = []
 
-    def stop(lines: Lines, counts: NDArray[np.float64], **_: object) -> Drawn:
-        seen.append((lines, counts))
+    def stop(equations: Equations, counts: NDArray[np.float64], **_: object) -> SubsetFits:
+        seen.append((equations, counts))
         raise _SeenEnough
 
     patch.setattr(published, "free_fit", stop)
@@ -92,53 +92,59 @@ def first_lines(
     return seen[0]
 
 
-def test_lines_are_of_all_occulted_pixels_and_some_lit_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines, _ = first_lines(monkeypatch, AS_PUBLISHED)
-    assert (lines.stratum == LIT).sum() == 10 * IMAGES
-    assert (lines.stratum != LIT).sum() == pytest.approx(IMAGES * np.pi * (10.75 - SHRUNK_PX) ** 2, rel=0.03)
-    assert set(np.unique(lines.stratum)) == set(range(-1, 10))
-    dark = lines.stratum != LIT
-    assert lines.unscattered[~dark].mean() > 3 * lines.unscattered[dark].mean()
+def test_equations_are_of_all_occulted_pixels_and_some_unocculted_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    equations, _ = first_equations(monkeypatch, AS_PUBLISHED)
+    assert (equations.stratum == UNOCCULTED).sum() == 10 * IMAGES
+    assert (equations.stratum != UNOCCULTED).sum() == pytest.approx(
+        IMAGES * np.pi * (10.75 - SHRUNK_PX) ** 2, rel=0.03
+    )
+    assert set(np.unique(equations.stratum)) == set(range(-1, 10))
+    dark = equations.stratum != UNOCCULTED
+    assert equations.unscattered[~dark].mean() > 3 * equations.unscattered[dark].mean()
 
 
-def test_each_choice_changes_its_own_part_of_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert [sum(dataclasses.astuple(choices)) for choices in MENDED_ALONE.values()] == [3, 3, 3, 3]
-    as_published, counts = first_lines(monkeypatch, AS_PUBLISHED)
-    dark = as_published.stratum != LIT
+def test_each_choice_changes_its_own_part_of_an_equation(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [sum(dataclasses.astuple(choices)) for choices in CORRECTED_ALONE.values()] == [3, 3, 3, 3]
+    as_published, counts = first_equations(monkeypatch, AS_PUBLISHED)
+    dark = as_published.stratum != UNOCCULTED
     first = as_published.observed[: int(np.argmin(dark))]  # the disc of the first image
     assert first.min() < 0.5 * first.mean()
-    # However little was observed, no pixel weighs without bound.
+    # However low the observed intensity, the weight of a pixel is limited.
     np.testing.assert_allclose(
         as_published.scale[: first.size], np.maximum(first, 0.5 * first.mean()), rtol=1e-12
     )
 
-    weighed, _ = first_lines(monkeypatch, dataclasses.replace(AS_PUBLISHED, weighed_by_observed=False))
+    weighed, _ = first_equations(monkeypatch, dataclasses.replace(AS_PUBLISHED, weighed_by_observed=False))
     assert np.unique(weighed.scale[dark]).size == IMAGES  # one for each disc
     np.testing.assert_array_equal(weighed.ring_sums, as_published.ring_sums)
     exposure_s = faint().frames[0].exposure_s
     noise = np.sqrt(6.0 * first.mean() * exposure_s + 2.0**2) / exposure_s
     np.testing.assert_allclose(weighed.scale[: first.size], noise)
 
-    convolved, _ = first_lines(monkeypatch, dataclasses.replace(AS_PUBLISHED, added=False))
+    convolved, _ = first_equations(monkeypatch, dataclasses.replace(AS_PUBLISHED, added=False))
     np.testing.assert_array_equal(convolved.unscattered, as_published.unscattered)
     assert not np.allclose(convolved.ring_sums, as_published.ring_sums, rtol=1e-3)
-    # Light that is diffracted first is smoother, and there is as much of it.
+    # Diffracted light is smoother, and its total is the same.
     near = slice(0, 5)
     assert convolved.ring_sums[dark, near].sum() > as_published.ring_sums[dark, near].sum()
     assert convolved.ring_sums.sum() == pytest.approx(as_published.ring_sums.sum(), rel=0.02)
 
-    reaching, all_counts = first_lines(monkeypatch, dataclasses.replace(AS_PUBLISHED, counted_on_array=False))
+    reaching, all_counts = first_equations(
+        monkeypatch, dataclasses.replace(AS_PUBLISHED, counted_on_array=False)
+    )
     assert counts.sum() == GRID_PX**2 - 1
     assert all_counts.sum() == REACH_GRID_PX**2 - 1
     np.testing.assert_array_equal(reaching.unscattered, as_published.unscattered)
 
-    fully, _ = first_lines(monkeypatch, dataclasses.replace(AS_PUBLISHED, whole_disc_blanked=False))
+    fully, _ = first_equations(monkeypatch, dataclasses.replace(AS_PUBLISHED, whole_disc_blanked=False))
     assert (fully.ring_sums.sum(axis=1) >= as_published.ring_sums.sum(axis=1) * (1 - 1e-6)).all()
     assert fully.ring_sums.sum() > 1.0001 * as_published.ring_sums.sum()
 
 
-def test_filled_pixels_make_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, _ = first_lines(monkeypatch, AS_PUBLISHED)
+def test_filled_pixels_give_no_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = first_equations(monkeypatch, AS_PUBLISHED)
     place = faint().frames[4].place
     filled = np.zeros((SIZE_PX, SIZE_PX), bool)
     filled[round(place.y_px) - 1 : round(place.y_px) + 2, round(place.x_px)] = True
@@ -147,32 +153,32 @@ def test_filled_pixels_make_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     changed = dataclasses.replace(faint(), frames=tuple(frames))
     with monkeypatch.context() as patch:
         patch.setattr("tests.psfcore.scatter.as_published.test_published.faint", lambda: changed)
-        fewer, _ = first_lines(patch, AS_PUBLISHED)
+        fewer, _ = first_equations(patch, AS_PUBLISHED)
     assert len(fewer) == len(whole) - 3
 
 
-def test_one_draw_has_no_spread() -> None:
-    """Of two draws one is kept."""
-    for draws in (1, 2):
-        of = invert_as_published(faint(), draws=draws)
+def test_one_subset_has_no_spread() -> None:
+    """Of two subsets, one is kept."""
+    for subsets in (1, 2):
+        of = invert_as_published(faint(), subsets=subsets)
         assert of.free.fits.shape[0] == 1
         assert of.spread is None
         assert np.isfinite(of.curve_pct).all()
 
 
-def test_shells_that_outshine_the_centre_are_no_scatter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Less than all light in the four pixels next to the centre, and yet each brighter than it."""
+def test_shells_brighter_than_the_centre_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The four pixels next to the centre contain less than all light, but each is brighter than the centre."""
     nearest = np.zeros(50)
     nearest[0] = 0.22
-    monkeypatch.setattr(published, "free_fit", lambda *_, **__: Drawn(nearest[None], np.zeros(1)))
+    monkeypatch.setattr(published, "free_fit", lambda *_, **__: SubsetFits(nearest[None], np.zeros(1)))
     with pytest.raises(
         DataError, match=r"round 1: free shells: expected a PSF .* centre; got .* 1 px"
     ) as caught:
-        invert_as_published(faint(), draws=1)
+        invert_as_published(faint(), subsets=1)
     assert caught.value.code == "no-scatter"
 
 
-def test_without_an_occulted_pixel_there_are_no_lines() -> None:
+def test_without_an_occulted_pixel_it_is_refused() -> None:
     frames = [dataclasses.replace(f, place=Place(50.0, 50.0, 0.9)) for f in faint().frames]
     with pytest.raises(DataError, match="no-lines"):
-        invert_as_published(dataclasses.replace(faint(), frames=tuple(frames)), draws=1)
+        invert_as_published(dataclasses.replace(faint(), frames=tuple(frames)), subsets=1)

@@ -1,3 +1,5 @@
+"""Sums over segments equal plain sums and convolutions, for any image, targets and threads."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -17,13 +19,13 @@ PUBLISHED = tuple(shells_as_published(90.0))
 
 
 def scene(shape: tuple[int, int], seed: int = 0) -> NDArray[np.float64]:
-    """A bright side and a faint one, a hundred times fainter."""
+    """An image whose right side is a hundred times fainter than its left side."""
     falling = np.geomspace(1.0, 0.01, shape[1])
     return np.random.default_rng(seed).gamma(2.0, 100.0, shape) * falling
 
 
 def some_targets(shape: tuple[int, int], n: int, seed: int = 0) -> NDArray[np.int64]:
-    """Neighbours in a disc, places anywhere, corners, and one of them twice."""
+    """The pixels of a disc, random pixels, the corners, and one pixel twice."""
     rng = np.random.default_rng(seed)
     y, x = np.indices(shape)
     disc = np.argwhere((y - shape[0] // 3) ** 2 + (x - shape[1] // 2) ** 2 <= 30)
@@ -79,7 +81,7 @@ def test_published_shells_of_a_large_image_equal_the_plain_sum() -> None:
 
 
 def test_light_lands_at_source_plus_offset() -> None:
-    """A source at (20, 20): a target to its right sees it in sector 0, one below it (larger y) in sector 1."""
+    """The source at (20, 20) is in sector 0 of a target to its right, and in sector 1 of a target at larger y."""
     image = np.zeros((41, 41))
     image[20, 20] = 7.0
     segments = Segments((0.5, 12.0), 4, 64)
@@ -144,10 +146,10 @@ def test_an_image_with_a_pixel_that_is_not_finite_is_refused(value: float) -> No
     ("shape", "targets", "message"),
     [
         ((20,), [[1, 1]], "two axes"),
-        ((20, 20), [1, 1], "whole-numbered"),
-        ((20, 20), [[1.0, 1.0]], "whole-numbered"),
-        ((20, 20), [[20, 1]], "off it"),
-        ((20, 20), [[1, -1]], "off it"),
+        ((20, 20), [1, 1], "integer targets"),
+        ((20, 20), [[1.0, 1.0]], "integer targets"),
+        ((20, 20), [[20, 1]], "outside it"),
+        ((20, 20), [[1, -1]], "outside it"),
     ],
 )
 def test_what_cannot_be_summed_is_refused(shape: tuple[int, ...], targets: object, message: str) -> None:

@@ -1,3 +1,5 @@
+"""Segments of the PSF: their edges, their pixels, and means of kernels over them."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -62,7 +64,7 @@ def test_shells_need_a_reach() -> None:
 
 @pytest.mark.parametrize("edges", [(1.0,), (0.0, 1.0), (1.0, 1.0), (2.0, 1.0), (1.0, np.nan)])
 def test_edges_must_rise_from_above_zero(edges: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="edges that rise"):
+    with pytest.raises(ValueError, match="edges that increase"):
         Segments(edges)
     with pytest.raises(ValueError, match="sector"):
         Segments((1.0, 2.0), sectors=0)
@@ -99,7 +101,7 @@ def test_sectors_of_a_whole_shell_hold_the_same_pixels_turned(sectors: int) -> N
 
 
 @pytest.mark.parametrize("size", [1, 40, 63, 64, 65, 100])
-def test_a_map_of_any_size_is_cut_from_the_reach_grid(size: int) -> None:
+def test_a_map_of_any_size_is_a_crop_of_the_reach_grid(size: int) -> None:
     segments = Segments(tuple(fine_shells(50.0)), 12, 64)
     dx, dy = offsets(size)
     on_grid = (np.minimum(dx, dy) >= -32) & (np.maximum(dx, dy) < 32)
@@ -143,7 +145,7 @@ def test_mean_of_a_radial_kernel_is_the_mean_over_pixels(sectors: int) -> None:
     np.testing.assert_allclose(segments.mean_of_radial(power_law), expected, rtol=1e-6)
 
 
-def test_means_times_counts_hold_the_light_of_the_full_reach() -> None:
+def test_means_times_counts_sum_to_the_light_of_the_full_reach() -> None:
     segments = Segments(tuple(fine_shells()))
     kernel = scatter_kernel(6.15, 2.53, 0.411, 2048)
     amplitude = kernel[1024, 1025] / power_law(np.array(1.0))

@@ -1,4 +1,4 @@
-"""Cross-validation: draws, both schemes beside a fit from the start, bands, and free fit beside formula."""
+"""Cross-validation: bootstrap samples, and both schemes compared with a fit from the start."""
 
 from __future__ import annotations
 
@@ -8,36 +8,25 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from psfcore.errors import DataError
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Lanes, Optics
-from psfcore.scatter.shapes import SHAPES
+from psfcore.scatter.validation.bands import Bands, bands
 from psfcore.scatter.validation.cross_validation import (
-    LIMITS,
-    ONE_SIGMA,
-    TWO_SIGMA,
-    Bands,
-    Excess,
     FoldFit,
-    FoldShells,
-    bands,
-    draws,
+    bootstrap_samples,
     exact_fit,
     shared_fits,
     shared_step,
-    shell_bands,
 )
-from psfcore.scatter.validation.cross_validation_plot import cross_validation_png
-from psfcore.scatter.validation.free_shells import shells
 from psfcore.transit.blocks import folds
 from tests.psfcore.small_transits import IMAGES, observed, sky, solved
 
 
 @cache
 def shared() -> tuple[FoldFit, ...]:
-    return shared_fits(solved(), draws(IMAGES, runs=5))
+    return shared_fits(solved(), bootstrap_samples(IMAGES, runs=5))
 
 
 @cache
@@ -45,25 +34,19 @@ def in_bands() -> Bands:
     return bands(shared(), solved().inversion.radii_px)
 
 
-def test_percentiles_are_a_gaussians() -> None:
-    assert np.array(ONE_SIGMA) / 100 == pytest.approx(norm.cdf([-1, 1]), abs=1e-12)
-    assert np.array(TWO_SIGMA) / 100 == pytest.approx(norm.cdf([-2, 2]), abs=1e-12)
-    assert list(LIMITS) == sorted(LIMITS)
-
-
-def test_a_draw_holds_its_block_and_guard_out_and_keeps_the_blocks_sizes() -> None:
+def test_a_sample_excludes_its_block_and_guard_and_keeps_the_sizes_of_blocks() -> None:
     parts = folds(IMAGES)
-    for draw in draws(IMAGES, runs=3):
+    for draw in bootstrap_samples(IMAGES, runs=3):
         fitted = set(parts[draw.fold].fitted)
         assert draw.held_out == parts[draw.fold].held_out
         assert {n for n, k in enumerate(draw.counts) if k} <= fitted and sum(draw.counts) == len(fitted)
     with pytest.raises(DataError, match="too-few-images"):
-        draws(5)
+        bootstrap_samples(5)
 
 
-def test_an_exact_fold_is_what_a_fit_from_the_start_finds() -> None:
-    """Begun at the shared step it ends, within what a fit settles to, where `invert` ends with the same counts."""
-    draw = draws(IMAGES, runs=1)[1]
+def test_an_exact_fold_agrees_with_a_fit_from_the_start() -> None:
+    """Started at the shared step, it converges to the result of `invert` with the same counts."""
+    draw = bootstrap_samples(IMAGES, runs=1)[1]
     slow = invert(observed(sky()).transit, counts=draw.counts)
     found = exact_fit(solved(), draw)
     sigma = solved().inversion.curve_sigma
@@ -72,18 +55,18 @@ def test_an_exact_fold_is_what_a_fit_from_the_start_finds() -> None:
     assert set(found.held_out_pct) == set(draw.held_out)
 
 
-def test_the_solution_is_as_it_was_after_its_folds() -> None:
+def test_folds_do_not_change_the_solution() -> None:
     before = [scene.copy() for scene in solved().sky.scenes]
     places = list(solved().sky.found)
-    exact_fit(solved(), draws(IMAGES, runs=1)[0])
+    exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[0])
     assert all((a == b).all() for a, b in zip(before, solved().sky.scenes, strict=True))
     assert places == solved().sky.found
 
 
-def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So a worker's lease outlasts what is done in silence, and a cancel is seen."""
+def test_a_fold_reports_progress_before_every_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So a worker can renew its lease between images, and notices a cancellation."""
     since_report, most = 0, 0
-    undo = Optics.undo
+    undo = Optics.invert
 
     def counted(optics: Optics, observed: Lanes, start: Lanes | None = None, *, steps: int) -> Lanes:
         nonlocal since_report, most
@@ -100,7 +83,7 @@ def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.
         assert 0 <= step < steps
 
     monkeypatch.setattr(Optics, "undo", counted)
-    draw = draws(IMAGES, runs=1)[1]
+    draw = bootstrap_samples(IMAGES, runs=1)[1]
     exact_fit(solved(), draw, progress=progress)
     assert most == 1
     assert stages["images held out"] == list(range(len(draw.held_out)))
@@ -108,7 +91,7 @@ def test_a_fold_reports_before_every_image_that_it_looks_at(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("stage", ["images held out", "settling"])
-def test_a_fold_stops_where_its_report_says_so(stage: str) -> None:
+def test_a_progress_callback_can_stop_a_fold(stage: str) -> None:
     class Stop(Exception):
         pass
 
@@ -117,11 +100,11 @@ def test_a_fold_stops_where_its_report_says_so(stage: str) -> None:
             raise Stop
 
     with pytest.raises(Stop):
-        exact_fit(solved(), draws(IMAGES, runs=1)[1], progress=progress)
+        exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[1], progress=progress)
 
 
 def test_both_schemes_agree() -> None:
-    wanted = draws(IMAGES, runs=1)
+    wanted = bootstrap_samples(IMAGES, runs=1)
     quick = shared_fits(solved(), wanted)
     assert quick == shared()[: len(wanted)]
     exactly = tuple(exact_fit(solved(), draw) for draw in wanted)
@@ -135,51 +118,18 @@ def test_both_schemes_agree() -> None:
     )
 
 
-def test_all_images_once_take_no_step() -> None:
-    everything = dataclasses.replace(draws(IMAGES, runs=1)[0], counts=(1,) * IMAGES)
+def test_with_all_images_once_the_step_is_zero() -> None:
+    everything = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(1,) * IMAGES)
     moved = np.abs(shared_step(solved(), everything))
     assert (moved < 0.05 * np.sqrt(np.diag(solved().inversion.covariance))).all()
 
 
-def test_a_draw_of_nothing_is_refused() -> None:
-    nothing = dataclasses.replace(draws(IMAGES, runs=1)[0], counts=(0,) * IMAGES)
+def test_an_empty_sample_is_refused() -> None:
+    nothing = dataclasses.replace(bootstrap_samples(IMAGES, runs=1)[0], counts=(0,) * IMAGES)
     with pytest.raises(DataError, match=r"transit-says-too-little.*run 0, fold 0"):
         shared_fits(solved(), (nothing,))
     with pytest.raises(DataError, match="transit-says-too-little"):
         exact_fit(solved(), nothing)
-
-
-def test_free_fit_and_formula_do_not_part_where_the_truth_is_the_formula() -> None:
-    found = in_bands().shells
-    assert found is not None
-    assert not found.largest.parts
-    assert abs(found.near_centre.points) < 3 * found.near_centre.sigma
-    assert found.near_centre.within_px == pytest.approx(3.1)
-    assert (found.free_weight >= 0).all() and (np.diff(found.free_weight, axis=0) >= 0).all()
-    total = found.law_beyond_pct[2, 0] / 100
-    assert total == pytest.approx(np.median([f.values["total"] for f in shared()]), rel=1e-6)
-
-
-def made(extra: float, sigma: float, seed: int) -> FoldShells:
-    """A draw whose free fit has `extra` more light in its fourth shell, give or take a little."""
-    law = np.full(shells().size, 0.4 / shells().size)
-    free = law.copy()
-    free[3] += extra + 1e-4 * np.random.default_rng(seed).standard_normal()
-    return FoldShells(tuple(free), tuple(law), (sigma,) * shells().size)
-
-
-def test_an_excess_is_told_with_the_larger_of_its_errors() -> None:
-    found = shell_bands([made(0.05, 0.01, seed) for seed in range(200)])
-    near = found.near_centre
-    assert near.points == pytest.approx(5.0, abs=0.01) and near.sigma == pytest.approx(1.0)
-    assert near.of_formula_pct == pytest.approx(100 * 0.05 / (6 * 0.4 / shells().size), rel=0.01)
-    assert found.largest.parts and near.parts
-    assert not Excess(3.1, points=2.9, sigma=1.0, of_formula_pct=10.0).parts
-    by_draws = shell_bands([made(0.05, 1e-9, seed) for seed in range(200)])
-    assert by_draws.near_centre.sigma == pytest.approx(0.01, rel=0.2)
-    beyond = by_draws.free_beyond_pct[2] - by_draws.law_beyond_pct[2]
-    np.testing.assert_allclose(beyond[:4], 5.0, atol=0.02)
-    np.testing.assert_allclose(beyond[4:], 0.0, atol=1e-9)
 
 
 def test_folds_go_to_json_and_back() -> None:
@@ -188,19 +138,3 @@ def test_folds_go_to_json_and_back() -> None:
     json.dumps(in_bands().to_json(), allow_nan=False)
     without = dataclasses.replace(shared()[0], shells=None)
     assert FoldFit.from_json(json.loads(json.dumps(without.to_json()))) == without
-
-
-def test_a_shape_that_is_stretched_has_no_shells() -> None:
-    start = SHAPES["stretched"].coordinates(solved().inversion.values)
-    solution = invert(observed(sky()).transit, SHAPES["stretched"], start=start)
-    found = bands(shared_fits(solution, draws(IMAGES, runs=1)), solution.inversion.radii_px)
-    assert found.shells is None and found.to_json()["shells"] is None
-
-
-def test_the_picture_has_a_row_more_with_a_free_fit(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    heights = []
-    for fits in (shared(), tuple(dataclasses.replace(fit, shells=None) for fit in shared())):
-        path = tmp_path / "p.png"
-        cross_validation_png(bands(fits, solved().inversion.radii_px), fits, [1] * IMAGES, path)
-        heights.append(int.from_bytes(path.read_bytes()[20:24], "big"))
-    assert heights[0] == 2 * heights[1]

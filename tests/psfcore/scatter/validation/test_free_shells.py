@@ -1,4 +1,4 @@
-"""Free fits beside the formula: slopes of the shells, sums over images, and what is found where it was put in."""
+"""Free fits near the formula: derivatives of the shells, sums over images, and recovery of simulated light."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from psfcore.scatter.validation.free_shells import (
     free_kernel,
     free_shares,
     law_light,
-    loosely,
+    looseness_of,
     shells,
 )
 from tests.psfcore.small_transits import BRIGHT, noise_free, sky, solved
@@ -34,7 +34,7 @@ def once() -> list[int]:
 
 
 def shell_blur(solution: Solution, shell: int) -> Blur:
-    """What a unit of light that goes from the centre to a shell does to an image."""
+    """Change of an image if a unit of light moves from the centre to a shell."""
     size = solution.total.size
     ring = np.where(shells().label_map(size) == shell, 1 / shells().counts[shell], 0.0)
     ring[size // 2, size // 2] = -1.0
@@ -44,21 +44,23 @@ def shell_blur(solution: Solution, shell: int) -> Blur:
 
 @pytest.mark.parametrize("shell", [0, 3, 8, 15, 22])
 def test_slopes_are_those_of_the_inversion(shell: int) -> None:
-    """Images' J^T w J and J^T w r beside those of the whole model's slopes; the field's edge is near to all discs."""
+    """J^T w J and J^T w r, compared with those of the exact derivatives; all discs are close to the field's edge."""
     solution = solved()
     blur = shell_blur(solution, shell)
     for k, n in list(enumerate(solution.part))[::4]:
         residual, expected = solution.residual(n)
-        slope = solution.answer(n, blur)
+        slope = solution.jacobian(n, blur)
         weight = solution.weight(n, expected)
         normal = float(weight @ slope**2)
-        assert shares().normal[k, shell, shell] == pytest.approx(normal, rel=0.2)  # slopes to a tenth
+        assert shares().normal[k, shell, shell] == pytest.approx(
+            normal, rel=0.2
+        )  # the derivatives agree to a tenth
         error = shares().score[k, shell] - float(weight @ (slope * residual))
-        assert abs(error) < 0.1 * np.sqrt(normal)  # a tenth of what its noise makes of it
+        assert abs(error) < 0.1 * np.sqrt(normal)  # a tenth of its noise
 
 
 def test_images_add_up() -> None:
-    """An image drawn twice counts as two images; one that was not drawn does not count."""
+    """An image that occurs twice in a bootstrap sample counts as two; a missing image does not count."""
     of = shares()
     twice = [0, 2, *([1] * (len(once()) - 2))]
     listed = [k for k, n in enumerate(of.frames) for _ in range(twice[n])]
@@ -75,31 +77,31 @@ def test_images_add_up() -> None:
     assert np.abs(found.light - of.fit(once(), of.law_light).light).max() > 1e-4
 
 
-def test_no_shell_takes_light_away_and_none_that_is_undecided_moves_much() -> None:
+def test_no_shell_is_negative_and_unconstrained_shells_stay_at_the_prior() -> None:
     found = shares().fit(once(), shares().law_light)
     assert found.light.min() >= 0
-    beyond = np.array(shells().edges_px[:-1]) > 200.0  # farther than any two pixels of a field of 128 px
+    beyond = np.array(shells().edges_px[:-1]) > 200.0  # no two pixels of a 128 px field are that far apart
     np.testing.assert_allclose(found.light[beyond], found.law_light[beyond], rtol=0.02)
     held = np.sqrt(np.diag(found.covariance))[beyond]
-    np.testing.assert_allclose(held, loosely(shares().law_light)[beyond], rtol=0.02)
+    np.testing.assert_allclose(held, looseness_of(shares().law_light)[beyond], rtol=0.02)
 
 
-def test_where_the_formula_goes_the_undecided_shells_follow() -> None:
+def test_unconstrained_shells_follow_the_formula() -> None:
     moved = 1.1 * shares().law_light
     found = shares().fit(once(), moved)
     beyond = np.array(shells().edges_px[:-1]) > 200.0
     np.testing.assert_allclose(found.light[beyond], moved[beyond], rtol=0.02)
 
 
-def test_light_near_the_centre_that_the_formula_leaves_out_is_found() -> None:
-    """A noise-free transit of a power law, about a formula that lacks 2 % of all light at 3 to 10 px."""
+def test_light_that_the_formula_lacks_near_the_centre_is_found() -> None:
+    """A noise-free transit, and a formula that lacks 2 % of all light at 3 to 10 px."""
     transit = noise_free(sky(brightness=BRIGHT))
     solution = invert(transit)
     right = free_shares(solution, solution.inversion.coordinates)
     missing = np.zeros_like(right.law_light)
     band = (np.array(shells().edges_px[:-1]) >= 2.9) & (np.array(shells().edges_px[1:]) <= 10.0)
     missing[band] = 0.02 / band.sum()
-    # To first order a model without that light leaves J d unexplained.
+    # To first order, a model without that light leaves the residual J d.
     lacking = FreeShares(
         frames=right.frames,
         law_light=right.law_light,
@@ -112,7 +114,7 @@ def test_light_near_the_centre_that_the_formula_leaves_out_is_found() -> None:
     assert np.abs(excess[~band]).sum() < 0.004
 
 
-def test_the_free_kernel_of_the_formulas_light_is_the_formulas() -> None:
+def test_a_free_kernel_with_the_light_of_the_formula_is_the_formulas_kernel() -> None:
     solution = solved()
     at, shape = solution.inversion.coordinates, SOFTENED_POWER_LAW
     free = shares().fit(once(), shares().law_light)

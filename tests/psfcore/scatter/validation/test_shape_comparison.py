@@ -1,4 +1,4 @@
-"""What other shapes add to a fit: found where it is there, and not where it is not."""
+"""Comparison of other shapes with a fit: real deviations are found, and no false ones."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def by_name(shapes: tuple[ComparedShape, ...]) -> dict[str, ComparedShape]:
     return {shape.name: shape for shape in shapes}
 
 
-def test_a_stretch_put_in_is_found() -> None:
-    """To first order, about the best fit that has none."""
+def test_a_simulated_stretch_is_found() -> None:
+    """To first order, near the best fit without a stretch."""
     log, turn = math.log(1.15), math.radians(2 * -15.0)
     found = compared_stretched()["stretched"].added
     for name, true in (("stretch_p", log * math.cos(turn)), ("stretch_q", log * math.sin(turn))):
@@ -38,7 +38,7 @@ def test_a_stretch_put_in_is_found() -> None:
         assert abs(value) > 8 * sigma
 
 
-def test_the_shape_that_was_put_in_gains_most() -> None:
+def test_the_simulated_shape_gains_most() -> None:
     shapes = compared_stretched()
     by_gain = sorted(shapes, key=lambda name: -shapes[name].gain)
     held_out = {name: shape.held_out_gain or 0.0 for name, shape in shapes.items()}
@@ -48,7 +48,7 @@ def test_the_shape_that_was_put_in_gains_most() -> None:
 
 
 @pytest.mark.slow
-def test_nothing_is_found_where_nothing_was_put_in() -> None:
+def test_no_shape_gains_on_a_softened_power_law() -> None:
     shapes = fitted().shapes
     assert [shape.name for shape in shapes] == [name for name in SHAPES if name != SOFTENED_POWER_LAW.name]
     for shape in shapes:
@@ -59,8 +59,8 @@ def test_nothing_is_found_where_nothing_was_put_in() -> None:
         assert shape.held_out_gain is not None and shape.held_out_gain < 16
 
 
-def test_gains_are_what_the_residuals_say() -> None:
-    """The steps of each fold, and chi2 on the images held out before and after, from pixels."""
+def test_gains_agree_with_the_residuals() -> None:
+    """Steps of each fold, and chi2 of the held-out images before and after, computed from pixels."""
     solution, shape = solved(), SHAPES["knee"]
     found = by_name(fitted().shapes)["knee"]
     slopes = [*solution.total.slopes(solution.inversion.coordinates), bend_slope(solution)]
@@ -68,8 +68,8 @@ def test_gains_are_what_the_residuals_say() -> None:
     frames = []
     for n in solution.part:
         residual, expected = solution.residual(n)
-        answers = np.array([solution.answer(n, blur) for blur in blurs])
-        frames.append((residual, answers, solution.weight(n, expected)))
+        jacobian = np.array([solution.jacobian(n, blur) for blur in blurs])
+        frames.append((residual, jacobian, solution.weight(n, expected)))
 
     def step(of: list[int], size: int) -> np.ndarray:
         lines = np.concatenate([(frames[n][1][:size] * np.sqrt(frames[n][2])).T for n in of])
