@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import Diagnosis
-from psfcore.gap.effect import Field, View
 from psfcore.gap.verdict.correction import Corrected
+from psfcore.gap.view import Field, View
 from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_or_pad
 from psfcore.scatter.optics import Blur, Lanes, Optics
 from psfcore.scatter.total_psf import TotalPsf

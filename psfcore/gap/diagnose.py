@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.gap.effect import Effect, View
+from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
@@ -34,6 +34,7 @@ from psfcore.gap.verdict.closure import (
 from psfcore.gap.verdict.correction import Corrected, add_to_model, beyond
 from psfcore.gap.verdict.judge import LEAST_IMAGES, Judgement, Tried, judge
 from psfcore.gap.verdict.where import Axis, where
+from psfcore.gap.view import View
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named

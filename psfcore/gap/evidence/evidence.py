@@ -14,9 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.effect import Change, Effect, View
+from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.cells import DiscCells, disc_cells
 from psfcore.gap.evidence.lit_blocks import LitBlocks, LitEquations, blocks, lit_blocks
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.optics import Blur
 from psfcore.transit.occulter import UNDESCRIBED, FoundPlace

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfcore.gap.effect import View
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, invert
 from psfcore.transit.transit import Transit
 

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.effect import View
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.transit.occulter import disc_distance
 

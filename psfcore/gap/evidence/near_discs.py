@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import correlations
-from psfcore.gap.effect import Field, View
 from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
+from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.optics import Optics
 

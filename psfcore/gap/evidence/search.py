@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import correlations, linear_convolve
-from psfcore.gap.effect import View
 from psfcore.gap.evidence.cells import sensitivities
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.near_discs import NearDiscs, cut
+from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
 
 Plane = NDArray[np.float64]

@@ -20,9 +20,10 @@ from types import ModuleType
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.gap.effect import Change, Effect, Field, View
+from psfcore.gap.effect import Change, Effect
 from psfcore.gap.effect_sources import is_file, sha256_of_source
 from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.view import Field, View
 
 NAME = "EFFECTS"
 

@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+from psfcore.gap.effect import Change, Effect, EffectParameter
+from psfcore.gap.view import Field, View
 
 FAINT_DN = (30.0, 150.0)  # a mixture of both follows a loss at any faint level between
 # In mean waits between images: with a share of the last image, mixtures of these fade as traps do.

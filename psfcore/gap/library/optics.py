@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter, rotate
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.search import KERNEL_REACH_PX, displaced, place_search
+from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.optics import Blur
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.search import place_search
 from psfcore.gap.library.detector import cosine_parameters, cosines, fixed, flat, times_image
 from psfcore.gap.library.optics import (
@@ -25,6 +25,7 @@ from psfcore.gap.library.optics import (
     shape_slopes,
 )
 from psfcore.gap.library.scene import COARSE_PX, RIDGE, STRUCTURE_PX, lit_on_coarse, on_pixels
+from psfcore.gap.view import Field, View
 from psfcore.transit.occulter import coverage
 
 Plane = NDArray[np.float64]

@@ -23,19 +23,16 @@ from psfcore.drawing.plots import CHANGE, INK
 from psfcore.evaluation.plot import tidy
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.cells import RINGS, DiscCells
+from psfcore.gap.report.bars import MOST_EFFECTS, draw_effects, draw_where
 from psfcore.gap.report.report import fits_of
 
 Vector = NDArray[np.float64]
 Report = dict[str, Any]
 
 WIDTH_IN = 9.9
-MOST_EFFECTS = 10
-CERTAIN_P = 1e-12  # smaller ones are written as smaller than this
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#8a6d00", "#56B4E9")
 _SYMBOLS = ("o", "s", "^", "D", "v", "P")
 _BEFORE, _AFTER, _OBSERVED = "#D55E00", "#0072B2", "#333333"
-_ANSWER, _OTHER = "#0072B2", "#9a9a9a"
-_NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3  # where bars and intervals are cut
 _DARK = 0.55  # of the colour scale: from there on numbers are white
 _SLICE_PX, SLICE_ROWS = 20, 2  # along x, and on either side of the middle row
 _FITTED, _ANSWERED = "Fitted model", "With the answer"
@@ -212,79 +209,11 @@ def where_png(report: Report) -> bytes:
     return _png(figure)
 
 
-def draw_where(axes: Any, report: Report) -> None:
-    """Bars, the strongest at the top, p-values beside."""
-    rows = report["where"]
-    at = np.arange(len(rows))[::-1]
-    shares = np.array([100 * row["share"] for row in rows])
-    colours = [_ANSWER if n == 0 and report["verdict"] != "none" else _OTHER for n in range(len(rows))]
-    axes.barh(at, shares, color=colours, height=0.7)
-    for y, share, row in zip(at, shares, rows, strict=True):
-        axes.annotate(
-            p_words(row["p_value"]), (share, y), (4, 0), textcoords="offset points", va="center", fontsize=8.5
-        )
-    axes.set_yticks(at, [row["axis"].replace("_", " ") for row in rows])
-    axes.set(xlim=(0, 1.3 * max(float(shares.max(initial=0.0)), 1.0)), xlabel="Share of the gap (%)")
-    tidy([axes])
-
-
-def p_words(p_value: float) -> str:
-    """A p-value as it is written beside a bar."""
-    return f"p < {CERTAIN_P:.0e}" if p_value < CERTAIN_P else f"p = {p_value:.2g}"
-
-
 def effects_png(report: Report) -> bytes:
     """How far each effect closes the gap on images held out, best first."""
     figure = _figure(WIDTH_IN, 1.1 + 0.34 * min(len(fits_of(report)), MOST_EFFECTS))
     draw_effects(figure.subplots(), report)
     return _png(figure)
-
-
-def draw_effects(axes: Any, report: Report) -> None:
-    """Closure with its 90 % interval; the answer, or what is tied, stands out; scores beside."""
-    rows = fits_of(report)[:MOST_EFFECTS]
-    at = np.arange(len(rows))[::-1]
-    names = []
-    for y, row in zip(at, rows, strict=True):
-        chosen = _chosen(row, report)
-        colour = _ANSWER if chosen else _OTHER
-        _draw_closure(axes, float(y), row["closure"], colour)
-        axes.text(1.52, y, f"{row['score']:.1f}", va="center", ha="right", fontsize=9)
-        mark = {"attributed": "answer", "tie": "tie"}.get(report["verdict"], "") if chosen else ""
-        names.append(row["name"].replace("_", " ") + (f"  ({mark})" if mark else ""))
-    axes.text(1.52, at.max(initial=0) + 0.75, "score", va="center", ha="right", fontsize=9, color="#555555")
-    axes.set_yticks(at, names)
-    for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
-        if _chosen(row, report):
-            tick.set_fontweight("bold")
-    axes.axvline(0, color="#555555", linewidth=1.0)
-    axes.axvline(1, color="#555555", linewidth=1.0, linestyle=(0, (4, 3)))
-    axes.set(xlim=(_NO_CLOSURE, 1.56), ylim=(-0.7, len(rows) + 0.2), xticks=(0, 0.25, 0.5, 0.75, 1.0))
-    axes.set_xlabel("Closure of the gap on images held out (0: nothing, 1: all)", x=0.45)
-    tidy([axes])
-
-
-def _chosen(row: Report, report: Report) -> bool:
-    """Whether an effect, or some together, are the answer, or one of those that are tied."""
-    names, answer = set(row["name"].split(" + ")), set(report["answer"])
-    if report["verdict"] != "tie":
-        return names == answer
-    certain = answer.difference(*report["ties"])
-    return certain <= names <= answer and names != certain
-
-
-def _draw_closure(axes: Any, y: float, closure: dict[str, Any] | None, colour: str) -> None:
-    if closure is None:
-        axes.text(0.02, y, "no gap to close", va="center", fontsize=8.5, color="#666666")
-        return
-    value, (low, high) = closure["value"], closure["ci90"]
-    axes.barh(y, float(np.clip(value, _NO_CLOSURE, _MOST_CLOSURE)), color=colour, height=0.62)
-    ends = np.clip([low, high], _NO_CLOSURE + 0.012, _MOST_CLOSURE)
-    axes.plot(ends, [y, y], color=INK, linewidth=1.4)
-    for end, beyond, cut in zip(ends, (low < ends[0], high > ends[1]), ("<", ">"), strict=True):
-        axes.plot([end], [y], cut if beyond else "|", color=INK, markersize=5 if beyond else 8, clip_on=False)
-    if value < _NO_CLOSURE:
-        axes.text(_NO_CLOSURE + 0.03, y + 0.2, f"{value:.1f}", va="center", fontsize=7.5, color=INK)
 
 
 def slices_png(found: Diagnosis) -> bytes:

@@ -290,3 +290,8 @@ def _excluded(found: Diagnosis, best: Tried) -> str:
 def words(name: str) -> str:
     """A name as a person writes it."""
     return name.replace("_", " ")
+
+
+def best_words(found: Diagnosis) -> str:
+    """The effects of the first real refit."""
+    return " + ".join(words(effect.name) for effect in found.corrected[0].effects)

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.gap.effect import Effect, View
+from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.judge import Tried, fitted, label_of, left_chi2
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.transit.transit import Transit
 

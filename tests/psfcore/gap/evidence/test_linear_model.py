@@ -10,7 +10,6 @@ import scipy.linalg
 from scipy.ndimage import gaussian_filter
 from scipy.stats import multivariate_normal
 
-from psfcore.gap.effect import View
 from psfcore.gap.evidence.cells import cells_of, disc_cells, sensitivities
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, UNLIKELY, LinearModel, Step, Vector
@@ -34,6 +33,7 @@ from psfcore.gap.verdict.judge import (
     no_refit,
 )
 from psfcore.gap.verdict.where import _shapley
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.optics import pick, put
 from psfcore.simulate.plan import default_plan

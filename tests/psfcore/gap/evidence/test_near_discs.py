@@ -10,11 +10,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import correlations
-from psfcore.gap.effect import View
 from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
 from psfcore.gap.evidence.near_discs import NearDiscs, cut
 from psfcore.gap.evidence.search import displaced, place_search
 from psfcore.gap.library.optics import _blurred, _sought_blur
+from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Blur

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, rotate
 
 from psfcore.errors import DataError
-from psfcore.gap.effect import Effect, View, _ratio
+from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.cells import sensitivities
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
@@ -35,6 +35,7 @@ from psfcore.gap.verdict import correction
 from psfcore.gap.verdict import judge as judging
 from psfcore.gap.verdict.correction import _with_noise_of, add_to_model, beyond, corrected
 from psfcore.gap.verdict.judge import fitted
+from psfcore.gap.view import View, _ratio
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.inversion import Solution, invert
 from psfcore.scatter.optics import Blur

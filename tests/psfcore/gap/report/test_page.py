@@ -12,9 +12,11 @@ import pytest
 
 from psfcore.drawing.page import with_error
 from psfcore.gap.diagnose import Diagnosis, Shrinking
+from psfcore.gap.report import bars
 from psfcore.gap.report import plot as gap_plot
+from psfcore.gap.report.bars import draw_effects
 from psfcore.gap.report.page import gap_page, interval_words, unit_words
-from psfcore.gap.report.plot import cell_means, draw_cells, draw_effects, draw_map, gap_png, simulated_of
+from psfcore.gap.report.plot import cell_means, draw_cells, draw_map, gap_png, simulated_of
 from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict.judge import fitted
 from tests.html_page import Tag, check_stands_alone, read_page
@@ -174,7 +176,7 @@ def test_a_tie_beside_an_effect_that_is_certain_says_which_is_which(coarse: None
         {"name": name}
         for name in ("dark_offset", "core_blur", "core_blur + dark_offset", "persistence + dark_offset")
     ]
-    assert [gap_plot._chosen(row, report) for row in rows] == [False, False, True, False]
+    assert [bars._chosen(row, report) for row in rows] == [False, False, True, False]
 
 
 def test_effects_that_act_together_stand_before_those_that_alone_do_more(coarse: None) -> None:
