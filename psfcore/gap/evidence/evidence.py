@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.cells import DiscCells, disc_cells
-from psfcore.gap.evidence.lit_blocks import LitBlocks, LitEquations, blocks, lit_blocks
+from psfcore.gap.evidence.unocculted_blocks import LitBlocks, LitEquations, blocks, lit_blocks
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.optics import Blur

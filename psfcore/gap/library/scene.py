@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.gap.effect import Change, Effect, EffectParameter
-from psfcore.gap.evidence.lit_blocks import blocks, not_compared
+from psfcore.gap.evidence.unocculted_blocks import blocks, not_compared
 from psfcore.gap.evidence.search import coarse_kernel
 from psfcore.gap.view import Field, View
 from psfcore.transit.occulter import coverage
