@@ -8,7 +8,7 @@ An effect is declared once (`effect.Effect`). One of your own is a Python file t
     def glow(view):
         x, _ = view.places
         plane = np.exp(-(((x - 0.5) / 0.15) ** 2)).astype(np.float32)
-        return [Change(lambda n, images: plane, lit=False)]
+        return [Change(lambda n, images: plane, unocculted=False)]
 
     EFFECTS = (Effect("edge_glow", "detector", (EffectParameter("height", "DN/s", 5.0),),
         "A lamp beside the detector lights its right edge.", "a dark exposure", ("detector_x",), glow),)

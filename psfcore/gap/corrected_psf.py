@@ -117,11 +117,11 @@ class _Point(View):
         return [frame.pixels for frame in self.solution.transit.frames]
 
     @cached_property
-    def lit(self) -> list[Field]:
+    def pointing_means(self) -> list[Field]:
         """The PSF."""
         return list(self.expected)
 
-    def lit_scene(self, n: int) -> Lanes:
+    def occulted_scene(self, n: int) -> Lanes:
         """The point, in the engine's order."""
         return self.solution.optics.lanes(self.scenes[n])
 

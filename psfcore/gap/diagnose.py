@@ -147,7 +147,7 @@ def diagnose_solution(
         evidence,
         FLOOR,
         disc_scale=float(np.clip(expected.disc_scale, SMALLEST_SCALE, LARGEST_SCALE)),
-        lit_scale=float(np.clip(expected.lit_scale, SMALLEST_SCALE, LARGEST_SCALE)),
+        unocculted_scale=float(np.clip(expected.unocculted_scale, SMALLEST_SCALE, LARGEST_SCALE)),
         scale_error=expected.scale_error,
     )
     refits = _Refits(view, model, progress)
@@ -301,7 +301,7 @@ def _before_refit(model: LinearModel, found: Judgement, rng: np.random.Generator
     base = list(model.evidence.base)
     rows = []
     for disc in model.evidence.discs:
-        mean = float(disc.share @ (disc.residual - disc.answers[base].T @ step.values[: len(base)]))
+        mean = float(disc.share @ (disc.residual - disc.jacobian[base].T @ step.values[: len(base)]))
         rows.append((-100 * mean / disc.level, 100 * disc.mean_noise / disc.level))
     residual, noise = np.array(rows).T
     nothing = np.zeros_like(residual)
@@ -340,7 +340,9 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
             + "; ".join(f"{k}: {v}" for k, v in list(left_out.items())[:3])
         )
     restless = [
-        evidence.taken[disc.index].file for disc in evidence.discs if not evidence.taken[disc.index].described
+        evidence.image_info[disc.index].file
+        for disc in evidence.discs
+        if not evidence.image_info[disc.index].described
     ]
     if restless:
         out.append(
@@ -353,7 +355,7 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
         out.append(
             f"With {images} images nothing can be held out: closure and the gap held out are not given."
         )
-    aimed = len({taken.fov for taken in evidence.taken})
+    aimed = len({taken.pointing for taken in evidence.image_info})
     if aimed > MOST_POINTINGS:
         out.append(
             f"Light from outside the field is looked for in the first {MOST_POINTINGS} of {aimed} pointings alone."
@@ -362,7 +364,7 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
         out.append(
             "One pointing alone: what differs between pointings cannot be told, and none can be left out."
         )
-    exposures = {taken.exposure_s for taken in evidence.taken}
+    exposures = {taken.exposure_s for taken in evidence.image_info}
     if len(exposures) == 1:
         out.append("One exposure alone: an error a readout and an error a second look the same.")
     return tuple(out)

@@ -41,7 +41,7 @@ class Change:
     """
 
     change: Callable[[int, Sequence[Field]], Field]
-    lit: bool = True
+    unocculted: bool = True
     disc: bool = True
     numbers: int = 0
 

@@ -24,7 +24,7 @@ KEPT_BYTES = 2**25  # of one kind of field; a few fields are kept however large 
 LEAST_KEPT = 4
 
 
-class _Fields(Sequence[Field]):
+class _LazyFields(Sequence[Field]):
     """Fields of all images, worked out where asked for; those of thirty images of 512 px are kept, of larger ones the last.
 
     Nobody writes to them.
@@ -82,8 +82,8 @@ class View:
     def expected(self) -> Sequence[Field]:
         """Every image as the model sees it [y, x], DN/s."""
         optics = self.solution.optics
-        return _Fields(
-            len(self.solution.transit.frames), lambda n: optics.field(optics.see(self.lit_scene(n)))
+        return _LazyFields(
+            len(self.solution.transit.frames), lambda n: optics.field(optics.see(self.occulted_scene(n)))
         )
 
     def behind(self, n: int) -> Field | None:
@@ -100,7 +100,7 @@ class View:
     @cached_property
     def unocculted(self) -> Sequence[Field]:
         """Every image as observed, with the light put back that its occulter hides [y, x], DN/s."""
-        return _Fields(len(self.solution.transit.frames), self._put_back)
+        return _LazyFields(len(self.solution.transit.frames), self._put_back)
 
     def _put_back(self, n: int) -> Field:
         solution = self.solution
@@ -112,7 +112,7 @@ class View:
         return seen + optics.field(optics.see(optics.lanes(hidden.astype(np.float32))))
 
     @cached_property
-    def lit(self) -> list[Field]:
+    def pointing_means(self) -> list[Field]:
         """For every image the mean unocculted image of its pointing [y, x], DN/s: what all of them show but for gain.
 
         The same array for all of a pointing, so that a template made of it differs between them by what is meant.
@@ -158,7 +158,7 @@ class View:
 
         A template made of the image's own scene would hold the noise that its residual holds, and fit it.
         """
-        return _Fields(len(self.solution.transit.frames), self._scene)
+        return _LazyFields(len(self.solution.transit.frames), self._scene)
 
     def _scene(self, n: int) -> Field:
         own, away = self._own(n)
@@ -183,18 +183,18 @@ class View:
         out[window] -= (coverage(shape, place)[window] * shown).astype(np.float32)
         return out
 
-    def lit_scene(self, n: int) -> Lanes:
+    def occulted_scene(self, n: int) -> Lanes:
         """One of `scenes` less what the occulter hides of it, in the engine's order; to be read alone."""
-        return self._lit_scenes[n]
+        return self._occulted_scenes[n]
 
     @cached_property
-    def _lit_scenes(self) -> Sequence[Lanes]:
-        return _Fields(len(self.solution.transit.frames), self._lit_scene)
+    def _occulted_scenes(self) -> Sequence[Lanes]:
+        return _LazyFields(len(self.solution.transit.frames), self._occulted_scene)
 
-    def _lit_scene(self, n: int) -> Lanes:
-        lit = self.solution.optics.lanes(self.scenes[n] * self.uncovered(n))
-        put(lit, self.solution.sky.dark[n], 0.0)
-        return lit
+    def _occulted_scene(self, n: int) -> Lanes:
+        scene = self.solution.optics.lanes(self.scenes[n] * self.uncovered(n))
+        put(scene, self.solution.sky.dark[n], 0.0)
+        return scene
 
     @cached_property
     def places(self) -> tuple[Field, Field]:
@@ -210,10 +210,10 @@ class View:
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
         """dH x of frame n, the scene times a weight of where its light is from [y, x], DN/s."""
-        lit = self.lit_scene(n)
+        scene = self.occulted_scene(n)
         if weight is not None:
-            lit = lit * slope.lanes(weight)
-        return slope.field(slope.see(lit))
+            scene = scene * slope.lanes(weight)
+        return slope.field(slope.see(scene))
 
 
 def _ratio(one: float, other: float) -> float:

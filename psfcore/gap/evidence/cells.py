@@ -109,11 +109,11 @@ class DiscCells:
     residual: Vector
     expected: Vector
     covariance: Matrix
-    answers: Matrix
+    jacobian: Matrix
     pixels: Vector
     radius: Vector
     azimuth: Vector
-    untouched: float | None = None
+    level_before: float | None = None
 
     @property
     def share(self) -> Vector:
@@ -128,7 +128,7 @@ class DiscCells:
     @property
     def level(self) -> float:
         """What percents of the disc are of, DN/s: the size of its mean as it was observed, whatever was taken out since."""
-        return abs(self.observed if self.untouched is None else self.untouched)
+        return abs(self.observed if self.level_before is None else self.level_before)
 
     @property
     def mean_expected(self) -> float:
@@ -157,7 +157,7 @@ def disc_cells(solution: Solution, n: int) -> tuple[DiscCells, Planes]:
         residual=cells.weights @ residual,
         expected=cells.weights @ expected,
         covariance=np.asarray(covariance, dtype=np.float64),
-        answers=np.zeros((0, cells.pixels.size)),
+        jacobian=np.zeros((0, cells.pixels.size)),
         pixels=cells.pixels,
         radius=cells.radius,
         azimuth=cells.azimuth,

@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 
 from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.cells import DiscCells, disc_cells
-from psfcore.gap.evidence.unocculted_blocks import LitBlocks, LitEquations, blocks, lit_blocks
+from psfcore.gap.evidence.unocculted_blocks import (
+    UnoccultedBlocks,
+    UnoccultedEquations,
+    blocks,
+    unocculted_blocks,
+)
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.optics import Blur
@@ -30,12 +35,12 @@ AT_ONCE = 16  # fields that are looked at together
 
 
 @dataclass(frozen=True)
-class Taken:
+class ImageInfo:
     """How one image was taken: what the axes are made of. described: whether its neighbours in time show what is round its
     occulter, so that this was found where it is."""
 
     file: str
-    fov: int
+    pointing: int
     x_px: float
     y_px: float
     time_s: float
@@ -54,8 +59,8 @@ class Evidence:
     columns: dict[str, tuple[int, ...]]
     base: tuple[int, ...]
     discs: tuple[DiscCells, ...]
-    lit: LitBlocks
-    taken: tuple[Taken, ...]
+    unocculted: UnoccultedBlocks
+    image_info: tuple[ImageInfo, ...]
     untestable: dict[str, str]
     numbers: dict[int, int] = field(default_factory=dict)
 
@@ -68,24 +73,24 @@ class Evidence:
         """Positions, among all images, of those with a disc."""
         return tuple(disc.index for disc in self.discs)
 
-    def lit_equations(self, images: Sequence[int] | None = None) -> LitEquations:
+    def unocculted_equations(self, images: Sequence[int] | None = None) -> UnoccultedEquations:
         """The lit blocks' equations of all columns, from some images (none: all)."""
-        return self.whole_lit if images is None else self.lit.equations(range(self.size), images)
+        return self.all_unocculted if images is None else self.unocculted.equations(range(self.size), images)
 
     @cached_property
-    def whole_lit(self) -> LitEquations:
+    def all_unocculted(self) -> UnoccultedEquations:
         """`lit_equations` of all images."""
-        return self.lit.equations(range(self.size))
+        return self.unocculted.equations(range(self.size))
 
     @cached_property
-    def steady_lit(self) -> LitEquations:
+    def steady_unocculted(self) -> UnoccultedEquations:
         """`whole_lit` with restless blocks weighed by what they show: what is left is judged by these."""
-        return self.lit.with_restless_blocks().equations(range(self.size))
+        return self.unocculted.with_restless_blocks().equations(range(self.size))
 
     @property
     def size(self) -> int:
         """How many columns there are."""
-        return self.discs[0].answers.shape[0]
+        return self.discs[0].jacobian.shape[0]
 
     @property
     def of_effects(self) -> range:
@@ -108,7 +113,7 @@ def gather(
     changes, columns, untestable = _changes(view, library)
     base = tuple(range(solution.inversion.coordinates.size))
     columns = {name: tuple(c + len(base) for c in here) for name, here in columns.items()}
-    lit = lit_blocks(view, len(base) + len(changes), progress)
+    unocculted = unocculted_blocks(view, len(base) + len(changes), progress)
     part = set(solution.part)
     discs, distances = [], []
     count = len(solution.transit.frames)
@@ -121,16 +126,16 @@ def gather(
         else:
             distances.append(float("nan"))
         for k, change in enumerate(changes):
-            if change.lit:
-                lit.errors[len(base) + k, n] = blocks(change.change(n, view.lit))
+            if change.unocculted:
+                unocculted.errors[len(base) + k, n] = blocks(change.change(n, view.pointing_means))
     found = Evidence(
         effects=tuple(effect for effect in library if effect.name in columns),
         columns=columns,
         base=base,
         discs=tuple(discs),
-        lit=lit,
-        taken=tuple(
-            _taken(frame, place, distance)
+        unocculted=unocculted,
+        image_info=tuple(
+            _image_info(frame, place, distance)
             for frame, place, distance in zip(
                 solution.transit.frames, solution.sky.found, distances, strict=True
             )
@@ -138,7 +143,7 @@ def gather(
         untestable=untestable,
         numbers={len(base) + k: change.numbers for k, change in enumerate(changes) if change.numbers},
     )
-    return _without_unseen(found)
+    return _testable(found)
 
 
 def _changes(
@@ -164,17 +169,17 @@ def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
     solution = view.solution
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
-    lit = view.lit_scene(n)
-    slopes = (slope.field(slope.see(lit)) for slope in view.slopes)
+    scene = view.occulted_scene(n)
+    slopes = (slope.field(slope.see(scene)) for slope in view.slopes)
     shown = [k for k, change in enumerate(changes) if change.disc]
     fields = itertools.chain(slopes, (changes[k].change(n, view.expected) for k in shown))
     rows = [*range(len(view.slopes)), *(len(view.slopes) + k for k in shown)]
-    answers = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
+    jacobian = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
     for first in range(0, len(rows), AT_ONCE):
         # Together: the cells' planes are read from memory once for all of them.
         some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
-        answers[rows[first : first + AT_ONCE]] = some @ flat.T
-    return replace(cells, answers=answers)
+        jacobian[rows[first : first + AT_ONCE]] = some @ flat.T
+    return replace(cells, jacobian=jacobian)
 
 
 class _Distance:
@@ -190,15 +195,15 @@ class _Distance:
         """In px, for image n."""
         solution = view.solution
         dark = solution.sky.dark[n]
-        lit = view.lit_scene(n)
-        there = self._blur.field(self._blur.see(lit))[dark].mean()
+        scene = view.occulted_scene(n)
+        there = self._blur.field(self._blur.see(scene))[dark].mean()
         return float(there / max(float(view.expected[n][dark].mean()), 1e-9))
 
 
-def _taken(frame: Frame, found: FoundPlace, distance_px: float) -> Taken:
-    return Taken(
+def _image_info(frame: Frame, found: FoundPlace, distance_px: float) -> ImageInfo:
+    return ImageInfo(
         file=frame.file,
-        fov=frame.fov,
+        pointing=frame.fov,
         x_px=found.place.x_px,
         y_px=found.place.y_px,
         time_s=frame.time_s,
@@ -209,12 +214,12 @@ def _taken(frame: Frame, found: FoundPlace, distance_px: float) -> Taken:
     )
 
 
-def _without_unseen(evidence: Evidence) -> Evidence:
+def _testable(evidence: Evidence) -> Evidence:
     """The evidence without effects that no image answers to."""
     untestable, columns = dict(evidence.untestable), dict(evidence.columns)
     for name, here in evidence.columns.items():
-        cells = max(float(np.abs(disc.answers[list(here)]).max()) for disc in evidence.discs)
-        if not (cells > 0 or np.abs(evidence.lit.errors[list(here)]).max() > 0):
+        cells = max(float(np.abs(disc.jacobian[list(here)]).max()) for disc in evidence.discs)
+        if not (cells > 0 or np.abs(evidence.unocculted.errors[list(here)]).max() > 0):
             untestable[name] = "no image of this transit answers to it"
             del columns[name]
     effects = tuple(effect for effect in evidence.effects if effect.name in columns)

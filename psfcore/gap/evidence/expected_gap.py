@@ -25,7 +25,7 @@ class ExpectedGap:
     residual_pct: rms residual of the discs' means."""
 
     disc_scale: float
-    lit_scale: float
+    unocculted_scale: float
     scale_error: float
     residual_pct: float
 
@@ -36,8 +36,8 @@ def simulated(view: View, seed: int) -> Transit:
     transit, optics = solution.transit, solution.optics
     frames = []
     for n, frame in enumerate(transit.frames):
-        lit = view.pointing_scene(n) * view.uncovered(n)
-        seen = optics.field(optics.see(optics.lanes(lit.astype(np.float32)))).astype(np.float64)
+        scene = view.pointing_scene(n) * view.uncovered(n)
+        seen = optics.field(optics.see(optics.lanes(scene.astype(np.float32)))).astype(np.float64)
         rng = np.random.default_rng([seed, n])
         pixels = transit.noise.observe(seen, frame.exposure_s, rng)
         frames.append(replace(frame, pixels=pixels.astype(np.float32)))
@@ -67,11 +67,11 @@ def expected_gap(
     model = LinearModel(gather(again, (), progress=say), floor)
     left = model.left(model.base)
     cells = max(sum(one.size for one in left) - len(model.base.columns), 1)
-    lit = model.evidence.whole_lit
+    unocculted = model.evidence.all_unocculted
     residual = [100 * float(d.share @ d.residual) / d.level for d in model.evidence.discs]
     return ExpectedGap(
         disc_scale=sum(float(one @ one) for one in left) / cells,
-        lit_scale=lit.chi2 / lit.freedom,
+        unocculted_scale=unocculted.chi2 / unocculted.freedom,
         scale_error=float(np.sqrt(2 / cells)),
         residual_pct=float(np.sqrt(np.mean(np.square(residual)))),
     )

@@ -48,7 +48,7 @@ class Whitened:
 
     index: int
     residual: Vector
-    answers: Matrix
+    jacobian: Matrix
     white: Matrix
 
 
@@ -70,7 +70,7 @@ class LinearModel:
     evidence: Evidence
     floor: float
     disc_scale: float = 1.0
-    lit_scale: float = 1.0
+    unocculted_scale: float = 1.0
     scale_error: float = 0.0
 
     @cached_property
@@ -83,7 +83,7 @@ class LinearModel:
             disc.expected, disc.expected
         )
         white = whitening(covariance)
-        return Whitened(disc.index, white @ disc.residual, disc.answers @ white, white)
+        return Whitened(disc.index, white @ disc.residual, disc.jacobian @ white, white)
 
     def equations(self, images: Sequence[int] | None = None) -> tuple[Matrix, Vector]:
         """Normal matrix and score of all columns from some images (none: all); worked out once."""
@@ -101,10 +101,13 @@ class LinearModel:
         normal, score = np.zeros((size, size)), np.zeros(size)
         for disc in self.discs:
             if images is None or disc.index in images:
-                normal += disc.answers @ disc.answers.T
-                score += disc.answers @ disc.residual
-        lit = self.evidence.lit_equations(images)
-        return normal + lit.normal / self.lit_scale, score + lit.score / self.lit_scale
+                normal += disc.jacobian @ disc.jacobian.T
+                score += disc.jacobian @ disc.residual
+        unocculted = self.evidence.unocculted_equations(images)
+        return (
+            normal + unocculted.normal / self.unocculted_scale,
+            score + unocculted.score / self.unocculted_scale,
+        )
 
     @cached_property
     def patterns(self) -> tuple[Matrix, ...]:
@@ -170,14 +173,14 @@ class LinearModel:
 
     def left(self, step: Step) -> tuple[Vector, ...]:
         """The whitened residuals of every disc after a step."""
-        return tuple(d.residual - d.answers[list(step.columns)].T @ step.values for d in self.discs)
+        return tuple(d.residual - d.jacobian[list(step.columns)].T @ step.values for d in self.discs)
 
-    def left_lit(self, step: Step) -> float:
+    def left_unocculted(self, step: Step) -> float:
         """chi2 of the lit blocks after a step, over lit_scale, restless blocks weighed by what they show."""
-        here, lit = list(step.columns), self.evidence.steady_lit
+        here, unocculted = list(step.columns), self.evidence.steady_unocculted
         theta = step.values
-        fall = 2 * theta @ lit.score[here] - theta @ lit.normal[np.ix_(here, here)] @ theta
-        return float(lit.chi2 - fall) / self.lit_scale
+        fall = 2 * theta @ unocculted.score[here] - theta @ unocculted.normal[np.ix_(here, here)] @ theta
+        return float(unocculted.chi2 - fall) / self.unocculted_scale
 
     def gain_of_patterns(
         self, step: Step, patterns: Sequence[Matrix], left: Sequence[Vector]
@@ -190,7 +193,7 @@ class LinearModel:
         here = list(step.columns)
         design = np.concatenate(
             [
-                np.vstack([disc.answers[here], pattern @ disc.white])
+                np.vstack([disc.jacobian[here], pattern @ disc.white])
                 for disc, pattern in zip(self.discs, patterns, strict=True)
             ],
             axis=1,

@@ -58,10 +58,10 @@ def measured_noise(transit: Transit) -> MeasuredNoise | None:
     level, variance = np.concatenate(levels), np.concatenate(variances)
     stated = transit.noise.photon_gain_dn * np.maximum(level, 0) + transit.noise.read_noise_dn**2
     ratio = float(np.median(variance / stated))
-    gain, readout = _line(level, variance)
-    if gain <= 0 and readout <= 0:
+    gain, read_variance = _line(level, variance)
+    if gain <= 0 and read_variance <= 0:
         return None
-    return MeasuredNoise(Noise(max(gain, 0.0), math.sqrt(max(readout, 0.0))), ratio, level.size)
+    return MeasuredNoise(Noise(max(gain, 0.0), math.sqrt(max(read_variance, 0.0))), ratio, level.size)
 
 
 def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:

@@ -78,8 +78,8 @@ class NearDiscs:
     def of_kernel(self, change: Plane) -> Vector:
         """How a change of the PSF [y, x], its centre at n // 2, moves the cells, Eq. (1), over their noise (cells,)."""
         near = crop_or_pad(change, 2 * REACH_PX + 1).astype(np.float32)
-        answers = [np.tensordot(disc, near, axes=2) for disc in self._to_displacements]
-        return np.concatenate(answers, dtype=np.float64)
+        responses = [np.tensordot(disc, near, axes=2) for disc in self._to_displacements]
+        return np.concatenate(responses, dtype=np.float64)
 
     def of_copies(self, n: int, image: Field, displacements: Sequence[tuple[int, int]]) -> Plane:
         """How an image [y, x] displaced by whole pixels (x, y) moves the cells of disc n, over their noise (cells, k)."""

@@ -19,18 +19,18 @@ DEGREES = 4  # of a polynomial in time: 0 to 3
 
 def patterns(evidence: Evidence) -> tuple[Matrix, ...]:
     """For each disc the patterns (patterns, cells), each a share of what is expected there, DN/s."""
-    fovs = sorted({taken.fov for taken in evidence.taken})
-    times = {fov: [t.time_s for t in evidence.taken if t.fov == fov] for fov in fovs}
+    fovs = sorted({taken.pointing for taken in evidence.image_info})
+    times = {fov: [t.time_s for t in evidence.image_info if t.pointing == fov] for fov in fovs}
     return tuple(_of_disc(evidence, disc, fovs, times) for disc in evidence.discs)
 
 
 def _of_disc(evidence: Evidence, disc: DiscCells, fovs: list[int], times: dict[int, list[float]]) -> Matrix:
-    taken = evidence.taken[disc.index]
-    first, last = min(times[taken.fov]), max(times[taken.fov])
+    taken = evidence.image_info[disc.index]
+    first, last = min(times[taken.pointing]), max(times[taken.pointing])
     at = 2 * (taken.time_s - first) / (last - first) - 1 if last > first else 0.0
     level = np.full(disc.expected.size, float(disc.share @ disc.expected))
     in_time = np.zeros((len(fovs), DEGREES))
-    in_time[fovs.index(taken.fov)] = [np.polynomial.Legendre.basis(k)(at) for k in range(DEGREES)]
+    in_time[fovs.index(taken.pointing)] = [np.polynomial.Legendre.basis(k)(at) for k in range(DEGREES)]
     return np.vstack([in_time.ravel()[:, None] * level, in_disc(disc) * level])
 
 

@@ -68,7 +68,7 @@ class PlaceSearch:
             (plane,) = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
             self._planes[n] = _binned(plane, STEP_PX) * STEP_PX**2
             self._fine[n] = _binned(plane, FINE_PX) * FINE_PX**2
-            scene = solution.optics.field(view.lit_scene(n))
+            scene = solution.optics.field(view.occulted_scene(n))
             to_displacements.append(_correlation(plane, scene, KERNEL_REACH_PX))
             self._near.add(n, scene)
             reach = max(self._planes[n].shape) - 2
@@ -78,12 +78,12 @@ class PlaceSearch:
         self._nearest_px = NEAREST_RADII * float(np.mean([f.place.radius_px for f in solution.sky.found]))
         frames = solution.inversion.frames
         self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
-        answers = np.array([f.answer for f in frames]) / self._sigma[:, None]
+        responses = np.array([f.answer for f in frames]) / self._sigma[:, None]
         residual = np.array([f.observed - f.expected for f in frames]) / self._sigma
         in_cells = np.array([self._near.of_kernel(slope) for slope in view.slope_kernels]).T
-        self._of_means = _Left(answers, residual)
-        self._of_all = _Left(
-            np.concatenate([answers, in_cells]), np.concatenate([residual, self._near.residual])
+        self._of_means = _Unabsorbed(responses, residual)
+        self._of_all = _Unabsorbed(
+            np.concatenate([responses, in_cells]), np.concatenate([residual, self._near.residual])
         )
 
     def kernel(self, kernels: Sequence[Plane]) -> int:
@@ -170,27 +170,27 @@ class PlaceSearch:
 
     def _gains(self, answer: Callable[[int, Plane], Plane], sign: float) -> Plane:
         """Eq. (2) at every place."""
-        answers = np.array(
+        responses = np.array(
             [answer(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
         )
-        gain = self._gain(answers.reshape(self._sigma.size, -1), sign, least=SEEN)
-        return np.asarray(gain.reshape(answers.shape[1:]))
+        gain = self._gain(responses.reshape(self._sigma.size, -1), sign, least=SEEN)
+        return np.asarray(gain.reshape(responses.shape[1:]))
 
     def _gain(self, means: Plane, sign: float, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
         """Eq. (2) of some forms (forms,): how they move the discs' means (discs, forms), over their noise; and the cells.
 
         sign: of the form's amplitude. least: share of the largest sum T^2 below which a form gains nothing.
         """
-        left, answers = (
+        left, responses = (
             (self._of_means, means) if cells is None else (self._of_all, np.concatenate([means, cells]))
         )
-        flat = left.of(answers)
+        flat = left.of(responses)
         size, along = (flat**2).sum(axis=0), sign * (left.residual @ flat)
         seen = size > max(least * float(size.max()), UNSEEN)
         return np.asarray(np.where(seen & (along > 0), along**2 / np.where(seen, size, 1.0), 0.0))
 
 
-class _Left:
+class _Unabsorbed:
     """What the PSF's parameters leave, of a residual (n,) and of answers to forms (n, forms), over the noise.
 
     absorbed: the answers to those parameters (n, parameters).
@@ -200,9 +200,9 @@ class _Left:
         self._absorbed = np.linalg.qr(absorbed)[0]
         self.residual: Vector = self.of(residual)
 
-    def of(self, answers: Plane) -> Plane:
+    def of(self, responses: Plane) -> Plane:
         """What is left of answers."""
-        return np.asarray(answers - self._absorbed @ (self._absorbed.T @ answers))
+        return np.asarray(responses - self._absorbed @ (self._absorbed.T @ responses))
 
 
 def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int) -> Plane:

@@ -37,7 +37,7 @@ RESTLESS = 4.0  # times the median block's chi2 a degree of freedom
 
 
 @dataclass(frozen=True, eq=False)
-class LitBlocks:
+class UnoccultedBlocks:
     """Blocks of all images: (images, blocks) in DN/s.
 
     levels: means, the hidden light put back. variance: of noise, and of a floor. free: which are away from disc and
@@ -51,17 +51,17 @@ class LitBlocks:
     free: NDArray[np.bool_]
     means: Matrix
     errors: NDArray[np.float64]
-    fov: NDArray[np.int64]
+    pointing: NDArray[np.int64]
     kind: NDArray[np.int64]
     part: NDArray[np.bool_]
 
-    def with_restless_blocks(self) -> LitBlocks:
+    def with_restless_blocks(self) -> UnoccultedBlocks:
         """The same with the variance of restless blocks raised to what they show."""
         variance = self.variance.copy()
         gains = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
         steady = self.levels / (1 + gains[:, None])
-        for fov in np.unique(self.fov):
-            here = np.flatnonzero((self.fov == fov) & self.part)
+        for pointing in np.unique(self.pointing):
+            here = np.flatnonzero((self.pointing == pointing) & self.part)
             weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
             images = (weight > 0).sum(axis=0)
             used = images >= LEAST_IMAGES
@@ -86,19 +86,21 @@ class LitBlocks:
                 spread.extend((free[here] - np.median(free[here])) ** 2 * here.sum() / (here.sum() - 1))
         return max(float(np.sqrt(np.mean(spread))), LEAST_GAIN) if spread else WIDEST_GAIN
 
-    def equations(self, columns: Sequence[int], images: Sequence[int] | None = None) -> LitEquations:
+    def equations(self, columns: Sequence[int], images: Sequence[int] | None = None) -> UnoccultedEquations:
         """Normal equations of these columns from some images (none: all), scene and brightness free."""
         chosen = (
             np.flatnonzero(self.part) if images is None else np.array([n for n in images if self.part[n]])
         )
         return self._equations(chosen, np.asarray(columns, dtype=int), self.gain_width)
 
-    def _equations(self, images: NDArray[np.intp], columns: NDArray[np.intp], width: float) -> LitEquations:
+    def _equations(
+        self, images: NDArray[np.intp], columns: NDArray[np.intp], width: float
+    ) -> UnoccultedEquations:
         size = columns.size
         count = self.levels.shape[0]
         normal, score, chi2, freedom = np.zeros((size + count,) * 2), np.zeros(size + count), 0.0, 0
-        for fov in np.unique(self.fov[images]) if images.size else []:
-            here = images[self.fov[images] == fov]
+        for pointing in np.unique(self.pointing[images]) if images.size else []:
+            here = images[self.pointing[images] == pointing]
             if here.size < LEAST_IMAGES:
                 continue
             weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
@@ -126,9 +128,9 @@ class LitBlocks:
         (n,) and (columns, n): the blocks of each image, and its brightness in units of how much this spreads.
         """
         errors = self.errors[list(columns)]
-        residuals, answered = [np.zeros(0)], [np.zeros((len(columns), 0))]
+        residuals, jacobians = [np.zeros(0)], [np.zeros((len(columns), 0))]
         for n in images:
-            others = [k for k in fitted if self.fov[k] == self.fov[n] and self.part[k]]
+            others = [k for k in fitted if self.pointing[k] == self.pointing[n] and self.part[k]]
             if not self.part[n] or len(others) < LEAST_IMAGES - 1:
                 continue
             here = np.array(others)
@@ -147,14 +149,14 @@ class LitBlocks:
 
             scene = (self.levels[here] * weight).sum(axis=0)[use] / total[use]
             residuals.append(in_noise(self.levels[n, use] - scene))
-            answered.append(
+            jacobians.append(
                 in_noise(errors[:, n, use] - (errors[:, here] * weight).sum(axis=1)[:, use] / total[use])
             )
-        return np.concatenate(residuals), np.concatenate(answered, axis=1)
+        return np.concatenate(residuals), np.concatenate(jacobians, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
-class LitEquations:
+class UnoccultedEquations:
     """Normal equations of some columns, brightness and scene taken out; chi2 where none acts; degrees of freedom.
 
     gains: brightness of each image, where none acts.
@@ -169,12 +171,12 @@ class LitEquations:
 
 def _without_gains(
     normal: Matrix, score: Vector, chi2: float, freedom: int, size: int, width: float, *, used_images: int
-) -> LitEquations:
+) -> UnoccultedEquations:
     of_gains = normal[size:, size:]
     inverse = np.linalg.inv(of_gains + np.eye(of_gains.shape[0]) / width**2)
     cross = normal[:size, size:]
     gains = inverse @ score[size:]
-    return LitEquations(
+    return UnoccultedEquations(
         normal=normal[:size, :size] - cross @ inverse @ cross.T,
         score=score[:size] - cross @ gains,
         chi2=chi2 - float(score[size:] @ gains),
@@ -203,7 +205,7 @@ def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:
     return near if filled is None else near | filled
 
 
-def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
+def unocculted_blocks(view: View, columns: int, progress: Progress) -> UnoccultedBlocks:
     """Blocks of all images, with room for the errors of some columns; the caller fills those in."""
     solution = view.solution
     transit = solution.transit
@@ -211,7 +213,7 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
     for n, frame in enumerate(transit.frames):
         progress("lit parts", n, len(transit.frames))
         levels.append(blocks(view.unocculted[n]))
-        means.append(blocks(view.lit[n]))
+        means.append(blocks(view.pointing_means[n]))
         pixels = block_px(transit.shape) ** 2
         noise = transit.noise.variance(means[-1], frame.exposure_s) / pixels
         variance.append(noise + (FLOOR * levels[-1]) ** 2)
@@ -219,13 +221,13 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
     kinds = [(f.fov, f.gain_mode, f.exposure_s) for f in transit.frames]
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     shape = np.shape(levels)
-    return LitBlocks(
+    return UnoccultedBlocks(
         levels=np.array(levels),
         variance=np.array(variance),
         free=np.array(free),
         means=np.array(means),
         errors=np.zeros((columns, *shape)),
-        fov=np.array([f.fov for f in transit.frames]),
+        pointing=np.array([f.fov for f in transit.frames]),
         kind=np.array([number[kind] for kind in kinds]),
         part=np.ones(len(transit.frames), dtype=bool),
     )

@@ -27,12 +27,12 @@ def flat(view: View) -> Field:
 
 def fixed(plane: Field) -> Change:
     """The same plane in every image."""
-    return Change(lambda n, images: plane, lit=False)
+    return Change(lambda n, images: plane, unocculted=False)
 
 
 def times_image(pattern: Field) -> Change:
     """Every image times one pattern."""
-    return Change(lambda n, images: np.asarray(images[n] * pattern), lit=False)
+    return Change(lambda n, images: np.asarray(images[n] * pattern), unocculted=False)
 
 
 def _dark_offset(view: View) -> Sequence[Change]:
@@ -103,7 +103,7 @@ def _column_smear(view: View) -> Sequence[Change]:
         summed = np.cumsum(image, axis=0, dtype=np.float32) - image / 2
         return np.asarray(summed[::way] / np.float32(image.shape[0]))
 
-    return [Change(lambda n, images, way=way: passed(n, images, way), lit=False) for way in (1, -1)]  # type: ignore[misc]
+    return [Change(lambda n, images, way=way: passed(n, images, way), unocculted=False) for way in (1, -1)]  # type: ignore[misc]
 
 
 def _persistence(view: View) -> Sequence[Change]:
@@ -146,7 +146,7 @@ def _filled(view: View) -> Sequence[Change]:
         return np.asarray(images[n] * np.maximum(depth, 0.0), dtype=np.float32)
 
     # Blocks with such a pixel are no part of what the lit parts are compared by.
-    return [Change(lambda n, images, k=k: change(n, images, k), lit=False) for k in (False, True)]  # type: ignore[misc]
+    return [Change(lambda n, images, k=k: change(n, images, k), unocculted=False) for k in (False, True)]  # type: ignore[misc]
 
 
 def _nothing_filled(view: View) -> str | None:

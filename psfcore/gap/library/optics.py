@@ -40,12 +40,12 @@ AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate that says how
 
 def by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
     """A change of the PSF, times a weight of where the light is from."""
-    return Change(lambda n, images: view.blurred(n, blur, weight), lit=False)
+    return Change(lambda n, images: view.blurred(n, blur, weight), unocculted=False)
 
 
 def by_psf_in_time(view: View, blur: Blur, factor: Callable[[int], float]) -> Change:
     """A change of the PSF that differs from image to image."""
-    return Change(lambda n, images: view.blurred(n, blur) * np.float32(factor(n)), lit=False)
+    return Change(lambda n, images: view.blurred(n, blur) * np.float32(factor(n)), unocculted=False)
 
 
 def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Blur]:
@@ -82,7 +82,7 @@ def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
     def change(n: int, images: Sequence[Field]) -> Field:
         return np.asarray(displaced(gaussian_filter(images[n], blur_px), dx, dy), dtype=np.float32)
 
-    return [Change(change, lit=False)]
+    return [Change(change, unocculted=False)]
 
 
 def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
@@ -104,7 +104,7 @@ def _anisotropic(view: View) -> Sequence[Change]:
 
 
 def _halo(view: View) -> Sequence[Change]:
-    return _as_halo(view, _sought_halo(view))
+    return _as_halo(view, _best_halo(view))
 
 
 def _exponential(scale_px: float) -> Halo:
@@ -131,14 +131,14 @@ def _as_halo(view: View, halo: Halo) -> Sequence[Change]:
     return [by_psf(view, _blur(view, total.diffracted(halo(total.size) - scatter)))]
 
 
-def _sought_halo(view: View) -> Halo:
+def _best_halo(view: View) -> Halo:
     """The halo that explains most."""
     size = view.solution.total.size
     return HALOS[place_search(view).wide_kernel([halo(size) for halo in HALOS])]
 
 
 def _held_halo(view: View) -> Effect:
-    halo = _sought_halo(view)
+    halo = _best_halo(view)
     return _held("wide_halo", lambda view: _as_halo(view, halo))
 
 
@@ -151,7 +151,7 @@ def _field_dependent(view: View) -> Sequence[Change]:
 
 
 def _core_blur(view: View) -> Sequence[Change]:
-    return blur_as(view, *_sought_blur(view))
+    return blur_as(view, *_best_blur(view))
 
 
 def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
@@ -160,7 +160,7 @@ def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
     return [by_psf(view, _blur(view, change))]
 
 
-def _sought_blur(view: View) -> tuple[float, Steps]:
+def _best_blur(view: View) -> tuple[float, Steps]:
     """Width (px) and directions of the blur that explains most."""
     near = crop_or_pad(view.kernel, 2 * KERNEL_REACH_PX + 1)
     return BLURS[place_search(view).kernel([_blurred(near, *blur) - near for blur in BLURS])]
@@ -178,7 +178,7 @@ def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
 
 
 def _held_blur(view: View) -> Effect:
-    blur = _sought_blur(view)
+    blur = _best_blur(view)
     return _held("core_blur", lambda view: blur_as(view, *blur))
 
 
@@ -209,7 +209,7 @@ def _stretched(pattern: Kernel, percent: float) -> Kernel:
     )
 
 
-def _sought(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> float:
+def _best_amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> float:
     """By how much the diffraction pattern has to change for the discs: looked for, the orders move by more than they are wide.
 
     form(pattern, amount): the pattern changed. steps: sizes of amounts that are tried, both signs; then between them.
@@ -238,7 +238,7 @@ def _changed_mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: f
 def _mesh_effect(name: str, form: Callable[[Kernel, float], Kernel], steps: Sequence[float],
                  parameter: EffectParameter, cause: str, axes: tuple[str, ...]) -> Effect:  # fmt: skip
     def held(view: View) -> Effect:
-        amount = _sought(view, form, steps)
+        amount = _best_amount(view, form, steps)
         return replace(effect, changes=lambda view: _changed_mesh(view, form, amount), held=None)
 
     effect = Effect(
@@ -248,7 +248,7 @@ def _mesh_effect(name: str, form: Callable[[Kernel, float], Kernel], steps: Sequ
         cause,
         "the arms of a flare",
         axes,
-        lambda view: _changed_mesh(view, form, _sought(view, form, steps)),
+        lambda view: _changed_mesh(view, form, _best_amount(view, form, steps)),
         trials=2 * len(steps),
         held=held,
     )

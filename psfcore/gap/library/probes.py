@@ -24,7 +24,7 @@ from psfcore.gap.library.optics import (
     not_a_power_law,
     shape_slopes,
 )
-from psfcore.gap.library.scene import COARSE_PX, RIDGE, STRUCTURE_PX, lit_on_coarse, on_pixels
+from psfcore.gap.library.scene import COARSE_PX, RIDGE, STRUCTURE_PX, on_pixels, unocculted_on_coarse
 from psfcore.gap.view import Field, View
 from psfcore.transit.occulter import coverage
 
@@ -66,7 +66,7 @@ def _planes_of_pointings(view: View) -> Sequence[Change]:
 
     def one(fov: int, plane: Field) -> Change:
         nothing = np.zeros_like(plane)
-        return Change(lambda n, images: plane if frames[n].fov == fov else nothing, lit=False)
+        return Change(lambda n, images: plane if frames[n].fov == fov else nothing, unocculted=False)
 
     x, y = view.places
     fovs = sorted({f.fov for f in frames})
@@ -111,11 +111,11 @@ def _rows(view: View) -> Sequence[Change]:
     def change(n: int, images: Sequence[Field]) -> Field:
         return np.broadcast_to(images[n].mean(axis=1, keepdims=True, dtype=np.float32), images[n].shape)
 
-    return [Change(change, lit=False)]
+    return [Change(change, unocculted=False)]
 
 
 def _bright(view: View) -> Sequence[Change]:
-    scale = np.float32(max(float(np.mean(plane)) for plane in view.lit))
+    scale = np.float32(max(float(np.mean(plane)) for plane in view.pointing_means))
     return [Change(lambda n, images: np.asarray(-images[n] * images[n] / scale))]
 
 
@@ -126,7 +126,7 @@ def _shutter(view: View) -> Sequence[Change]:
     return [along(place) for place in view.places]
 
 
-def _readout_pattern(view: View) -> Sequence[Change]:
+def _read_pattern(view: View) -> Sequence[Change]:
     """What the lit parts show to be the same in every readout wherever the telescope points, for a pattern of 1 DN rms.
 
     As DN/s it goes with one over the exposure, which the images of a pointing differ in.
@@ -149,7 +149,7 @@ def _in_pointings(view: View, readouts: Plane) -> Iterator[tuple[Plane, Plane, P
     frames = view.solution.transit.frames
     for fov in _pointings_of_exposures(view):
         here = [n for n, frame in enumerate(frames) if frame.fov == fov]
-        seen, weight, free = lit_on_coarse(view, here)
+        seen, weight, free = unocculted_on_coarse(view, here)
         total = np.maximum(weight.sum(axis=0), 1)
         scene = (seen * weight).sum(axis=0) / total
         a_second = readouts[here][:, None, None]
@@ -187,10 +187,10 @@ def _lit_occulter(view: View) -> Sequence[Change]:
         place = view.solution.sky.found[n].place
         dy, dx = np.ogrid[: shape[0], : shape[1]]
         squared = ((dx - place.x_px) ** 2 + (dy - place.y_px) ** 2) / place.radius_px**2
-        lit = coverage(shape, place) * np.minimum(squared, 1.0) ** power
-        return optics.field(optics.see(optics.lanes(lit.astype(np.float32))))
+        light = coverage(shape, place) * np.minimum(squared, 1.0) ** power
+        return optics.field(optics.see(optics.lanes(light.astype(np.float32))))
 
-    return [Change(lambda n, images, k=k: disc(n, k), lit=False) for k in (0, 1)]  # type: ignore[misc]
+    return [Change(lambda n, images, k=k: disc(n, k), unocculted=False) for k in (0, 1)]  # type: ignore[misc]
 
 
 def _p(*names: str) -> tuple[EffectParameter, ...]:
@@ -224,7 +224,7 @@ PROBES: tuple[Effect, ...] = (
     _probe("uneven_shutter", "detector", _p("x", "y"), "an exposure that differs across the field",
            ("exposure", "detector_x", "detector_y"), _shutter, _one_exposure),
     _probe("readout_pattern", "detector", (EffectParameter("rms", "DN", 2.0, True),),
-           "a pattern that is the same in every readout", ("detector_x", "detector_y", "exposure"), _readout_pattern,
+           "a pattern that is the same in every readout", ("detector_x", "detector_y", "exposure"), _read_pattern,
            _no_pointing_of_exposures),
     _probe("lit_occulter", "scene", _p("level", "rim"), "an occulter that is not dark",
            ("radius_in_disc",), _lit_occulter),

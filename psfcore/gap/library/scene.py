@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.gap.effect import Change, Effect, EffectParameter
-from psfcore.gap.evidence.unocculted_blocks import blocks, not_compared
 from psfcore.gap.evidence.search import coarse_kernel
+from psfcore.gap.evidence.unocculted_blocks import blocks, not_compared
 from psfcore.gap.view import Field, View
 from psfcore.transit.occulter import coverage
 from psfcore.transit.transit import Place
@@ -56,7 +56,7 @@ def _beyond_field(view: View) -> Sequence[Change]:
     nothing = np.zeros(solution.transit.shape, np.float32)
 
     def one(fov: int, side: NDArray[np.bool_]) -> Change:
-        return Change(lambda n, _: change(n, side) if frames[n].fov == fov else nothing, lit=False)
+        return Change(lambda n, _: change(n, side) if frames[n].fov == fov else nothing, unocculted=False)
 
     # Each pointing has its own surroundings.
     return [one(fov, side) for fov in sorted({f.fov for f in frames})[:MOST_POINTINGS] for side in sides]
@@ -96,7 +96,7 @@ def _motion(view: View) -> Sequence[Change]:
         optics = solution.optics
         return optics.field(optics.see(optics.lanes((-lost).astype(np.float32))))
 
-    return [Change(lambda n, _, px=px: change(n, px), lit=False) for px in MOTIONS_PX]  # type: ignore[misc]
+    return [Change(lambda n, _, px=px: change(n, px), unocculted=False) for px in MOTIONS_PX]  # type: ignore[misc]
 
 
 def _evolution(view: View) -> Sequence[Change]:
@@ -157,7 +157,7 @@ def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
     at = 2 * (time_s - time_s[0]) / max(float(time_s[-1] - time_s[0]), 1e-9) - 1
     degree = min(MOST_TERMS, len(images) // 2)
     basis = np.polynomial.legendre.legvander(at, degree)
-    seen, weight, free = lit_on_coarse(view, images)
+    seen, weight, free = unocculted_on_coarse(view, images)
     level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
     normal = np.einsum("nk,nyx,nl->yxkl", basis, weight, basis) + RIDGE * np.eye(degree + 1)
     score = np.einsum("nk,nyx->yxk", basis, weight * (seen - level))
@@ -171,7 +171,7 @@ def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
     )
 
 
-def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
+def unocculted_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
     """Images of one pointing on coarse pixels, the hidden light put back and each as bright as their mean, DN/s
     (images, y, x); one where they can be compared; and how many of them show each of the blocks."""
     planes, weights, free = [], [], []

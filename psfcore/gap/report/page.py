@@ -40,7 +40,7 @@ from psfcore.gap.report.report import (
     words,
 )
 from psfcore.gap.verdict.judge import ALARM, TIE, TIE_SHARE
-from psfcore.gap.verdict.where import DRAWS
+from psfcore.gap.verdict.where import SIGN_FLIPS
 
 Report = dict[str, Any]
 
@@ -211,7 +211,7 @@ def _where(found: Diagnosis, report: Report) -> list[Part]:
             where_png(report),
             "How much of what all axes explain together goes with each: its share, averaged over all orders in which axes can be "
             "taken, for they go together in a transit. Beside it how likely chance alone would do as well, counted for the number of axes; "
-            f"{DRAWS} draws cannot tell less than {len(report['where']) / (DRAWS + 1):.2g} in the discs.",
+            f"{SIGN_FLIPS} draws cannot tell less than {len(report['where']) / (SIGN_FLIPS + 1):.2g} in the discs.",
             "Bars of the share of the gap that goes with each axis",
         )
     )
@@ -328,11 +328,11 @@ def _closure_cells(closure: dict[str, Any] | None) -> list[str]:
 
 
 def _slices(found: Diagnosis) -> list[Part]:
-    taken = found.evidence.taken[largest_residual(found)]
+    taken = found.evidence.image_info[largest_residual(found)]
     return [
         Figure(
             slices_png(found),
-            f"The mean of {2 * SLICE_ROWS + 1} rows through the middle of the occulter of {taken.file} (pointing {taken.fov}), whose disc departs most from the model for its "
+            f"The mean of {2 * SLICE_ROWS + 1} rows through the middle of the occulter of {taken.file} (pointing {taken.pointing}), whose disc departs most from the model for its "
             "noise: observed as points with their noise, simulated as a line. Grey: fully dark pixels, where all light is scattered; what is lit "
             "is reconstructed from this image, which the line follows there. Left: the fitted model; right: with the answer's effects.",
             "Observed and simulated light along x through an occulter, before and with the answer",

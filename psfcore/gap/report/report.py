@@ -73,7 +73,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "expected": {
             "residual_pct": found.expected.residual_pct,
             "disc_chi2_a_cell": found.expected.disc_scale,
-            "lit_chi2_a_block": found.expected.lit_scale,
+            "lit_chi2_a_block": found.expected.unocculted_scale,
         },
         "psf": {
             "shape": found.solution.inversion.shape.name,
@@ -152,11 +152,11 @@ def _images(found: Diagnosis) -> list[dict[str, Any]]:
     noise_after = {} if after is None else dict(zip(after.images, after.noise_pct, strict=True))
     out = []
     for disc in found.evidence.discs:
-        taken = found.evidence.taken[disc.index]
+        taken = found.evidence.image_info[disc.index]
         out.append(
             {
                 "file": taken.file,
-                "fov": taken.fov,
+                "fov": taken.pointing,
                 "x_px": taken.x_px,
                 "y_px": taken.y_px,
                 "time_s": taken.time_s,
@@ -207,7 +207,7 @@ def sentence(found: Diagnosis) -> str:
     strongest = found.where[0]
     pointings = " and ".join(str(p) for p in strongest.at.get("pointings", []))
     lead = f"A residual of {left} {AXIS_WORDS[strongest.name]}, most in pointings {pointings}"
-    if found.rms.value < found.noise_pct and _lit_alone(found):
+    if found.rms.value < found.noise_pct and _unocculted_alone(found):
         lead = (
             f"The lit parts of neighbouring images differ {AXIS_WORDS[strongest.name]}, which the discs hide "
             f"(a residual of {left} there)"
@@ -229,14 +229,18 @@ def sentence(found: Diagnosis) -> str:
     return f"{lead}; {_explained(found, best)}{_excluded(found, best)}."
 
 
-def _lit_alone(found: Diagnosis) -> bool:
+def _unocculted_alone(found: Diagnosis) -> bool:
     """Whether the lit blocks show a gap that the discs' cells do not."""
     model = found.model
     left = model.left(model.base)
     cells = sum(float(one @ one) for one in left)
     freedom = sum(one.size for one in left)
-    lit = model.evidence.steady_lit
-    return bool(chdtrc(freedom, cells) > ALARM > chdtrc(lit.freedom, max(model.left_lit(model.base), 0.0)))
+    unocculted = model.evidence.steady_unocculted
+    return bool(
+        chdtrc(freedom, cells)
+        > ALARM
+        > chdtrc(unocculted.freedom, max(model.left_unocculted(model.base), 0.0))
+    )
 
 
 def _explained(found: Diagnosis, best: Tried) -> str:

@@ -30,7 +30,7 @@ from psfcore.transit.blocks import Fold, folds
 
 Vector = NDArray[np.float64]
 
-DRAWS = 1000
+RESAMPLES = 1000
 FORM_ERROR = 0.1  # of an effect's amplitude: its square is a share of chi2
 INTERVAL = (5.0, 95.0)
 HIDDEN_SIGMA = 1.645  # 95 % of a normal distribution lies below
@@ -60,8 +60,8 @@ class HeldOut:
     images: tuple[int, ...]
     chi2: Vector
     expected: Vector
-    lit_chi2: Vector
-    lit_expected: Vector
+    unocculted_chi2: Vector
+    unocculted_expected: Vector
     residual_pct: Vector
     noise_pct: Vector
     deviance: Mapping[tuple[int, ...], float] = field(default_factory=dict)
@@ -74,8 +74,8 @@ class HeldOut:
             tuple(images),
             self.chi2[here],
             self.expected[here],
-            self.lit_chi2[here],
-            self.lit_expected[here],
+            self.unocculted_chi2[here],
+            self.unocculted_expected[here],
             self.residual_pct[here],
             self.noise_pct[here],
         )
@@ -83,12 +83,12 @@ class HeldOut:
 
 def time_blocks(model: LinearModel) -> tuple[Fold, ...]:
     """Sequential blocks of all images with a guard; none where there are fewer than six."""
-    return folds(len(model.evidence.taken))
+    return folds(len(model.evidence.image_info))
 
 
 def pointings(model: LinearModel) -> tuple[Fold, ...]:
     """One fold a pointing; none where there are fewer than two."""
-    fovs = [taken.fov for taken in model.evidence.taken]
+    fovs = [taken.pointing for taken in model.evidence.image_info]
     if len(set(fovs)) < 2:
         return ()
     every = range(len(fovs))
@@ -107,7 +107,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
     deviance: dict[tuple[int, ...], float] = {}
     base = len(evidence.base)
     free = base + len(set(columns) - model.of_fields)  # a field's numbers have a prior to go by
-    lit_noise = math.sqrt(model.lit_scale)
+    unocculted_noise = math.sqrt(model.unocculted_scale)
     for fold in scheme:
         fitted = [n for n in fold.fitted if n in by_index]
         held = [n for n in fold.held_out if n in by_index]
@@ -118,16 +118,20 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
         everything: list[tuple[Vector, Vector]] = []
         for n in held:
             disc, white = evidence.discs[by_index[n]], model.discs[by_index[n]]
-            left = white.residual - white.answers[here].T @ step.values
-            error = float(np.einsum("ki,kl,li->", white.answers[here], step.covariance, white.answers[here]))
-            of_blocks, answers = evidence.lit.held_out(columns, [n], fitted)
-            of_blocks = (of_blocks - step.values[base:] @ answers) / lit_noise
+            left = white.residual - white.jacobian[here].T @ step.values
+            error = float(
+                np.einsum("ki,kl,li->", white.jacobian[here], step.covariance, white.jacobian[here])
+            )
+            of_blocks, jacobian = evidence.unocculted.held_out(columns, [n], fitted)
+            of_blocks = (of_blocks - step.values[base:] @ jacobian) / unocculted_noise
             errors = step.covariance[base:, base:]
-            of_lit = max(of_blocks.size - 1, 0) + float(np.einsum("kb,kl,lb->", answers, errors, answers))
+            of_unocculted = max(of_blocks.size - 1, 0) + float(
+                np.einsum("kb,kl,lb->", jacobian, errors, jacobian)
+            )
             of_all = np.zeros((len(here), of_blocks.size))  # to the PSF the lit blocks do not answer
-            of_all[base:] = answers / lit_noise
-            everything += [(left, white.answers[here]), (of_blocks, of_all)]
-            answer = disc.answers[here] @ disc.share
+            of_all[base:] = jacobian / unocculted_noise
+            everything += [(left, white.jacobian[here]), (of_blocks, of_all)]
+            answer = disc.jacobian[here] @ disc.share
             mean = float(disc.share @ disc.residual - answer @ step.values)
             noise = math.sqrt(disc.mean_noise**2 + float(answer @ step.covariance @ answer))
             images.append(n)
@@ -136,23 +140,25 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
                     float(left @ left),
                     left.size + error,
                     float(of_blocks @ of_blocks),
-                    of_lit,
+                    of_unocculted,
                     -100 * mean / disc.level,
                     100 * noise / disc.level,
                 )
             )
-        residuals, answered = (np.concatenate(parts, axis=-1) for parts in zip(*everything, strict=True))
-        deviance[tuple(held)] = _deviance(residuals, answered, step.covariance)
+        residuals, jacobians = (np.concatenate(parts, axis=-1) for parts in zip(*everything, strict=True))
+        deviance[tuple(held)] = _deviance(residuals, jacobians, step.covariance)
     if not rows:
         return None
-    chi2, expected, lit_chi2, lit_expected, residual, noise_pct = np.array(rows).T
-    return HeldOut(tuple(images), chi2, expected, lit_chi2, lit_expected, residual, noise_pct, deviance)
+    chi2, expected, unocculted_chi2, unocculted_expected, residual, noise_pct = np.array(rows).T
+    return HeldOut(
+        tuple(images), chi2, expected, unocculted_chi2, unocculted_expected, residual, noise_pct, deviance
+    )
 
 
-def _deviance(left: Vector, answers: Vector, covariance: Vector) -> float:
+def _deviance(left: Vector, jacobian: Vector, covariance: Vector) -> float:
     """Eq. (4): left (n,) in units of the noise, answers (parameters, n), their covariance."""
     values, vectors = np.linalg.eigh(covariance)
-    along = (np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ answers
+    along = (np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ jacobian
     inner = np.eye(values.size) + along @ along.T
     projected = along @ left
     return float(left @ left - projected @ np.linalg.solve(inner, projected) + np.linalg.slogdet(inner)[1])
@@ -175,19 +181,19 @@ def closure(
         return None
     before, after = both
     chi2_before, chi2_after, nu, nu_after = before.chi2, after.chi2, before.expected, after.expected
-    shown = float((before.lit_chi2 - before.lit_expected).sum())
-    fallen = float((before.lit_chi2 - after.lit_chi2).sum())
+    shown = float((before.unocculted_chi2 - before.unocculted_expected).sum())
+    fallen = float((before.unocculted_chi2 - after.unocculted_chi2).sum())
     if shown > (chi2_before - nu).sum() and fallen > shown / 2:
-        chi2_before, chi2_after = chi2_before + before.lit_chi2, chi2_after + after.lit_chi2
-        nu, nu_after = nu + before.lit_expected, nu_after + after.lit_expected
+        chi2_before, chi2_after = chi2_before + before.unocculted_chi2, chi2_after + after.unocculted_chi2
+        nu, nu_after = nu + before.unocculted_expected, nu_after + after.unocculted_expected
     total = float((chi2_before - nu).sum())
     if total <= 0:
         return None
-    chosen = rng.integers(0, nu.size, (DRAWS, nu.size))
-    scale = np.exp(scale_error * rng.standard_normal(DRAWS))
+    chosen = rng.integers(0, nu.size, (RESAMPLES, nu.size))
+    scale = np.exp(scale_error * rng.standard_normal(RESAMPLES))
     totals = chi2_before[chosen].sum(axis=1) / scale - nu[chosen].sum(axis=1)
     use = totals > 0
-    if use.sum() < DRAWS // 2:
+    if use.sum() < RESAMPLES // 2:
         return None
     seen = chi2_after[chosen].sum(axis=1) / scale
     drawn, without_errors = (
@@ -210,7 +216,7 @@ def fall(before: HeldOut, after: HeldOut) -> float:
 def gap(held_out: HeldOut, rng: np.random.Generator) -> Interval:
     """Eq. (3) with its interval, whose upper end is not below what noise alone would hide."""
     squares = held_out.residual_pct**2 - held_out.noise_pct**2
-    chosen = rng.integers(0, squares.size, (DRAWS, squares.size))
+    chosen = rng.integers(0, squares.size, (RESAMPLES, squares.size))
     drawn = np.sqrt(np.maximum(squares[chosen].mean(axis=1), 0.0))
     low, high = np.percentile(drawn, INTERVAL)
     hidden = math.sqrt(HIDDEN_SIGMA * math.sqrt(2 * float(np.mean(held_out.noise_pct**4)) / squares.size))

@@ -56,7 +56,7 @@ class Corrected:
         return self.model.fit(columns).covariance[:base, :base]
 
 
-def corrected(transit: Transit, view: View, effects: Sequence[Effect], theta: Vector) -> Transit:
+def images_without(transit: Transit, view: View, effects: Sequence[Effect], theta: Vector) -> Transit:
     """The images of a transit less what the effects with these parameters did to them."""
     changes = [change for effect in effects for change in effect.changes(view)]
     frames = []
@@ -97,12 +97,12 @@ def add_to_model(
     for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
         try:
             if in_images.any():
-                images = corrected(transit, here, held, theta)
+                images = images_without(transit, here, held, theta)
                 shape, threads = solution.inversion.shape, solution.threads
                 near = start is not None
                 fit = invert(images, shape, start=start, near=near, threads=threads, progress=progress)
                 here = View(fit)
-            seen = _look(here, held, theta, in_images, model, progress)
+            seen = _fit_remaining(here, held, theta, in_images, model, progress)
         except DataError:
             if taken is None:
                 raise
@@ -138,7 +138,7 @@ def add_to_model(
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _Remaining:
     """What a fit shows of effects that were partly taken out of its images: the model about it, what is left of them
     there, their parameters with what was taken out, and where the PSF's coordinates go beside them: as `_stepped`."""
 
@@ -153,14 +153,14 @@ class _Seen:
         return np.array([sigma for _, sigma, _ in self.left.values.values()])
 
 
-def _look(
+def _fit_remaining(
     view: View,
     held: Sequence[Effect],
     out: Vector,
     in_images: NDArray[np.bool_],
     model: LinearModel,
     progress: Progress,
-) -> _Seen:
+) -> _Remaining:
     """out: the parameters, of which those in_images were taken out of the images."""
     evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
     again = replace(model, evidence=evidence)
@@ -177,7 +177,7 @@ def _look(
     found -= again.pull_of_prior(left.step, out_already)[base:]
     # What was taken out of the images shows what is left of it, the rest shows all of it.
     theta = np.where(in_images, out + found, found)
-    return _Seen(again, left, theta, _stepped(view.solution, left.step.values[:base]))
+    return _Remaining(again, left, theta, _stepped(view.solution, left.step.values[:base]))
 
 
 def _stepped(current: Solution, step: Vector) -> Vector | None:
@@ -247,9 +247,13 @@ def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
         was = were.get(disc.index)
         if was is not None:
             same = was.covariance.shape == disc.covariance.shape
-            disc = replace(disc, covariance=was.covariance if same else disc.covariance, untouched=was.level)
+            disc = replace(
+                disc, covariance=was.covariance if same else disc.covariance, level_before=was.level
+            )
         discs.append(disc)
-    return replace(after, discs=tuple(discs), lit=replace(after.lit, variance=before.lit.variance))
+    return replace(
+        after, discs=tuple(discs), unocculted=replace(after.unocculted, variance=before.unocculted.variance)
+    )
 
 
 def _acting(effect: Effect, found: Tried, effects: int) -> Effect:

@@ -63,7 +63,7 @@ MANY_PLACES = 100
 MOST_SECONDS = 2  # that may act beside an effect that explains most: of more none is named
 CLEAR = 12.0  # by which a pair must beat a single effect that is not enough, and a probe all effects
 TEMPLATE_ERROR = 0.05
-LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
+UNOCCULTED_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
 LENIENT = 5.0  # times likelier: what shows a gap, and names its cause, may be so under the other floors
 BY_CHANCE = 0.01  # a probe's greater gain is less likely than this to come of its further numbers alone
 MOST_AMISS = (
@@ -159,7 +159,7 @@ class Judgement:
 
 
 # The model about a real refit with an effect in it, its columns beside the PSF's; none where there is no such fit.
-Refit = Callable[[Tried], LinearModel | None]
+Refitter = Callable[[Tried], LinearModel | None]
 
 
 def no_refit(tried: Tried) -> LinearModel | None:
@@ -167,7 +167,7 @@ def no_refit(tried: Tried) -> LinearModel | None:
     return None
 
 
-def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit) -> Judgement:
+def judge(model: LinearModel, refit: Refitter = no_refit, beyond: Refitter = no_refit) -> Judgement:
     """The verdict under the model's floor, and twice with others.
 
     refit, beyond: the model about a real refit with one effect or some, and the same with the effect always fitted and
@@ -203,7 +203,7 @@ def _labels(tried: Sequence[Tried]) -> tuple[str, ...]:
 
 
 def _without_those_that_fail(
-    model: LinearModel, found: Judgement, refit: Refit
+    model: LinearModel, found: Judgement, refit: Refitter
 ) -> tuple[Judgement, list[Tried]]:
     """A tie without those of its single effects that fail in the model for real, and these; of MOST_AMISS it is asked."""
     alone = [t for t in found.tried if t is not found.best and len(t.names) == 1 and t.label in found.answer]
@@ -212,7 +212,7 @@ def _without_those_that_fail(
     return replace(found, verdict="tie" if len(answer) > 1 else "attributed", answer=answer), fallen
 
 
-def _confirmed(model: LinearModel, found: Judgement, once: Refit, further: Refit) -> Judgement:
+def _confirmed(model: LinearModel, found: Judgement, once: Refitter, further: Refitter) -> Judgement:
     """A verdict under the model's floor, as it stands on images held out and under other floors."""
     if found.answer and _worse_held_out(model, found, once):
         return replace(found, verdict="inconclusive")
@@ -234,7 +234,7 @@ def _confirmed(model: LinearModel, found: Judgement, once: Refit, further: Refit
     return replace(found, verdict="tie", answer=tuple(sorted(answers)), certain=tuple(sorted(certain)))
 
 
-def _fails_for_real(model: LinearModel, tried: Tried, refit: Refit) -> bool:
+def _fails_for_real(model: LinearModel, tried: Tried, refit: Refitter) -> bool:
     """Whether of what an effect explains in the linear model, wherever that is most, a real refit explains less than half,
     or cannot be made."""
     real = refit(tried)
@@ -255,13 +255,13 @@ def _acting(found: Judgement) -> int:
     return 0 if found.best is None else len(found.best.names)
 
 
-def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
+def _worse_held_out(model: LinearModel, found: Judgement, refit: Refitter) -> bool:
     """Whether the answer says less than nothing of images held out of its fit, so that it fits by its freedom alone."""
     scheme = time_blocks(model)
     before = hold_out(model, (), scheme)
     if found.best is None or before is None:
         return False
-    if model.evidence.whole_lit.freedom and not before.lit_expected.any():
+    if model.evidence.all_unocculted.freedom and not before.unocculted_expected.any():
         return False  # few images: no two neighbours in one fold, so that nothing is asked of what the lit blocks show
     linear = hold_out(model, found.best.step.columns[len(model.evidence.base) :], scheme)
     if linear is not None and fall(before, linear) > 0:
@@ -272,7 +272,7 @@ def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
     return bool(tried) and all(fall(before, one) <= 0 for one in tried)
 
 
-def _once(ask: Refit) -> Refit:
+def _once(ask: Refitter) -> Refitter:
     asked: dict[str, LinearModel | None] = {}
 
     def once(tried: Tried) -> LinearModel | None:
@@ -283,7 +283,7 @@ def _once(ask: Refit) -> Refit:
     return once
 
 
-def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0) -> Judgement:
+def _judge(model: LinearModel, refit: Refitter, beyond: Refitter, lenient: float = 1.0) -> Judgement:
     """lenient: how many times likelier than usual a gap and an effect may be to come by chance."""
     evidence = model.evidence
     every = [fitted(model, (effect,)) for effect in evidence.effects]
@@ -392,7 +392,7 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
     return sorted(named, key=place), failed
 
 
-def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
+def _beside(model: LinearModel, best: Tried, beyond: Refitter) -> Judgement | None:
     """The verdict where one effect explains most of a gap and not all: is another at work beside it? None where that
     cannot be said; the one alone where more than MOST_SECONDS could be the other. Its tried are the answer's alone.
 
@@ -405,23 +405,25 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
     effects = {effect.name: effect for effect in model.evidence.effects}
     still = tuple(effect for effect in rest.evidence.effects if effect.name in effects)
     rest = replace(rest, evidence=replace(rest.evidence, effects=still))
-    lit = rest.evidence.steady_lit
+    unocculted = rest.evidence.steady_unocculted
     rest = replace(rest, floor=model.floor)
     # Of so much as the first explained in the lit parts a little is left, its form being not quite the sky's: no form
     # that fits this remainder by chance may come out of it.
-    excess = rest.left_lit(rest.base) - (lit.freedom - rest.evidence.numbers_of(rest.base.columns))
-    rest = replace(rest, lit_scale=rest.lit_scale * max(excess / CLEAR, 1.0))
+    excess = rest.left_unocculted(rest.base) - (
+        unocculted.freedom - rest.evidence.numbers_of(rest.base.columns)
+    )
+    rest = replace(rest, unocculted_scale=rest.unocculted_scale * max(excess / CLEAR, 1.0))
     second = _judge(rest, no_refit, no_refit)
     if second.verdict == "none":
         return Judgement("attributed", best.names, second.p_value, (), (), best) if best.explains else None
-    lit_alone = _lit_alone(model, best)
+    unocculted_alone = _unocculted_alone(model, best)
     if second.best is None or second.verdict not in ("attributed", "tie"):
         # Occulters that are where they were found say that the discs' gap is not made by what changes in the lit parts.
-        found_well = all(model.evidence.taken[n].described for n in model.evidence.images)
-        if not (lit_alone and found_well):
+        found_well = all(model.evidence.image_info[n].described for n in model.evidence.images)
+        if not (unocculted_alone and found_well):
             return None
         return Judgement("inconclusive", (), second.p_value, (), (), best, discs_unexplained=True)
-    if len(second.best.names) > 1 and not lit_alone:
+    if len(second.best.names) > 1 and not unocculted_alone:
         return None
     if len(second.answer) > MOST_SECONDS and best.explains:
         return Judgement("attributed", best.names, second.p_value, (), (), best)
@@ -444,10 +446,10 @@ def _own(model: LinearModel, tried: Tried) -> list[int]:
     return [column for column in tried.step.columns if column not in model.evidence.base]
 
 
-def _lit_alone(model: LinearModel, tried: Tried) -> bool:
+def _unocculted_alone(model: LinearModel, tried: Tried) -> bool:
     """Whether an effect was measured in the lit parts and no disc answers to it."""
     own = _own(model, tried)
-    silent = all(not disc.answers[own].any() for disc in model.evidence.discs)
+    silent = all(not disc.jacobian[own].any() for disc in model.evidence.discs)
     return silent and model.evidence.numbers_of(own) > 0
 
 
@@ -475,7 +477,9 @@ def _is_enough(tried: Tried, rival_score: float) -> bool:
     return tried.left_p_value >= ENOUGH or nearly
 
 
-def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, enough: bool) -> Tried | None:
+def _best_pair(
+    model: LinearModel, best: Tried, before: _Left, refit: Refitter, *, enough: bool
+) -> Tried | None:
     """The pair of effects that explains most, if it is clearly better than one and leaves nothing."""
     couples = itertools.combinations((effect for effect in model.evidence.effects if effect.named), 2)
     if enough:
@@ -518,7 +522,7 @@ def left_chi2(model: LinearModel, step: Step, images: Collection[int] | None = N
     """What a step leaves in the discs, of some images (none: all), and in the lit parts."""
     discs = zip(model.evidence.images, model.left(step), strict=True)
     left = sum(float(one @ one) for n, one in discs if images is None or n in images)
-    return np.array([left, model.left_lit(step)])
+    return np.array([left, model.left_unocculted(step)])
 
 
 def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tried]]:
@@ -651,7 +655,7 @@ class _Left:
         return max(self.gains[most] - self.freedom[most], 0.0) / max(excess[most], 1e-9)
 
 
-def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refit) -> Tried:
+def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refitter) -> Tried:
     """With what is left: in the linear model, and where that is too much, after a real refit."""
     unsure = np.array(tried.step.values) * TEMPLATE_ERROR
     unsure[: len(model.base.columns)] = 0.0
@@ -679,15 +683,15 @@ def _left(model: LinearModel, step: Step, unsure: Vector) -> _Left:
     # An unsure template adds a covariance along its own answer: taken off along that direction, disc by disc.
     shrink = []
     for disc, left in zip(model.discs, model.left(step), strict=True):
-        answer = disc.answers[here].T @ unsure
+        answer = disc.jacobian[here].T @ unsure
         length = float(answer @ answer)
         shrink.append(left - answer * float(answer @ left) / (1 + length))
     freedom = max(sum(left.size for left in shrink) - len(here), 1)
     cells = sum(float(left @ left) for left in shrink)
     gain, directions = model.gain_of_patterns(step, model.patterns, shrink)
     of_means, images = model.gain_of_patterns(step, model.means, shrink)
-    lit = model.evidence.steady_lit
-    moved = float(unsure @ lit.normal[np.ix_(here, here)] @ unsure) / model.lit_scale
-    of_lit = max(model.left_lit(step) - moved, 0.0) / (1 + LIT_WIDTH)
-    of_lit_freedom = max(lit.freedom - model.evidence.numbers_of(here), 1)
-    return _Left((gain, of_means, cells, of_lit), (directions, images, freedom, of_lit_freedom))
+    unocculted = model.evidence.steady_unocculted
+    moved = float(unsure @ unocculted.normal[np.ix_(here, here)] @ unsure) / model.unocculted_scale
+    of_unocculted = max(model.left_unocculted(step) - moved, 0.0) / (1 + UNOCCULTED_WIDTH)
+    of_unocculted_freedom = max(unocculted.freedom - model.evidence.numbers_of(here), 1)
+    return _Left((gain, of_means, cells, of_unocculted), (directions, images, freedom, of_unocculted_freedom))

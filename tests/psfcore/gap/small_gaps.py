@@ -17,7 +17,7 @@ from psfcore.transit.transit import Transit
 from tests.transit_files import TRUTH, diffraction
 
 OFFSET_DN = 6.0
-QUICK = patch.object(where, "DRAWS", 99)  # quicker than 999
+QUICK = patch.object(where, "SIGN_FLIPS", 99)  # quicker than 999
 # Of each stage one, one that these data cannot show, and a probe: a diagnosis with them takes seconds.
 FEW = tuple(
     effect

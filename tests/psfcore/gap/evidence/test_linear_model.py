@@ -114,7 +114,9 @@ def test_a_global_gain_cannot_be_seen_in_a_disc(solution: Solution) -> None:
 
 
 def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> None:
-    bare = replace(evidence, lit=replace(evidence.lit, part=np.zeros(len(evidence.taken), dtype=bool)))
+    bare = replace(
+        evidence, unocculted=replace(evidence.unocculted, part=np.zeros(len(evidence.image_info), dtype=bool))
+    )
     model = LinearModel(bare, 0.003)
     columns = evidence.columns["dark_offset"]
 
@@ -123,7 +125,7 @@ def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> 
         for disc in evidence.discs:
             covariance = disc.covariance + 0.003**2 * np.outer(disc.expected, disc.expected)
             white = np.linalg.inv(np.linalg.cholesky(covariance))
-            design.append(white @ disc.answers[here].T)
+            design.append(white @ disc.jacobian[here].T)
             target.append(white @ disc.residual)
         # The prior of the effect's parameter is a measurement of 0.
         likely = next(e for e in evidence.effects if e.name == "dark_offset").parameters[0].likely
@@ -140,15 +142,17 @@ def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> 
 
 def test_a_field_s_gain_less_its_cost_is_how_much_likelier_it_makes_the_discs(solution: Solution) -> None:
     evidence = gather(solution, [effect for effect in EFFECTS if effect.name == "flat_field_residual"])
-    bare = replace(evidence, lit=replace(evidence.lit, part=np.zeros(len(evidence.taken), dtype=bool)))
+    bare = replace(
+        evidence, unocculted=replace(evidence.unocculted, part=np.zeros(len(evidence.image_info), dtype=bool))
+    )
     model = LinearModel(bare, FLOOR)
     (effect,) = bare.effects
     residual = np.concatenate([disc.residual for disc in model.discs])
-    answers = np.concatenate([disc.answers for disc in model.discs], axis=1)
+    jacobian = np.concatenate([disc.jacobian for disc in model.discs], axis=1)
     base, columns = list(bare.base), list(bare.columns[effect.name])
     # What the PSF's own coordinates absorb is not looked at, and the rest has unit noise.
-    free = scipy.linalg.null_space(answers[base])
-    seen = (answers[columns] @ free).T * [parameter.likely for parameter in effect.parameters]
+    free = scipy.linalg.null_space(jacobian[base])
+    seen = (jacobian[columns] @ free).T * [parameter.likely for parameter in effect.parameters]
     ours, nothing = (
         multivariate_normal(np.zeros(free.shape[1]), np.eye(free.shape[1]) + more).logpdf(residual @ free)
         for more in (seen @ seen.T, 0.0)
@@ -179,14 +183,14 @@ def with_residuals(evidence: Evidence, values: dict[str, float], noise: float = 
     discs = tuple(
         replace(
             disc,
-            residual=disc.answers.T @ theta
+            residual=disc.jacobian.T @ theta
             + noise
             * rng.multivariate_normal(np.zeros(disc.expected.size), disc.covariance, check_valid="ignore"),
         )
         for disc in evidence.discs
     )
-    lit = replace(evidence.lit, part=np.zeros(len(evidence.taken), dtype=bool))
-    return LinearModel(replace(evidence, discs=discs, lit=lit), FLOOR)
+    unocculted = replace(evidence.unocculted, part=np.zeros(len(evidence.image_info), dtype=bool))
+    return LinearModel(replace(evidence, discs=discs, unocculted=unocculted), FLOOR)
 
 
 def test_what_was_taken_out_of_the_images_counts_against_the_prior_of_what_is_left(
@@ -291,14 +295,17 @@ def about_fit_with(name: str, model: LinearModel, *, left: float) -> LinearModel
         replace(
             disc,
             residual=disc.residual * left,
-            answers=disc.answers[here] * (np.arange(len(here)) < first)[:, None],
+            jacobian=disc.jacobian[here] * (np.arange(len(here)) < first)[:, None],
         )
         for disc in evidence.discs
     )
-    lit = replace(evidence.lit, errors=evidence.lit.errors[here])
+    unocculted = replace(evidence.unocculted, errors=evidence.unocculted.errors[here])
     effects = tuple(effect for effect in evidence.effects if effect.name == name)
     columns = {name: tuple(range(first, len(here)))}
-    return replace(model, evidence=replace(evidence, discs=discs, lit=lit, effects=effects, columns=columns))
+    return replace(
+        model,
+        evidence=replace(evidence, discs=discs, unocculted=unocculted, effects=effects, columns=columns),
+    )
 
 
 @pytest.mark.parametrize("lost", [0, 1])
@@ -369,28 +376,30 @@ def test_beside_an_effect_nothing_is_named_that_was_set_aside(evidence: Evidence
 
 
 @pytest.fixture(scope="module")
-def with_lit(solution: Solution) -> Evidence:
+def with_unocculted(solution: Solution) -> Evidence:
     """Of three effects the first taken for one that was measured in the lit parts, which no disc answers to."""
     gradient = [effect for effect in EFFECTS if effect.name == "intensity_gradient"]
     found = gather(solution, (*gradient, *FEW))
     own = list(found.columns["intensity_gradient"])
     discs = []
     for disc in found.discs:
-        answers = disc.answers.copy()
-        answers[own] = 0.0
-        discs.append(replace(disc, answers=answers))
-    found.lit.errors[own] = np.arange(found.lit.levels.shape[0])[:, None]
+        jacobian = disc.jacobian.copy()
+        jacobian[own] = 0.0
+        discs.append(replace(disc, jacobian=jacobian))
+    found.unocculted.errors[own] = np.arange(found.unocculted.levels.shape[0])[:, None]
     return replace(found, discs=tuple(discs), numbers=dict.fromkeys(own, 5))
 
 
 @pytest.mark.parametrize("found_well", [True, False])
 def test_a_gap_of_the_discs_is_not_laid_on_what_they_do_not_answer_to(
-    with_lit: Evidence, monkeypatch: pytest.MonkeyPatch, found_well: bool
+    with_unocculted: Evidence, monkeypatch: pytest.MonkeyPatch, found_well: bool
 ) -> None:
     """Beside what shows in the lit parts the discs show a gap of unknown cause."""
-    taken = tuple(replace(one, described=found_well or n > 0) for n, one in enumerate(with_lit.taken))
-    model = LinearModel(replace(with_lit, taken=taken), FLOOR)
-    first, other = (fitted(model, [effect], any_sign=True) for effect in with_lit.effects[:2])
+    taken = tuple(
+        replace(one, described=found_well or n > 0) for n, one in enumerate(with_unocculted.image_info)
+    )
+    model = LinearModel(replace(with_unocculted, image_info=taken), FLOOR)
+    first, other = (fitted(model, [effect], any_sign=True) for effect in with_unocculted.effects[:2])
     unknown = Judgement("unknown", (), 1e-9, (), (), other)
     monkeypatch.setattr(judging, "_judge", lambda *some: unknown)
     found = judging._beside(model, first, lambda tried: model)
@@ -403,12 +412,12 @@ def test_a_gap_of_the_discs_is_not_laid_on_what_they_do_not_answer_to(
 
 
 def test_beside_what_the_discs_do_not_answer_to_two_may_act_in_them(
-    with_lit: Evidence, monkeypatch: pytest.MonkeyPatch
+    with_unocculted: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = with_residuals(with_lit, {"dark_offset": 10.0, "column_smear": 0.3})
+    model = with_residuals(with_unocculted, {"dark_offset": 10.0, "column_smear": 0.3})
     # All parameters of the first are kept, as a Sun's are that changes much.
     monkeypatch.setattr(judging, "_not_worth_its_numbers", lambda *some: None)
-    first, two = fitted(model, with_lit.effects[:1]), fitted(model, with_lit.effects[1:])
+    first, two = fitted(model, with_unocculted.effects[:1]), fitted(model, with_unocculted.effects[1:])
     for verdict, certain in (("attributed", ()), ("tie", ("dark_offset",))):
         second = Judgement(verdict, two.names, 1e-9, (two,), (), two, certain)  # type: ignore[arg-type]
         monkeypatch.setattr(judging, "_judge", lambda *some, second=second: second)
@@ -417,14 +426,16 @@ def test_beside_what_the_discs_do_not_answer_to_two_may_act_in_them(
         assert found.verdict == verdict and found.best.names == (*first.names, *two.names)
         assert set(found.answer) == {*first.names, *two.names}
         assert found.certain == ((*first.names, "dark_offset") if certain else ())
-    alone = fitted(model, with_lit.effects[1:2])
+    alone = fitted(model, with_unocculted.effects[1:2])
     assert judging._beside(model, alone, lambda tried: model) is None  # discs answer to it
 
 
-def test_what_is_fitted_beside_an_effect_does_not_make_it_one_of_the_lit_parts(with_lit: Evidence) -> None:
+def test_what_is_fitted_beside_an_effect_does_not_make_it_one_of_the_lit_parts(
+    with_unocculted: Evidence,
+) -> None:
     """An offset that leaves much unexplained, beside what was measured in the lit parts and is always fitted."""
-    base = (*with_lit.base, *with_lit.columns["intensity_gradient"])
-    rest = replace(with_lit, base=base, effects=with_lit.effects[1:])
+    base = (*with_unocculted.base, *with_unocculted.columns["intensity_gradient"])
+    rest = replace(with_unocculted, base=base, effects=with_unocculted.effects[1:])
     found = judging._judge(with_residuals(rest, {"dark_offset": 30.0}, noise=3.0), no_refit, no_refit)
     assert found.best is not None and found.best.names == ("dark_offset",)
     assert found.verdict == "unknown"
@@ -434,7 +445,7 @@ def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: E
     model = LinearModel(evidence, 0.003)
     columns = [*evidence.base, *evidence.columns["dark_offset"]]
     step = model.fit(evidence.columns["dark_offset"])
-    design = np.concatenate([disc.answers[columns] for disc in model.discs], axis=1)
+    design = np.concatenate([disc.jacobian[columns] for disc in model.discs], axis=1)
     own = np.zeros((len(model.discs), design.shape[1]))
     start = 0
     for k, (disc, white) in enumerate(zip(evidence.discs, model.discs, strict=True)):
@@ -453,11 +464,11 @@ def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: E
 def test_lit_blocks_give_back_what_was_added_and_do_not_mind_brightness(solution: Solution) -> None:
     evidence = gather(solution, FEW)
     (column,) = evidence.columns["dark_offset"]
-    lit = evidence.lit
-    before = lit.equations([column])
+    unocculted = evidence.unocculted
+    before = unocculted.equations([column])
     rng = np.random.default_rng(2)
-    waver = 1 + 0.004 * rng.standard_normal(len(evidence.taken))
-    added = replace(lit, levels=lit.levels * waver[:, None] + 1.5 * lit.errors[column])
+    waver = 1 + 0.004 * rng.standard_normal(len(evidence.image_info))
+    added = replace(unocculted, levels=unocculted.levels * waver[:, None] + 1.5 * unocculted.errors[column])
     after = added.equations([column])
     found, was = (float(e.score[0] / e.normal[0, 0]) for e in (after, before))
     assert found - was == pytest.approx(1.5, abs=0.15)
@@ -511,8 +522,10 @@ def test_closure_and_gap_by_hand() -> None:
 def test_the_interval_of_closure_holds_what_the_cause_would_close() -> None:
     ones = np.ones(6)
 
-    def held_out(chi2: float, expected: float, lit: float = 0.0) -> HeldOut:
-        return HeldOut(tuple(range(6)), chi2 * ones, expected * ones, lit * ones, 0 * ones, 0 * ones, ones)
+    def held_out(chi2: float, expected: float, unocculted: float = 0.0) -> HeldOut:
+        return HeldOut(
+            tuple(range(6)), chi2 * ones, expected * ones, unocculted * ones, 0 * ones, 0 * ones, ones
+        )
 
     before, after = held_out(110.0, 10.0), held_out(30.0, 10.0)
     # All images alike: nothing is drawn but the form's error.
@@ -526,21 +539,27 @@ def test_the_interval_of_closure_holds_what_the_cause_would_close() -> None:
     wide = closure(before, after, np.random.default_rng(1), 0.2)
     assert wide is not None and wide.low < same.low - 0.02 and same.high + 0.02 < wide.high <= 1.01
     # The lit blocks are asked where they show more, and the effect is what they show.
-    for lit_before, lit_after, closed in ((900.0, 0.0, 0.9), (90.0, 0.0, 0.0), (900.0, 800.0, 0.0)):
+    for unocculted_before, unocculted_after, closed in (
+        (900.0, 0.0, 0.9),
+        (90.0, 0.0, 0.0),
+        (900.0, 800.0, 0.0),
+    ):
         found = closure(
-            held_out(110.0, 10.0, lit_before), held_out(110.0, 10.0, lit_after), np.random.default_rng(1)
+            held_out(110.0, 10.0, unocculted_before),
+            held_out(110.0, 10.0, unocculted_after),
+            np.random.default_rng(1),
         )
         assert found is not None and found.value == pytest.approx(closed)
 
 
 def test_deviance_is_how_likely_a_fold_is_as_the_fit_predicts_it() -> None:
     rng = np.random.default_rng(2)
-    left, answers, root = rng.normal(size=7), rng.normal(size=(3, 7)), rng.normal(size=(3, 3))
+    left, jacobian, root = rng.normal(size=7), rng.normal(size=(3, 7)), rng.normal(size=(3, 3))
     covariance = root @ root.T
-    spread = np.eye(7) + answers.T @ covariance @ answers
+    spread = np.eye(7) + jacobian.T @ covariance @ jacobian
     expected = -2 * multivariate_normal(cov=spread).logpdf(left) - 7 * np.log(2 * np.pi)
-    assert _deviance(left, answers, covariance) == pytest.approx(expected)
-    assert _deviance(left, answers[:0], covariance[:0, :0]) == pytest.approx(left @ left)
+    assert _deviance(left, jacobian, covariance) == pytest.approx(expected)
+    assert _deviance(left, jacobian[:0], covariance[:0, :0]) == pytest.approx(left @ left)
 
 
 def test_a_fall_is_of_the_folds_that_both_have() -> None:

@@ -13,7 +13,7 @@ from psfcore.convolution.convolver import correlations
 from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
 from psfcore.gap.evidence.near_discs import NearDiscs, cut
 from psfcore.gap.evidence.search import displaced, place_search
-from psfcore.gap.library.optics import _blurred, _sought_blur
+from psfcore.gap.library.optics import _best_blur, _blurred
 from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.inversion import invert
@@ -57,10 +57,10 @@ def by_whole_field(image: np.ndarray, n: int) -> np.ndarray:
     return np.asarray(moved - level * float(level @ moved) / float(level @ level))
 
 
-def first_cells(answers: np.ndarray, disc: int) -> np.ndarray:
+def first_cells(responses: np.ndarray, disc: int) -> np.ndarray:
     """The cells of one disc among those of all."""
     sizes = [near()._planes[n].shape[0] for n in view().solution.part]
-    return answers[sum(sizes[:disc]) : sum(sizes[: disc + 1])]
+    return responses[sum(sizes[:disc]) : sum(sizes[: disc + 1])]
 
 
 def test_sums_over_displacements_are_those_of_the_definition() -> None:
@@ -108,7 +108,7 @@ def test_a_core_drawn_out_along_a_line_is_found_along_that_line() -> None:
         )
         for f in clean().frames
     )
-    width, steps = _sought_blur(View(invert(replace(clean(), frames=blurred))))
+    width, steps = _best_blur(View(invert(replace(clean(), frames=blurred))))
     assert steps == LINE and width <= 1.5
 
 

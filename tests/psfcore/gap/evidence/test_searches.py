@@ -24,16 +24,16 @@ from psfcore.gap.library.optics import (
     DIRECTIONS,
     HALOS,
     Halo,
+    _best_amount,
+    _best_halo,
     _blurred,
     _copy,
-    _sought,
-    _sought_halo,
     _turned,
 )
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict import correction
 from psfcore.gap.verdict import judge as judging
-from psfcore.gap.verdict.correction import _with_noise_of, add_to_model, beyond, corrected
+from psfcore.gap.verdict.correction import _with_noise_of, add_to_model, beyond, images_without
 from psfcore.gap.verdict.judge import fitted
 from psfcore.gap.view import View, _ratio
 from psfcore.psf import crop_or_pad
@@ -108,7 +108,7 @@ def test_a_turned_mesh_is_found_at_its_angle() -> None:
     turned = np.maximum(rotate(cross(), 12.0, reshape=False, order=1), 0.0)
     transit = simulate(plan, TRUTH, turned / turned.sum(), seed=4).transit
     view = View(invert(replace(transit, diffraction=cross())))
-    assert _sought(view, _turned, ANGLES_DEG) == pytest.approx(12.0, abs=2.0)
+    assert _best_amount(view, _turned, ANGLES_DEG) == pytest.approx(12.0, abs=2.0)
 
 
 def test_a_wide_change_of_the_psf_moves_the_discs_as_its_sum_over_coarse_displacements_says() -> None:
@@ -143,7 +143,7 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
     wide = np.exp(-np.hypot(x, y) / 30.0)
     transit = simulate(plan, TRUTH, 0.8 * kernel + 0.2 * wide / wide.sum(), seed=4).transit
     found = invert(replace(transit, diffraction=kernel))
-    halo = _sought_halo(View(found))
+    halo = _best_halo(View(found))
     assert halo in HALOS[2:6]
     library = [effect("wide_halo"), effect("dark_offset")]
     model = LinearModel(gather(found, library), FLOOR)
@@ -170,11 +170,11 @@ def brightening(share: float) -> Transit:
 def test_a_sun_that_changes_shows_in_the_lit_parts_alone(share: float, seen: bool) -> None:
     evidence = gather(invert(brightening(share)), [effect("scene_evolution")])
     columns = evidence.columns["scene_evolution"]
-    assert all((disc.answers[list(columns)] == 0).all() for disc in evidence.discs)
+    assert all((disc.jacobian[list(columns)] == 0).all() for disc in evidence.discs)
     model = LinearModel(evidence, FLOOR)
     tried = fitted(model, evidence.effects)
     # It pays for every number that was taken from the lit parts, and for no more than these have.
-    assert 10 < evidence.numbers_of(columns) < evidence.whole_lit.freedom
+    assert 10 < evidence.numbers_of(columns) < evidence.all_unocculted.freedom
     assert (tried.p_value < 1e-6, tried.score > 0) == (seen, seen)
     # It changed evenly: the uneven part is not worth its numbers.
     assert set(tried.values) == ({"rms"} if seen else set())
@@ -215,7 +215,7 @@ def test_a_round_that_leaves_more_than_the_one_before_is_not_taken(monkeypatch: 
     found = invert(replace(clean(), frames=frames))
     model = LinearModel(gather(found, [offset]), FLOOR)
     taken_out: list[float] = []
-    as_it_is = correction.corrected
+    as_it_is = correction.images_without
 
     def spoiled(
         transit: Transit, view: View, effects: Sequence[Effect], theta: NDArray[np.float64]
@@ -227,7 +227,7 @@ def test_a_round_that_leaves_more_than_the_one_before_is_not_taken(monkeypatch: 
         light = np.linspace(0.0, 40.0, again.shape[1], dtype=np.float32)
         return replace(again, frames=tuple(replace(f, pixels=f.pixels + light) for f in again.frames))
 
-    monkeypatch.setattr(correction, "corrected", spoiled)
+    monkeypatch.setattr(correction, "images_without", spoiled)
     monkeypatch.setattr(correction, "SETTLED", 0.0)
     added = add_to_model(found, [offset], fitted(model, [offset]), model)
     value, sigma, _ = added.values["offset"]
@@ -279,6 +279,6 @@ def test_what_is_taken_out_of_an_image_is_as_bright_as_the_image() -> None:
     found = invert(replace(clean(), frames=frames))
     view, copy = View(found), replace(effect("ghost"), changes=lambda view: _copy(12.0, 40, -30), held=None)
     before = gather(found, [copy], view=view)
-    without = invert(corrected(found.transit, view, [copy], np.array([0.4])))
+    without = invert(images_without(found.transit, view, [copy], np.array([0.4])))
     after = _with_noise_of(before, gather(without, [copy]))
-    assert after.whole_lit.chi2 < before.whole_lit.chi2 * 1.02
+    assert after.all_unocculted.chi2 < before.all_unocculted.chi2 * 1.02

@@ -47,7 +47,7 @@ def test_its_change_is_seen_by_the_discs(tmp_path: Path) -> None:
     evidence = gather(found().solution, [one_of(written(tmp_path))])
     (column,) = evidence.columns["edge_glow"]
     by_place = sorted(
-        (evidence.taken[d.index].x_px, float(d.share @ d.answers[column])) for d in evidence.discs
+        (evidence.image_info[d.index].x_px, float(d.share @ d.jacobian[column])) for d in evidence.discs
     )
     assert by_place[-1][1] > 3 * abs(by_place[0][1])  # most at the right
 
@@ -149,7 +149,7 @@ def test_a_change_that_is_no_image_is_told_when_it_is_asked_for(
 
 
 def test_there_is_a_change_for_every_parameter(tmp_path: Path) -> None:
-    text = GLOW.replace("lit=False)]", "lit=False)] * 2")
+    text = GLOW.replace("unocculted=False)]", "unocculted=False)] * 2")
     with pytest.raises(DataError, match="edge_glow: expected 1 of Change, one a parameter; got 2 of Change"):
         one_of(written(tmp_path, text)).changes(View(found().solution))
 
