@@ -1,9 +1,10 @@
-"""An effect that the model leaves out: declared once, used to explain a gap and to correct for it.
+"""An effect that the model does not contain: declared once, then used to explain a gap and to correct for it.
 
-An effect is a change of the images, to first order and by a few numbers: e(n) for one unit of a parameter, in image n,
-DN/s. What changes the optics changes the images by dH x, H the PSF and x the scene as it is lit. The discs show a
-change through the whole estimate (`cells`), for the scene is reconstructed from the image that it is in. In the lit
-part only what differs between images of one pointing is seen, as it stands.
+An effect changes the images, to first order, in proportion to a few parameters: e(n), in DN/s, is the change of image n
+for one unit of a parameter. An effect of the optics changes the images by dH x, where H is the PSF and x the scene with
+its occulter. The discs respond to a change through the whole estimate (`evidence.cells`), because the scene is
+reconstructed from the same image. The unocculted field shows only differences between images of one pointing, and it
+shows them directly.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ Stage = Literal["scene", "optics", "detector"]
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """A number of an effect: its name, its unit, and how large it may well be; ten times that is hardly believed.
+    """A parameter of an effect.
 
-    positive: whether it can be nothing else, as a share of light.
+    likely: its largest plausible size, in its unit; ten times this value is hardly credible. positive: whether it cannot be
+    negative, like a share of light.
     """
 
     name: str
@@ -32,12 +34,12 @@ class EffectParameter:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What one unit of one parameter does: change(n, images) to image n [y, x] in DN/s.
+    """What one unit of one parameter does: change(n, images) is the change of image n, [y, x] in DN/s.
 
-    images: all images as they should be, each as bright as it is, or, for the lit part, their pointings' means. lit:
-    whether it differs between images of one pointing where these are compared, so that the lit part shows it. disc:
-    whether the discs do. numbers: how many numbers of its own were taken from the lit parts to make it, which its gain
-    pays for.
+    images: for the discs, all images as the model expects them, each with its own brightness; for the unocculted field, the
+    mean image of each pointing. unocculted: whether the change differs between images of one pointing, so that the
+    unocculted field shows it. disc: whether the discs show it. numbers: how many numbers were measured in the unocculted
+    field to build this change; the effect's score is reduced for them.
     """
 
     change: Callable[[int, Sequence[Field]], Field]
@@ -48,14 +50,15 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """One effect: its physical cause, what would settle it, and the axes along which it shows.
+    """One effect: its physical cause, the observation that would confirm it, and the axes along which it shows.
 
-    changes(view): one a parameter; where there are fewer or more, as of what is fitted by pointing, the first ones'.
-    why_not(view): why these data cannot show it, or None. trials: how many places were looked at for the best, about,
-    which its gain pays for. named: whether it may be an answer; if not, it is a probe: a form that gaps of unknown cause
-    have, which says that the cause is not in the library. held(view): of an effect that searches for a place, the same
-    with that place held. field: whether its parameters are those of a random field, each about as large as is likely:
-    its gain pays for what was learned of them, not for how many they are.
+    changes(view): one change for each parameter. An effect that is fitted per pointing may return fewer or more changes;
+    then they belong to the first parameters. why_not(view): why these data cannot show the effect, or None. trials: about
+    how many places were searched; the score is reduced for them. named: whether the effect may be an answer. If not, it is
+    a probe: a pattern typical of gaps of unknown cause, which suggests that the cause is not in the library. held(view): for
+    an effect that searches for a place, the same effect with that place fixed. field: whether its parameters describe a
+    random field in which each parameter is about as large as `likely`; the score is then reduced for the information gained
+    about the parameters, not for their number.
     """
 
     name: str

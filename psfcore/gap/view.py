@@ -25,9 +25,9 @@ LEAST_KEPT = 4
 
 
 class _LazyFields(Sequence[Field]):
-    """Fields of all images, worked out where asked for; those of thirty images of 512 px are kept, of larger ones the last.
+    """Fields of all images, each computed when it is first used. Read-only.
 
-    Nobody writes to them.
+    At most KEPT_BYTES are kept (thirty images of 512 px), but always the last LEAST_KEPT.
     """
 
     def __init__(self, count: int, field: Callable[[int], Field]) -> None:
@@ -48,31 +48,31 @@ class _LazyFields(Sequence[Field]):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What effects are worked out from: the solution, and the images as the model expects them.
+    """The data from which effects are computed: the solution, and the images that the model expects.
 
-    Expected images, not observed ones: a template made of a pixel's own noise would fit that noise.
+    The images are the expected ones, not the observed ones: a template made of a pixel's own noise would fit that noise.
     """
 
     solution: Solution
 
     @cached_property
     def kept(self) -> dict[type, Any]:
-        """What is worked out about it once, by its kind: searches."""
+        """Results that are computed once per view, such as searches, by their type."""
         return {}
 
     @cached_property
     def kernel(self) -> Vector:
-        """The solution's total PSF [y, x]."""
+        """The total PSF of the solution [y, x]."""
         return self.solution.total.kernel(self.solution.inversion.coordinates)
 
     @cached_property
     def slope_kernels(self) -> tuple[Vector, ...]:
-        """How it changes with each coordinate of its shape [y, x]."""
+        """The derivative of the kernel along each coordinate of the PSF's shape [y, x]."""
         return tuple(self.solution.total.slopes(self.solution.inversion.coordinates))
 
     @cached_property
     def slopes(self) -> tuple[Blur, ...]:
-        """The same, to be applied to fields."""
+        """The derivatives of the kernel, ready to be convolved with fields."""
         solution = self.solution
         return tuple(
             Blur(slope, solution.transit.shape, threads=solution.threads) for slope in self.slope_kernels
@@ -80,14 +80,14 @@ class View:
 
     @cached_property
     def expected(self) -> Sequence[Field]:
-        """Every image as the model sees it [y, x], DN/s."""
+        """Every image as the model predicts it [y, x], DN/s."""
         optics = self.solution.optics
         return _LazyFields(
             len(self.solution.transit.frames), lambda n: optics.field(optics.see(self.occulted_scene(n)))
         )
 
     def behind(self, n: int) -> Field | None:
-        """The scene that the occulter of image n hides, as neighbours in time show it; none where none does."""
+        """The scene that the occulter of image n hides [y, x], DN/s, from neighbouring images in time; None if no neighbour shows it."""
         solution = self.solution
         places = [found.place for found in solution.sky.found]
         chosen = neighbours_of(n, solution.transit.frames, places, solution.transit.noise)
@@ -99,7 +99,7 @@ class View:
 
     @cached_property
     def unocculted(self) -> Sequence[Field]:
-        """Every image as observed, with the light put back that its occulter hides [y, x], DN/s."""
+        """Every image as observed, with the light restored that its occulter hides [y, x], DN/s."""
         return _LazyFields(len(self.solution.transit.frames), self._put_back)
 
     def _put_back(self, n: int) -> Field:
@@ -113,9 +113,9 @@ class View:
 
     @cached_property
     def pointing_means(self) -> list[Field]:
-        """For every image the mean unocculted image of its pointing [y, x], DN/s: what all of them show but for gain.
+        """For every image the mean unocculted image of its pointing [y, x], DN/s: what all these images show, up to their brightness.
 
-        The same array for all of a pointing, so that a template made of it differs between them by what is meant.
+        All images of a pointing get the same array. A template made from it differs between images only where the effect does.
         """
         fov = [frame.fov for frame in self.solution.transit.frames]
         mean: dict[int, Field] = {}
@@ -129,7 +129,7 @@ class View:
 
     @cached_property
     def _scene_sums(self) -> dict[int, tuple[Vector, Vector]]:
-        """Of every pointing the sum of its scenes, each without the pixels round its own disc, and how many count."""
+        """For each pointing: the sum of its scenes without the pixels around each disc, and the number of scenes in each pixel."""
         solution = self.solution
         sums: dict[int, tuple[Vector, Vector]] = {}
         for n, frame in enumerate(solution.transit.frames):
@@ -139,24 +139,23 @@ class View:
         return sums
 
     def _own(self, n: int) -> tuple[Field, NDArray[np.bool_]]:
-        """The scene of frame n, and which pixels are away from its disc."""
+        """The scene of frame n, and a mask of the pixels away from its disc."""
         solution = self.solution
         place = solution.sky.found[n].place
         away = disc_distance(solution.transit.shape, place) > place.radius_px + DISC_MARGIN_PX
         return solution.optics.field(solution.sky.scenes[n]), away
 
     def pointing_scene(self, n: int) -> Field:
-        """The scene of frame n's pointing as all its images show it, each without its own disc [y, x], DN/s."""
+        """The mean scene of frame n's pointing, from all its images without their discs [y, x], DN/s."""
         total, count = self._scene_sums[self.solution.transit.frames[n].fov]
         own, _ = self._own(n)
         return np.asarray(np.where(count > 0, total / np.maximum(count, 1), own), dtype=np.float32)
 
     @cached_property
     def scenes(self) -> Sequence[Field]:
-        """The scene of every image as the others of its pointing show it, as bright as its own, nothing hidden [y, x],
-        DN/s.
+        """The scene of every image, from the other images of its pointing, scaled to its own brightness, with nothing hidden [y, x], DN/s.
 
-        A template made of the image's own scene would hold the noise that its residual holds, and fit it.
+        A template made from the image's own scene would contain the noise of its residual, and would fit that noise.
         """
         return _LazyFields(len(self.solution.transit.frames), self._scene)
 
@@ -166,14 +165,14 @@ class View:
         others = count - away
         mean = (total - own * away) / np.maximum(others, 1)
         both = (others > 0) & away
-        # Shutter and Sun are not steady to a percent: a copy of another image's light would leave that of what it adds.
+        # Shutter and Sun vary by about a percent: without this scaling an effect would keep that error of brightness.
         brightness = _ratio(float(own[both].sum(dtype=np.float64)), float(mean[both].sum()))
         return np.asarray(np.where(others > 0, mean * brightness, own), dtype=np.float32)
 
     def uncovered(self, n: int) -> Field:
-        """Share of each pixel [y, x] that frame n's occulter leaves open.
+        """The share of each pixel [y, x] that frame n's occulter leaves open.
 
-        One where no other image shows the scene: there it is the image's own, and hidden already.
+        It is 1 where no other image shows the scene: there the scene is the image's own, in which the occulter is already dark.
         """
         solution = self.solution
         shape, place = solution.transit.shape, solution.sky.found[n].place
@@ -184,7 +183,7 @@ class View:
         return out
 
     def occulted_scene(self, n: int) -> Lanes:
-        """One of `scenes` less what the occulter hides of it, in the engine's order; to be read alone."""
+        """The scene of image n with its occulter in front, in the engine's memory order. Read-only."""
         return self._occulted_scenes[n]
 
     @cached_property
@@ -198,18 +197,18 @@ class View:
 
     @cached_property
     def places(self) -> tuple[Field, Field]:
-        """Detector x and y of each pixel, -0.5 to 0.5 across the field."""
+        """Detector x and y of each pixel, from -0.5 to 0.5 across the image."""
         ny, nx = self.solution.transit.shape
         x = ((np.arange(nx) + 0.5) / nx - 0.5).astype(np.float32)
         y = ((np.arange(ny) + 0.5) / ny - 0.5).astype(np.float32)
         return np.broadcast_to(x, (ny, nx)), np.broadcast_to(y[:, None], (ny, nx))
 
     def exposure_s(self, n: int) -> float:
-        """Of frame n."""
+        """Exposure time of frame n, s."""
         return self.solution.transit.frames[n].exposure_s
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
-        """dH x of frame n, the scene times a weight of where its light is from [y, x], DN/s."""
+        """dH x for frame n [y, x], DN/s. weight: multiplies the scene, by where its light comes from."""
         scene = self.occulted_scene(n)
         if weight is not None:
             scene = scene * slope.lanes(weight)
@@ -217,5 +216,5 @@ class View:
 
 
 def _ratio(one: float, other: float) -> float:
-    """Of sums of light; one where there is none to compare with."""
+    """Ratio of two sums of light, not negative; 1 if the second is not positive."""
     return max(one, 0.0) / other if other > 0 else 1.0

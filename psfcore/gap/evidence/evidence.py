@@ -1,7 +1,8 @@
-"""What discs and lit parts say of every effect at once: small arrays, from which all questions are answered.
+"""What the discs and the unocculted field show of all effects at once: small arrays that answer all later questions.
 
-Columns are the PSF's coordinates first, then the effects' parameters. About the solution everything is linear in
-them: one look at each image gives how its cells (`cells`) and its lit blocks (`lit_blocks`) answer to all of them.
+The columns are the coordinates of the PSF, then the parameters of the effects. Everything is linear in them near the
+solution. One pass over the images gives the Jacobian of their cells (`cells`) and of their blocks in the unocculted
+field (`unocculted_blocks`).
 """
 
 from __future__ import annotations
@@ -31,13 +32,15 @@ from psfcore.transit.transit import Frame
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
-AT_ONCE = 16  # fields that are looked at together
+AT_ONCE = 16  # fields that are processed together
 
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """How one image was taken: what the axes are made of. described: whether its neighbours in time show what is round its
-    occulter, so that this was found where it is."""
+    """The circumstances of one image: its coordinates on the axes.
+
+    described: whether its neighbours in time show the scene around its occulter, so that the occulter's place is reliable.
+    """
 
     file: str
     pointing: int
@@ -52,8 +55,10 @@ class ImageInfo:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """All that a diagnosis goes by. discs: of the images that took part. taken: of all images. numbers: of `Change`, by
-    column."""
+    """All the data that a diagnosis uses.
+
+    discs: of the images that were used. image_info: of all images. numbers: `Change.numbers` of each column.
+    """
 
     effects: tuple[Effect, ...]
     columns: dict[str, tuple[int, ...]]
@@ -65,36 +70,36 @@ class Evidence:
     numbers: dict[int, int] = field(default_factory=dict)
 
     def numbers_of(self, columns: Sequence[int]) -> int:
-        """How many numbers were taken from the lit parts to make the changes of these columns."""
+        """How many numbers were measured in the unocculted field to build the changes of these columns."""
         return sum(self.numbers.get(column, 0) for column in columns)
 
     @cached_property
     def images(self) -> tuple[int, ...]:
-        """Positions, among all images, of those with a disc."""
+        """Positions, among all images, of the images with a disc."""
         return tuple(disc.index for disc in self.discs)
 
     def unocculted_equations(self, images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """The lit blocks' equations of all columns, from some images (none: all)."""
+        """The normal equations of all columns from the blocks of some images (None: all images)."""
         return self.all_unocculted if images is None else self.unocculted.equations(range(self.size), images)
 
     @cached_property
     def all_unocculted(self) -> UnoccultedEquations:
-        """`lit_equations` of all images."""
+        """`unocculted_equations` of all images."""
         return self.unocculted.equations(range(self.size))
 
     @cached_property
     def steady_unocculted(self) -> UnoccultedEquations:
-        """`whole_lit` with restless blocks weighed by what they show: what is left is judged by these."""
-        return self.unocculted.with_restless_blocks().equations(range(self.size))
+        """`all_unocculted` with flickering blocks down-weighted by their observed variance; used to judge what remains."""
+        return self.unocculted.with_flickering_blocks().equations(range(self.size))
 
     @property
     def size(self) -> int:
-        """How many columns there are."""
+        """The number of columns."""
         return self.discs[0].jacobian.shape[0]
 
     @property
     def of_effects(self) -> range:
-        """The columns behind the base: about a refit those of the effects that are in it."""
+        """The columns after the base. In the evidence of a full refit these are the parameters of the effects in that refit."""
         return range(len(self.base), self.size)
 
 
@@ -105,9 +110,9 @@ def gather(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """The evidence of a solution on all effects of a library that these data can show. view: of it, where there is one.
+    """The evidence of a solution on all effects of a library that these data can show. view: the view of the solution, if any.
 
-    Raises DataError "bad-effects" of what somebody added.
+    Raises DataError "bad-effects" if an added effect fails.
     """
     view = view or View(solution)
     changes, columns, untestable = _changes(view, library)
@@ -149,7 +154,7 @@ def gather(
 def _changes(
     view: View, library: Sequence[Effect]
 ) -> tuple[list[Change], dict[str, tuple[int, ...]], dict[str, str]]:
-    """Every effect's changes in a row, where each effect's are, and why some cannot be shown."""
+    """All effects' changes in one list, the positions of each effect's changes, and the reasons why some effects cannot be tested."""
     changes: list[Change] = []
     columns: dict[str, tuple[int, ...]] = {}
     untestable: dict[str, str] = {}
@@ -165,7 +170,7 @@ def _changes(
 
 
 def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
-    """The cells of one image with the answers of all columns."""
+    """The cells of one image with the Jacobian of all columns."""
     solution = view.solution
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
@@ -176,14 +181,14 @@ def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
     rows = [*range(len(view.slopes)), *(len(view.slopes) + k for k in shown)]
     jacobian = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
     for first in range(0, len(rows), AT_ONCE):
-        # Together: the cells' planes are read from memory once for all of them.
+        # Several fields at a time: the cells' planes are then read from memory once for all of them.
         some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
         jacobian[rows[first : first + AT_ONCE]] = some @ flat.T
     return replace(cells, jacobian=jacobian)
 
 
 class _Distance:
-    """From how far, on average, light scatters into a disc: the mean of r weighted by the light that comes from there."""
+    """The mean distance from which light scatters into a disc: the mean of r, weighted by the light that arrives from there."""
 
     def __init__(self, view: View) -> None:
         kernel, solution = view.kernel, view.solution
@@ -192,7 +197,7 @@ class _Distance:
         self._blur = Blur(weighted, solution.transit.shape, threads=solution.threads)
 
     def of(self, view: View, n: int) -> float:
-        """In px, for image n."""
+        """The mean distance for image n, px."""
         solution = view.solution
         dark = solution.sky.dark[n]
         scene = view.occulted_scene(n)
@@ -215,12 +220,12 @@ def _image_info(frame: Frame, found: FoundPlace, distance_px: float) -> ImageInf
 
 
 def _testable(evidence: Evidence) -> Evidence:
-    """The evidence without effects that no image answers to."""
+    """The evidence without effects that change no image."""
     untestable, columns = dict(evidence.untestable), dict(evidence.columns)
     for name, here in evidence.columns.items():
         cells = max(float(np.abs(disc.jacobian[list(here)]).max()) for disc in evidence.discs)
         if not (cells > 0 or np.abs(evidence.unocculted.errors[list(here)]).max() > 0):
-            untestable[name] = "no image of this transit answers to it"
+            untestable[name] = "it changes no image of this transit"
             del columns[name]
     effects = tuple(effect for effect in evidence.effects if effect.name in columns)
     return replace(evidence, effects=effects, columns=columns, untestable=untestable)

@@ -1,9 +1,9 @@
-"""The gap that is none: what the estimator leaves on data that the fitted model itself made.
+"""The expected gap: the residuals that the estimator leaves on data simulated from the fitted model itself.
 
-The scene of each pointing, as all its images show it, is hidden by the occulter where it was found, seen through the
-fitted PSF and observed once more with photons and readout. The same fit and the same cells then say by how much chi2
-exceeds its degrees of freedom where nothing is wrong: the place of an occulter is never found exactly, and what lies
-at the field's edge is never quite put back.
+Each pointing's mean scene is occulted where the occulter was found, convolved with the fitted PSF, and observed again
+with photon and read noise. The same fit and the same cells then tell by how much chi2 exceeds its degrees of freedom if
+the model is right. It does, because an occulter's place is never found exactly, and the light near the field's edge is
+never restored completely.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from psfcore.transit.transit import Transit
 
 @dataclass(frozen=True)
 class ExpectedGap:
-    """disc_scale, lit_scale: chi2 a degree of freedom of cells and lit blocks. scale_error: of disc_scale, a share.
-    residual_pct: rms residual of the discs' means."""
+    """disc_scale, unocculted_scale: chi2 per degree of freedom of the cells and of the blocks. scale_error: relative error
+    of disc_scale. residual_pct: rms residual of the discs' means, in percent.
+    """
 
     disc_scale: float
     unocculted_scale: float
@@ -31,7 +32,7 @@ class ExpectedGap:
 
 
 def simulated(view: View, seed: int) -> Transit:
-    """The transit that the fitted model makes of its own scenes, with noise."""
+    """The transit simulated from the fitted model and its own scenes, with noise."""
     solution = view.solution
     transit, optics = solution.transit, solution.optics
     frames = []
@@ -47,7 +48,7 @@ def simulated(view: View, seed: int) -> Transit:
 def expected_gap(
     view: View, *, seed: int = 1, floor: float, progress: Progress = lambda stage, step, steps: None
 ) -> ExpectedGap:
-    """What the estimator leaves on one simulation of the fitted model. view: of the fit.
+    """The residuals of the estimator on one simulation of the fitted model. view: of the fit.
 
     Raises DataError as `psfcore.scatter.inversion.invert` does.
     """

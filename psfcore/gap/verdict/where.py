@@ -1,9 +1,9 @@
-"""Where a gap lies: what share of it goes with each axis.
+"""Where the gap lies: which share of it varies with each axis.
 
-Axes are confounded: a transit has three pointings and one track, so that place, time and brightness go together. The
-share of an axis is what it adds to the others, averaged over all orders in which they could be taken (Shapley's
-value), of what all axes explain together; its p-value counts how often images with their signs drawn anew fall as far
-with this axis alone, times the number of axes.
+The axes are confounded: a transit has three pointings and one track, so place, time and brightness vary together. The
+share of an axis is its contribution to what all axes explain together, averaged over all orders in which the axes can
+be added (Shapley value). Its p-value is the fraction of random sign flips of the images' residuals for which chi2
+decreases at least as much by this axis alone, times the number of axes.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 SIGN_FLIPS = 999
-AS_GOOD = 0.3  # of the best axis' own fall: an axis of the effect that was found may be the strongest if it explains so much
-SIGNIFICANT = 0.05  # an axis that chance explains does not come before one that it does not
-SUSPECT = 2  # pointings that are named
+AS_GOOD = 0.3  # an axis of the best effect comes first if it alone explains this fraction of what the best axis explains
+SIGNIFICANT = 0.05  # axes below this p-value come before the others
+SUSPECT = 2  # number of pointings that are named
 
 
 @dataclass(frozen=True)
 class Axis:
-    """How much of a gap follows one axis, and where along it."""
+    """How much of a gap varies with one axis, and where along it."""
 
     name: str
     share: float
@@ -43,18 +43,18 @@ class Axis:
     at: dict[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """As a gap report has it."""
+        """The axis in the form of the gap report."""
         return {"axis": self.name, "share": self.share, "p_value": self.p_value, "at": self.at}
 
 
 def where(
     model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = (), explained: Step | None = None
 ) -> tuple[Axis, ...]:
-    """All axes, the strongest first: of those that chance does not explain, the one with the largest share.
+    """All axes, the strongest first: of those that are significant, the one with the largest share.
 
-    favoured: axes of the effect that was found; of axes that explain about as much, they come first, for the effect was
-    found by more than its place on the track. explained: the fit of an effect that explains the gap; shares are then of
-    what it explains, which has no noise.
+    favoured: the axes of the best effect. If they explain about as much as others they come first, because the effect was
+    identified by more than its place on the track. explained: the fit of an effect that explains the gap; the shares then
+    refer to what it explains, which has no noise.
     """
     designs = _designs(model.evidence)
     cells, unocculted = _of_cells(model, designs), _of_unocculted(model, designs)
@@ -92,7 +92,7 @@ def where(
 
 
 def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
-    """For each axis along which these images differ, a pattern (columns, cells) in DN/s for each disc."""
+    """For each axis along which these images vary: a pattern (columns, cells) in DN/s for each disc."""
     taken = [evidence.image_info[disc.index] for disc in evidence.discs]
     level = [np.full(disc.expected.size, disc.mean_expected) for disc in evidence.discs]
     out: dict[str, list[Matrix]] = {}
@@ -121,7 +121,7 @@ def _along(discs: Sequence[DiscCells], taken: Sequence[ImageInfo]) -> dict[str, 
 
 
 def _curve(values: Vector) -> Matrix | None:
-    """A slope and a bend along an axis, (2 or 1, images); none where all images lie at one place of it."""
+    """A slope and a curvature along an axis, (2 or 1, images); None if all images have the same value."""
     spread = float(values.std())
     if spread <= 1e-9 * max(1.0, float(np.abs(values).max())):
         return None
@@ -133,7 +133,7 @@ def _curve(values: Vector) -> Matrix | None:
 
 
 def _kinds(values: Vector) -> Matrix | None:
-    """Which kind an image is of, less the mean: (kinds - 1, images)."""
+    """Indicators of the kind of an image, minus their mean: (kinds - 1, images)."""
     kinds = np.unique(values)
     if kinds.size < 2:
         return None
@@ -156,18 +156,18 @@ class _Normal:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """All discs' cells, whitened: the axes' columns without what the PSF's coordinates take up, and a basis of that."""
+    """All discs' cells, whitened: the axes' columns without the component that the PSF absorbs, and a basis of that component."""
 
     design: Matrix
     absorbed: Matrix
 
     def left(self, of_discs: Sequence[Vector]) -> Vector:
-        """What the PSF's coordinates leave of residuals, disc by disc, in a row."""
+        """The residuals of all discs in one vector, without the component that the PSF's coordinates absorb."""
         residual = np.concatenate(of_discs)
         return np.asarray(residual - self.absorbed @ (self.absorbed.T @ residual))
 
     def equations(self, of_discs: Sequence[Vector]) -> _Normal:
-        """Normal equations of the axes' columns for residuals, disc by disc."""
+        """Normal equations of the axes' columns for these residuals."""
         return _Normal(self.design @ self.design.T, self.design @ self.left(of_discs))
 
 
@@ -190,8 +190,7 @@ def _explained(model: LinearModel, step: Step) -> list[Vector]:
 
 
 def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal:
-    """Normal equations of the axes' columns for how bright the images are among those of their pointing: their gains over
-    the width of these."""
+    """Normal equations of the axes' columns for the brightness of the images relative to their pointing, over its usual width."""
     unocculted = model.evidence.unocculted
     gains = model.evidence.all_unocculted.gains[list(model.evidence.images)] / unocculted.gain_width
     columns = np.vstack(
@@ -202,9 +201,9 @@ def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Nor
             for patterns in designs.values()
         ]
     )
-    fov = unocculted.pointing[list(model.evidence.images)]
-    for one in np.unique(fov):  # brightness is known among images of one pointing alone
-        here = fov == one
+    pointing = unocculted.pointing[list(model.evidence.images)]
+    for one in np.unique(pointing):  # brightness is known only relative to the same pointing
+        here = pointing == one
         columns[:, here] -= columns[:, here].mean(axis=1, keepdims=True)
         gains = np.where(here, gains - gains[here].mean(), gains)
     return _Normal(columns @ columns.T, columns @ gains)
@@ -219,7 +218,7 @@ def _fall_of(of: _Normal, columns: list[int]) -> float:
 
 
 def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
-    """How far chi2 falls by these columns beyond their number, for every row of scores (draws, columns)."""
+    """The decrease of chi2 by these columns minus their number, for every row of scores (flips, columns)."""
     if not columns:
         return np.zeros(scores.shape[0])
     normal, scores = normal[np.ix_(columns, columns)], scores[:, columns]
@@ -234,7 +233,7 @@ def _p_of_unocculted(unocculted: _Normal, columns: list[int], axes: int) -> floa
 
 
 def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
-    """What each name adds, averaged over all orders."""
+    """The contribution of each name, averaged over all orders."""
     count = len(names)
     out = dict.fromkeys(names, 0.0)
     for chosen, value in worth.items():
@@ -248,7 +247,7 @@ def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str,
 
 
 def _sign_flipped_scores(model: LinearModel, cells: _Cells, rng: np.random.Generator) -> Matrix:
-    """Scores of all columns with every image's residuals turned over or not: (DRAWS, columns)."""
+    """Scores of all columns with the residuals of random images sign-flipped: (SIGN_FLIPS, columns)."""
     residual = cells.left([disc.residual for disc in model.discs])
     which = np.repeat(np.arange(len(model.discs)), [d.residual.size for d in model.discs])
     signs = np.array([rng.choice((-1.0, 1.0), len(model.discs)) for _ in range(SIGN_FLIPS)])
@@ -256,7 +255,7 @@ def _sign_flipped_scores(model: LinearModel, cells: _Cells, rng: np.random.Gener
 
 
 def _at(model: LinearModel, name: str) -> dict[str, Any]:
-    """The pointings where the residuals are largest, and the axis' range in them."""
+    """The pointings with the largest residuals, and the range of the axis in them."""
     evidence = model.evidence
     left = model.left(model.base)
     excess = np.array([float(r @ r) - r.size for r in left])
