@@ -40,17 +40,17 @@ def psf_parts(found: Diagnosis) -> list[Part]:
     rows = [_parameter_row(k, columns) for k in range(len(before.shape.parameters))]
     rows += [_curve_row(k, radius, columns) for k, radius in enumerate(before.radii_px)]
     caption = (
-        f"Parameters of the shape “{before.shape.name}”, and the light of the total PSF beyond R, in percent of all light. Errors of parameters: noise, with "
-        f"a floor of {100 * FLOOR:g} % of a disc's light; with the answer, its parameters free beside them. Errors of the light: noise."
+        f"Parameters of the shape “{before.shape.name}”, and 1 - encircled energy of the total PSF (the light beyond R, in percent). Errors of the parameters: noise and "
+        f"a floor of {100 * FLOOR:g} % of a disc's light; with the answer, its parameters are free as well. Errors of the encircled energy: noise only."
     )
     optical = [words(e.name) for c in found.corrected[:1] for e in c.effects if e.stage == "optics"]
     if optical:
-        caption += f" What {' and '.join(optical)} itself adds to the PSF is not in these numbers; it is in the corrected PSF's file."
+        caption += f" The change of the PSF by {' and '.join(optical)} itself is not included in these numbers; it is in the file of the corrected PSF."
     parts: list[Part] = [Table(header, rows, caption)]
     if not found.corrected:
-        parts.append("No effect was added to the model, so that there is no corrected PSF.")
+        parts.append("No effect was added to the model, so there is no corrected PSF.")
     elif found.judgement.verdict == "tie":
-        parts.append(f"With the best of the effects that are tied: {best_words(found)}.")
+        parts.append(f"“With the answer” means with the best of the tied effects: {best_words(found)}.")
     return parts
 
 
@@ -68,11 +68,11 @@ def _parameter_row(k: int, columns: list[tuple[Inversion, Any]]) -> list[str]:
 def _curve_row(k: int, radius: float, columns: list[tuple[Inversion, Any]]) -> list[str]:
     values = [float(inversion.curve_pct[k]) for inversion, _ in columns]
     sigma = [float(inversion.curve_sigma[k]) for inversion, _ in columns]
-    return [f"light beyond {radius:g} px (%)", *_compared(values, sigma)]
+    return [f"1 - encircled energy at {radius:g} px (%)", *_compared(values, sigma)]
 
 
 def _compared(values: list[float], sigma: list[float]) -> list[str]:
-    """Values with errors; of two also the change over the first one's error."""
+    """Values with errors; for two values also the change in units of the first error."""
     cells = [with_error(value, s) for value, s in zip(values, sigma, strict=True)]
     if len(values) == 2:
         cells.append(f"{(values[1] - values[0]) / sigma[0]:+.1f}" if sigma[0] > 0 else DASH)
@@ -83,13 +83,11 @@ def _compared(values: list[float], sigma: list[float]) -> list[str]:
 
 
 def doubts(report: Report) -> list[Part]:
-    said = list(report["cautions"]) or ["Nothing in these data themselves."]
+    said = list(report["cautions"]) or ["These data give no reason for caution."]
     parts: list[Part] = [Bullets([one if one.endswith(".") else f"{one}." for one in said])]
     if report["untestable"]:
         rows = [[words(one["name"]), one["why"]] for one in report["untestable"]]
-        parts.append(
-            Table(["effect", "why it could not be tried"], rows, "Effects that these data cannot show.")
-        )
+        parts.append(Table(["effect", "why it was not tested"], rows, "Effects that these data cannot show."))
     return parts
 
 
@@ -97,33 +95,40 @@ def made_of(found: Diagnosis, report: Report) -> list[Part]:
     expected, noise = report["expected"], found.solution.transit.noise
     how = Values(
         [
-            Value(
-                "images that took part", f"{len(report['images'])} of {len(found.solution.transit.frames)}"
-            ),
-            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN a detected photon, as used"),
-            Value("readout noise", noise.read_noise_dn, unit="DN", meaning="rms, as used"),
+            Value("images used", f"{len(report['images'])} of {len(found.solution.transit.frames)}"),
+            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN per detected photon, as used"),
+            Value("read noise", noise.read_noise_dn, unit="DN", meaning="rms, as used"),
             Value(
                 "residual of the fit on its own simulation",
                 f"{expected['residual_pct']:.2f}",
                 unit="%",
-                meaning="rms of the discs' means: no gap, but noise and the estimator's own error",
+                meaning="rms of the discs' means, from noise and the error of the estimator alone",
             ),
-            Value("chi2 a cell there", f"{expected['disc_chi2_a_cell']:.3f}", meaning="1 where noise is all"),
+            Value(
+                "chi2 per cell in this simulation",
+                f"{expected['disc_chi2_a_cell']:.3f}",
+                meaning="1 if there is only noise",
+            ),
             Value(
                 "floor",
                 f"{100 * FLOOR:g}",
                 unit="%",
-                meaning="of a disc's light, common to its cells; the verdict is repeated at half and twice",
+                meaning="relative error common to all cells of a disc; the verdict is repeated with half and twice this value",
             ),
-            Value("an effect is enough where what it leaves is as likely as", f"{ENOUGH:g}"),
+            Value(
+                "smallest p-value of the residuals after an effect that explains the gap",
+                f"{ENOUGH:g}",
+            ),
             *(
-                Value("rounds of the real refit", str(one.rounds), meaning=f"at most {ROUNDS}")
+                Value("rounds of the full refit", str(one.rounds), meaning=f"at most {ROUNDS}")
                 for one in found.corrected[:1]
             ),
         ]
     )
     files = Table(
-        ["file", "SHA-256"], list(report["inputs_sha256"].items()), "Input files, by the hash of their bytes."
+        ["file", "SHA-256"],
+        list(report["inputs_sha256"].items()),
+        "Input files and the hashes of their bytes.",
     )
     return [
         how,
@@ -163,7 +168,7 @@ def _images(report: Report) -> Table:
             ]
             for row in report["images"]
         ],
-        "Every image that took part: where its occulter was found, how bright its disc was, and what was left there, held out.",
+        "Every image used: position of its occulter, brightness of its disc, and the held-out residual.",
     )
 
 

@@ -19,7 +19,7 @@ _NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3  # bars and intervals are cut at these c
 
 
 def draw_where(axes: Any, report: Report) -> None:
-    """Bars, the strongest at the top, p-values beside."""
+    """Horizontal bars, the strongest axis at the top, with p-values."""
     rows = report["where"]
     at = np.arange(len(rows))[::-1]
     shares = np.array([100 * row["share"] for row in rows])
@@ -35,12 +35,12 @@ def draw_where(axes: Any, report: Report) -> None:
 
 
 def p_words(p_value: float) -> str:
-    """A p-value as it is written beside a bar."""
+    """A p-value as written beside a bar."""
     return f"p < {CERTAIN_P:.0e}" if p_value < CERTAIN_P else f"p = {p_value:.2g}"
 
 
 def draw_effects(axes: Any, report: Report) -> None:
-    """Closure with its 90 % interval; the answer, or what is tied, stands out; scores beside."""
+    """Closure with its 90 % interval and score; the answer, or the tied effects, stand out."""
     rows = fits_of(report)[:MOST_EFFECTS]
     at = np.arange(len(rows))[::-1]
     names = []
@@ -59,12 +59,12 @@ def draw_effects(axes: Any, report: Report) -> None:
     axes.axvline(0, color="#555555", linewidth=1.0)
     axes.axvline(1, color="#555555", linewidth=1.0, linestyle=(0, (4, 3)))
     axes.set(xlim=(_NO_CLOSURE, 1.56), ylim=(-0.7, len(rows) + 0.2), xticks=(0, 0.25, 0.5, 0.75, 1.0))
-    axes.set_xlabel("Closure of the gap on images held out (0: nothing, 1: all)", x=0.45)
+    axes.set_xlabel("Closure of the gap on held-out images (0: none, 1: all)", x=0.45)
     tidy([axes])
 
 
 def _chosen(row: Report, report: Report) -> bool:
-    """Whether an effect, or some together, are the answer, or one of those that are tied."""
+    """Whether an effect, or several together, are the answer, or belong to a tie."""
     names, answer = set(row["name"].split(" + ")), set(report["answer"])
     if report["verdict"] != "tie":
         return names == answer

@@ -198,11 +198,11 @@ def closure(
     if use.sum() < RESAMPLES // 2:
         return None
     seen = chi2_after[chosen].sum(axis=1) / scale
-    drawn, without_errors = (
+    resampled, without_errors = (
         1 - (seen - expected[chosen].sum(axis=1))[use] / totals[use] for expected in (nu, nu_after)
     )
     value = 1 - float((chi2_after - nu).sum()) / total
-    low, high = np.percentile(drawn, INTERVAL)
+    low, high = np.percentile(resampled, INTERVAL)
     high = max(high, np.percentile(without_errors, INTERVAL[1]))
     # No cause closes more than the whole gap.
     return Interval(value, float(low) - FORM_ERROR**2, max(value, min(float(high), 1.0)) + FORM_ERROR**2)
@@ -219,7 +219,7 @@ def gap(held_out: HeldOut, rng: np.random.Generator) -> Interval:
     """Eq. (3) with its interval; its upper end is at least the gap that the noise could hide."""
     squares = held_out.residual_pct**2 - held_out.noise_pct**2
     chosen = rng.integers(0, squares.size, (RESAMPLES, squares.size))
-    drawn = np.sqrt(np.maximum(squares[chosen].mean(axis=1), 0.0))
-    low, high = np.percentile(drawn, INTERVAL)
+    resampled = np.sqrt(np.maximum(squares[chosen].mean(axis=1), 0.0))
+    low, high = np.percentile(resampled, INTERVAL)
     hidden = math.sqrt(HIDDEN_SIGMA * math.sqrt(2 * float(np.mean(held_out.noise_pct**4)) / squares.size))
     return Interval(math.sqrt(max(float(squares.mean()), 0.0)), float(low), max(float(high), hidden))

@@ -29,7 +29,7 @@ Vector = NDArray[np.float64]
 ROUNDS = 3
 SETTLED = 0.3  # of a parameter's error: smaller steps end the rounds
 WORSE = 9.0  # a round may leave so much more chi2 than the best round,
-WORSE_SHARE = 0.05  # or this fraction of the effect's gain
+WORSE_SHARE = 0.05  # or, if larger, this fraction of the effect's gain
 
 
 @dataclass(frozen=True, eq=False)

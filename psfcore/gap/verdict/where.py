@@ -69,11 +69,11 @@ def where(
     }
     shares = _shapley(names, subset)
     total = max(sum(max(share, 0.0) for share in shares.values()), 1e-300)
-    draws = _sign_flipped_scores(model, cells, rng)
+    flips = _sign_flipped_scores(model, cells, rng)
     out = []
     for name in names:
         alone = subset[(name,)]
-        beaten = int((_falls(disc.normal, draws, spans[name]) >= _fall_of(disc, spans[name])).sum())
+        beaten = int((_falls(disc.normal, flips, spans[name]) >= _fall_of(disc, spans[name])).sum())
         p_value = min(1.0, (1 + beaten) / (1 + SIGN_FLIPS) * len(names))
         if _fall_of(unocculted, spans[name]) > 0:
             p_value = min(p_value, _p_of_unocculted(unocculted, spans[name], len(names)))

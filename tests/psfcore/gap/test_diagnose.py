@@ -127,7 +127,7 @@ def test_a_flat_field_of_patches_is_found_as_one(clean: Transit) -> None:
     assert closure is not None and closure.value > 0.3
     # Many numbers, each near nothing where the discs say nothing of it: together no more than the patches are.
     assert np.linalg.norm([value for value, _, _ in best.values.values()]) < 0.2
-    assert f"{len(best.values)} numbers" in gap_report(found)["sentence"]
+    assert f"{len(best.values)} parameters" in gap_report(found)["sentence"]
 
 
 def test_a_sun_that_changes_faster_than_it_is_followed_is_named_all_the_same() -> None:

@@ -86,19 +86,22 @@ def test_the_examples_of_the_documentation_work(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "expected EFFECTS, a tuple of Effect; got nothing of that name"),
+        ("", "expected EFFECTS to be a tuple of Effect; got no such name"),
         ("EFFECTS = ()", "got an empty one"),
-        ("EFFECTS = (1, 'a')", "got one of int, str"),
+        ("EFFECTS = (1, 'a')", "got a tuple or list of int, str"),
         ("EFFECTS = 3", "got int"),
         ("EFFECTS = (", "SyntaxError"),
         ("import no_such_module_anywhere", "No module named 'no_such_module_anywhere' (line 1)"),
         ("x = 1\ny = x + z\n", "NameError: name 'z' is not defined (line 2)"),
         (GLOW.replace('"a dark exposure", ', ""), "missing 1 required positional argument"),
-        (GLOW.replace("edge_glow", "edge glow"), "expected a name of letters, digits and _; got 'edge glow'"),
-        (GLOW.replace("edge_glow", "dark_offset"), "names that nothing else has; got 'dark_offset' twice"),
+        (
+            GLOW.replace("edge_glow", "edge glow"),
+            "expected an effect name of letters, digits and _; got 'edge glow'",
+        ),
+        (GLOW.replace("edge_glow", "dark_offset"), "expected unique effect names; got 'dark_offset' twice"),
         (
             GLOW.replace('(EffectParameter("height", "DN/s", 5.0),)', "()"),
-            "a parameter of edge_glow; got none",
+            "edge_glow: expected at least one parameter; got none",
         ),
     ],
 )
@@ -131,7 +134,7 @@ def test_a_source_that_is_not_there_is_told(source: str) -> None:
     [
         (
             "lambda n, images: plane[1:]",
-            "edge_glow: expected an image of (96, 96) [y, x]; got one of (95, 96)",
+            "edge_glow: expected an image of shape (96, 96) [y, x]; got one of shape (95, 96)",
         ),
         ("lambda n, images: plane * np.nan", "got one with NaN or infinite values"),
         ("lambda n, images: plane / nothing", "NameError: name 'nothing' is not defined (line 8)"),
@@ -150,7 +153,9 @@ def test_a_change_that_is_no_image_is_told_when_it_is_asked_for(
 
 def test_there_is_a_change_for_every_parameter(tmp_path: Path) -> None:
     text = GLOW.replace("unocculted=False)]", "unocculted=False)] * 2")
-    with pytest.raises(DataError, match="edge_glow: expected 1 of Change, one a parameter; got 2 of Change"):
+    with pytest.raises(
+        DataError, match="edge_glow: expected 1 Change, one per parameter; got 2 of type Change"
+    ):
         one_of(written(tmp_path, text)).changes(View(found().solution))
 
 

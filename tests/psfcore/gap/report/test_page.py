@@ -82,7 +82,7 @@ def test_verdict_gap_before_and_after_and_noise_stand_at_the_top() -> None:
     assert said["gap, PSF refitted"] == f"{interval_words(gap['rms_pct'])} %"
     assert said["gap with the answer in the model"] == f"{interval_words(gap['after_pct'])} %"
     assert float(said["noise"].split()[0]) == pytest.approx(gap["noise_pct"], rel=0.05)
-    assert "a dark exposure, or a ladder of exposures" in text_of(html())  # what would settle it
+    assert "To confirm the answer, take a dark exposure" in text_of(html())
 
 
 def test_every_figure_has_its_place_and_all_are_one_picture_too() -> None:
@@ -127,9 +127,9 @@ def test_every_image_and_input_is_listed_and_what_made_the_report() -> None:
 @pytest.mark.parametrize(
     ("verdict", "answer", "told"),
     [
-        ("none", (), "Without a gap no effect is needed"),
-        ("unknown", (), "None of them is the answer"),
-        ("inconclusive", (), "changes with what is taken for granted"),
+        ("none", (), "There is no gap, so no effect is needed"),
+        ("unknown", (), "No effect is the answer, and no pair of effects is"),
+        ("inconclusive", (), "changes with the assumed floor"),
         ("tie", ("dark_offset", "gain_mismatch"), "Tied: dark offset or gain mismatch."),
     ],
 )
@@ -146,8 +146,8 @@ def test_every_verdict_has_a_page_that_says_what_it_means(
     assert any(name.startswith("Observed") for name in pictures(read_page(page))) is (verdict == "tie")
     # And bars of closure where there is a gap to close.
     assert ("Bars of held-out closure by effect" in pictures(read_page(page))) is (verdict != "none")
-    assert ("What would tell them apart: a dark exposure" in text) is (verdict == "tie")
-    assert ("with the answer” is with the best of those that are tied: dark offset" in text) is (
+    assert ("To tell them apart, take a dark exposure" in text) is (verdict == "tie")
+    assert ("with the answer” means with the best of the tied effects: dark offset" in text) is (
         verdict == "tie"
     )
     assert ("a patch of added light" in text) is (verdict in ("unknown", "inconclusive"))
@@ -157,10 +157,10 @@ def test_a_gap_of_the_discs_beside_what_shows_in_the_lit_parts_is_told_apart(coa
     diagnosis = judged("inconclusive")
     diagnosis = replace(diagnosis, judgement=replace(diagnosis.judgement, discs_unexplained=True))
     report = report_of(diagnosis)
-    told = "dark offset shows in the lit parts, and what leaves a gap in the discs beside it cannot be told"
-    assert told in report["sentence"] and "taken for granted" not in report["sentence"]
+    told = "dark offset explains the unocculted field, but the cause of the gap in the discs cannot be identified"
+    assert told[1:] in report["sentence"] and "assumed floor" not in report["sentence"]
     text = text_of(gap_page(diagnosis, report).html())
-    assert f"No effect is the answer: {told}." in text and "taken for granted" not in text
+    assert f"No effect is the answer: {told}." in text and "assumed floor" not in text
 
 
 def test_a_tie_beside_an_effect_that_is_certain_says_which_is_which(coarse: None) -> None:
@@ -168,8 +168,8 @@ def test_a_tie_beside_an_effect_that_is_certain_says_which_is_which(coarse: None
     both = replace(both, judgement=replace(both.judgement, certain=("dark_offset",)))
     report = report_of(both)
     assert report["ties"] == [["core_blur", "gain_mismatch"]]
-    told = "dark offset, and beside it core blur or gain mismatch"
-    assert f"{told}, which these data cannot tell apart" in report["sentence"]
+    told = "dark offset, together with core blur or gain mismatch"
+    assert f"These data cannot tell which effect causes it: {told}." in report["sentence"]
     assert "a dark exposure" not in report["would_separate"] and "both gain modes" in report["would_separate"]
     assert f"Tied: {told}." in text_of(gap_page(both, report).html())
     rows = [
