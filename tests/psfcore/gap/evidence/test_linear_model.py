@@ -61,7 +61,7 @@ def evidence(solution: Solution) -> Evidence:
 
 
 def left_in_disc(solution: Solution, n: int, image: np.ndarray) -> np.ndarray:
-    """r of Eq. (1) of cells, forwards."""
+    """r of Eq. (1) of cells, computed forwards."""
     optics, dark = solution.optics, solution.sky.dark[n]
     lanes = optics.lanes(np.ascontiguousarray(image, dtype=np.float32))
     scene = optics.undo(lanes, optics.undo_once(lanes), steps=1)
@@ -69,7 +69,7 @@ def left_in_disc(solution: Solution, n: int, image: np.ndarray) -> np.ndarray:
     return pick(lanes, dark) - pick(optics.see(scene), dark)
 
 
-def test_cells_share_out_all_dark_pixels(solution: Solution) -> None:
+def test_every_dark_pixel_belongs_to_one_cell(solution: Solution) -> None:
     n = solution.part[3]
     place = solution.sky.found[n].place
     cells = cells_of(solution.sky.dark[n], place.x_px, place.y_px)
@@ -78,7 +78,7 @@ def test_cells_share_out_all_dark_pixels(solution: Solution) -> None:
     assert cells.pixels.size == 13 and cells.radius.max() < 1.0
 
 
-def test_a_sensitivity_is_the_whole_estimate_backwards(solution: Solution) -> None:
+def test_a_sensitivity_is_the_adjoint_of_the_whole_estimate(solution: Solution) -> None:
     n = solution.part[3]
     place = solution.sky.found[n].place
     cells = cells_of(solution.sky.dark[n], place.x_px, place.y_px)
@@ -89,7 +89,7 @@ def test_a_sensitivity_is_the_whole_estimate_backwards(solution: Solution) -> No
     assert backwards == pytest.approx(forwards, abs=1e-4)
 
 
-def test_an_added_error_moves_the_residual_as_its_sensitivity_says(solution: Solution) -> None:
+def test_sensitivities_predict_the_effect_of_an_added_error(solution: Solution) -> None:
     n = solution.part[3]
     found, planes = disc_cells(solution, n)
     error = np.full(solution.transit.shape, 5.0, np.float32)
@@ -105,7 +105,7 @@ def test_an_added_error_moves_the_residual_as_its_sensitivity_says(solution: Sol
     assert after - found.residual == pytest.approx(expected, abs=0.05 * float(np.abs(expected).max()))
 
 
-def test_a_global_gain_cannot_be_seen_in_a_disc(solution: Solution) -> None:
+def test_a_disc_does_not_show_a_global_gain(solution: Solution) -> None:
     view = View(solution)
     n = solution.part[2]
     found, planes = disc_cells(solution, n)
@@ -113,7 +113,7 @@ def test_a_global_gain_cannot_be_seen_in_a_disc(solution: Solution) -> None:
     assert np.abs(moved).max() < 0.01 * float(found.expected.mean())
 
 
-def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> None:
+def test_a_gain_is_the_decrease_of_chi2_of_a_plain_least_squares_fit(evidence: Evidence) -> None:
     bare = replace(
         evidence, unocculted=replace(evidence.unocculted, part=np.zeros(len(evidence.image_info), dtype=bool))
     )
@@ -140,7 +140,7 @@ def test_a_gain_is_the_fall_of_a_plain_least_squares_fit(evidence: Evidence) -> 
     )
 
 
-def test_a_field_s_gain_less_its_cost_is_how_much_likelier_it_makes_the_discs(solution: Solution) -> None:
+def test_gain_minus_cost_of_a_random_field_is_its_log_likelihood_ratio(solution: Solution) -> None:
     evidence = gather(solution, [effect for effect in EFFECTS if effect.name == "flat_field_residual"])
     bare = replace(
         evidence, unocculted=replace(evidence.unocculted, part=np.zeros(len(evidence.image_info), dtype=bool))
@@ -150,7 +150,7 @@ def test_a_field_s_gain_less_its_cost_is_how_much_likelier_it_makes_the_discs(so
     residual = np.concatenate([disc.residual for disc in model.discs])
     jacobian = np.concatenate([disc.jacobian for disc in model.discs], axis=1)
     base, columns = list(bare.base), list(bare.columns[effect.name])
-    # What the PSF's own coordinates absorb is not looked at, and the rest has unit noise.
+    # Remove the component that the PSF's coordinates absorb; the rest has unit noise.
     free = scipy.linalg.null_space(jacobian[base])
     seen = (jacobian[columns] @ free).T * [parameter.likely for parameter in effect.parameters]
     ours, nothing = (
@@ -160,7 +160,7 @@ def test_a_field_s_gain_less_its_cost_is_how_much_likelier_it_makes_the_discs(so
     tried = fitted(model, [effect])
     assert tried.score == pytest.approx(2 * (ours - nothing), abs=1e-3)
     assert tried.gain > 0 and tried.gain - tried.score > 1.0
-    # Noise alone gains as much by chance as often as it does in many draws of it.
+    # The p-value of a gain agrees with many noise realisations.
     rng = np.random.default_rng(2)
     inverse = np.linalg.inv(np.eye(len(columns)) + seen.T @ seen)
     scores = rng.standard_normal((4000, free.shape[1])) @ seen
@@ -175,7 +175,7 @@ def test_a_field_s_gain_less_its_cost_is_how_much_likelier_it_makes_the_discs(so
 
 
 def with_residuals(evidence: Evidence, values: dict[str, float], noise: float = 0.0) -> LinearModel:
-    """A model whose discs show these effects' changes and so much of their noise, and no lit part."""
+    """A model whose discs show these effects and noise times this factor; the unocculted field is not used."""
     rng = np.random.default_rng(4)
     theta = np.zeros(evidence.size)
     for name, value in values.items():
@@ -193,7 +193,7 @@ def with_residuals(evidence: Evidence, values: dict[str, float], noise: float = 
     return LinearModel(replace(evidence, discs=discs, unocculted=unocculted), FLOOR)
 
 
-def test_what_was_taken_out_of_the_images_counts_against_the_prior_of_what_is_left(
+def test_the_prior_also_counts_what_was_subtracted_from_the_images(
     evidence: Evidence,
 ) -> None:
     columns = evidence.columns["dark_offset"]
@@ -207,11 +207,11 @@ def test_what_was_taken_out_of_the_images_counts_against_the_prior_of_what_is_le
     assert found[first] == pytest.approx(whole.values[first], rel=1e-6)
 
 
-def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_than_a_search_lets_it(
+def test_a_second_effect_is_named_if_it_gains_more_than_a_search_allows(
     evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def second(dark: float, smear: float, for_real: float = np.inf) -> Tried | None:
-        """for_real: what a refit of the first left in the discs."""
+        """for_real: chi2 of the discs after a full refit of the first effect."""
         model = with_residuals(evidence, {"dark_offset": dark, "column_smear": smear}, noise=1.0)
         best = max((fitted(model, [effect]) for effect in evidence.effects), key=lambda t: t.score)
         assert best.names == ("dark_offset",)
@@ -225,14 +225,14 @@ def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_t
     found = second(10.0, 8.0 * sigma)
     assert found is not None and set(found.names) == {"dark_offset", "column_smear"}
     assert second(10.0, 1.0 * sigma) is None
-    # What the first explains in the model for real, and not to first order, is no smear's.
+    # What only the full refit of the first effect explains is not credited to the smear.
     both = with_residuals(evidence, {"dark_offset": 10.0, "column_smear": 8.0 * sigma}, noise=1.0)
     discs = float(left_chi2(both, found.step)[0])
     assert second(10.0, 8.0 * sigma, for_real=discs) is None
-    # Of so large an offset the form's own error is larger than the smear,
+    # The error of form of so large an offset is larger than the smear,
     assert second(1000.0, 8.0 * sigma) is None
-    # and so it is of one that explains as much in the discs, but not of one that does in the lit parts: the smear shows
-    # in the discs.
+    # also if the offset explains as much in the discs, but not if it does in the unocculted field: the smear shows in
+    # the discs.
     for more, names in (((1e6, 0.0), None), ((0.0, 1e6), {"dark_offset", "column_smear"})):
 
         def chi2_of(model: LinearModel, step: Step, more: tuple[float, float] = more) -> Vector:
@@ -243,7 +243,7 @@ def test_another_effect_is_named_beside_one_that_is_enough_where_it_gains_more_t
         assert (None if found is None else set(found.names)) == names
 
 
-def test_what_would_do_in_place_of_one_of_a_pair_is_named_with_it(solution: Solution) -> None:
+def test_a_possible_replacement_of_one_member_of_a_pair_is_named(solution: Solution) -> None:
     again = replace(next(e for e in FEW if e.name == "column_smear"), name="smear_again")
     gradient = next(e for e in EFFECTS if e.name == "intensity_gradient")
     evidence = gather(solution, (*FEW, again, gradient))
@@ -266,7 +266,7 @@ def test_what_would_do_in_place_of_one_of_a_pair_is_named_with_it(solution: Solu
     assert _in_place_of_one(model, pair) == {"dark_offset": {}, "column_smear": {}}
 
 
-def test_what_another_floor_cannot_tell_from_one_of_a_pair_is_in_the_answer(
+def test_effects_that_are_tied_under_another_floor_are_in_the_answer(
     evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = with_residuals(evidence, {"dark_offset": 100.0})
@@ -287,7 +287,7 @@ def test_what_another_floor_cannot_tell_from_one_of_a_pair_is_in_the_answer(
 
 
 def about_fit_with(name: str, model: LinearModel, *, left: float) -> LinearModel:
-    """The model about a fit with an effect: so much of the residuals is left, to which the effect answers no more."""
+    """The model of a full refit with an effect: this fraction of the residuals is left, and the effect changes them no more."""
     evidence = model.evidence
     first = len(evidence.base)
     here = [*evidence.base, *evidence.columns[name]]
@@ -309,8 +309,8 @@ def about_fit_with(name: str, model: LinearModel, *, left: float) -> LinearModel
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-def test_what_a_refit_leaves_counts_where_it_is_of_the_same_images(evidence: Evidence, lost: int) -> None:
-    """An offset, and noise that it does not explain, so that a refit is asked for."""
+def test_the_residuals_of_a_refit_count_if_it_has_the_same_images(evidence: Evidence, lost: int) -> None:
+    """An offset, and noise that it does not explain, so that a refit is requested."""
     model = with_residuals(evidence, {"dark_offset": 100.0}, noise=3.0)
     again = about_fit_with("dark_offset", model, left=0.9)
     discs = again.evidence.discs[lost:]
@@ -328,29 +328,29 @@ def test_what_a_refit_leaves_counts_where_it_is_of_the_same_images(evidence: Evi
 
 
 @pytest.mark.parametrize("does", [True, False])
-def test_an_answer_that_does_not_do_it_in_the_model_for_real_is_none(evidence: Evidence, does: bool) -> None:
+def test_an_answer_that_fails_in_a_full_refit_is_excluded(evidence: Evidence, does: bool) -> None:
     model = with_residuals(evidence, {"dark_offset": 100.0})
 
     def refit(tried: Tried) -> LinearModel:
-        """About the fit with the effect: nothing is left, or all that was there."""
+        """The refit with the effect leaves nothing, or everything."""
         return about_fit_with(tried.names[0], model, left=0.0 if does else 1.0)
 
     found = judging.judge(model, refit)
     assert ("dark_offset" in found.answer) is does
     assert found.amiss[:1] == (() if does else ("dark_offset",))
     assert does or "dark_offset" in [tried.label for tried in found.tried][-len(found.amiss) :]
-    # What shows a gap shows it still.
+    # The evidence for a gap stays.
     assert found.p_value < 1e-6
 
 
-def test_an_answer_that_cannot_be_added_to_the_model_is_none(evidence: Evidence) -> None:
+def test_an_answer_without_a_full_refit_is_excluded(evidence: Evidence) -> None:
     model = with_residuals(evidence, {"dark_offset": 100.0})
     found = judging.judge(model, lambda tried: None)
     assert found.verdict in ("unknown", "inconclusive") and found.amiss[0] == "dark_offset"
     assert judging.judge(model).answer == ("dark_offset",)
 
 
-def test_of_a_tie_what_fails_in_the_model_for_real_is_left_out(
+def test_a_tied_effect_that_fails_in_a_full_refit_is_excluded(
     evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = with_residuals(evidence, {"dark_offset": 100.0})
@@ -361,8 +361,8 @@ def test_of_a_tie_what_fails_in_the_model_for_real_is_left_out(
     assert (found.verdict, found.answer, fallen) == ("attributed", best.names, [other])
 
 
-def test_beside_an_effect_nothing_is_named_that_was_set_aside(evidence: Evidence) -> None:
-    """The model with the first in it knows of all effects, the one that is judged no longer of the smear."""
+def test_an_excluded_effect_is_not_named_as_a_second_effect(evidence: Evidence) -> None:
+    """The model with the first effect knows all effects; the judged model no longer contains the smear."""
     whole = with_residuals(evidence, {"dark_offset": 10.0, "column_smear": 0.3})
     offset, smear = evidence.effects
     first = fitted(whole, [offset])
@@ -377,7 +377,7 @@ def test_beside_an_effect_nothing_is_named_that_was_set_aside(evidence: Evidence
 
 @pytest.fixture(scope="module")
 def with_unocculted(solution: Solution) -> Evidence:
-    """Of three effects the first taken for one that was measured in the lit parts, which no disc answers to."""
+    """Three effects, the first of which is treated as measured in the unocculted field and changes no disc."""
     gradient = [effect for effect in EFFECTS if effect.name == "intensity_gradient"]
     found = gather(solution, (*gradient, *FEW))
     own = list(found.columns["intensity_gradient"])
@@ -391,10 +391,10 @@ def with_unocculted(solution: Solution) -> Evidence:
 
 
 @pytest.mark.parametrize("found_well", [True, False])
-def test_a_gap_of_the_discs_is_not_laid_on_what_they_do_not_answer_to(
+def test_a_gap_in_the_discs_is_not_attributed_to_an_effect_that_they_do_not_show(
     with_unocculted: Evidence, monkeypatch: pytest.MonkeyPatch, found_well: bool
 ) -> None:
-    """Beside what shows in the lit parts the discs show a gap of unknown cause."""
+    """One effect explains the unocculted field, and the discs show a gap of unknown cause."""
     taken = tuple(
         replace(one, described=found_well or n > 0) for n, one in enumerate(with_unocculted.image_info)
     )
@@ -403,7 +403,7 @@ def test_a_gap_of_the_discs_is_not_laid_on_what_they_do_not_answer_to(
     unknown = Judgement("unknown", (), 1e-9, (), (), other)
     monkeypatch.setattr(judging, "_judge", lambda *some: unknown)
     found = judging._beside(model, first, lambda tried: model)
-    # Where an occulter may be elsewhere, what changes round it may make the gap after all.
+    # If an occulter's place is unreliable, a change of the scene around it may cause the gap.
     if found_well:
         assert found is not None and (found.verdict, found.discs_unexplained) == ("inconclusive", True)
     else:
@@ -411,11 +411,11 @@ def test_a_gap_of_the_discs_is_not_laid_on_what_they_do_not_answer_to(
     assert judging._beside(model, other, lambda tried: model) is None
 
 
-def test_beside_what_the_discs_do_not_answer_to_two_may_act_in_them(
+def test_two_effects_may_act_in_the_discs_with_one_in_the_unocculted_field(
     with_unocculted: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = with_residuals(with_unocculted, {"dark_offset": 10.0, "column_smear": 0.3})
-    # All parameters of the first are kept, as a Sun's are that changes much.
+    # Keep all parameters of the first effect, as for a Sun that changes much.
     monkeypatch.setattr(judging, "_not_worth_its_numbers", lambda *some: None)
     first, two = fitted(model, with_unocculted.effects[:1]), fitted(model, with_unocculted.effects[1:])
     for verdict, certain in (("attributed", ()), ("tie", ("dark_offset",))):
@@ -427,13 +427,13 @@ def test_beside_what_the_discs_do_not_answer_to_two_may_act_in_them(
         assert set(found.answer) == {*first.names, *two.names}
         assert found.certain == ((*first.names, "dark_offset") if certain else ())
     alone = fitted(model, with_unocculted.effects[1:2])
-    assert judging._beside(model, alone, lambda tried: model) is None  # discs answer to it
+    assert judging._beside(model, alone, lambda tried: model) is None  # the discs show it
 
 
-def test_what_is_fitted_beside_an_effect_does_not_make_it_one_of_the_lit_parts(
+def test_an_always_fitted_effect_does_not_count_as_part_of_another_effect(
     with_unocculted: Evidence,
 ) -> None:
-    """An offset that leaves much unexplained, beside what was measured in the lit parts and is always fitted."""
+    """An offset that leaves much unexplained, with an always fitted effect that was measured in the unocculted field."""
     base = (*with_unocculted.base, *with_unocculted.columns["intensity_gradient"])
     rest = replace(with_unocculted, base=base, effects=with_unocculted.effects[1:])
     found = judging._judge(with_residuals(rest, {"dark_offset": 30.0}, noise=3.0), no_refit, no_refit)
@@ -441,7 +441,7 @@ def test_what_is_fitted_beside_an_effect_does_not_make_it_one_of_the_lit_parts(
     assert found.verdict == "unknown"
 
 
-def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: Evidence) -> None:
+def test_the_gain_of_means_is_that_of_a_free_brightness_of_each_disc(evidence: Evidence) -> None:
     model = LinearModel(evidence, 0.003)
     columns = [*evidence.base, *evidence.columns["dark_offset"]]
     step = model.fit(evidence.columns["dark_offset"])
@@ -461,7 +461,7 @@ def test_means_fall_by_what_a_brightness_of_each_disc_s_own_explains(evidence: E
     assert len(model.discs) - len(columns) <= directions <= len(model.discs)
 
 
-def test_lit_blocks_give_back_what_was_added_and_do_not_mind_brightness(solution: Solution) -> None:
+def test_blocks_recover_an_added_effect_whatever_the_brightness(solution: Solution) -> None:
     evidence = gather(solution, FEW)
     (column,) = evidence.columns["dark_offset"]
     unocculted = evidence.unocculted
@@ -480,7 +480,7 @@ def test_shares_are_averages_over_orders() -> None:
     assert shares == pytest.approx({"a": 0.75, "b": 1.75})  # (1 + 0.5) / 2 and (2 + 1.5) / 2
 
 
-def test_a_copy_and_a_patch_are_found_where_they_are(clean: Transit) -> None:
+def test_a_copy_is_found_at_its_place(clean: Transit) -> None:
     dx, dy = 66, -30
     frames = tuple(
         replace(f, pixels=f.pixels + 0.05 * displaced(gaussian_filter(f.pixels, 4.0), dx, dy))
@@ -490,8 +490,8 @@ def test_a_copy_and_a_patch_are_found_where_they_are(clean: Transit) -> None:
     assert (x, y) == pytest.approx((dx, dy), abs=6) and blur in (2.0, 4.0, 8.0)
 
 
-def test_percents_are_of_the_light_that_was_observed_whatever_was_taken_out(evidence: Evidence) -> None:
-    """With an effect's light taken out a disc may be left with less than none."""
+def test_percentages_refer_to_the_observed_light_after_a_subtraction(evidence: Evidence) -> None:
+    """After the subtraction of an effect a disc may have a negative mean."""
     taken_out = replace(
         evidence, discs=tuple(replace(disc, residual=-1.5 * disc.expected) for disc in evidence.discs)
     )
@@ -519,7 +519,7 @@ def test_closure_and_gap_by_hand() -> None:
     assert closure(held_out([9.0] * 4, [0.0] * 4), after, rng) is None
 
 
-def test_the_interval_of_closure_holds_what_the_cause_would_close() -> None:
+def test_the_interval_of_closure_contains_its_known_errors() -> None:
     ones = np.ones(6)
 
     def held_out(chi2: float, expected: float, unocculted: float = 0.0) -> HeldOut:
@@ -528,17 +528,17 @@ def test_the_interval_of_closure_holds_what_the_cause_would_close() -> None:
         )
 
     before, after = held_out(110.0, 10.0), held_out(30.0, 10.0)
-    # All images alike: nothing is drawn but the form's error.
+    # All images are equal, so the interval contains only the error of form.
     same = closure(before, after, np.random.default_rng(1))
     assert same is not None
     assert (same.low, same.value, same.high) == pytest.approx((0.79, 0.80, 0.81))
-    # 15 of the 20 that are left are errors of the parameters.
+    # Of the remaining 20, 15 come from errors of the parameters.
     unsure = closure(before, held_out(30.0, 25.0), np.random.default_rng(1))
     assert unsure is not None and (unsure.value, unsure.high) == pytest.approx((0.80, 0.96))
-    # A scale that is known to 20 % alone: chi2 / 1.2 is less, and as much of the gap's 100 is closed more surely.
+    # A noise scale with an error of 20 % widens the interval on both sides.
     wide = closure(before, after, np.random.default_rng(1), 0.2)
     assert wide is not None and wide.low < same.low - 0.02 and same.high + 0.02 < wide.high <= 1.01
-    # The lit blocks are asked where they show more, and the effect is what they show.
+    # The unocculted blocks count if they show more of the gap and the effect explains them.
     for unocculted_before, unocculted_after, closed in (
         (900.0, 0.0, 0.9),
         (90.0, 0.0, 0.0),
@@ -552,7 +552,7 @@ def test_the_interval_of_closure_holds_what_the_cause_would_close() -> None:
         assert found is not None and found.value == pytest.approx(closed)
 
 
-def test_deviance_is_how_likely_a_fold_is_as_the_fit_predicts_it() -> None:
+def test_deviance_is_the_log_likelihood_of_a_fold() -> None:
     rng = np.random.default_rng(2)
     left, jacobian, root = rng.normal(size=7), rng.normal(size=(3, 7)), rng.normal(size=(3, 3))
     covariance = root @ root.T
@@ -562,7 +562,7 @@ def test_deviance_is_how_likely_a_fold_is_as_the_fit_predicts_it() -> None:
     assert _deviance(left, jacobian[:0], covariance[:0, :0]) == pytest.approx(left @ left)
 
 
-def test_a_fall_is_of_the_folds_that_both_have() -> None:
+def test_a_decrease_of_deviance_uses_the_common_folds() -> None:
     ones = np.ones(2)
     before, after = (
         HeldOut((0, 1), ones, ones, ones, ones, ones, ones, of_folds)
@@ -571,7 +571,7 @@ def test_a_fall_is_of_the_folds_that_both_have() -> None:
     assert fall(before, after) == 18.0
 
 
-def test_a_probe_counts_where_it_explains_more_and_not_where_it_has_fewer_numbers() -> None:
+def test_a_probe_counts_if_it_explains_more_but_not_if_it_has_fewer_parameters() -> None:
     def tried(gain: float, numbers: int) -> Tried:
         step = Step((), np.zeros(0), np.zeros((0, 0)), gain)
         values = {str(k): (1.0, 1.0, "") for k in range(numbers)}
@@ -581,13 +581,13 @@ def test_a_probe_counts_where_it_explains_more_and_not_where_it_has_fewer_number
     assert not _explains_more(tried(45.5, 1), effect)
     assert not _explains_more(tried(60.0, 12), effect)
     assert _explains_more(tried(60.0, 2), effect)
-    # Eight numbers more gain 17.5 from noise once in forty times, and 30 hardly ever.
+    # Eight more parameters gain 17.5 from noise once in forty times, and 30 hardly ever.
     assert tried(62.5, 11).score > effect.score
     assert not _explains_more(tried(62.5, 11), effect)
     assert _explains_more(tried(75.0, 11), effect)
 
 
-def test_few_numbers_that_gain_nearly_as_much_go_before_what_was_measured_in_the_lit_parts() -> None:
+def test_an_effect_of_few_parameters_precedes_one_measured_in_the_unocculted_field() -> None:
     def tried(name: str, gain: float) -> Tried:
         step = Step((), np.zeros(0), np.zeros((0, 0)), gain)
         return Tried((name,), True, {}, gain, gain, 0.0, Freedom(1, 1, 1), step)
@@ -604,14 +604,14 @@ def test_few_numbers_that_gain_nearly_as_much_go_before_what_was_measured_in_the
     [
         (15, "dark_offset", 3.0, False),
         (15, "intensity_gradient", 0.0, True),
-        # No two neighbours in one fold: what the lit blocks show so surely is not asked held out.
+        # No fold has two neighbours, so the unocculted blocks are not tested on held-out images.
         (9, "dark_offset", 3.0, False),
     ],
 )
-def test_what_fits_by_its_freedom_predicts_held_out_images_worse_than_nothing(
+def test_an_effect_that_fits_noise_predicts_held_out_images_worse_than_none(
     images: int, name: str, offset_dn: float, worse: bool
 ) -> None:
-    """An offset that is there, and three numbers fitted to noise."""
+    """A real offset, and a three-parameter effect fitted to noise."""
     plan = default_plan(images, 160, oversampling=1, brightness=4.0)
     transit = simulate(plan, TRUTH, diffraction(), seed=5).transit
     frames = tuple(replace(f, pixels=f.pixels + np.float32(offset_dn / f.exposure_s)) for f in transit.frames)

@@ -1,4 +1,4 @@
-"""What is looked for before it is fitted: changes of the PSF, a turned mesh, a blur, a Sun that changes; and a second effect."""
+"""Searches before a fit (changes of the PSF, rotated meshes, blurs, a changing Sun), and the search for a second effect."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def effect(name: str):  # type: ignore[no-untyped-def]
     return next(one for one in LIBRARY if one.name == name)
 
 
-def test_a_change_of_the_psf_moves_the_discs_as_its_sum_over_displacements_says() -> None:
+def test_the_sum_over_displacements_predicts_the_effect_of_a_psf_change_on_the_discs() -> None:
     view, rng = View(solution()), np.random.default_rng(1)
     kernel = rng.normal(size=(31, 31))
     search, blur = place_search(view), Blur(kernel, solution().transit.shape)
@@ -77,7 +77,7 @@ def test_a_change_of_the_psf_moves_the_discs_as_its_sum_over_displacements_says(
     assert place_search(view) is search
 
 
-def test_a_blur_is_nowhere_negative_and_as_wide_as_it_says() -> None:
+def test_a_blur_is_not_negative_and_has_its_nominal_width() -> None:
     point = np.zeros((63, 63))
     point[31, 31] = 1.0
     y, x = np.indices(point.shape) - 31
@@ -93,7 +93,7 @@ def test_a_blur_is_nowhere_negative_and_as_wide_as_it_says() -> None:
 
 @cache
 def cross() -> Plane:
-    """A core with orders along a cross that is 3 to 45 px from it, 127 px, sum 1."""
+    """A core with orders along a cross from 3 to 45 px, 127 px wide, sum 1."""
     plane = np.zeros((127, 127))
     for r in range(3, 46, 3):
         plane[63, 63 + r] = plane[63, 63 - r] = plane[63 + r, 63] = plane[63 - r, 63] = 1 / r
@@ -103,7 +103,7 @@ def cross() -> Plane:
 
 
 def test_a_turned_mesh_is_found_at_its_angle() -> None:
-    """Turned by more than its orders are wide: what a derivative cannot tell."""
+    """The rotation is larger than the width of the orders, so a derivative could not find it."""
     plan = default_plan(12, 128, oversampling=1, brightness=8.0)
     turned = np.maximum(rotate(cross(), 12.0, reshape=False, order=1), 0.0)
     transit = simulate(plan, TRUTH, turned / turned.sum(), seed=4).transit
@@ -111,7 +111,7 @@ def test_a_turned_mesh_is_found_at_its_angle() -> None:
     assert _best_amount(view, _turned, ANGLES_DEG) == pytest.approx(12.0, abs=2.0)
 
 
-def test_a_wide_change_of_the_psf_moves_the_discs_as_its_sum_over_coarse_displacements_says() -> None:
+def test_the_coarse_sum_predicts_the_effect_of_a_wide_psf_change_on_the_discs() -> None:
     view = View(solution())
     search, blur = place_search(view), Blur(HALOS[2](255), solution().transit.shape)
     coarse = coarse_kernel(HALOS[2](255), STEP_PX)
@@ -131,12 +131,12 @@ def test_a_halo_of_share_one_holds_all_light(halo: Halo) -> None:
     kernel = halo(2047)
     assert kernel.min() >= 0 and kernel.shape == (2047, 2047)
     assert kernel[1023, 1023] == kernel.max()
-    beyond = 0.08  # of a Moffat of 80 px a thirteenth lies beyond the plane
+    beyond = 0.08  # one thirteenth of a Moffat of 80 px lies outside the plane
     assert float(kernel.sum()) == pytest.approx(1.0, abs=beyond)
 
 
 def test_a_wide_halo_is_found_at_about_its_width() -> None:
-    """An exponential of 30 px, between two that are tried; the power law refitted takes up the most of it."""
+    """An exponential of 30 px, between two scales of the search; the refitted power law absorbs most of it."""
     plan = default_plan(18, 128, oversampling=1, brightness=60.0)
     kernel = crop_or_pad(diffraction(), 255)
     y, x = np.indices(kernel.shape) - 127
@@ -152,7 +152,7 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
 
 
 def brightening(share: float) -> Transit:
-    """A patch of the first pointing brightens by a share in its images' time; behind the occulter it does not show."""
+    """A patch of the first pointing brightens by a share over its images; behind the occulter it does not show."""
     transit = clean()
     first = [frame for frame in transit.frames if frame.fov == 1]
     start, end = first[0].time_s, first[-1].time_s
@@ -167,22 +167,22 @@ def brightening(share: float) -> Transit:
 
 
 @pytest.mark.parametrize(("share", "seen"), [(0.0, False), (1.0, True)])
-def test_a_sun_that_changes_shows_in_the_lit_parts_alone(share: float, seen: bool) -> None:
+def test_a_changing_sun_shows_only_in_the_unocculted_field(share: float, seen: bool) -> None:
     evidence = gather(invert(brightening(share)), [effect("scene_evolution")])
     columns = evidence.columns["scene_evolution"]
     assert all((disc.jacobian[list(columns)] == 0).all() for disc in evidence.discs)
     model = LinearModel(evidence, FLOOR)
     tried = fitted(model, evidence.effects)
-    # It pays for every number that was taken from the lit parts, and for no more than these have.
+    # Its score is reduced for every number measured in the unocculted field, but for no more than that field has.
     assert 10 < evidence.numbers_of(columns) < evidence.all_unocculted.freedom
     assert (tried.p_value < 1e-6, tried.score > 0) == (seen, seen)
-    # It changed evenly: the uneven part is not worth its numbers.
+    # The change is linear in time, so the uneven part is left out.
     assert set(tried.values) == ({"rms"} if seen else set())
 
 
 @pytest.mark.slow
-def test_beside_an_effect_that_explains_the_lit_parts_a_second_is_found_in_the_discs() -> None:
-    """A difference of gain, which the discs hide, and a light leak, which they alone show."""
+def test_a_second_effect_is_found_in_the_discs_after_one_of_the_unocculted_field() -> None:
+    """A gain mismatch, which the discs do not show, and a light leak, which only the discs show."""
     transit = clean()
     x = np.indices(transit.shape)[1] / 128 - 0.5
     frames = tuple(
@@ -206,8 +206,8 @@ def test_beside_an_effect_that_explains_the_lit_parts_a_second_is_found_in_the_d
     assert nothing is None
 
 
-def test_a_round_that_leaves_more_than_the_one_before_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An offset of 1 DN; in the second round the images lose what was never there."""
+def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An offset of 1 DN; the second round also subtracts light that was never added."""
     offset = effect("dark_offset")
     frames = tuple(
         replace(frame, pixels=frame.pixels + np.float32(1.0 / frame.exposure_s)) for frame in clean().frames
@@ -235,8 +235,8 @@ def test_a_round_that_leaves_more_than_the_one_before_is_not_taken(monkeypatch: 
     assert value == pytest.approx(1.0, abs=4 * sigma)
 
 
-def test_a_share_of_light_is_never_less_than_none() -> None:
-    """Images that lost a share of their columns' light: by a smear that adds light nothing of it is explained."""
+def test_a_share_of_light_cannot_be_negative() -> None:
+    """Images that lost a share of their columns' light: a smear that adds light must not explain them."""
     smear = effect("column_smear")
     frames = tuple(
         replace(frame, pixels=frame.pixels - np.float32(0.03) * frame.pixels.mean(axis=0))
@@ -251,8 +251,8 @@ def test_a_share_of_light_is_never_less_than_none() -> None:
     assert caught.value.code == "effect-unseen"
 
 
-def test_a_scene_is_as_bright_as_the_image_s_own() -> None:
-    """The second image is 5 % brighter than the others of its pointing, which do not know it."""
+def test_a_scene_has_the_brightness_of_its_own_image() -> None:
+    """The second image is 5 % brighter than the others of its pointing."""
     frames = tuple(
         replace(frame, pixels=frame.pixels * np.float32(1.05 if n == 1 else 1.0))
         for n, frame in enumerate(clean().frames)
@@ -263,8 +263,8 @@ def test_a_scene_is_as_bright_as_the_image_s_own() -> None:
     assert _ratio(2.0, 4.0) == 0.5 and _ratio(-1.0, 4.0) == 0.0 and _ratio(1.0, 0.0) == 1.0
 
 
-def test_what_is_taken_out_of_an_image_is_as_bright_as_the_image() -> None:
-    """A copy of every image, and a Sun that is not steady to 2 %: without the copy the images of a pointing agree no less."""
+def test_a_subtracted_effect_scales_with_the_brightness_of_the_image() -> None:
+    """A copy in every image, and brightness that varies by 2 %: after subtraction the images of a pointing agree as well."""
     rng = np.random.default_rng(4)
     frames = tuple(
         replace(
