@@ -1,8 +1,7 @@
-"""Searches before a fit (changes of the PSF, rotated meshes, blurs, a changing Sun), and the search for a second effect."""
+"""Searches before a fit: changes of the PSF, rotated meshes, blurs, halos, copies, and a changing Sun."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -11,12 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, rotate
 
-from psfcore.errors import DataError
-from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.cells import sensitivities
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
-from psfcore.gap.evidence.search import STEP_PX, coarse_kernel, displaced, place_search
+from psfcore.gap.evidence.search import STEP_PX, PlaceSearch, coarse_kernel, displaced, place_search
 from psfcore.gap.library.optics import (
     ANGLES_DEG,
     BETWEEN_THEM,
@@ -27,40 +24,21 @@ from psfcore.gap.library.optics import (
     _best_amount,
     _best_halo,
     _blurred,
-    _copy,
     _turned,
 )
-from psfcore.gap.library.registry import LIBRARY
-from psfcore.gap.verdict import correction
-from psfcore.gap.verdict import judge as judging
-from psfcore.gap.verdict.correction import _with_noise_of, add_to_model, beyond, images_without
 from psfcore.gap.verdict.judge import fitted
-from psfcore.gap.view import View, _ratio
+from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
-from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Blur
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.occulter import coverage
 from psfcore.transit.transit import Transit
+from tests.psfcore.gap.small_transits import clean, effect, solution
 from tests.transit_files import TRUTH, diffraction
 
 Plane = NDArray[np.float64]
-
-
-@cache
-def clean(images: int = 18) -> Transit:
-    plan = default_plan(images, 128, oversampling=1, brightness=8.0)
-    return simulate(plan, TRUTH, diffraction(), seed=3).transit
-
-
-@cache
-def solution() -> Solution:
-    return invert(clean())
-
-
-def effect(name: str):  # type: ignore[no-untyped-def]
-    return next(one for one in LIBRARY if one.name == name)
 
 
 def test_the_sum_over_displacements_predicts_the_effect_of_a_psf_change_on_the_discs() -> None:
@@ -180,105 +158,14 @@ def test_a_changing_sun_shows_only_in_the_unocculted_field(share: float, seen: b
     assert set(tried.values) == ({"rms"} if seen else set())
 
 
-@pytest.mark.slow
-def test_a_second_effect_is_found_in_the_discs_after_one_of_the_unocculted_field() -> None:
-    """A gain mismatch, which the discs do not show, and a light leak, which only the discs show."""
-    transit = clean()
-    x = np.indices(transit.shape)[1] / 128 - 0.5
+def test_a_copy_is_found_at_its_place() -> None:
+    dx, dy = 66, -30
+    transit = simulate(
+        default_plan(9, 160, oversampling=1, brightness=4.0), TRUTH, diffraction(), seed=5
+    ).transit
     frames = tuple(
-        replace(
-            frame,
-            pixels=(
-                (frame.pixels + 6.0 + 20.0 * x) * (1.1 if (frame.gain_mode or "") == "combined" else 1.0)
-            ).astype(np.float32),
-        )
-        for frame in transit.frames
+        replace(f, pixels=f.pixels + 0.05 * displaced(gaussian_filter(f.pixels, 4.0), dx, dy))
+        for f in transit.frames
     )
-    found = invert(replace(transit, frames=frames))
-    library = [effect(name) for name in ("gain_mismatch", "intensity_gradient", "dark_offset", "core_blur")]
-    model = LinearModel(gather(found, library), FLOOR)
-    best = fitted(model, [library[0]])
-    added = add_to_model(found, [library[0]], best, model)
-    second = judging._beside(model, best, lambda tried: beyond(added, library, model))
-    assert second is not None and second.verdict == "attributed"
-    assert second.answer == ("gain_mismatch", "intensity_gradient")
-    nothing = judging._beside(model, best, judging.no_refit)
-    assert nothing is None
-
-
-def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An offset of 1 DN; the second round also subtracts light that was never added."""
-    offset = effect("dark_offset")
-    frames = tuple(
-        replace(frame, pixels=frame.pixels + np.float32(1.0 / frame.exposure_s)) for frame in clean().frames
-    )
-    found = invert(replace(clean(), frames=frames))
-    model = LinearModel(gather(found, [offset]), FLOOR)
-    taken_out: list[float] = []
-    as_it_is = correction.images_without
-
-    def spoiled(
-        transit: Transit, view: View, effects: Sequence[Effect], theta: NDArray[np.float64]
-    ) -> Transit:
-        taken_out.append(float(theta[0]))
-        again = as_it_is(transit, view, effects, theta)
-        if len(taken_out) == 1:
-            return again
-        light = np.linspace(0.0, 40.0, again.shape[1], dtype=np.float32)
-        return replace(again, frames=tuple(replace(f, pixels=f.pixels + light) for f in again.frames))
-
-    monkeypatch.setattr(correction, "images_without", spoiled)
-    monkeypatch.setattr(correction, "SETTLED", 0.0)
-    added = add_to_model(found, [offset], fitted(model, [offset]), model)
-    value, sigma, _ = added.values["offset"]
-    assert len(taken_out) == 2 and added.rounds == 1
-    assert value == pytest.approx(1.0, abs=4 * sigma)
-
-
-def test_a_share_of_light_cannot_be_negative() -> None:
-    """Images that lost a share of their columns' light: a smear that adds light must not explain them."""
-    smear = effect("column_smear")
-    frames = tuple(
-        replace(frame, pixels=frame.pixels - np.float32(0.03) * frame.pixels.mean(axis=0))
-        for frame in clean().frames
-    )
-    found = invert(replace(clean(), frames=frames))
-    model = LinearModel(gather(found, [smear]), FLOOR)
-    below = fitted(model, [smear], any_sign=True)
-    assert all(value < 0 for value, _, _ in below.values.values())
-    with pytest.raises(DataError, match="expected column_smear to add light") as caught:
-        add_to_model(found, [smear], below, model)
-    assert caught.value.code == "effect-unseen"
-
-
-def test_a_scene_has_the_brightness_of_its_own_image() -> None:
-    """The second image is 5 % brighter than the others of its pointing."""
-    frames = tuple(
-        replace(frame, pixels=frame.pixels * np.float32(1.05 if n == 1 else 1.0))
-        for n, frame in enumerate(clean().frames)
-    )
-    view = View(invert(replace(clean(), frames=frames)))
-    of_one, of_next = (float(view.expected[n].mean() / frames[n].pixels.mean()) for n in (1, 2))
-    assert of_one == pytest.approx(of_next, rel=2e-3)
-    assert _ratio(2.0, 4.0) == 0.5 and _ratio(-1.0, 4.0) == 0.0 and _ratio(1.0, 0.0) == 1.0
-
-
-def test_a_subtracted_effect_scales_with_the_brightness_of_the_image() -> None:
-    """A copy in every image, and brightness that varies by 2 %: after subtraction the images of a pointing agree as well."""
-    rng = np.random.default_rng(4)
-    frames = tuple(
-        replace(
-            frame,
-            pixels=(
-                (frame.pixels + 0.4 * displaced(gaussian_filter(frame.pixels, 12.0), 40, -30))
-                * (1 + 0.02 * rng.standard_normal())
-            ).astype(np.float32),
-        )
-        for frame in clean().frames
-    )
-    found = invert(replace(clean(), frames=frames))
-    view, copy = View(found), replace(effect("ghost"), changes=lambda view: _copy(12.0, 40, -30), held=None)
-    before = gather(found, [copy], view=view)
-    without = invert(images_without(found.transit, view, [copy], np.array([0.4])))
-    after = _with_noise_of(before, gather(without, [copy]))
-    assert after.all_unocculted.chi2 < before.all_unocculted.chi2 * 1.02
+    blur, x, y = PlaceSearch(View(invert(replace(transit, frames=frames)))).copy
+    assert (x, y) == pytest.approx((dx, dy), abs=6) and blur in (2.0, 4.0, 8.0)
