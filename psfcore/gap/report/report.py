@@ -206,7 +206,6 @@ def sentence(found: Diagnosis) -> str:
             f"{found.noise_pct:.1f} %, and p = {judged.p_value:.2g}."
         )
     strongest = found.where[0]
-
     lead = f"A gap of {left} varies most {AXIS_WORDS[strongest.name]} and is largest in {_pointings(strongest.at)}."
     if found.rms.value < found.noise_pct and _unocculted_alone(found):
         lead = (
