@@ -1,11 +1,12 @@
-"""`python -m studies.venus_gap`: what a measured gap says of its cause, and what it cannot say.
+"""`python -m studies.venus_gap`: which causes of a measured gap the data support, and which they cannot separate.
 
-32 epochs of Venus before the Sun in AIA 193, deconvolved with the standard PSF, which has no scatter of long range:
-the disc should be dark and is not. What is left is fitted as a sum of terms, each with a meaning:
+The data are 32 epochs of Venus in front of the Sun in AIA 193, deconvolved with the standard PSF, which contains no
+long-range scatter. The disc of Venus should be dark, but is not. The remaining light is fitted as a sum of terms, each
+with a physical meaning:
 
     core = sum over terms of weight x term          Eq. (1)
 
-judged by the error of each epoch when it is held out, and by BIC = n ln(rss / n) + k ln n.
+Choices of terms are compared by the error of each epoch when it is held out, and by BIC = n ln(rss / n) + k ln n.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ FILE = "data/real/occultation/aia193_venus_residuals.csv"
 
 @dataclass(frozen=True)
 class Explained:
-    """One choice of terms: weights and errors in DN where the term has its mean, held-out rms (DN), BIC."""
+    """One choice of terms.
+
+    weights: weight and error of each term, DN where the term has its mean. held_out_rms: DN. bic: BIC.
+    """
 
     terms: tuple[str, ...]
     weights: dict[str, tuple[float, float]]
@@ -36,13 +40,13 @@ class Explained:
 
 
 def read(shared: Path) -> tuple[Vector, dict[str, Vector]]:
-    """What is left in the disc (DN) at each epoch, and the terms, scaled to a mean (or a step) of 1."""
+    """The light that remains in the disc (DN) at each epoch, and the terms, scaled to a mean (or a step) of 1."""
     with (shared / FILE).open() as lines:
         rows = list(csv.DictReader(lines))
     column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name != "time"}
     order = np.linspace(-0.5, 0.5, len(rows))
     ring, disk = column["annulus_DN_after_std_psf"], column["fulldisk_DN"]
-    # Every other image or so has 5 % more light over the whole disk: two ways of taking them.
+    # About every other image has 5 % more light over the whole disk: there are two kinds of images.
     brighter = (disk > np.polyval(np.polyfit(order, disk, 1), order)).astype(float)
     return column["core_DN_after_std_psf"], {
         "level": np.ones(len(rows)),
@@ -54,7 +58,7 @@ def read(shared: Path) -> tuple[Vector, dict[str, Vector]]:
 
 
 def explained(core: Vector, terms: dict[str, Vector], chosen: Sequence[str]) -> Explained:
-    """Eq. (1) by least squares."""
+    """Fit Eq. (1) by least squares."""
     design = np.array([terms[name] for name in chosen]).T
     inverse = np.linalg.inv(design.T @ design)
     weights = inverse @ design.T @ core
@@ -71,7 +75,7 @@ def explained(core: Vector, terms: dict[str, Vector], chosen: Sequence[str]) -> 
 
 
 def ranking(core: Vector, terms: dict[str, Vector], most: int = 3) -> list[Explained]:
-    """Every choice of up to `most` terms, the best first."""
+    """Fit every choice of up to `most` terms; the smallest BIC first."""
     chosen = (c for k in range(1, most + 1) for c in itertools.combinations(terms, k))
     return sorted((explained(core, terms, c) for c in chosen), key=lambda one: one.bic)
 
@@ -79,7 +83,9 @@ def ranking(core: Vector, terms: dict[str, Vector], most: int = 3) -> list[Expla
 if __name__ == "__main__":
     shared = Path(os.environ.get("HELIOPSF_SHARED", Path(__file__).parents[2] / "shared"))
     core, terms = read(shared)
-    print(f"left in the disc after the standard PSF: {core.mean():.1f} DN, rms about that {core.std():.1f}")
+    print(
+        f"light in the disc after the standard PSF: mean {core.mean():.1f} DN, standard deviation {core.std():.1f} DN"
+    )
     for one in ranking(core, terms)[:8]:
         said = ", ".join(f"{name} {w:.1f} +- {s:.1f}" for name, (w, s) in one.weights.items())
         print(f"BIC {one.bic:6.1f}  held-out rms {one.held_out_rms:.2f} DN  {said}")

@@ -23,7 +23,7 @@ LONGEST_FIRST = (
     "whole/test_real_data.py",
     "service/api/bulk/test_bulk.py",
     "service/cli/test_gap.py",
-    "psfcore/gap/evidence/test_searches.py",
+    "psfcore/gap/evidence/test_search.py",
     "psfcore/report/test_report.py",
     "psfcore/flare/test_arms.py",
     "psfcore/deconvolve/assess/test_error_planes.py",

@@ -1,4 +1,4 @@
-"""A small transit with a gap, as files; and the patches with which a job diagnoses it in seconds."""
+"""A small transit with a gap, written as files, and the patches with which a job diagnoses it in seconds."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ GLOW_DN_S = 25.0
 
 
 def glow() -> NDArray[np.float64]:
-    """Light at the right edge [y, x], 1 there: nobody's effect but that of who wrote EDGE_GLOW."""
+    """Light at the right edge [y, x], 1 there: no effect of the library, only the added EDGE_GLOW."""
     x = (np.arange(SIZE_PX) + 0.5) / SIZE_PX - 0.5
     return np.asarray(np.exp(-(((x - 0.5) / 0.15) ** 2)) * np.ones((SIZE_PX, 1)))
 
@@ -42,7 +42,7 @@ from psfcore.gap.effect import Change, Effect, EffectParameter
 def glow(view):
     x, _ = view.places
     plane = np.exp(-(((x - 0.5) / 0.15) ** 2)).astype(np.float32)
-    return [Change(lambda n, images: plane, lit=False)]
+    return [Change(lambda n, images: plane, unocculted=False)]
 
 EFFECTS = (Effect("edge_glow", "detector", (EffectParameter("height", "DN/s", 5.0),),
     "A lamp beside the detector lights its right edge.", "a dark exposure", ("detector_x",), glow),)
@@ -50,7 +50,7 @@ EFFECTS = (Effect("edge_glow", "detector", (EffectParameter("height", "DN/s", 5.
 
 
 def write_gap(folder: Path, *, offset_dn: float = 0.0, light_dn_s: float = 0.0) -> Path:
-    """Twelve images of SIZE_PX px, with a dark level that is wrong or with light at their right edge."""
+    """Twelve images of SIZE_PX px with a wrong dark level, or with light at their right edge."""
     plan = default_plan(12, SIZE_PX, oversampling=1, brightness=8.0)
     made = simulate(plan, TRUTH, diffraction(), seed=8)
     frames = tuple(
@@ -63,7 +63,7 @@ def write_gap(folder: Path, *, offset_dn: float = 0.0, light_dn_s: float = 0.0) 
 
 @contextmanager
 def quick_diagnosis() -> Iterator[None]:
-    """A library of a few effects, and fewer draws."""
+    """Diagnose with a library of a few effects and fewer sign flips."""
     with ExitStack() as stack:
         stack.enter_context(patch.object(added_effects, "LIBRARY", FEW))
         stack.enter_context(QUICK)
@@ -71,7 +71,7 @@ def quick_diagnosis() -> Iterator[None]:
 
 
 def answer_at_once(monkeypatch: pytest.MonkeyPatch, found: Diagnosis) -> list[dict[str, Any]]:
-    """Let jobs answer a diagnosis that was made before, with small pictures and PSFs; what they ask for is listed."""
+    """Let jobs return a diagnosis made before, with small pictures and PSFs; the returned list records the jobs' arguments."""
     asked: list[dict[str, Any]] = []
 
     def diagnose(transit: object, **how: Any) -> Diagnosis:
@@ -85,7 +85,7 @@ def answer_at_once(monkeypatch: pytest.MonkeyPatch, found: Diagnosis) -> list[di
 
 
 def _small_psf(*given: Any, **named: Any) -> Psf:
-    """The corrected PSF's middle, which is quicker to write down."""
+    """The centre of the corrected PSF, which is quicker to write."""
     psf = corrected_psf(*given, **named)
     parts = {name: crop_centred(part, (257, 257)) for name, part in psf.components.items()}
     return replace(psf, kernel=crop_centred(psf.kernel, (257, 257)), components=parts)

@@ -1,6 +1,9 @@
 """The gap between the fitted model and the images: where it lies, which effect causes it, how far it shrinks.
 
-An effect is declared once (`effect.Effect`). One of your own is a Python file that defines EFFECTS, as this one does:
+This package and `psfcore.blind` share no code on purpose: the blind set tests this library, so its effects are written
+independently.
+
+An effect is declared once, as an `effect.Effect`. To add your own, write a Python file that defines EFFECTS, like this one:
 
     import numpy as np
     from psfcore.gap.effect import Change, Effect, EffectParameter
@@ -8,11 +11,11 @@ An effect is declared once (`effect.Effect`). One of your own is a Python file t
     def glow(view):
         x, _ = view.places
         plane = np.exp(-(((x - 0.5) / 0.15) ** 2)).astype(np.float32)
-        return [Change(lambda n, images: plane, lit=False)]
+        return [Change(lambda n, images: plane, unocculted=False)]
 
     EFFECTS = (Effect("edge_glow", "detector", (EffectParameter("height", "DN/s", 5.0),),
         "A lamp beside the detector lights its right edge.", "a dark exposure", ("detector_x",), glow),)
 
-`heliopsf gap TRANSIT --local --effects FILE.py` tries it beside the library; a service tries those of the modules that
-its operator names in HELIOPSF_GAP_EFFECTS.
+`heliopsf gap TRANSIT --local --effects FILE.py` tests it together with the library. A service tests the effects of the
+modules that its operator names in HELIOPSF_GAP_EFFECTS.
 """

@@ -1,12 +1,13 @@
-"""The PSF that is fitted once an effect is in the model, and the effect in it where it is one of the optics.
+"""The PSF that is fitted together with the answer's effects; it contains those effects that belong to the optics.
 
-With H the PSF fitted beside the effects, theta their parameters and dH_k what one unit of each does to a point of light:
+H is the PSF fitted together with the effects, theta_k are their parameters, and dH_k is the change of a point source's
+image for one unit of parameter k:
 
     H' = H + sum over effects of the optics of theta_k dH_k        Eq. (1)
 
-to first order, cut off below zero and scaled to the sum of H. What a detector or a scene does is no part of a PSF: such
-an effect changes it by being no longer mistaken for scatter. An effect that differs across the field has dH_k of the
-field's middle.
+to first order, with negative values set to zero and scaled to the sum of H. An effect of the detector or of the scene is
+not part of a PSF. It changes the PSF only because the fit no longer takes it for scatter. An effect that varies across
+the field has dH_k of the field's centre.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import Diagnosis
-from psfcore.gap.effect import Field, View
 from psfcore.gap.verdict.correction import Corrected
+from psfcore.gap.view import Field, View
 from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_or_pad
 from psfcore.scatter.optics import Blur, Lanes, Optics
 from psfcore.scatter.total_psf import TotalPsf
@@ -32,15 +33,17 @@ Kernel = NDArray[np.float64]
 
 
 def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[str, Any]) -> Psf:
-    """The PSF with the answer's effects in the model, on the full reach; components DIFFRACTION and SCATTER beside it.
+    """The PSF with the answer's effects in the model, on the full reach, with the components DIFFRACTION and SCATTER.
 
-    provenance: what made it and its parents; effects, their parameters, the gap and the inputs are added here. Raises
-    DataError "no-answer" where no effect was added to the model, "bad-effects" of what somebody added, and as `Psf` does.
+    provenance: what made the PSF, and its parents; this function adds the effects, their parameters, the gap and the
+    inputs. Raises DataError "no-answer" if no effect was added to the model, "bad-effects" if an added effect fails, and the
+    errors of `Psf`.
     """
     if not found.corrected:
         raise DataError(
             "no-answer",
-            f"expected a diagnosis whose answer was added to the model; got the verdict {found.judgement.verdict}",
+            "expected a diagnosis whose answer was fitted together with the PSF; got the verdict "
+            f"{found.judgement.verdict}: there is no corrected PSF",
         )
     added = found.corrected[0]
     transit, inversion = added.solution.transit, added.solution.inversion
@@ -66,7 +69,7 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
 
 
 def _history(found: Diagnosis, added: Corrected) -> dict[str, Any]:
-    """What was added, how well it is known, what it did to the gap, and what it was found in."""
+    """The added effects, their parameters with errors, the gap before and after, and the input files."""
     return {
         "effects": [effect.name for effect in added.effects],
         "effect_in_kernel": [effect.name for effect in added.effects if effect.stage == "optics"],
@@ -102,11 +105,11 @@ def _kernel(added: Corrected) -> Kernel:
 
 
 class _Point(View):
-    """One point of light in the middle of a field as wide as the full reach, seen through the PSF."""
+    """A point source in the centre of a field as large as the full reach, convolved with the PSF."""
 
     @cached_property
     def scenes(self) -> Sequence[Field]:
-        """The point, a unit of light."""
+        """The point source: one unit of light."""
         point = np.zeros(self.solution.transit.shape, np.float32)
         point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
         return [point]
@@ -117,22 +120,22 @@ class _Point(View):
         return [frame.pixels for frame in self.solution.transit.frames]
 
     @cached_property
-    def lit(self) -> list[Field]:
+    def pointing_means(self) -> list[Field]:
         """The PSF."""
         return list(self.expected)
 
-    def lit_scene(self, n: int) -> Lanes:
-        """The point, in the engine's order."""
+    def occulted_scene(self, n: int) -> Lanes:
+        """The point source, in the engine's memory order."""
         return self.solution.optics.lanes(self.scenes[n])
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
-        """dH of the point, the weight being that of its place."""
+        """dH of the point source, times the weight at its place."""
         point = slope.lanes(self.scenes[n] if weight is None else self.scenes[n] * weight)
         return slope.field(slope.convolve(point))
 
 
 def _point(added: Corrected, total: TotalPsf, kernel: Kernel) -> View:
-    """The solution, its first image replaced by that of a point."""
+    """The view of a solution whose only image is that of a point source."""
     solution = added.solution
     middle = REACH_GRID_PX // 2
     frame = replace(

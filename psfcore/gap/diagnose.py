@@ -1,9 +1,9 @@
-"""The diagnosis of a transit: noise, fit, expected gap, evidence, verdict, real refits, where, and how far it shrinks.
+"""The diagnosis of a transit: noise, fit, expected gap, evidence, verdict, full refits, location and closure of the gap.
 
-In this order: the noise that the images show; the PSF fitted; what the same fit leaves on its own
-simulation; how discs and lit parts answer to every effect; the verdict; the answer's effects added to the model for
-real, and with a tie those it lies between, at most MOST_REFITS (the verdict asks for such fits too, each made once);
-closure and gap on images held out.
+In this order: the noise that the images show; the fit of the PSF; the residuals of the same fit on its own simulation;
+the response of discs and unocculted field to every effect; the verdict; full refits with the answer's effects in the
+model and, for a tie, with each of the tied effects, at most MOST_REFITS (the verdict may also request refits; each is
+made once); closure and gap on held-out images.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.gap.effect import Effect, View
+from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
@@ -34,6 +34,7 @@ from psfcore.gap.verdict.closure import (
 from psfcore.gap.verdict.correction import Corrected, add_to_model, beyond
 from psfcore.gap.verdict.judge import LEAST_IMAGES, Judgement, Tried, judge
 from psfcore.gap.verdict.where import Axis, where
+from psfcore.gap.view import View
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named
@@ -46,7 +47,7 @@ SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Shrinking:
-    """How far an effect closes the gap, in both schemes; closure is none where there is no gap."""
+    """How far an effect closes the gap, by both ways of holding out images; closure is None if there is no gap."""
 
     closure: Interval | None
     closure_by_pointing: Interval | None
@@ -55,10 +56,11 @@ class Shrinking:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What a transit says of the gap between it and the model fitted to it.
+    """What a transit shows of the gap between it and the model fitted to it.
 
-    before_refit, rms, after: the gap with the PSF that the found effect leaves, refitted, and with the effect added.
-    cautions: what weakens it. corrected: the real refits, the answer's first.
+    before_refit, rms, after: the gap before the PSF is refitted (with the PSF fitted together with the answer, but without
+    the answer's effects), after the refit, and with the answer in the model. cautions: what weakens the result. corrected: the
+    full refits, the answer's first.
     """
 
     judgement: Judgement
@@ -79,7 +81,7 @@ class Diagnosis:
 
     @property
     def evidence(self) -> Evidence:
-        """What it goes by."""
+        """The data that it uses."""
         return self.model.evidence
 
     @property
@@ -99,14 +101,18 @@ def diagnose(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Diagnosis:
-    """Fit a transit and diagnose what the fit leaves.
+    """Fit a transit and diagnose the residuals of the fit.
 
-    start: the shape's coordinates that the fit starts from; none: its own. refit: add the answer's effects to the model
-    for real. seed: of the simulation and of the intervals. Raises DataError as `psfcore.scatter.inversion.invert` does,
-    "bad-library" where an answerable effect is missing, "bad-effects" of what somebody added.
+    start: the shape's coordinates from which the fit starts (None: the shape's own start). refit: whether to make full
+    refits with the answer's effects in the model. seed: of the simulation and of the intervals. Raises DataError as
+    `psfcore.scatter.inversion.invert` does, "bad-library" if no effect of the library can be an answer, and "bad-effects" if
+    an added effect fails.
     """
     if not any(effect.named for effect in library):
-        raise DataError("bad-library", "expected at least one effect that can be an answer; got none")
+        raise DataError(
+            "bad-library",
+            "expected a library with at least one effect that is not a probe; got none: add an effect",
+        )
     noise = measured_noise(transit)
     if noise is not None and not noise.agrees:
         transit = replace(transit, noise=noise.noise)
@@ -117,14 +123,15 @@ def diagnose(
 
 
 def start_of(psf: Psf) -> tuple[Shape, Vector]:
-    """The shape that a PSF was fitted with, and its coordinates: where `diagnose` may start.
+    """The shape with which a PSF was fitted, and its coordinates, from which `diagnose` may start.
 
-    Raises DataError "psf-not-fitted" where it was not fitted to a transit, "unknown-shape" where not with one known here.
+    Raises DataError "psf-not-fitted" if the PSF was not fitted to a transit, "unknown-shape" if its shape is not known here.
     """
     if psf.fitted is None:
         raise DataError(
             "psf-not-fitted",
-            f"expected a PSF that was fitted to a transit, to start from; {psf.name} {psf.version} holds no fitted shape",
+            "expected a PSF that was fitted to a transit, because the fit starts from its shape; "
+            f"{psf.name} {psf.version} has no fitted shape: choose another PSF, or none",
         )
     return shape_named(psf.fitted.shape), np.array(psf.fitted.coordinates, dtype=np.float64)
 
@@ -138,7 +145,7 @@ def diagnose_solution(
     refit: bool = True,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Diagnosis:
-    """The diagnosis of a fit that was made already; arguments and errors as in `diagnose`."""
+    """The diagnosis of an existing fit; arguments and errors as in `diagnose`."""
     view = View(solution)
     expected = expected_gap(view, seed=seed, floor=FLOOR, progress=progress)
     evidence = gather(solution, library, view=view, progress=progress)
@@ -146,7 +153,7 @@ def diagnose_solution(
         evidence,
         FLOOR,
         disc_scale=float(np.clip(expected.disc_scale, SMALLEST_SCALE, LARGEST_SCALE)),
-        lit_scale=float(np.clip(expected.lit_scale, SMALLEST_SCALE, LARGEST_SCALE)),
+        unocculted_scale=float(np.clip(expected.unocculted_scale, SMALLEST_SCALE, LARGEST_SCALE)),
         scale_error=expected.scale_error,
     )
     refits = _Refits(view, model, progress)
@@ -175,25 +182,25 @@ def diagnose_solution(
         corrected=fits,
         residual=before,
         residual_after=after if gone else None,
-        cautions=(*_cautions(solution, noise, evidence), *refits.failures, *_amiss(found)),
+        cautions=(*_cautions(solution, noise, evidence), *refits.failures, *_rejected(found)),
     )
 
 
 def _likely(found: Judgement) -> tuple[str, ...]:
-    """The effects that explain most of a gap: with a tie the best of it."""
+    """The effects that explain most of a gap; for a tie the best of the tied effects."""
     return () if found.verdict == "none" or found.best is None else found.best.names
 
 
 def _shrinking(
     model: LinearModel, found: Judgement, fits: Sequence[Corrected], rng: np.random.Generator
 ) -> tuple[dict[str, Shrinking], HeldOut | None, HeldOut | None]:
-    """Closure of every effect tried; residuals held out without an effect, and with the best.
+    """Closure of every effect tried; held-out residuals without an effect, and with the best effect.
 
-    Of effects that were added to the model for real, by that model.
+    An effect with a full refit is judged by the model of that refit.
     """
     schemes = (time_blocks(model), pointings(model))
     before = [hold_out(model, (), scheme) for scheme in schemes]
-    real = {fit.label: fit.model for fit in fits}  # whatever became of them
+    real = {fit.label: fit.model for fit in fits}  # also those that were rejected later
     out: dict[str, Shrinking] = {}
     best: HeldOut | None = None
     base = len(model.evidence.base)
@@ -218,18 +225,18 @@ def _shrinking(
 
 
 def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
-    """By a model with effects in it, all of which are fitted."""
+    """Hold out images with a model that contains effects; all of them are fitted."""
     return hold_out(model, model.evidence.of_effects, scheme)
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
-    """The real refit's, unless an image took no part in that."""
+    """The result of the full refit, unless it does not cover the same images as the linear model."""
     same = real is not None and linear is not None and real.images == linear.images
     return real if same else linear
 
 
 class _Refits:
-    """Real refits of effects, each made once."""
+    """Full refits with effects in the model, each made once."""
 
     def __init__(self, view: View, model: LinearModel, progress: Progress) -> None:
         self._view, self._model, self._progress = view, model, progress
@@ -237,12 +244,12 @@ class _Refits:
         self.failures: list[str] = []
 
     def model(self, tried: Tried) -> LinearModel | None:
-        """The model about the refit with an effect, or some together; none where there is no fit with it."""
+        """The model of the full refit with an effect, or with several; None if this fit failed."""
         made = self._fit(tried)
         return None if made is None else made.model
 
     def beyond(self, tried: Tried) -> LinearModel | None:
-        """The same with the rest of the library beside it."""
+        """The model of the same refit, with the rest of the library added."""
         made = self._fit(tried)
         if made is None:
             return None
@@ -254,11 +261,11 @@ class _Refits:
 
     @property
     def made(self) -> tuple[Corrected, ...]:
-        """All that there are."""
+        """All refits that succeeded."""
         return tuple(fit for fit in self._made.values() if fit is not None)
 
     def of(self, found: Judgement) -> tuple[Corrected, ...]:
-        """Of the answer; with a tie, of each of its effects, or of each with the one that is certain, the best first."""
+        """The refits of the answer, the best first; for a tie, of each tied effect, with the certain ones if there are any."""
         if found.verdict not in ("attributed", "tie") or found.best is None:
             return ()
         chosen: list[Tried] = [found.best]
@@ -286,21 +293,23 @@ class _Refits:
             made = add_to_model(
                 self._view.solution, chosen, tried, self._model, view=self._view, progress=say
             )
-        except DataError as error:  # images less an effect that is not there may have no fit
-            self.failures.append(f"No fit with {tried.label} in the model: {error}")
+        except (
+            DataError
+        ) as error:  # a fit may fail after an effect is subtracted that the images do not contain
+            self.failures.append(f"The full refit with {tried.label} in the model failed: {error}")
         self._made[tried.label] = made
         return made
 
 
 def _before_refit(model: LinearModel, found: Judgement, rng: np.random.Generator) -> Interval | None:
-    """The gap of the PSF that the effect's fit gives, the effect itself left out: what a refit then absorbs."""
+    """The gap with the PSF of the effect's fit but without the effect: what a refit of the PSF would then partly absorb."""
     if found.best is None or found.verdict not in ("attributed", "tie"):
         return None
     step = found.best.step
     base = list(model.evidence.base)
     rows = []
     for disc in model.evidence.discs:
-        mean = float(disc.share @ (disc.residual - disc.answers[base].T @ step.values[: len(base)]))
+        mean = float(disc.share @ (disc.residual - disc.jacobian[base].T @ step.values[: len(base)]))
         rows.append((-100 * mean / disc.level, 100 * disc.mean_noise / disc.level))
     residual, noise = np.array(rows).T
     nothing = np.zeros_like(residual)
@@ -311,57 +320,61 @@ def _noise_pct(evidence: Evidence) -> float:
     return float(np.sqrt(np.mean([(100 * d.mean_noise / d.level) ** 2 for d in evidence.discs])))
 
 
-def _amiss(found: Judgement) -> tuple[str, ...]:
+def _rejected(found: Judgement) -> tuple[str, ...]:
     return tuple(
-        f"{label.replace('_', ' ')} explains much of the gap to first order and less than half of that in the model for "
-        "real: it is no answer, whatever its score."
+        f"To first order {label.replace('_', ' ')} explains much of the gap, but the full refit explains less than half of that: "
+        "it was excluded in spite of its score."
         for label in found.amiss
     )
 
 
 def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidence) -> tuple[str, ...]:
-    """What a reader should know before believing a verdict."""
+    """What a reader should know before trusting a verdict."""
     out = []
     if noise is None:
         out.append(
-            "The stated noise could not be checked: too few images of one pointing, gain mode and exposure follow each other, or "
-            "what differs between them has no noise's form."
+            "The stated noise could not be checked: too few consecutive images have the same pointing, gain mode and "
+            "exposure, or their differences do not look like noise."
         )
     elif not noise.agrees:
         out.append(
-            f"The images are {noise.ratio:.2f} times as noisy (in variance) as stated; the measured noise was used "
-            f"({noise.noise.photon_gain_dn:.2f} DN a photon, {noise.noise.read_noise_dn:.2f} DN of readout)."
+            f"The images are {noise.ratio:.2f} times as noisy (in variance) as stated. The measured noise was used: "
+            f"{noise.noise.photon_gain_dn:.2f} DN per photon, read noise {noise.noise.read_noise_dn:.2f} DN."
         )
     left_out = solution.inversion.left_out
     if left_out:
         out.append(
-            f"{len(left_out)} images took no part: "
+            f"{len(left_out)} images were not used: "
             + "; ".join(f"{k}: {v}" for k, v in list(left_out.items())[:3])
         )
-    restless = [
-        evidence.taken[disc.index].file for disc in evidence.discs if not evidence.taken[disc.index].described
+    unmatched = [
+        evidence.image_info[disc.index].file
+        for disc in evidence.discs
+        if not evidence.image_info[disc.index].described
     ]
-    if restless:
+    if unmatched:
         out.append(
-            f"What is round the occulters of {len(restless)} images their neighbours in time do not show, or not as it is "
-            f"({', '.join(restless[:3])}{', …' if len(restless) > 3 else ''}): they may be elsewhere than "
-            "where they were found, and what is left in the discs may come of that."
+            f"In {len(unmatched)} images ({', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}) the scene around the "
+            "occulter differs from that in the neighbouring images, or no neighbour shows it. The occulter's position may be wrong there, and this "
+            "may cause the residuals in these discs."
         )
     images = len(evidence.discs)
     if images < LEAST_IMAGES:
         out.append(
-            f"With {images} images nothing can be held out: closure and the gap held out are not given."
+            f"With only {images} images none can be held out, so closure and the held-out gap are not given."
         )
-    aimed = len({taken.fov for taken in evidence.taken})
+    aimed = len({taken.pointing for taken in evidence.image_info})
     if aimed > MOST_POINTINGS:
         out.append(
-            f"Light from outside the field is looked for in the first {MOST_POINTINGS} of {aimed} pointings alone."
+            f"Light from outside the field was tested only in the first {MOST_POINTINGS} of {aimed} pointings."
         )
     if aimed == 1:
         out.append(
-            "One pointing alone: what differs between pointings cannot be told, and none can be left out."
+            "There is only one pointing: effects that differ between pointings cannot be detected, and no pointing can be held out."
         )
-    exposures = {taken.exposure_s for taken in evidence.taken}
+    exposures = {taken.exposure_s for taken in evidence.image_info}
     if len(exposures) == 1:
-        out.append("One exposure alone: an error a readout and an error a second look the same.")
+        out.append(
+            "There is only one exposure time: an error per readout and an error per second look the same."
+        )
     return tuple(out)

@@ -1,4 +1,4 @@
-"""The text that defines effects which somebody adds: a Python file's, or a module's. Nothing of it is run here."""
+"""The source text that defines added effects: a Python file or a module. This module never runs that text."""
 
 from __future__ import annotations
 
@@ -10,21 +10,19 @@ from psfcore.errors import DataError
 
 
 def is_file(source: str) -> bool:
-    """Whether a name is a file's; else it is a module's."""
+    """Whether a source is the name of a file; otherwise it is the name of a module."""
     return source.endswith(".py")
 
 
 def sha256_of_source(source: str) -> str:
-    """SHA-256 (hex) of the text of a file, whose path ends in .py, or of a module's. Raises DataError "bad-effects".
+    """SHA-256 (hex) of the text of a file (path ending in .py) or of a module. Raises DataError "bad-effects".
 
-    What that text imports is not in it. The packages that a module lies in are imported, to find it.
+    The hash does not cover what that text imports. To find a module, its parent packages are imported.
     """
     try:
         text = _file_of(source).read_bytes()
     except (OSError, ImportError, ValueError) as error:
-        message = (
-            f"effects of {source}: expected a Python file (.py) or a module that can be read; got {error}"
-        )
+        message = f"effects of {source}: expected a readable Python file (.py) or module; got {error}"
         raise DataError("bad-effects", message) from error
     return hashlib.sha256(text).hexdigest()
 
@@ -36,5 +34,5 @@ def _file_of(source: str) -> Path:
     if spec is None:
         raise ImportError(f"No module named {source!r}")
     if not spec.has_location or spec.origin is None:
-        raise ImportError(f"{source!r}, which has no file of its own")
+        raise ImportError(f"the module {source!r}, which has no source file")
     return Path(spec.origin)

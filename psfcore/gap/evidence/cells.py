@@ -1,19 +1,20 @@
-"""What the discs say: means over cells of radius and azimuth, and how each answers to any change of its image.
+"""What the discs show: means over cells of radius and azimuth, and their response to any change of the image.
 
 With y an image, D its fully dark pixels, H the PSF, G the inverse on the periodic plane and x = (2 - G H) G y the
-scene, the light left unexplained in the disc is r = D [y - H (1 - D) x]. A cell's mean of r is a linear function of
-the whole image, and its weights are found once by going backwards:
+scene, the unexplained light in the disc is r = D [y - H (1 - D) x]. The mean of r over a cell is a linear function of
+the whole image. The adjoint gives its weights in one pass:
 
     a . r = q . y,   q = a - (2 - G^T H^T) G^T (1 - D) H^T a        Eq. (1)
 
-so that an effect's change e of the image moves the cell by q . e: a sum over pixels, whatever the effect. A global gain
-error has q . e = 0, nearly. The noise of two cells, the disc's own and that of the scene which scatters into it:
+An effect that changes the image by e therefore changes the cell by q . e, a sum over pixels, whatever the effect. A
+global gain error has q . e close to 0. The noise of two cells contains the disc's own noise and the noise of the scene
+that scatters into the disc:
 
     cov(a_1 . r, a_2 . r) = sum over all pixels of q_1 q_2 var(y)    Eq. (2)
 
 | symbol | name | unit |
 |---|---|---|
-| a | weights of a cell: one over its number of pixels | - |
+| a | weights of a cell: 1 / number of its pixels | - |
 | q | sensitivity | - |
 """
 
@@ -35,14 +36,14 @@ RINGS = (
     (0.0, 0.38, 1),
     (0.38, 0.7, 4),
     (0.7, 1.0, 8),
-)  # from, to (of the outermost dark pixel's radius), sectors
+)  # inner and outer radius (in units of the outermost dark pixel's radius), number of sectors
 LEAST_PIXELS = 3
-LEAST_VARIANCE = 1e-12  # of the noisiest direction's: cells that say the same leave others with none
+LEAST_VARIANCE = 1e-12  # of the largest eigenvalue: redundant cells have directions without any noise
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The cells of one disc: weights (cells, dark pixels), mean radius over the disc's, and azimuth (rad)."""
+    """The cells of one disc: weights (cells, dark pixels), number of pixels, mean radius over the disc's, and azimuth (rad)."""
 
     weights: Matrix
     pixels: Vector
@@ -51,7 +52,7 @@ class Cells:
 
 
 def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
-    """Cells of the dark pixels round a disc's centre; those of fewer than LEAST_PIXELS pixels are left out."""
+    """Divide the dark pixels around a disc's centre into cells; cells of fewer than LEAST_PIXELS pixels are left out."""
     rows, columns = dark
     dx, dy = columns - x_px, rows - y_px
     r = np.hypot(dx, dy)
@@ -74,7 +75,7 @@ def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
 
 
 def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
-    """Eq. (1): how each cell's mean answers to every pixel of the image, (cells, ny, nx)."""
+    """Eq. (1): the derivative of each cell's mean with respect to every pixel of the image, (cells, ny, nx)."""
     out = []
     for weight in weights:
         cell = np.zeros(optics.engine.lanes_shape, np.float32)
@@ -89,7 +90,7 @@ def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
 
 
 def whitening(covariance: Matrix) -> Matrix:
-    """What gives numbers with this covariance (n, n) a noise of one each; zeros where they have no noise at all."""
+    """The matrix that gives numbers with this covariance (n, n) unit noise; zeros if they have no noise."""
     values, vectors = np.linalg.eigh(covariance)
     if values[-1] <= 0:
         return np.zeros_like(covariance)
@@ -98,26 +99,26 @@ def whitening(covariance: Matrix) -> Matrix:
 
 @dataclass(frozen=True, eq=False)
 class DiscCells:
-    """The cells of frame `index` (a position among all frames): residuals (observed minus expected) and what moves them.
+    """The cells of frame `index` (its position among all frames): residuals (observed minus expected) and their derivatives.
 
-    residual, expected: (cells,) in DN/s. covariance: Eq. (2). answers: (columns, cells), DN/s for one unit.
-    pixels, radius, azimuth: of `Cells`. observed: the disc's mean. untouched: the same, DN/s, before an effect's light was
-    taken out of the image; none where nothing was.
+    residual, expected: (cells,) in DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of a parameter.
+    pixels, radius, azimuth: as in `Cells`. observed: the disc's mean. level_before: `level` before the light of an effect
+    was subtracted from the image, DN/s; None if nothing was subtracted.
     """
 
     index: int
     residual: Vector
     expected: Vector
     covariance: Matrix
-    answers: Matrix
+    jacobian: Matrix
     pixels: Vector
     radius: Vector
     azimuth: Vector
-    untouched: float | None = None
+    level_before: float | None = None
 
     @property
     def share(self) -> Vector:
-        """Each cell's share of the disc's pixels."""
+        """Each cell's fraction of the disc's pixels."""
         return np.asarray(self.pixels / self.pixels.sum())
 
     @property
@@ -127,22 +128,22 @@ class DiscCells:
 
     @property
     def level(self) -> float:
-        """What percents of the disc are of, DN/s: the size of its mean as it was observed, whatever was taken out since."""
-        return abs(self.observed if self.untouched is None else self.untouched)
+        """Reference of percentages of this disc, DN/s: the absolute mean as observed, before any effect was subtracted."""
+        return abs(self.observed if self.level_before is None else self.level_before)
 
     @property
     def mean_expected(self) -> float:
-        """What it should be, DN/s."""
+        """The disc's expected mean, DN/s."""
         return float(self.share @ self.expected)
 
     @property
     def mean_noise(self) -> float:
-        """Noise of the disc's mean, DN/s."""
+        """The noise of the disc's mean, DN/s."""
         return float(np.sqrt(self.share @ self.covariance @ self.share))
 
 
 def disc_cells(solution: Solution, n: int) -> tuple[DiscCells, Planes]:
-    """The cells of frame n, with no column of answers yet, and their sensitivities."""
+    """The cells of frame n, with an empty Jacobian, and their sensitivities."""
     place = solution.sky.found[n].place
     dark = solution.sky.dark[n]
     cells = cells_of(dark, place.x_px, place.y_px)
@@ -157,7 +158,7 @@ def disc_cells(solution: Solution, n: int) -> tuple[DiscCells, Planes]:
         residual=cells.weights @ residual,
         expected=cells.weights @ expected,
         covariance=np.asarray(covariance, dtype=np.float64),
-        answers=np.zeros((0, cells.pixels.size)),
+        jacobian=np.zeros((0, cells.pixels.size)),
         pixels=cells.pixels,
         radius=cells.radius,
         azimuth=cells.azimuth,

@@ -1,7 +1,8 @@
-"""What discs and lit parts say of every effect at once: small arrays, from which all questions are answered.
+"""What the discs and the unocculted field show of all effects at once: small arrays that answer all later questions.
 
-Columns are the PSF's coordinates first, then the effects' parameters. About the solution everything is linear in
-them: one look at each image gives how its cells (`cells`) and its lit blocks (`lit_blocks`) answer to all of them.
+The columns are the coordinates of the PSF, then the parameters of the effects. Everything is linear in them near the
+solution. One pass over the images gives the Jacobian of their cells (`cells`) and of their blocks in the unocculted
+field (`unocculted_blocks`).
 """
 
 from __future__ import annotations
@@ -14,9 +15,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.effect import Change, Effect, View
+from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.cells import DiscCells, disc_cells
-from psfcore.gap.evidence.lit_blocks import LitBlocks, LitEquations, blocks, lit_blocks
+from psfcore.gap.evidence.unocculted_blocks import (
+    UnoccultedBlocks,
+    UnoccultedEquations,
+    blocks,
+    unocculted_blocks,
+)
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.optics import Blur
 from psfcore.transit.occulter import UNDESCRIBED, FoundPlace
@@ -25,16 +32,18 @@ from psfcore.transit.transit import Frame
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
-AT_ONCE = 16  # fields that are looked at together
+AT_ONCE = 16  # fields that are processed together
 
 
 @dataclass(frozen=True)
-class Taken:
-    """How one image was taken: what the axes are made of. described: whether its neighbours in time show what is round its
-    occulter, so that this was found where it is."""
+class ImageInfo:
+    """The circumstances of one image: its coordinates on the axes.
+
+    described: whether its neighbours in time show the scene around its occulter, so that the occulter's place is reliable.
+    """
 
     file: str
-    fov: int
+    pointing: int
     x_px: float
     y_px: float
     time_s: float
@@ -46,49 +55,51 @@ class Taken:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """All that a diagnosis goes by. discs: of the images that took part. taken: of all images. numbers: of `Change`, by
-    column."""
+    """All the data that a diagnosis uses.
+
+    discs: of the images that were used. image_info: of all images. numbers: `Change.numbers` of each column.
+    """
 
     effects: tuple[Effect, ...]
     columns: dict[str, tuple[int, ...]]
     base: tuple[int, ...]
     discs: tuple[DiscCells, ...]
-    lit: LitBlocks
-    taken: tuple[Taken, ...]
+    unocculted: UnoccultedBlocks
+    image_info: tuple[ImageInfo, ...]
     untestable: dict[str, str]
     numbers: dict[int, int] = field(default_factory=dict)
 
     def numbers_of(self, columns: Sequence[int]) -> int:
-        """How many numbers were taken from the lit parts to make the changes of these columns."""
+        """How many numbers were measured in the unocculted field to build the changes of these columns."""
         return sum(self.numbers.get(column, 0) for column in columns)
 
     @cached_property
     def images(self) -> tuple[int, ...]:
-        """Positions, among all images, of those with a disc."""
+        """Positions, among all images, of the images with a disc."""
         return tuple(disc.index for disc in self.discs)
 
-    def lit_equations(self, images: Sequence[int] | None = None) -> LitEquations:
-        """The lit blocks' equations of all columns, from some images (none: all)."""
-        return self.whole_lit if images is None else self.lit.equations(range(self.size), images)
+    def unocculted_equations(self, images: Sequence[int] | None = None) -> UnoccultedEquations:
+        """The normal equations of all columns from the blocks of some images (None: all images)."""
+        return self.all_unocculted if images is None else self.unocculted.equations(range(self.size), images)
 
     @cached_property
-    def whole_lit(self) -> LitEquations:
-        """`lit_equations` of all images."""
-        return self.lit.equations(range(self.size))
+    def all_unocculted(self) -> UnoccultedEquations:
+        """`unocculted_equations` of all images."""
+        return self.unocculted.equations(range(self.size))
 
     @cached_property
-    def steady_lit(self) -> LitEquations:
-        """`whole_lit` with restless blocks weighed by what they show: what is left is judged by these."""
-        return self.lit.with_restless_blocks().equations(range(self.size))
+    def steady_unocculted(self) -> UnoccultedEquations:
+        """`all_unocculted` with flickering blocks down-weighted by their observed variance; used to judge what remains."""
+        return self.unocculted.with_flickering_blocks().equations(range(self.size))
 
     @property
     def size(self) -> int:
-        """How many columns there are."""
-        return self.discs[0].answers.shape[0]
+        """The number of columns."""
+        return self.discs[0].jacobian.shape[0]
 
     @property
     def of_effects(self) -> range:
-        """The columns behind the base: about a refit those of the effects that are in it."""
+        """The columns after the base. In the evidence of a full refit these are the parameters of the effects in that refit."""
         return range(len(self.base), self.size)
 
 
@@ -99,15 +110,15 @@ def gather(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """The evidence of a solution on all effects of a library that these data can show. view: of it, where there is one.
+    """The evidence of a solution on all effects of a library that these data can show. view: the view of the solution, if any.
 
-    Raises DataError "bad-effects" of what somebody added.
+    Raises DataError "bad-effects" if an added effect fails.
     """
     view = view or View(solution)
     changes, columns, untestable = _changes(view, library)
     base = tuple(range(solution.inversion.coordinates.size))
     columns = {name: tuple(c + len(base) for c in here) for name, here in columns.items()}
-    lit = lit_blocks(view, len(base) + len(changes), progress)
+    unocculted = unocculted_blocks(view, len(base) + len(changes), progress)
     part = set(solution.part)
     discs, distances = [], []
     count = len(solution.transit.frames)
@@ -120,16 +131,16 @@ def gather(
         else:
             distances.append(float("nan"))
         for k, change in enumerate(changes):
-            if change.lit:
-                lit.errors[len(base) + k, n] = blocks(change.change(n, view.lit))
+            if change.unocculted:
+                unocculted.errors[len(base) + k, n] = blocks(change.change(n, view.pointing_means))
     found = Evidence(
         effects=tuple(effect for effect in library if effect.name in columns),
         columns=columns,
         base=base,
         discs=tuple(discs),
-        lit=lit,
-        taken=tuple(
-            _taken(frame, place, distance)
+        unocculted=unocculted,
+        image_info=tuple(
+            _image_info(frame, place, distance)
             for frame, place, distance in zip(
                 solution.transit.frames, solution.sky.found, distances, strict=True
             )
@@ -137,13 +148,13 @@ def gather(
         untestable=untestable,
         numbers={len(base) + k: change.numbers for k, change in enumerate(changes) if change.numbers},
     )
-    return _without_unseen(found)
+    return _testable(found)
 
 
 def _changes(
     view: View, library: Sequence[Effect]
 ) -> tuple[list[Change], dict[str, tuple[int, ...]], dict[str, str]]:
-    """Every effect's changes in a row, where each effect's are, and why some cannot be shown."""
+    """All effects' changes in one list, the positions of each effect's changes, and the reasons why some effects cannot be tested."""
     changes: list[Change] = []
     columns: dict[str, tuple[int, ...]] = {}
     untestable: dict[str, str] = {}
@@ -159,25 +170,25 @@ def _changes(
 
 
 def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
-    """The cells of one image with the answers of all columns."""
+    """The cells of one image with the Jacobian of all columns."""
     solution = view.solution
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
-    lit = view.lit_scene(n)
-    slopes = (slope.field(slope.convolve(lit)) for slope in view.slopes)
+    scene = view.occulted_scene(n)
+    slopes = (slope.field(slope.convolve(scene)) for slope in view.slopes)
     shown = [k for k, change in enumerate(changes) if change.disc]
     fields = itertools.chain(slopes, (changes[k].change(n, view.expected) for k in shown))
     rows = [*range(len(view.slopes)), *(len(view.slopes) + k for k in shown)]
-    answers = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
+    jacobian = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
     for first in range(0, len(rows), AT_ONCE):
-        # Together: the cells' planes are read from memory once for all of them.
+        # Several fields at a time: the cells' planes are then read from memory once for all of them.
         some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
-        answers[rows[first : first + AT_ONCE]] = some @ flat.T
-    return replace(cells, answers=answers)
+        jacobian[rows[first : first + AT_ONCE]] = some @ flat.T
+    return replace(cells, jacobian=jacobian)
 
 
 class _Distance:
-    """From how far, on average, light scatters into a disc: the mean of r weighted by the light that comes from there."""
+    """The mean distance from which light scatters into a disc: the mean of r, weighted by the light that arrives from there."""
 
     def __init__(self, view: View) -> None:
         kernel, solution = view.kernel, view.solution
@@ -186,18 +197,18 @@ class _Distance:
         self._blur = Blur(weighted, solution.transit.shape, threads=solution.threads)
 
     def of(self, view: View, n: int) -> float:
-        """In px, for image n."""
+        """The mean distance for image n, px."""
         solution = view.solution
         dark = solution.sky.dark[n]
-        lit = view.lit_scene(n)
-        there = self._blur.field(self._blur.convolve(lit))[dark].mean()
+        scene = view.occulted_scene(n)
+        there = self._blur.field(self._blur.convolve(scene))[dark].mean()
         return float(there / max(float(view.expected[n][dark].mean()), 1e-9))
 
 
-def _taken(frame: Frame, found: FoundPlace, distance_px: float) -> Taken:
-    return Taken(
+def _image_info(frame: Frame, found: FoundPlace, distance_px: float) -> ImageInfo:
+    return ImageInfo(
         file=frame.file,
-        fov=frame.fov,
+        pointing=frame.fov,
         x_px=found.place.x_px,
         y_px=found.place.y_px,
         time_s=frame.time_s,
@@ -208,13 +219,13 @@ def _taken(frame: Frame, found: FoundPlace, distance_px: float) -> Taken:
     )
 
 
-def _without_unseen(evidence: Evidence) -> Evidence:
-    """The evidence without effects that no image answers to."""
+def _testable(evidence: Evidence) -> Evidence:
+    """The evidence without effects that change no image."""
     untestable, columns = dict(evidence.untestable), dict(evidence.columns)
     for name, here in evidence.columns.items():
-        cells = max(float(np.abs(disc.answers[list(here)]).max()) for disc in evidence.discs)
-        if not (cells > 0 or np.abs(evidence.lit.errors[list(here)]).max() > 0):
-            untestable[name] = "no image of this transit answers to it"
+        cells = max(float(np.abs(disc.jacobian[list(here)]).max()) for disc in evidence.discs)
+        if not (cells > 0 or np.abs(evidence.unocculted.errors[list(here)]).max() > 0):
+            untestable[name] = "it changes no image of this transit"
             del columns[name]
     effects = tuple(effect for effect in evidence.effects if effect.name in columns)
     return replace(evidence, effects=effects, columns=columns, untestable=untestable)

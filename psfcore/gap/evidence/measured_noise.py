@@ -1,11 +1,11 @@
-"""The noise that the images themselves show, beside what they are said to have.
+"""The noise measured in the images, to check the stated noise.
 
-Two images of one pointing that follow each other show one scene. Of their difference d the mixed second difference
+Two consecutive images of one pointing show the same scene. Let d be their difference. The mixed second difference
 
     h = (d_00 - d_01 - d_10 + d_11) / 2          Eq. (1)
 
-holds nothing smooth, and where the noise of pixels is independent it has the variance of d. In blocks this gives the
-variance against the level; the line through it is g D + r^2 (`psfcore.noise`, Eq. (1)).
+removes everything smooth. If the noise of the pixels is independent, h has the variance of d. Blocks of h give the
+variance as a function of the level; the fitted line is g D + r^2 (`psfcore.noise`, Eq. (1)).
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from psfcore.transit.transit import Frame, Transit
 
 Vector = NDArray[np.float64]
 
-BLOCK = 16  # of h, which has half the pixels along each axis
+BLOCK = 16  # px of h, which has half the image's pixels along each axis
 FREE_OF_DISC_PX = 20.0
 NORMAL_MAD = 1.4826
 LEAST_BLOCKS = 20
 ROUNDS = 5
-TRUSTED = 0.15  # a ratio of variances nearer to 1 than this is left alone
+TRUSTED = 0.15  # the stated noise stands if the ratio of variances is closer to 1 than this
 
 
 @dataclass(frozen=True)
 class MeasuredNoise:
-    """noise: as fitted. ratio: measured variance over the stated one, the median of all blocks."""
+    """noise: as fitted. ratio: measured variance over the stated one, the median of all blocks. blocks: their number."""
 
     noise: Noise
     ratio: float
@@ -40,12 +40,12 @@ class MeasuredNoise:
 
     @property
     def agrees(self) -> bool:
-        """Whether the stated figures may stand."""
+        """Whether the measurement confirms the stated noise."""
         return abs(self.ratio - 1) <= TRUSTED
 
 
 def measured_noise(transit: Transit) -> MeasuredNoise | None:
-    """The noise of a transit's images; none where too few of them show one scene."""
+    """The noise of a transit's images; None if too few consecutive images show the same scene, or if no line fits."""
     levels, variances = [], []
     frames = transit.frames
     for one, other in itertools.pairwise(frames):
@@ -58,14 +58,14 @@ def measured_noise(transit: Transit) -> MeasuredNoise | None:
     level, variance = np.concatenate(levels), np.concatenate(variances)
     stated = transit.noise.photon_gain_dn * np.maximum(level, 0) + transit.noise.read_noise_dn**2
     ratio = float(np.median(variance / stated))
-    gain, readout = _line(level, variance)
-    if gain <= 0 and readout <= 0:
+    gain, read_variance = _line(level, variance)
+    if gain <= 0 and read_variance <= 0:
         return None
-    return MeasuredNoise(Noise(max(gain, 0.0), math.sqrt(max(readout, 0.0))), ratio, level.size)
+    return MeasuredNoise(Noise(max(gain, 0.0), math.sqrt(max(read_variance, 0.0))), ratio, level.size)
 
 
 def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
-    """Level (DN) and variance (DN^2) of an exposure in blocks away from both discs."""
+    """Level (DN) and variance (DN^2) of an exposure, in blocks away from both discs."""
     a, b = (frame.pixels.astype(np.float64) * frame.exposure_s for frame in (one, other))
     difference = a - b * (a.mean() / b.mean())
     ny, nx = (n // 2 * 2 for n in difference.shape)
@@ -88,7 +88,7 @@ def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
 
 
 def _line(level: Vector, variance: Vector) -> tuple[float, float]:
-    """Slope and intercept of variance against level, each block weighted by what its own variance is known to."""
+    """Slope and intercept of variance against level, each block weighted by the precision of its variance."""
     expected = np.full(level.shape, float(np.median(variance)))
     slope = intercept = 0.0
     for _ in range(ROUNDS):

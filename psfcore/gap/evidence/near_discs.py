@@ -1,13 +1,13 @@
-"""What the cells of the discs say of a form, their means left out: looked at in small patches round the discs.
+"""What the cells of the discs show of a form, apart from the discs' means: computed in small patches around the discs.
 
-A core that widens leaves a disc's mean nearly as it is and shows in its outermost cells; so does where exactly a copy of
-the image lies. With q_k the sensitivity of cell k (`cells`), worked out in a patch round the disc, a form f of the image
-moves the cell by the sum of q_k f over the patch, and a change K of the PSF by
+A wider core hardly changes a disc's mean; it shows in the outermost cells. So does the exact place of a copy of the
+image. Let q_k be the sensitivity of cell k (`cells`), computed in a patch around the disc. A form f of the image changes
+the cell by the sum of q_k f over the patch, and a change K of the PSF changes it by
 
     T_k = sum over displacements of K(d) C_k(d),   C_k(d) = sum over the patch of q_k(x) scene(x - d)    Eq. (1)
 
-How bright the disc is as a whole is taken out of every answer: `search` has that from the whole field. What scatters in
-from beyond the patch is nearly even over a disc, and left out.
+The brightness of the disc as a whole is removed from every response: `search` gets it from the whole field. Light that
+scatters in from outside the patch is nearly uniform over a disc, and is left out.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import correlations
-from psfcore.gap.effect import Field, View
 from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
+from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.optics import Optics
 
 Plane = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
-MARGIN_PX = 28  # of a patch round the disc
+MARGIN_PX = 28  # of a patch around the disc
 REACH_PX = 64  # of Eq. (1)
 
 
 class NearDiscs:
-    """The patches of all discs that take part, added one by one."""
+    """The patches of all discs that are used, added one at a time."""
 
     def __init__(self, view: View) -> None:
         solution = self._solution = view.solution
@@ -41,7 +41,7 @@ class NearDiscs:
         radius_px = max(solution.sky.found[n].place.radius_px for n in solution.part)
         wanted = 2 * math.ceil(radius_px + MARGIN_PX) + 1
         self._size = size = (min(wanted, shape[0]), min(wanted, shape[1]))
-        # Any two pixels of a patch are joined by it.
+        # This kernel is large enough to connect any two pixels of a patch.
         self._optics = Optics(crop_or_pad(view.kernel, 2 * max(size) - 1), size, threads=solution.threads)
         self._corners: dict[int, tuple[int, int]] = {}
         self._planes: dict[int, NDArray[np.float32]] = {}
@@ -49,7 +49,7 @@ class NearDiscs:
         self._to_displacements: list[NDArray[np.floating]] = []
 
     def add(self, n: int, scene: Field) -> None:
-        """The disc of image n. scene: what lights it [y, x], DN/s."""
+        """Add the disc of image n. scene: with its occulter in front [y, x], DN/s."""
         solution, size = self._solution, self._size
         place, (rows, columns) = solution.sky.found[n].place, solution.sky.dark[n]
         ny, nx = solution.transit.shape
@@ -72,17 +72,17 @@ class NearDiscs:
 
     @property
     def residual(self) -> Vector:
-        """What the cells of all discs leave unexplained, over its noise, each disc's mean left out (cells,)."""
+        """The residuals of the cells of all discs in units of their noise, without each disc's mean (cells,)."""
         return np.concatenate(self._residuals)
 
     def of_kernel(self, change: Plane) -> Vector:
-        """How a change of the PSF [y, x], its centre at n // 2, moves the cells, Eq. (1), over their noise (cells,)."""
+        """Eq. (1): the response of the cells to a change of the PSF [y, x] with its centre at n // 2, in units of the noise (cells,)."""
         near = crop_or_pad(change, 2 * REACH_PX + 1).astype(np.float32)
-        answers = [np.tensordot(disc, near, axes=2) for disc in self._to_displacements]
-        return np.concatenate(answers, dtype=np.float64)
+        responses = [np.tensordot(disc, near, axes=2) for disc in self._to_displacements]
+        return np.concatenate(responses, dtype=np.float64)
 
     def of_copies(self, n: int, image: Field, displacements: Sequence[tuple[int, int]]) -> Plane:
-        """How an image [y, x] displaced by whole pixels (x, y) moves the cells of disc n, over their noise (cells, k)."""
+        """The response of the cells of disc n to an image [y, x] displaced by whole pixels (x, y), over their noise (cells, k)."""
         (top, left), planes = self._corners[n], self._planes[n]
         copies = [cut(image, top - dy, left - dx, self._size).ravel() for dx, dy in displacements]
         return np.asarray(
@@ -91,7 +91,7 @@ class NearDiscs:
 
 
 def _without(covariance: Plane, level: Vector) -> Plane:
-    """What makes the noise of some cells one, and takes out of them what goes like a level."""
+    """The matrix that whitens the noise of some cells and removes the component proportional to a level."""
     white = whitening(covariance)
     along = white @ level
     along /= max(float(np.linalg.norm(along)), 1e-300)
@@ -99,7 +99,7 @@ def _without(covariance: Plane, level: Vector) -> Plane:
 
 
 def cut(plane: Any, top: int, left: int, size: tuple[int, int]) -> Any:
-    """A part of a plane [y, x], dark where the plane does not reach."""
+    """A window of a plane [y, x]; zero outside the plane."""
     out = np.zeros(size, plane.dtype)
     low_y, high_y = (min(max(at, 0), plane.shape[0]) for at in (top, top + size[0]))
     low_x, high_x = (min(max(at, 0), plane.shape[1]) for at in (left, left + size[1]))

@@ -1,19 +1,21 @@
-"""Where a form with a place of its own fits best: looked at over a coarse grid, all places at a time.
+"""The search for the place where a form fits best, over a coarse grid and all places at once.
 
 A form f at place or displacement d changes the mean of disc n by
 
     T_n(d) = sum over pixels of q_n(x) f_n(x - d)          Eq. (1)
 
-q_n being the disc's sensitivity (`cells`): a correlation. Of what the PSF's own parameters leave, a place explains
+where q_n is the disc's sensitivity (`cells`): a correlation. Of the residuals r that the PSF's own parameters leave, a
+place explains
 
-    gain(d) = (sum r T)^2 / sum T^2     where the sum r T has the form's sign        Eq. (2)
+    gain(d) = (sum r T)^2 / sum T^2     where sum r T has the sign of the form        Eq. (2)
 
-r and T over their noise, the PSF's part taken out. In the same way a change K of the PSF changes disc n's mean by
+with r and T in units of the noise, and with the component that the PSF absorbs removed. In the same way a change K of
+the PSF changes disc n's mean by
 
     T_n = sum over displacements of K(d) C_n(d),   C_n(d) = sum over pixels of q_n(x) scene_n(x - d)     Eq. (3)
 
-so that any number of kernels is looked at for the price of one correlation a disc. Where a form shows within the discs too,
-as copies and changes of the core do, r and T go on with their cells (`near_discs`).
+so that any number of kernels costs one correlation per disc. Copies and changes of the core also show within the discs.
+For them r and T also contain the cells (`near_discs`).
 """
 
 from __future__ import annotations
@@ -27,10 +29,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import correlations, linear_convolve
-from psfcore.gap.effect import View
 from psfcore.gap.evidence.cells import sensitivities
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.near_discs import NearDiscs, cut
+from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
 
 Plane = NDArray[np.float64]
@@ -40,14 +42,14 @@ STEP_PX = 8
 FINE_PX = 2
 COARSE_BLUR_PX = 8.0
 BLURS_PX = (2.0, 4.0, 8.0, 16.0)
-NEAREST_RADII = 1.8  # of the disc: nearer, a copy would be the disc's own surroundings
-KERNEL_REACH_PX = 255  # beyond it no order of a mesh has much light
-SEEN = 1e-4  # of the best seen place's sum T^2: a place that the discs see less of is not looked at
+NEAREST_RADII = 1.8  # of the disc: a closer copy could not be told from the disc's own surroundings
+KERNEL_REACH_PX = 255  # the mesh's orders have little light beyond
+SEEN = 1e-4  # of the largest sum T^2: places to which the discs respond less are skipped
 UNSEEN = 1e-300
 
 
 def place_search(view: View) -> PlaceSearch:
-    """The search about a view: made once."""
+    """The search of a view; made once."""
     if PlaceSearch not in view.kept:
         view.kept[PlaceSearch] = PlaceSearch(view)
     found = view.kept[PlaceSearch]
@@ -56,7 +58,7 @@ def place_search(view: View) -> PlaceSearch:
 
 
 class PlaceSearch:
-    """The discs' sensitivities on a grid of STEP_PX, and to displacements, and their cells', for any number of searches."""
+    """The sensitivities of the discs and of their cells, on a coarse grid and to displacements, for any number of searches."""
 
     def __init__(self, view: View) -> None:
         solution, self._expected = view.solution, view.expected
@@ -68,7 +70,7 @@ class PlaceSearch:
             (plane,) = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
             self._planes[n] = _binned(plane, STEP_PX) * STEP_PX**2
             self._fine[n] = _binned(plane, FINE_PX) * FINE_PX**2
-            scene = solution.optics.field(view.lit_scene(n))
+            scene = solution.optics.field(view.occulted_scene(n))
             to_displacements.append(_correlation(plane, scene, KERNEL_REACH_PX))
             self._near.add(n, scene)
             reach = max(self._planes[n].shape) - 2
@@ -78,24 +80,24 @@ class PlaceSearch:
         self._nearest_px = NEAREST_RADII * float(np.mean([f.place.radius_px for f in solution.sky.found]))
         frames = solution.inversion.frames
         self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
-        answers = np.array([f.mean_jacobian for f in frames]) / self._sigma[:, None]
+        responses = np.array([f.mean_jacobian for f in frames]) / self._sigma[:, None]
         residual = np.array([f.observed - f.expected for f in frames]) / self._sigma
         in_cells = np.array([self._near.of_kernel(slope) for slope in view.slope_kernels]).T
-        self._of_means = _Left(answers, residual)
-        self._of_all = _Left(
-            np.concatenate([answers, in_cells]), np.concatenate([residual, self._near.residual])
+        self._of_means = _Unabsorbed(responses, residual)
+        self._of_all = _Unabsorbed(
+            np.concatenate([responses, in_cells]), np.concatenate([residual, self._near.residual])
         )
 
     def kernel(self, kernels: Sequence[Plane]) -> int:
-        """Which of some changes of the PSF [y, x], their centres at n//2, explains most as it stands, Eq. (2) and (3).
+        """Index of the change of the PSF [y, x], centred at n//2, that explains most of the residuals, Eq. (2) and (3).
 
-        In the discs' means, and in their cells so far as light moves near them.
+        It uses the discs' means, and their cells for light that moves near them.
         """
         cells = np.array([self._near.of_kernel(kernel) for kernel in kernels]).T
         return self._best(self._to_displacements, kernels, cells)
 
     def wide_kernel(self, kernels: Sequence[Plane]) -> int:
-        """The same of changes that are smooth and may reach across the field; looked at on coarse pixels."""
+        """As `kernel`, for changes that are smooth and may reach across the field; computed on coarse pixels."""
         return self._best(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
 
     def _best(
@@ -111,10 +113,10 @@ class PlaceSearch:
 
     @cached_property
     def copy(self) -> tuple[float, int, int]:
-        """Blur (px) and displacement (whole pixels x, y) of a copy of each image that explains most of the residuals.
+        """Blur (px) and displacement (whole pixels x, y) of the copy of each image that explains most of the residuals.
 
-        Not nearer than NEAREST_RADII of the disc. The place is looked for on a coarse grid with a middling blur, then
-        round it on a fine one with several.
+        The copy is at least NEAREST_RADII of the disc away. The search runs on a coarse grid with a medium blur, then around the
+        best place on a fine grid with several blurs.
         """
         dx, dy = self._coarse_displacement(COARSE_BLUR_PX)
         best = (-1.0, COARSE_BLUR_PX, dx, dy)
@@ -126,18 +128,18 @@ class PlaceSearch:
     def _coarse_displacement(self, blur_px: float) -> tuple[int, int]:
         rows, columns = (2 * n - 1 for n in next(iter(self._planes.values())).shape)
 
-        def answer(n: int, q: Plane) -> Plane:
+        def response(n: int, q: Plane) -> Plane:
             copy = _binned(gaussian_filter(self._expected[n], blur_px), STEP_PX)
             return linear_convolve(q, copy[::-1, ::-1], (rows, columns))
 
         dy, dx = (_displacements(n) for n in (rows, columns))
-        gain = self._gains(answer, 1.0)
+        gain = self._gains(response, 1.0)
         gain[np.hypot(dy[:, None], dx[None, :]) < self._nearest_px] = -1.0
         at = int(np.argmax(gain))
         return int(dx[at % columns]), int(dy[at // columns])
 
     def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:
-        """The best gain within one coarse step of a displacement, on a grid of FINE_PX; in all cells of the discs."""
+        """The best gain within one coarse step of a displacement, on a grid of FINE_PX, from all cells of the discs."""
         reach = STEP_PX // FINE_PX
         steps = [(j, k) for j in range(-reach, reach + 1) for k in range(-reach, reach + 1)]
         places = [(dx + k * FINE_PX, dy + j * FINE_PX) for j, k in steps]
@@ -155,64 +157,64 @@ class PlaceSearch:
         return float(gain[best]), *places[best]
 
     def place(self, width_px: float, *, of_image: bool, sign: float) -> tuple[float, float]:
-        """Pixel (x, y) where a Gaussian patch of light (of_image: of the image itself) explains most.
+        """Pixel (x, y) where a Gaussian patch explains most: of light (of_image false), or proportional to the image (true).
 
-        sign: +1 for more light, -1 for less.
+        sign: +1 for added light, -1 for lost light.
         """
 
-        def answer(n: int, q: Plane) -> Plane:
+        def response(n: int, q: Plane) -> Plane:
             seen = q * _binned(self._expected[n], STEP_PX) if of_image else q
             return np.asarray(gaussian_filter(seen, width_px / STEP_PX, mode="constant"))
 
-        gain = self._gains(answer, sign)
+        gain = self._gains(response, sign)
         row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
         return (float(column) + 0.5) * STEP_PX - 0.5, (float(row) + 0.5) * STEP_PX - 0.5
 
-    def _gains(self, answer: Callable[[int, Plane], Plane], sign: float) -> Plane:
+    def _gains(self, response: Callable[[int, Plane], Plane], sign: float) -> Plane:
         """Eq. (2) at every place."""
-        answers = np.array(
-            [answer(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
+        responses = np.array(
+            [response(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
         )
-        gain = self._gain(answers.reshape(self._sigma.size, -1), sign, least=SEEN)
-        return np.asarray(gain.reshape(answers.shape[1:]))
+        gain = self._gain(responses.reshape(self._sigma.size, -1), sign, least=SEEN)
+        return np.asarray(gain.reshape(responses.shape[1:]))
 
     def _gain(self, means: Plane, sign: float, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
-        """Eq. (2) of some forms (forms,): how they move the discs' means (discs, forms), over their noise; and the cells.
+        """Eq. (2) of some forms (forms,). means: response of the discs' means (discs, forms), in units of the noise; cells: of the cells.
 
-        sign: of the form's amplitude. least: share of the largest sum T^2 below which a form gains nothing.
+        sign: of the form's amplitude. least: fraction of the largest sum T^2 below which a form gains nothing.
         """
-        left, answers = (
+        left, responses = (
             (self._of_means, means) if cells is None else (self._of_all, np.concatenate([means, cells]))
         )
-        flat = left.of(answers)
+        flat = left.of(responses)
         size, along = (flat**2).sum(axis=0), sign * (left.residual @ flat)
         seen = size > max(least * float(size.max()), UNSEEN)
         return np.asarray(np.where(seen & (along > 0), along**2 / np.where(seen, size, 1.0), 0.0))
 
 
-class _Left:
-    """What the PSF's parameters leave, of a residual (n,) and of answers to forms (n, forms), over the noise.
+class _Unabsorbed:
+    """What the PSF's parameters cannot absorb of a residual (n,) and of responses to forms (n, forms), in units of the noise.
 
-    absorbed: the answers to those parameters (n, parameters).
+    absorbed: the responses to those parameters (n, parameters).
     """
 
     def __init__(self, absorbed: Plane, residual: Vector) -> None:
         self._absorbed = np.linalg.qr(absorbed)[0]
         self.residual: Vector = self.of(residual)
 
-    def of(self, answers: Plane) -> Plane:
-        """What is left of answers."""
-        return np.asarray(answers - self._absorbed @ (self._absorbed.T @ answers))
+    def of(self, responses: Plane) -> Plane:
+        """The component of the responses that is not absorbed."""
+        return np.asarray(responses - self._absorbed @ (self._absorbed.T @ responses))
 
 
 def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int) -> Plane:
-    """C of Eq. (3) for displacements up to reach_px along each axis: (2 reach + 1, 2 reach + 1), none in the middle."""
+    """C of Eq. (3) for displacements up to reach_px along each axis: (2 reach + 1, 2 reach + 1), zero in the middle."""
     around = np.pad(scene.astype(np.float64), reach_px)
     return np.asarray(correlations(plane[None].astype(np.float64), around, reach_px)[0])
 
 
 def coarse_kernel(kernel: Plane, step: int) -> Plane:
-    """Light by displacement in coarse pixels, the middle of the kernel in the middle of one: sums of squares of `step` px."""
+    """A kernel summed over squares of `step` px, with its centre in the middle of a coarse pixel."""
     middle = kernel.shape[0] // 2
     reach = (middle + step // 2) // step
     at = (np.arange(kernel.shape[0]) - middle + step // 2) // step + reach
@@ -223,19 +225,19 @@ def coarse_kernel(kernel: Plane, step: int) -> Plane:
 
 
 def _displacements(count: int) -> NDArray[np.intp]:
-    """Displacement (px) at each index of a full correlation of two lines of (count + 1) / 2."""
+    """Displacement (px) at each index of a full correlation of two rows of (count + 1) / 2."""
     line = (count + 1) // 2
     zero = line - 1 - (2 * (line // 2) - count // 2)
     return (np.arange(count) - zero) * STEP_PX
 
 
 def displaced(plane: Any, dx: int, dy: int) -> Any:
-    """A plane [y, x] moved by whole pixels, dark where nothing moved in."""
+    """A plane [y, x] moved by whole pixels; zero where nothing moved in."""
     return cut(plane, -dy, -dx, plane.shape)
 
 
 def _binned(plane: NDArray[np.floating], step: int) -> Plane:
-    """Means over squares of `step` px; the far edges' rest is dropped."""
+    """Means over squares of `step` px; an incomplete square at the far edges is dropped."""
     rows, columns = (n // step for n in plane.shape)
     cut = plane[: rows * step, : columns * step].astype(np.float64)
     return np.asarray(cut.reshape(rows, step, columns, step).mean(axis=(1, 3)))

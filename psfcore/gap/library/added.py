@@ -1,7 +1,7 @@
-"""Effects that somebody adds to the library: a Python file, or a module, that defines EFFECTS.
+"""Effects that are added to the library: a Python file, or a module, that defines EFFECTS.
 
-Its code is run. A name of one comes from who runs the diagnosis, never with the data. What that code does wrong, when it
-is read or when it is asked for a change, is said to its author with the line where it happened.
+This code is run. Its name comes from whoever runs the diagnosis, never with the data. If the code fails, when it is
+imported or when it computes a change, the error names the source and the line, for its author.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from types import ModuleType
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.gap.effect import Change, Effect, Field, View
+from psfcore.gap.effect import Change, Effect
 from psfcore.gap.effect_sources import is_file, sha256_of_source
 from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.view import Field, View
 
 NAME = "EFFECTS"
 
@@ -37,19 +38,22 @@ class Added:
 
 
 def added_effects(sources: Sequence[str]) -> tuple[Added, ...]:
-    """What some files, whose paths end in .py, or modules add to the library. Raises DataError "bad-effects"."""
+    """The effects that some files (path ending in .py) or modules add to the library. Raises DataError "bad-effects"."""
     found = tuple(_added(source) for source in sources)
     taken = {effect.name for effect in LIBRARY}
     for one in found:
         for effect in one.effects:
             if effect.name in taken:
-                raise _bad(one.source, f"expected names that nothing else has; got {effect.name!r:.60} twice")
+                raise _bad(
+                    one.source,
+                    f"expected unique effect names; got {effect.name!r:.60} twice: rename this effect",
+                )
             taken.add(effect.name)
     return found
 
 
 def library_with(added: Sequence[Added]) -> tuple[Effect, ...]:
-    """The library, and what was added to it."""
+    """The library, followed by the added effects."""
     return (*LIBRARY, *(effect for one in added for effect in one.effects))
 
 
@@ -59,63 +63,63 @@ def _added(source: str) -> Added:
         module = _of_file(Path(source)) if is_file(source) else _of_name(source)
     found = getattr(module, NAME, None)
     if not isinstance(found, (tuple, list)) or not found or not all(isinstance(e, Effect) for e in found):
-        raise _bad(source, f"expected {NAME}, a tuple of Effect; got {_words(found)}")
+        raise _bad(source, f"expected {NAME} to be a tuple of Effect; got {_words(found)}")
     for effect in found:
         _check(effect, source)
     return Added(source, sha256, tuple(_guarded(e, source) for e in found))
 
 
 def _of_name(name: str) -> ModuleType:
-    """The module of a name, read anew: a worker that imported it before would run what it was then."""
+    """The module of this name, reloaded: a worker that imported it before would otherwise run an old version."""
     before = sys.modules.get(name)
     return importlib.import_module(name) if before is None else importlib.reload(before)
 
 
 def _of_file(path: Path) -> ModuleType:
-    """The module that a file is, read anew; under a name of its own, so that no other's is taken."""
+    """The module in a file, reloaded, under a name that no other module has."""
     name = "heliopsf_effects_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be imported")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up there
+    sys.modules[name] = module  # dataclasses need their module there
     spec.loader.exec_module(module)
     return module
 
 
 def _check(effect: Effect, source: str) -> None:
     if not effect.name.isidentifier():
-        raise _bad(source, f"expected a name of letters, digits and _; got {effect.name!r:.60}")
+        raise _bad(source, f"expected an effect name of letters, digits and _; got {effect.name!r:.60}")
     if not effect.parameters:
-        raise _bad(source, f"expected a parameter of {effect.name}; got none")
+        raise _bad(source, f"{effect.name}: expected at least one parameter; got none")
 
 
-# --- code of somebody else --------------------------------------------------------------------------------
+# --- errors of added code ----------------------------------------------------------------------------------
 
 
 @contextmanager
 def _theirs(source: str) -> Iterator[None]:
-    """Whatever the code of a source raises, as one DataError with the line that did it."""
+    """Turn every error that the code of a source raises into a DataError that names the line."""
     try:
         yield
     except DataError:
         raise
-    # Not ours: of what kind its errors are nobody knows, and a traceback would tell of this software.
+    # Added code may raise any error, and a full traceback would show this software instead of that code.
     except Exception as error:
         raise _bad(source, f"{type(error).__name__}: {error}{_line(error, source)}") from error
 
 
 def _line(error: Exception, source: str) -> str:
-    """Where in the source's file an error arose, in words; nothing where that is not known."""
+    """The line of the source at which an error arose, as text; empty if it is not known."""
     if isinstance(error, SyntaxError):
-        return ""  # says so itself
+        return ""  # its message contains the line
     name = Path(source).name if is_file(source) else f"{source.rpartition('.')[2]}.py"
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name == name]
     return f" (line {lines[-1]})" if lines else ""
 
 
 def _guarded(effect: Effect, source: str) -> Effect:
-    """The effect, what it answers being checked: a change for each parameter, finite and as large as an image."""
+    """The effect with its results checked: one change for each parameter, each finite and of the image's shape."""
 
     def changes(view: View) -> list[Change]:
         with _theirs(source):
@@ -125,7 +129,7 @@ def _guarded(effect: Effect, source: str) -> Effect:
             kinds = ", ".join(sorted({type(change).__name__ for change in made}))
             raise _bad(
                 source,
-                f"{effect.name}: expected {wanted} of Change, one a parameter; got {len(made)} of {kinds}",
+                f"{effect.name}: expected {wanted} Change, one per parameter; got {len(made)} of type {kinds}",
             )
         shape = view.solution.transit.shape
         return [
@@ -158,8 +162,8 @@ def _checked(
         with _theirs(source):
             field = np.asarray(change(n, images))
         if field.shape != shape or not np.isfinite(field).all():
-            got = "one with NaN or infinite values" if field.shape == shape else f"one of {field.shape}"
-            raise _bad(source, f"{name}: expected an image of {shape} [y, x]; got {got}")
+            got = "one with NaN or infinite values" if field.shape == shape else f"one of shape {field.shape}"
+            raise _bad(source, f"{name}: expected an image of shape {shape} [y, x]; got {got}")
         return field
 
     return checked
@@ -171,8 +175,8 @@ def _bad(source: str, what: str) -> DataError:
 
 def _words(found: object) -> str:
     if found is None:
-        return "nothing of that name"
+        return "no such name"
     if isinstance(found, (tuple, list)):
         kinds = sorted({type(one).__name__ for one in found})
-        return f"one of {', '.join(kinds)}" if kinds else "an empty one"
+        return f"a tuple or list of {', '.join(kinds)}" if kinds else "an empty one"
     return type(found).__name__

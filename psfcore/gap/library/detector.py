@@ -1,4 +1,4 @@
-"""Effects of the detector and its electronics: changes of the image as it is read out."""
+"""Effects of the detector and its electronics: changes of the image as it is read."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+from psfcore.gap.effect import Change, Effect, EffectParameter
+from psfcore.gap.view import Field, View
 
-FAINT_DN = (30.0, 150.0)  # a mixture of both follows a loss at any faint level between
-# In mean waits between images: with a share of the last image, mixtures of these fade as traps do.
+FAINT_DN = (30.0, 150.0)  # a mixture of both approximates a loss at any faint level between them
+# In mean intervals between images: mixtures of these and of a share of the last image decay like charge traps.
 FADES_IN = {"one_wait": 1, "three_waits": 3}
-LEAST_LEFT = 0.01  # what is left of an image after so long is too little to see
-DEEP_PX = 9.0  # so far in from its rim what was filled in is off by the share that is stated
-FINEST = 5  # half waves across the field, of a smooth field's finest cosines
+LEAST_LEFT = 0.01  # a smaller remaining fraction of an image is too small to see
+DEEP_PX = 9.0  # at this depth inside a filled area the error is the parameter's value
+FINEST = 5  # half waves across the field of the finest cosines of a smooth field
 
 
 def flat(view: View) -> Field:
-    """One on every pixel."""
+    """A field of ones."""
     return np.ones(view.solution.transit.shape, np.float32)
 
 
 def fixed(plane: Field) -> Change:
     """The same plane in every image."""
-    return Change(lambda n, images: plane, lit=False)
+    return Change(lambda n, images: plane, unocculted=False)
 
 
 def times_image(pattern: Field) -> Change:
     """Every image times one pattern."""
-    return Change(lambda n, images: np.asarray(images[n] * pattern), lit=False)
+    return Change(lambda n, images: np.asarray(images[n] * pattern), unocculted=False)
 
 
 def _dark_offset(view: View) -> Sequence[Change]:
@@ -54,7 +55,7 @@ def _gain_mismatch(view: View) -> Sequence[Change]:
 
 def _one_gain_mode(view: View) -> str | None:
     modes = sorted({frame.gain_mode or "unknown" for frame in view.solution.transit.frames})
-    return None if len(modes) > 1 else f"all images have one gain mode ({modes[0]})"
+    return None if len(modes) > 1 else f"all images have the same gain mode ({modes[0]})"
 
 
 def _nonlinearity(view: View) -> Sequence[Change]:
@@ -66,13 +67,13 @@ def _nonlinearity(view: View) -> Sequence[Change]:
 
 
 def half_waves() -> list[tuple[int, int]]:
-    """How many half waves along x and y the cosines of a smooth field have across it; the even one is not among them."""
+    """The numbers of half waves along x and y of the cosines of a smooth field, without the constant."""
     every = range(FINEST + 1)
     return [(kx, ky) for ky in every for kx in every if 0 < kx * kx + ky * ky <= FINEST * FINEST]
 
 
 def cosines(view: View) -> list[Field]:
-    """Cosines of these half waves [y, x], rms 1: no smooth field lacks them, and none has a slope at the edges."""
+    """The cosines of these half waves [y, x], rms 1: a basis of smooth fields without a slope at the edges."""
     x, y = (np.pi * (place + 0.5) for place in view.places)
 
     def along(waves: int, at: Field) -> Field:
@@ -82,7 +83,7 @@ def cosines(view: View) -> list[Field]:
 
 
 def cosine_parameters(unit: str, likely: float) -> tuple[EffectParameter, ...]:
-    """One a cosine."""
+    """One parameter for each cosine."""
     return tuple(EffectParameter(f"cos_{kx}x_{ky}y", unit, likely) for kx, ky in half_waves())
 
 
@@ -91,10 +92,10 @@ def _flat_field(view: View) -> Sequence[Change]:
 
 
 def _column_smear(view: View) -> Sequence[Change]:
-    """Every pixel gets shares of the light of its column's pixels below it, and of those above it.
+    """Every pixel receives shares of the light of the pixels below it and above it in its column.
 
-    It passes the ones on its way out, and the others before the exposure; with both shares alike it gets a share of the
-    column's mean.
+    Its charge passes the ones while it is read, and the others before the exposure. If both shares are equal, it receives a
+    share of the column's mean.
     """
 
     def passed(n: int, images: Sequence[Field], way: int) -> Field:
@@ -102,11 +103,11 @@ def _column_smear(view: View) -> Sequence[Change]:
         summed = np.cumsum(image, axis=0, dtype=np.float32) - image / 2
         return np.asarray(summed[::way] / np.float32(image.shape[0]))
 
-    return [Change(lambda n, images, way=way: passed(n, images, way), lit=False) for way in (1, -1)]  # type: ignore[misc]
+    return [Change(lambda n, images, way=way: passed(n, images, way), unocculted=False) for way in (1, -1)]  # type: ignore[misc]
 
 
 def _persistence(view: View) -> Sequence[Change]:
-    """A share of the image before, and of all earlier ones as they fade in some waits: traps empty slowly."""
+    """A share of the previous image, and of all earlier images as they decay over some intervals: traps empty slowly."""
     frames = view.solution.transit.frames
     waits = [later.time_s - earlier.time_s for earlier, later in pairwise(frames)]
     mean_s = max(float(np.mean(waits)), 1e-9) if waits else 1.0
@@ -129,8 +130,9 @@ def _persistence(view: View) -> Sequence[Change]:
 
 
 def _filled(view: View) -> Sequence[Change]:
-    """What was filled in, or stayed clipped, is off by a share, and by one that grows from its rim inwards: what clipping
-    takes from a brightening does."""
+    """Filled or clipped pixels are wrong by a fraction, and by another that grows from the rim of their area inwards, as
+    clipping of a brightening does.
+    """
     frames = view.solution.transit.frames
     nothing = np.zeros(view.solution.transit.shape, np.float32)
 
@@ -140,12 +142,12 @@ def _filled(view: View) -> Sequence[Change]:
             return nothing
         if not inside:
             return np.asarray(images[n] * filled)
-        # 0 in the rim's own pixels: those are 1 px in.
+        # 0 in the pixels at the rim, whose distance is 1 px.
         depth = (np.sqrt(distance_transform_edt(filled)) - 1) / (math.sqrt(DEEP_PX) - 1)
         return np.asarray(images[n] * np.maximum(depth, 0.0), dtype=np.float32)
 
-    # Blocks with such a pixel are no part of what the lit parts are compared by.
-    return [Change(lambda n, images, k=k: change(n, images, k), lit=False) for k in (False, True)]  # type: ignore[misc]
+    # Blocks with such a pixel are not compared in the unocculted field.
+    return [Change(lambda n, images, k=k: change(n, images, k), unocculted=False) for k in (False, True)]  # type: ignore[misc]
 
 
 def _nothing_filled(view: View) -> str | None:
@@ -159,25 +161,25 @@ def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectPar
 
 EFFECTS: tuple[Effect, ...] = (
     Effect("dark_offset", "detector", (_p("offset", "DN", 2.0),),
-           "The dark level taken off every readout is wrong.",
-           "a dark exposure, or a ladder of exposures at one pointing", ("exposure", "intensity"), _dark_offset),
+           "The dark level subtracted from every readout is wrong.",
+           "a dark exposure, or a series of exposure times at one pointing", ("exposure", "intensity"), _dark_offset),
     Effect("intensity_gradient", "detector",
            (_p("level", "DN/s", 2.0), _p("slope_x", "DN/s/field", 2.0), _p("slope_y", "DN/s/field", 2.0)),
-           "A light leak lays a faint plane over every image.", "an exposure with the door shut",
+           "A light leak adds a faint plane to every image.", "an exposure with the door closed",
            ("detector_x", "detector_y"), _gradient),
-    Effect("gain_mismatch", "detector", (_p("excess", "", 0.05),), "Combined and high-only images differ in gain.",
-           "the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
-    Effect("nonlinearity", "detector", (_p("loss", "", 0.05), _p("loss_beyond", "", 0.05)), "Faint signals are read out too low.",
-           "a ladder of exposures at one pointing", ("intensity",), _nonlinearity),
+    Effect("gain_mismatch", "detector", (_p("excess", "", 0.05),), "Combined-gain and high-gain images differ in their calibrated gain.",
+           "images of the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
+    Effect("nonlinearity", "detector", (_p("loss", "", 0.05), _p("loss_beyond", "", 0.05)), "The detector reads faint signals too low.",
+           "a series of exposure times at one pointing", ("intensity",), _nonlinearity),
     Effect("flat_field_residual", "detector", cosine_parameters("", 0.02),
-           "The detector's sensitivity is not quite flattened.", "the same scene displaced on the detector",
+           "The flat field leaves a smooth error of the detector's sensitivity.", "images of the same scene at several places on the detector",
            ("detector_x", "detector_y"), _flat_field, field=True),
     Effect("column_smear", "detector", (_p("share_below", "", 0.01, True), _p("share_above", "", 0.01, True)),
-           "Charge is smeared along columns while they are read.",
+           "The readout smears charge along the columns.",
            "an exposure with half of the field dark", ("detector_x", "detector_y", "intensity"), _column_smear),
     Effect("persistence", "detector", (_p("share", "", 0.01, True), *(_p(f"share_fading_in_{waits}", "", 0.01, True) for waits in FADES_IN)),
-           "Shares of the images before are left in the next, and fade.",
+           "A share of each image remains in the following images and decays.",
            "a dark exposure after a bright one", ("time", "pointing"), _persistence),
-    Effect("saturation_fill", "detector", (_p("excess", "", 0.1), _p("excess_inside", "", 0.1)), "What was filled in for saturated pixels is wrong.",
-           "a shorter exposure of the same time", ("pointing", "intensity"), _filled, _nothing_filled),
+    Effect("saturation_fill", "detector", (_p("excess", "", 0.1), _p("excess_inside", "", 0.1)), "The values filled in for saturated pixels are wrong.",
+           "a shorter exposure at the same time", ("pointing", "intensity"), _filled, _nothing_filled),
 )  # fmt: skip

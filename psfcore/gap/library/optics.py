@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter, rotate
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.search import KERNEL_REACH_PX, displaced, place_search
+from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.optics import Blur
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
@@ -19,36 +20,36 @@ from psfcore.scatter.total_psf import TotalPsf
 
 Kernel = NDArray[np.float64]
 Steps = tuple[tuple[int, int], ...]
-Halo = Callable[[int], Kernel]  # of a size: weights [y, x], sum 1 on the plane, the centre at size // 2
+Halo = Callable[[int], Kernel]  # size -> weights [y, x], sum 1 on the infinite plane, centre at size // 2
 HALO_SCALES_PX = (20.0, 40.0, 80.0, 160.0, 320.0)
 MOFFAT = 1.5  # exponent of a halo that falls off as r^-3
-GHOST_TRIALS = 300  # a field of 512 px holds about that many copies that differ
+GHOST_TRIALS = 300  # about the number of distinguishable copies in a field of 512 px
 ANGLES_DEG = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
 PITCHES_PCT = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 38.0)
 DIRECTIONS: tuple[Steps, ...] = (((1, 0), (0, 1)), ((1, 0),), ((0, 1),), ((1, 1),), ((1, -1),))
-# Between those, steps are longer: for blurs alone that are wider.
+# Directions between those have longer steps, so they serve only for wider blurs.
 BETWEEN_THEM: tuple[Steps, ...] = (((1, 2),), ((2, 1),), ((1, -2),), ((2, -1),))
 BLURS = (
     *((width, steps) for width in (0.4, 0.8, 1.5, 2.5) for steps in DIRECTIONS),
     *((width, steps) for width in (1.5, 2.5) for steps in BETWEEN_THEM),
 )
-BETWEEN = 6  # parts that the steps on both sides of the best are divided into
-SPLINE = 3  # a linear interpolation would blur what it turns
-AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate that says how much is scattered
+BETWEEN = 6  # the interval between the neighbours of the best step is divided into so many parts
+SPLINE = 3  # a linear interpolation would blur the pattern that it turns
+AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate of the total scatter
 
 
 def by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
-    """A change of the PSF, times a weight of where the light is from."""
-    return Change(lambda n, images: view.blurred(n, blur, weight), lit=False)
+    """A change of the PSF, applied to the scene times a weight of each place."""
+    return Change(lambda n, images: view.blurred(n, blur, weight), unocculted=False)
 
 
 def by_psf_in_time(view: View, blur: Blur, factor: Callable[[int], float]) -> Change:
-    """A change of the PSF that differs from image to image."""
-    return Change(lambda n, images: view.blurred(n, blur) * np.float32(factor(n)), lit=False)
+    """A change of the PSF, times a factor of each image."""
+    return Change(lambda n, images: view.blurred(n, blur) * np.float32(factor(n)), unocculted=False)
 
 
 def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Blur]:
-    """Slopes of the total PSF along coordinates of a shape, about the solution."""
+    """Derivatives of the total PSF along coordinates of a shape, at the solution."""
     transit, solution = view.solution.transit, view.solution
     total = TotalPsf(transit.diffraction, SHAPES[shape], transit.shape, threads=solution.threads)
     at = SHAPES[shape].coordinates(solution.inversion.values)
@@ -56,9 +57,13 @@ def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Bl
 
 
 def not_a_power_law(view: View) -> str | None:
-    """Why a change of the power law cannot be tried."""
+    """Why a change of the power law cannot be tested, or None."""
     name = view.solution.inversion.shape.name
-    return None if name == SOFTENED_POWER_LAW.name else f"the fitted shape is {name}, of which it is a part"
+    return (
+        None
+        if name == SOFTENED_POWER_LAW.name
+        else f"it needs the softened power law; the fitted shape is {name}"
+    )
 
 
 def core_slope(view: View) -> Blur:
@@ -73,7 +78,7 @@ def _blur(view: View, kernel: Kernel) -> Blur:
 
 
 def _ghost(view: View) -> Sequence[Change]:
-    """A blurred copy, displaced to where the discs ask for it most, by a search over the field."""
+    """A blurred copy, displaced to the place that the discs fit best, by a search over the field."""
     return _copy(*place_search(view).copy)
 
 
@@ -81,11 +86,11 @@ def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
     def change(n: int, images: Sequence[Field]) -> Field:
         return np.asarray(displaced(gaussian_filter(images[n], blur_px), dx, dy), dtype=np.float32)
 
-    return [Change(change, lit=False)]
+    return [Change(change, unocculted=False)]
 
 
 def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
-    """The effect of that name with a form that is sought no more."""
+    """The effect of this name with a fixed form."""
     sought = next(effect for effect in EFFECTS if effect.name == name)
     return replace(sought, changes=changes, held=None)
 
@@ -103,7 +108,7 @@ def _anisotropic(view: View) -> Sequence[Change]:
 
 
 def _halo(view: View) -> Sequence[Change]:
-    return _as_halo(view, _sought_halo(view))
+    return _as_halo(view, _best_halo(view))
 
 
 def _exponential(scale_px: float) -> Halo:
@@ -124,43 +129,43 @@ HALOS: tuple[Halo, ...] = tuple(form(scale) for scale in HALO_SCALES_PX for form
 
 
 def _as_halo(view: View, halo: Halo) -> Sequence[Change]:
-    """A share of the scattered light in a halo instead."""
+    """A share of the scattered light moved into a halo."""
     total, inversion = view.solution.total, view.solution.inversion
     scatter = inversion.shape.kernel(inversion.coordinates, total.size)
     return [by_psf(view, _blur(view, total.diffracted(halo(total.size) - scatter)))]
 
 
-def _sought_halo(view: View) -> Halo:
-    """The halo that explains most."""
+def _best_halo(view: View) -> Halo:
+    """The halo that explains most of the residuals."""
     size = view.solution.total.size
     return HALOS[place_search(view).wide_kernel([halo(size) for halo in HALOS])]
 
 
 def _held_halo(view: View) -> Effect:
-    halo = _sought_halo(view)
+    halo = _best_halo(view)
     return _held("wide_halo", lambda view: _as_halo(view, halo))
 
 
 def _field_dependent(view: View) -> Sequence[Change]:
     slope = view.slopes[AMOUNT]
-    # The coordinate is a logit: a share of the amount of scatter is what people ask for.
+    # The coordinate is a logit; the parameter is a relative change of the total scatter.
     share = np.float32(1 - view.solution.inversion.values["total"])
     x, y = view.places
     return [by_psf(view, slope, (where / share).astype(np.float32)) for where in (x, y, x * x + y * y)]
 
 
 def _core_blur(view: View) -> Sequence[Change]:
-    return blur_as(view, *_sought_blur(view))
+    return blur_as(view, *_best_blur(view))
 
 
 def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
-    """A blur of that width, for a variance of 1 px^2."""
+    """A blur of that width, per variance of 1 px^2."""
     change = (_blurred(view.kernel, width_px, steps) - view.kernel) / width_px**2
     return [by_psf(view, _blur(view, change))]
 
 
-def _sought_blur(view: View) -> tuple[float, Steps]:
-    """Width (px) and directions of the blur that explains most."""
+def _best_blur(view: View) -> tuple[float, Steps]:
+    """Width (px) and directions of the blur that explains most of the residuals."""
     near = crop_or_pad(view.kernel, 2 * KERNEL_REACH_PX + 1)
     return BLURS[place_search(view).kernel([_blurred(near, *blur) - near for blur in BLURS])]
 
@@ -168,7 +173,7 @@ def _sought_blur(view: View) -> tuple[float, Steps]:
 def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
     """A kernel [y, x] blurred to that width along each of some directions: a random walk of these steps (y, x).
 
-    On pixels a Gaussian of less than one would ring; this one is nowhere negative and has its variance exactly.
+    A sampled Gaussian narrower than a pixel would ring. The random walk is never negative and has the exact variance.
     """
     fy, fx = np.fft.fftfreq(kernel.shape[0])[:, None], np.fft.rfftfreq(kernel.shape[1])[None, :]
     walk = sum((np.cos(2 * np.pi * (y * fy + x * fx)) - 1) / (y * y + x * x) for y, x in steps)
@@ -177,12 +182,12 @@ def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
 
 
 def _held_blur(view: View) -> Effect:
-    blur = _sought_blur(view)
+    blur = _best_blur(view)
     return _held("core_blur", lambda view: blur_as(view, *blur))
 
 
 def _mesh(view: View, changed: Kernel) -> list[Change]:
-    """A change of the diffraction pattern, seen through the scatter."""
+    """A change of the diffraction pattern, convolved with the scatter kernel."""
     solution = view.solution
     size = solution.total.size
     scatter = solution.inversion.shape.kernel(solution.inversion.coordinates, size)
@@ -191,7 +196,7 @@ def _mesh(view: View, changed: Kernel) -> list[Change]:
 
 
 def _odd(view: View) -> Kernel:
-    """The diffraction pattern with its centre in the middle."""
+    """The diffraction pattern with its centre in the middle pixel."""
     pattern = view.solution.transit.diffraction
     return np.asarray(pattern[1 - pattern.shape[0] % 2 :, 1 - pattern.shape[1] % 2 :])
 
@@ -208,10 +213,11 @@ def _stretched(pattern: Kernel, percent: float) -> Kernel:
     )
 
 
-def _sought(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> float:
-    """By how much the diffraction pattern has to change for the discs: looked for, the orders move by more than they are wide.
+def _best_amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> float:
+    """The change of the diffraction pattern that explains most of the residuals.
 
-    form(pattern, amount): the pattern changed. steps: sizes of amounts that are tried, both signs; then between them.
+    A search is needed because the orders move by more than their width. form(pattern, amount): the changed pattern. steps:
+    sizes of the amounts that are tried with both signs; then amounts between the neighbours of the best one are tried.
     """
     search, pattern = place_search(view), _near(_odd(view))
     tried = sorted(sign * step for step in steps for sign in (-1, 1))
@@ -223,12 +229,12 @@ def _sought(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence
 
 
 def _near(pattern: Kernel) -> Kernel:
-    """What of a pattern a search looks at."""
+    """The centre of a pattern, which is all that a search uses."""
     return crop_or_pad(pattern, min(2 * KERNEL_REACH_PX + 1, pattern.shape[0]))
 
 
 def _changed_mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: float) -> list[Change]:
-    """The mesh changed by an amount, for one unit of it."""
+    """The mesh changed by an amount, per unit of it."""
     pattern = _odd(view)
     change = (form(pattern, amount) - pattern) / amount
     return _mesh(view, crop_or_pad(change, view.solution.transit.diffraction.shape[0]))
@@ -237,7 +243,7 @@ def _changed_mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: f
 def _mesh_effect(name: str, form: Callable[[Kernel, float], Kernel], steps: Sequence[float],
                  parameter: EffectParameter, cause: str, axes: tuple[str, ...]) -> Effect:  # fmt: skip
     def held(view: View) -> Effect:
-        amount = _sought(view, form, steps)
+        amount = _best_amount(view, form, steps)
         return replace(effect, changes=lambda view: _changed_mesh(view, form, amount), held=None)
 
     effect = Effect(
@@ -245,9 +251,9 @@ def _mesh_effect(name: str, form: Callable[[Kernel, float], Kernel], steps: Sequ
         "optics",
         (parameter,),
         cause,
-        "the arms of a flare",
+        "the diffraction arms of a flare",
         axes,
-        lambda view: _changed_mesh(view, form, _sought(view, form, steps)),
+        lambda view: _changed_mesh(view, form, _best_amount(view, form, steps)),
         trials=2 * len(steps),
         held=held,
     )
@@ -259,25 +265,25 @@ def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectPar
 
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection lays a displaced, defocused copy over the image.",
-           "a bright source moved across the field", ("detector_x", "detector_y", "intensity"), _ghost,
+    Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection adds a displaced, defocused copy of the image.",
+           "images of a bright source at several places in the field", ("detector_x", "detector_y", "intensity"), _ghost,
            trials=GHOST_TRIALS, held=_held_ghost),
     Effect("anisotropic_scatter", "optics", (_p("p", "", 0.1), _p("q", "", 0.1)),
-           "Scatter reaches farther along one direction: ln(1 + stretch) times cos and sin of twice its angle.",
-           "a transit of a second track across the first", ("azimuth_in_disc", "detector_x", "detector_y"),
+           "Scatter reaches farther along one direction: p and q are ln(1 + stretch) times cos and sin of twice its angle.",
+           "a transit along a second track that crosses the first", ("azimuth_in_disc", "detector_x", "detector_y"),
            _anisotropic, not_a_power_law),
     Effect("field_dependent_scatter", "optics",
            (_p("x", "/field", 0.1), _p("y", "/field", 0.1), _p("outwards", "/field2", 0.2)),
-           "The amount of scatter changes across the detector, along it or from its middle outwards.", "a transit of another part of the detector",
+           "The total scatter varies across the detector, linearly or from its centre outwards.", "a transit across another part of the detector",
            ("detector_x", "detector_y"), _field_dependent, not_a_power_law),
-    Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "A second, wide component of scatter.",
-           "an eclipse or a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,
+    Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "There is a second, wide component of scatter.",
+           "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,
            trials=len(HALOS), held=_held_halo),
     Effect("core_blur", "optics", (_p("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
-           "a sharp limb, or a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur, trials=len(BLURS),
+           "an image of a sharp limb or of a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur, trials=len(BLURS),
            held=_held_blur),
     _mesh_effect("mesh_rotation", _turned, ANGLES_DEG, _p("angle", "deg", 3.0),
-                 "The meshes are turned against the detector.", ("azimuth_in_disc", "detector_x", "detector_y")),
+                 "The meshes are rotated relative to the detector.", ("azimuth_in_disc", "detector_x", "detector_y")),
     _mesh_effect("mesh_pitch", _stretched, PITCHES_PCT, _p("stretch", "%", 3.0),
-                 "The meshes' pitch is not the drawing's.", ("radius_in_disc", "azimuth_in_disc")),
+                 "The pitch of the meshes differs from its nominal value.", ("radius_in_disc", "azimuth_in_disc")),
 )  # fmt: skip

@@ -1,7 +1,7 @@
-"""Probes: forms that gaps of unknown cause have.
+"""Probes: patterns that are typical of gaps of unknown cause.
 
-No probe is ever an answer. One that explains a gap clearly better than every effect of the library says that the
-cause is not in the library, and what it looks like.
+A probe is never an answer. If a probe explains a gap clearly better than every effect of the library, the cause is not
+in the library, and the probe tells what it looks like.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
+from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.search import place_search
 from psfcore.gap.library.detector import cosine_parameters, cosines, fixed, flat, times_image
 from psfcore.gap.library.optics import (
@@ -24,12 +24,13 @@ from psfcore.gap.library.optics import (
     not_a_power_law,
     shape_slopes,
 )
-from psfcore.gap.library.scene import COARSE_PX, RIDGE, STRUCTURE_PX, lit_on_coarse, on_pixels
+from psfcore.gap.library.scene import COARSE_PX, RIDGE, STRUCTURE_PX, on_pixels, unocculted_on_coarse
+from psfcore.gap.view import Field, View
 from psfcore.transit.occulter import coverage
 
 Plane = NDArray[np.float64]
 
-PATCH_SHARE = 0.08  # of the field: width of a patch of light or shadow
+PATCH_SHARE = 0.08  # width of a patch of light or shadow, as a fraction of the field
 PATCH_TRIALS = 60
 LEAST_EXPOSURES = 2
 
@@ -65,7 +66,7 @@ def _planes_of_pointings(view: View) -> Sequence[Change]:
 
     def one(fov: int, plane: Field) -> Change:
         nothing = np.zeros_like(plane)
-        return Change(lambda n, images: plane if frames[n].fov == fov else nothing, lit=False)
+        return Change(lambda n, images: plane if frames[n].fov == fov else nothing, unocculted=False)
 
     x, y = view.places
     fovs = sorted({f.fov for f in frames})
@@ -110,11 +111,11 @@ def _rows(view: View) -> Sequence[Change]:
     def change(n: int, images: Sequence[Field]) -> Field:
         return np.broadcast_to(images[n].mean(axis=1, keepdims=True, dtype=np.float32), images[n].shape)
 
-    return [Change(change, lit=False)]
+    return [Change(change, unocculted=False)]
 
 
 def _bright(view: View) -> Sequence[Change]:
-    scale = np.float32(max(float(np.mean(plane)) for plane in view.lit))
+    scale = np.float32(max(float(np.mean(plane)) for plane in view.pointing_means))
     return [Change(lambda n, images: np.asarray(-images[n] * images[n] / scale))]
 
 
@@ -125,17 +126,17 @@ def _shutter(view: View) -> Sequence[Change]:
     return [along(place) for place in view.places]
 
 
-def _readout_pattern(view: View) -> Sequence[Change]:
-    """What the lit parts show to be the same in every readout wherever the telescope points, for a pattern of 1 DN rms.
+def _read_pattern(view: View) -> Sequence[Change]:
+    """The pattern that is the same in every readout at all pointings, as measured in the unocculted field, for 1 DN rms.
 
-    As DN/s it goes with one over the exposure, which the images of a pointing differ in.
+    In DN/s it is proportional to 1 / exposure, so it shows where the images of a pointing differ in exposure.
     """
     frames = view.solution.transit.frames
     readouts = np.array([1 / frame.exposure_s for frame in frames])
     over, under, shown = (sum(some) for some in zip(*_in_pointings(view, readouts), strict=True))
-    least = max(RIDGE * float(np.max(under)), 1e-300)  # where few images show a place
+    least = max(RIDGE * float(np.max(under)), 1e-300)  # damps places that few images show
     pattern = gaussian_filter(over / (under + least), STRUCTURE_PX / COARSE_PX)
-    pattern -= pattern.mean()  # a level is another effect's
+    pattern -= pattern.mean()  # its mean is the effect dark_offset
     plane = on_pixels(pattern / max(float(pattern.std()), 1e-9), view.solution.transit.shape)
     return [
         Change(lambda n, _: plane * np.float32(readouts[n]), disc=False, numbers=int(np.count_nonzero(shown)))
@@ -143,12 +144,13 @@ def _readout_pattern(view: View) -> Sequence[Change]:
 
 
 def _in_pointings(view: View, readouts: Plane) -> Iterator[tuple[Plane, Plane, Plane]]:
-    """Of each pointing that tells, on coarse pixels: sums over its images of what goes with the readouts a second and of
-    their squares, the scene free; and of each block whether it tells."""
+    """For each pointing with several exposures, on coarse pixels: the sums over its images of the part that is proportional to
+    1 / exposure and of its weight, with a free scene; and whether each block contributes.
+    """
     frames = view.solution.transit.frames
     for fov in _pointings_of_exposures(view):
         here = [n for n, frame in enumerate(frames) if frame.fov == fov]
-        seen, weight, free = lit_on_coarse(view, here)
+        seen, weight, free = unocculted_on_coarse(view, here)
         total = np.maximum(weight.sum(axis=0), 1)
         scene = (seen * weight).sum(axis=0) / total
         a_second = readouts[here][:, None, None]
@@ -170,26 +172,26 @@ def _pointings_of_exposures(view: View) -> list[int]:
 
 
 def _no_pointing_of_exposures(view: View) -> str | None:
-    return None if _pointings_of_exposures(view) else "no pointing's images differ in exposure"
+    return None if _pointings_of_exposures(view) else "no pointing has images of different exposures"
 
 
 def _one_exposure(view: View) -> str | None:
     exposures = {frame.exposure_s for frame in view.solution.transit.frames}
-    return None if len(exposures) >= LEAST_EXPOSURES else "all images have one exposure"
+    return None if len(exposures) >= LEAST_EXPOSURES else "all images have the same exposure"
 
 
 def _lit_occulter(view: View) -> Sequence[Change]:
-    """The occulter not dark: light of its own on its disc, DN/s, evenly and more towards its rim."""
+    """An occulter that is not dark: light on its disc, DN/s, uniform and increasing towards its rim."""
     optics, shape = view.solution.optics, view.solution.transit.shape
 
     def disc(n: int, power: int) -> Field:
         place = view.solution.sky.found[n].place
         dy, dx = np.ogrid[: shape[0], : shape[1]]
         squared = ((dx - place.x_px) ** 2 + (dy - place.y_px) ** 2) / place.radius_px**2
-        lit = coverage(shape, place) * np.minimum(squared, 1.0) ** power
-        return optics.field(optics.convolve(optics.lanes(lit.astype(np.float32))))
+        light = coverage(shape, place) * np.minimum(squared, 1.0) ** power
+        return optics.field(optics.convolve(optics.lanes(light.astype(np.float32))))
 
-    return [Change(lambda n, images, k=k: disc(n, k), lit=False) for k in (0, 1)]  # type: ignore[misc]
+    return [Change(lambda n, images, k=k: disc(n, k), unocculted=False) for k in (0, 1)]  # type: ignore[misc]
 
 
 def _p(*names: str) -> tuple[EffectParameter, ...]:
@@ -206,7 +208,7 @@ PROBES: tuple[Effect, ...] = (
     _probe("patch_of_shadow", "detector", _p("depth"), "a patch of lost light, fixed on the detector",
            ("detector_x", "detector_y"), _shadow, trials=PATCH_TRIALS),
     _probe("structured_light", "detector", (EffectParameter("level", "DN/s", 2.0), *cosine_parameters("DN/s", 0.4)),
-           "added light of a smooth form, fixed on the detector", ("detector_x", "detector_y"), _structured, field=True),
+           "added light with smooth structure, fixed on the detector", ("detector_x", "detector_y"), _structured, field=True),
     _probe("drifting_light", "scene", _p("linear", "quadratic"), "added light that drifts with time", ("time",), _drift),
     _probe("drifting_dark_level", "detector", _p("linear", "quadratic"), "a dark level that drifts with time",
            ("time", "exposure"), _dark_drift),
@@ -215,15 +217,15 @@ PROBES: tuple[Effect, ...] = (
            not_a_power_law),
     _probe("one_sided_scatter", "optics", _p("x_share", "y_share"), "scatter that is stronger on one side",
            ("azimuth_in_disc",), _one_sided, not_a_power_law),
-    _probe("bent_scatter", "optics", _p("bend"), "scatter that falls off faster or slower far out",
+    _probe("bent_scatter", "optics", _p("bend"), "scatter that falls off faster or more slowly at large distances",
            ("scattering_distance",), _bent, not_a_power_law),
-    _probe("light_along_rows", "detector", _p("share"), "a share of each row's light along the row",
+    _probe("light_along_rows", "detector", _p("share"), "a share of each row's light spread along the row",
            ("detector_y", "intensity"), _rows),
-    _probe("bright_loss", "detector", _p("loss"), "bright pixels read out too low", ("intensity",), _bright),
-    _probe("uneven_shutter", "detector", _p("x", "y"), "an exposure that differs across the field",
+    _probe("bright_loss", "detector", _p("loss"), "bright pixels that are read too low", ("intensity",), _bright),
+    _probe("uneven_shutter", "detector", _p("x", "y"), "an exposure time that varies across the field",
            ("exposure", "detector_x", "detector_y"), _shutter, _one_exposure),
     _probe("readout_pattern", "detector", (EffectParameter("rms", "DN", 2.0, True),),
-           "a pattern that is the same in every readout", ("detector_x", "detector_y", "exposure"), _readout_pattern,
+           "a pattern that is the same in every readout", ("detector_x", "detector_y", "exposure"), _read_pattern,
            _no_pointing_of_exposures),
     _probe("lit_occulter", "scene", _p("level", "rim"), "an occulter that is not dark",
            ("radius_in_disc",), _lit_occulter),

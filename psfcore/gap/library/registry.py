@@ -1,4 +1,4 @@
-"""All effects that are tried, and the probes beside them. To add one, add it to the file of its stage."""
+"""All effects that are tested, and the probes. To add an effect, add it to EFFECTS in the file of its stage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects of the scene: what lies beyond the field, the occulter's motion, a Sun that changes."""
+"""Effects of the scene: light from outside the field, motion of the occulter, and a Sun that changes."""
 
 from __future__ import annotations
 
@@ -10,30 +10,31 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.gap.effect import Change, Effect, EffectParameter, Field, View
-from psfcore.gap.evidence.lit_blocks import blocks, not_compared
+from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.search import coarse_kernel
+from psfcore.gap.evidence.unocculted_blocks import blocks, not_compared
+from psfcore.gap.view import Field, View
 from psfcore.transit.occulter import coverage
 from psfcore.transit.transit import Place
 
 Planes = NDArray[np.float64]
 
-# In the longest exposure. What a long track changes is not so many times what a short one does.
+# In the longest exposure. Two lengths, because the change is not proportional to the length.
 MOTIONS_PX = (1.0, 5.0)
-MOTION_PARTS = 5  # that an exposure is divided into
+MOTION_PARTS = 5  # an exposure is divided into so many parts
 STRUCTURE_PX = 6.0
 LEAST_TO_EVOLVE = 5
 MOST_TERMS = 4
-RIDGE = 1e-3  # of an image's weight, where few images show a place
+RIDGE = 1e-3  # of an image's weight: damps places that few images show
 COARSE_PX = 4
 SIDES = ("left", "right", "bottom", "top")
-MOST_POINTINGS = 8  # whose surroundings are told apart
+MOST_POINTINGS = 8  # each of these has its own surroundings
 
 
 def _beyond_field(view: View) -> Sequence[Change]:
-    """The field's mirror image beyond each of its edges, seen through the PSF.
+    """The mirror image of the field beyond each of its edges, convolved with the PSF.
 
-    What gets in from there is smooth but for the outermost pixels: worked out on coarse pixels.
+    The light that enters from there is smooth except in the outermost pixels, so it is computed on coarse pixels.
     """
     solution = view.solution
     ny, nx = (-(-n // COARSE_PX) for n in solution.transit.shape)
@@ -42,7 +43,7 @@ def _beyond_field(view: View) -> Sequence[Change]:
     through = Convolver(kernel, (ny + 2 * pad_y, nx + 2 * pad_x), dtype=np.float32, threads=solution.threads)
     y, x = np.indices((ny + 2 * pad_y, nx + 2 * pad_x))
     low_y, high_y, low_x, high_x = y < pad_y, y >= pad_y + ny, x < pad_x, x >= pad_x + nx
-    # A corner belongs to the side: the sides share all that is beyond the field.
+    # Left and right include the corners, so that the four sides cover all that is outside the field.
     sides = (low_x, high_x, low_y & ~low_x & ~high_x, high_y & ~low_x & ~high_x)
 
     def change(n: int, side: NDArray[np.bool_]) -> Field:
@@ -55,14 +56,14 @@ def _beyond_field(view: View) -> Sequence[Change]:
     nothing = np.zeros(solution.transit.shape, np.float32)
 
     def one(fov: int, side: NDArray[np.bool_]) -> Change:
-        return Change(lambda n, _: change(n, side) if frames[n].fov == fov else nothing, lit=False)
+        return Change(lambda n, _: change(n, side) if frames[n].fov == fov else nothing, unocculted=False)
 
     # Each pointing has its own surroundings.
     return [one(fov, side) for fov in sorted({f.fov for f in frames})[:MOST_POINTINGS] for side in sides]
 
 
 def _coarse(plane: Field) -> Field:
-    """Means of squares of COARSE_PX; the last ones are made whole with their own edge."""
+    """Means of squares of COARSE_PX; incomplete squares are completed by repeating the edge."""
     ny, nx = plane.shape
     whole = np.pad(plane, ((0, -ny % COARSE_PX), (0, -nx % COARSE_PX)), mode="edge")
     rows, columns = (n // COARSE_PX for n in whole.shape)
@@ -70,7 +71,7 @@ def _coarse(plane: Field) -> Field:
 
 
 def _motion(view: View) -> Sequence[Change]:
-    """The disc drawn out along its track: light where it was dark for a part of the exposure, and the other way."""
+    """The disc blurred along its track: light where it was dark for a fraction of the exposure, and the reverse."""
     solution = view.solution
     frames = solution.transit.frames
     places = [found.place for found in solution.sky.found]
@@ -95,14 +96,13 @@ def _motion(view: View) -> Sequence[Change]:
         optics = solution.optics
         return optics.field(optics.convolve(optics.lanes((-lost).astype(np.float32))))
 
-    return [Change(lambda n, _, px=px: change(n, px), lit=False) for px in MOTIONS_PX]  # type: ignore[misc]
+    return [Change(lambda n, _, px=px: change(n, px), unocculted=False) for px in MOTIONS_PX]  # type: ignore[misc]
 
 
 def _evolution(view: View) -> Sequence[Change]:
-    """What the lit parts of a pointing's images show to have changed evenly in time, and beyond that smoothly, for a
-    change of one rms.
+    """The change of a pointing's unocculted field that is linear in time, and the smooth change beyond that, per unit of rms.
 
-    The discs do not show it: each image's scene is its own.
+    The discs do not show it, because each image has its own scene.
     """
     frames = view.solution.transit.frames
     evolving = [
@@ -129,8 +129,11 @@ def _evolution(view: View) -> Sequence[Change]:
 
 @dataclass(frozen=True, eq=False)
 class _Evolving:
-    """One pointing on coarse pixels. basis: polynomials in time (images, terms); terms: the maps that they multiply,
-    DN/s (terms, y, x); level: of its mean. free: how many images show each of its blocks."""
+    """The change of one pointing on coarse pixels.
+
+    basis: polynomials in time (images, terms). terms: the maps that they multiply, DN/s (terms, y, x). level: mean of the
+    pointing's mean image. free: the number of images that show each of its blocks.
+    """
 
     images: tuple[int, ...]
     basis: NDArray[np.float64]
@@ -139,13 +142,13 @@ class _Evolving:
     free: NDArray[np.int64]
 
     def planes(self, terms: slice) -> dict[int, Planes]:
-        """How each image differs from the mean over time, by some of the terms."""
-        # The mean over time is the scene's: no part of how it changes.
+        """The difference of each image from the mean over time, by some of the terms."""
+        # The mean over time belongs to the scene, not to its change.
         basis = self.basis[:, terms] - self.basis[:, terms].mean(axis=0)
         return dict(zip(self.images, np.tensordot(basis, self.terms[terms], axes=1), strict=True))
 
     def numbers(self, terms: slice) -> int:
-        """How many numbers were taken from the blocks for some of the terms: of a block no more than it has images."""
+        """How many numbers were measured in the blocks for some of the terms: for each block at most the number of its images."""
         last = np.minimum(self.basis.shape[1] if terms.stop is None else terms.stop, self.free)
         return int(np.maximum(last - terms.start, 0).sum())
 
@@ -156,7 +159,7 @@ def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
     at = 2 * (time_s - time_s[0]) / max(float(time_s[-1] - time_s[0]), 1e-9) - 1
     degree = min(MOST_TERMS, len(images) // 2)
     basis = np.polynomial.legendre.legvander(at, degree)
-    seen, weight, free = lit_on_coarse(view, images)
+    seen, weight, free = unocculted_on_coarse(view, images)
     level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
     normal = np.einsum("nk,nyx,nl->yxkl", basis, weight, basis) + RIDGE * np.eye(degree + 1)
     score = np.einsum("nk,nyx->yxk", basis, weight * (seen - level))
@@ -170,9 +173,10 @@ def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
     )
 
 
-def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
-    """Images of one pointing on coarse pixels, the hidden light put back and each as bright as their mean, DN/s
-    (images, y, x); one where they can be compared; and how many of them show each of the blocks."""
+def unocculted_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
+    """Images of one pointing on coarse pixels, with the hidden light restored and scaled to their mean, DN/s (images, y, x);
+    their weights, 1 where they can be compared; and the number of images that show each of the blocks.
+    """
     planes, weights, free = [], [], []
     for n in images:
         out = not_compared(view.solution, n)
@@ -181,7 +185,7 @@ def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, ND
         free.append(blocks(out.astype(np.float64)) == 0)
     seen, weight = np.array(planes, dtype=np.float64), np.array(weights, dtype=np.float64)
     level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
-    # How bright an image is as a whole is not the Sun's structure.
+    # The brightness of a whole image is not a change of the Sun's structure.
     for one, use in zip(seen, weight > 0, strict=True):
         if use.any():
             one /= one[use].sum() / max(float(level[use].sum()), 1e-9)
@@ -189,7 +193,7 @@ def lit_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, ND
 
 
 def on_pixels(plane: Field, shape: tuple[int, ...]) -> Field:
-    """A coarse plane on the images' pixels."""
+    """A coarse plane on the pixels of the images."""
     fine = np.repeat(np.repeat(plane, COARSE_PX, axis=0), COARSE_PX, axis=1)
     return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
 
@@ -199,7 +203,7 @@ def _too_few_to_evolve(view: View) -> str | None:
     most = max(sum(f.fov == fov for f in frames) for fov in {f.fov for f in frames})
     if most >= LEAST_TO_EVOLVE:
         return None
-    return f"no pointing has the {LEAST_TO_EVOLVE} images that it takes; the most is {most}"
+    return f"it needs a pointing with {LEAST_TO_EVOLVE} images; the largest has {most}"
 
 
 def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
@@ -211,8 +215,8 @@ EFFECTS: tuple[Effect, ...] = (
            (_p("short_tracks", "", 4.0, True), _p("long_tracks", "", 1.0, True)), "The occulter moves during an exposure.",
            "shorter exposures", ("radius_in_disc", "azimuth_in_disc"), _motion),
     Effect("out_of_field_light", "scene", tuple(_p(f"{side}_{k}", "", 0.5, True) for k in range(1, MOST_POINTINGS + 1) for side in SIDES),
-           "The Sun goes on beyond the field and scatters in.",
-           "full-Sun images of the same time", ("scattering_distance", "pointing", "intensity"), _beyond_field),
-    Effect("scene_evolution", "scene", (_p("rms", "", 0.3, True), _p("rms_uneven", "", 0.3, True)), "The Sun changes while the occulter crosses a pointing.",
-           "images closer in time", ("time", "pointing"), _evolution, _too_few_to_evolve),
+           "Light from the Sun outside the field scatters into the field.",
+           "full-Sun images taken at the same time", ("scattering_distance", "pointing", "intensity"), _beyond_field),
+    Effect("scene_evolution", "scene", (_p("rms", "", 0.3, True), _p("rms_uneven", "", 0.3, True)), "The Sun changes while the occulter crosses the field of a pointing.",
+           "images closer together in time", ("time", "pointing"), _evolution, _too_few_to_evolve),
 )  # fmt: skip

@@ -1,7 +1,7 @@
-"""The figures of a gap diagnosis, each as PNG, made for a page about ten inches wide; and one picture of all.
+"""The figures of a gap diagnosis, each a PNG for a page about ten inches wide, and one picture with all of them.
 
-Residuals are simulated minus observed, in percent of the observed mean of a disc. Full symbols: the
-fitted model; open ones: with the answer's effects in it. Pointings differ in colour and in symbol.
+Residuals are simulated minus observed, in percent of the observed mean of a disc. Full symbols: the fitted model; open
+symbols: with the answer's effects in it. Pointings differ in colour and symbol.
 """
 
 from __future__ import annotations
@@ -23,21 +23,18 @@ from psfcore.drawing.plots import CHANGE, INK
 from psfcore.evaluation.plot import tidy
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.cells import RINGS, DiscCells
+from psfcore.gap.report.bars import MOST_EFFECTS, draw_effects, draw_where
 from psfcore.gap.report.report import fits_of
 
 Vector = NDArray[np.float64]
 Report = dict[str, Any]
 
 WIDTH_IN = 9.9
-MOST_EFFECTS = 10
-CERTAIN_P = 1e-12  # smaller ones are written as smaller than this
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#8a6d00", "#56B4E9")
 _SYMBOLS = ("o", "s", "^", "D", "v", "P")
 _BEFORE, _AFTER, _OBSERVED = "#D55E00", "#0072B2", "#333333"
-_ANSWER, _OTHER = "#0072B2", "#9a9a9a"
-_NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3  # where bars and intervals are cut
-_DARK = 0.55  # of the colour scale: from there on numbers are white
-_SLICE_PX, SLICE_ROWS = 20, 2  # along x, and on either side of the middle row
+_DARK = 0.55  # of the colour scale: numbers on stronger colours are white
+_SLICE_PX, SLICE_ROWS = 20, 2  # on either side of the centre along x, and of the middle row
 _FITTED, _ANSWERED = "Fitted model", "With the answer"
 
 
@@ -49,7 +46,7 @@ def residuals_png(report: Report) -> bytes:
 
 
 def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
-    """On three charts; their legend goes on the figure."""
+    """Draw the residuals on three charts; their legend goes on the figure."""
     rows = report["images"]
     before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
     noise, noise_after = _column(rows, "noise_pct"), _column(rows, "noise_after_pct")
@@ -83,7 +80,7 @@ def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
 
 
 def map_png(report: Report) -> bytes:
-    """Where on the detector: every disc at its place, coloured by its residual, before and with the answer."""
+    """Every disc at its place on the detector, coloured by its residual, before and with the answer."""
     panels = 2 if has_after(report) else 1
     figure = _figure(4.95 * panels + 0.6, 4.6)
     charts = list(np.ravel(figure.subplots(1, panels, squeeze=False)))
@@ -92,7 +89,7 @@ def map_png(report: Report) -> bytes:
 
 
 def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
-    """One chart: before. Two: with the answer in the second, on the same scale."""
+    """One chart: before. A second chart: with the answer, on the same scale."""
     rows = report["images"]
     before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
     top = _scale(before, _column(rows, "noise_pct"))
@@ -125,7 +122,7 @@ def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
 
 
 def cells_png(found: Diagnosis) -> bytes:
-    """Where in the disc: mean residual of its cells over all images, before and with the answer."""
+    """The mean residual of each cell over all images, before and with the answer."""
     panels = 2 if found.corrected else 1
     figure = _figure(4.2 * panels + 0.9, 4.2)
     draw_cells(figure, list(np.ravel(figure.subplots(1, panels, squeeze=False))), found)
@@ -133,7 +130,7 @@ def cells_png(found: Diagnosis) -> bytes:
 
 
 def draw_cells(figure: Any, charts: Sequence[Any], found: Diagnosis) -> None:
-    """Sectors of rings, as the cells are; the second chart, where there is one, with the answer."""
+    """Sectors of rings, like the cells; the second chart, if there is one, is with the answer."""
     maps = [cell_means(found.evidence.discs)]
     if found.corrected:
         maps.append(cell_means(found.corrected[0].evidence.discs))
@@ -162,15 +159,15 @@ def draw_cells(figure: Any, charts: Sequence[Any], found: Diagnosis) -> None:
             )
         axes.add_patch(Circle((0, 0), 1.0, fc="none", ec="#555555", lw=1.0))
         axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", title=title)
-        axes.set(xlabel="x from the centre (dark radii)")
+        axes.set(xlabel="x from the centre (radii of the dark disc)")
         axes.title.set_fontsize(11)
         for side in axes.spines.values():
             side.set_visible(False)
-    charts[0].set(ylabel="y from the centre (dark radii)")
+    charts[0].set(ylabel="y from the centre (radii of the dark disc)")
 
 
 def cell_means(discs: Sequence[DiscCells]) -> tuple[Vector, Vector]:
-    """Mean residual of each cell over the discs and its error from noise, percent; nan where no disc has the cell."""
+    """Mean residual of each cell over the discs and its error from noise, percent; nan if no disc has the cell."""
     places = _places()
     sums, variance, count = (np.zeros(len(places)) for _ in range(3))
     for disc in discs:
@@ -184,18 +181,18 @@ def cell_means(discs: Sequence[DiscCells]) -> tuple[Vector, Vector]:
 
 
 def _scale(values: Vector, noise: Vector) -> float:
-    """Where colours end: the largest value, and no less than three times the noise, which would look like a gap."""
+    """The end of the colour scale: the largest value, but at least three times the noise, which would otherwise look like a gap."""
     typical = float(np.sqrt(np.nanmean(noise**2))) if np.isfinite(noise).any() else 0.0
     return max(float(np.nanmax(np.abs(values), initial=0.0)), 3 * typical, 1e-3)
 
 
 def _places() -> list[tuple[float, float, int, int]]:
-    """Of every cell: from, to (of the dark radius), its sector, and how many its ring has."""
+    """For every cell: inner and outer radius (of the dark disc), its sector, and the number of sectors in its ring."""
     return [(low, high, k, sectors) for low, high, sectors in RINGS for k in range(sectors)]
 
 
 def _numbers(disc: DiscCells) -> list[int]:
-    """Which of `_places` each cell of a disc is: discs lack those of too few pixels."""
+    """The index in `_places` of each cell of a disc; a disc lacks cells of too few pixels."""
     out = []
     for radius, azimuth in zip(disc.radius, disc.azimuth, strict=True):
         ring = next(k for k, (_, high, _) in enumerate(RINGS) if radius < high or k == len(RINGS) - 1)
@@ -206,89 +203,21 @@ def _numbers(disc: DiscCells) -> list[int]:
 
 
 def where_png(report: Report) -> bytes:
-    """What share of the gap goes with each axis."""
+    """The share of the gap along each axis."""
     figure = _figure(7.4, 0.9 + 0.32 * len(report["where"]))
     draw_where(figure.subplots(), report)
     return _png(figure)
 
 
-def draw_where(axes: Any, report: Report) -> None:
-    """Bars, the strongest at the top, p-values beside."""
-    rows = report["where"]
-    at = np.arange(len(rows))[::-1]
-    shares = np.array([100 * row["share"] for row in rows])
-    colours = [_ANSWER if n == 0 and report["verdict"] != "none" else _OTHER for n in range(len(rows))]
-    axes.barh(at, shares, color=colours, height=0.7)
-    for y, share, row in zip(at, shares, rows, strict=True):
-        axes.annotate(
-            p_words(row["p_value"]), (share, y), (4, 0), textcoords="offset points", va="center", fontsize=8.5
-        )
-    axes.set_yticks(at, [row["axis"].replace("_", " ") for row in rows])
-    axes.set(xlim=(0, 1.3 * max(float(shares.max(initial=0.0)), 1.0)), xlabel="Share of the gap (%)")
-    tidy([axes])
-
-
-def p_words(p_value: float) -> str:
-    """A p-value as it is written beside a bar."""
-    return f"p < {CERTAIN_P:.0e}" if p_value < CERTAIN_P else f"p = {p_value:.2g}"
-
-
 def effects_png(report: Report) -> bytes:
-    """How far each effect closes the gap on images held out, best first."""
+    """How far each effect closes the gap on held-out images, best first."""
     figure = _figure(WIDTH_IN, 1.1 + 0.34 * min(len(fits_of(report)), MOST_EFFECTS))
     draw_effects(figure.subplots(), report)
     return _png(figure)
 
 
-def draw_effects(axes: Any, report: Report) -> None:
-    """Closure with its 90 % interval; the answer, or what is tied, stands out; scores beside."""
-    rows = fits_of(report)[:MOST_EFFECTS]
-    at = np.arange(len(rows))[::-1]
-    names = []
-    for y, row in zip(at, rows, strict=True):
-        chosen = _chosen(row, report)
-        colour = _ANSWER if chosen else _OTHER
-        _draw_closure(axes, float(y), row["closure"], colour)
-        axes.text(1.52, y, f"{row['score']:.1f}", va="center", ha="right", fontsize=9)
-        mark = {"attributed": "answer", "tie": "tie"}.get(report["verdict"], "") if chosen else ""
-        names.append(row["name"].replace("_", " ") + (f"  ({mark})" if mark else ""))
-    axes.text(1.52, at.max(initial=0) + 0.75, "score", va="center", ha="right", fontsize=9, color="#555555")
-    axes.set_yticks(at, names)
-    for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
-        if _chosen(row, report):
-            tick.set_fontweight("bold")
-    axes.axvline(0, color="#555555", linewidth=1.0)
-    axes.axvline(1, color="#555555", linewidth=1.0, linestyle=(0, (4, 3)))
-    axes.set(xlim=(_NO_CLOSURE, 1.56), ylim=(-0.7, len(rows) + 0.2), xticks=(0, 0.25, 0.5, 0.75, 1.0))
-    axes.set_xlabel("Closure of the gap on images held out (0: nothing, 1: all)", x=0.45)
-    tidy([axes])
-
-
-def _chosen(row: Report, report: Report) -> bool:
-    """Whether an effect, or some together, are the answer, or one of those that are tied."""
-    names, answer = set(row["name"].split(" + ")), set(report["answer"])
-    if report["verdict"] != "tie":
-        return names == answer
-    certain = answer.difference(*report["ties"])
-    return certain <= names <= answer and names != certain
-
-
-def _draw_closure(axes: Any, y: float, closure: dict[str, Any] | None, colour: str) -> None:
-    if closure is None:
-        axes.text(0.02, y, "no gap to close", va="center", fontsize=8.5, color="#666666")
-        return
-    value, (low, high) = closure["value"], closure["ci90"]
-    axes.barh(y, float(np.clip(value, _NO_CLOSURE, _MOST_CLOSURE)), color=colour, height=0.62)
-    ends = np.clip([low, high], _NO_CLOSURE + 0.012, _MOST_CLOSURE)
-    axes.plot(ends, [y, y], color=INK, linewidth=1.4)
-    for end, beyond, cut in zip(ends, (low < ends[0], high > ends[1]), ("<", ">"), strict=True):
-        axes.plot([end], [y], cut if beyond else "|", color=INK, markersize=5 if beyond else 8, clip_on=False)
-    if value < _NO_CLOSURE:
-        axes.text(_NO_CLOSURE + 0.03, y + 0.2, f"{value:.1f}", va="center", fontsize=7.5, color=INK)
-
-
 def slices_png(found: Diagnosis) -> bytes:
-    """Light along x through the occulter with the largest residual: observed, simulated before and with the answer."""
+    """Light along x through the occulter with the largest residual: observed, and simulated before and with the answer."""
     panels = 2 if found.corrected else 1
     figure = _figure(4.95 * panels + 0.1, 3.7)
     draw_slices(list(np.ravel(figure.subplots(1, panels, squeeze=False, sharey=True))), found)
@@ -296,12 +225,12 @@ def slices_png(found: Diagnosis) -> bytes:
 
 
 def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
-    """One chart: before. Two: with the answer in the second."""
+    """One chart: before. A second chart: with the answer."""
     n = largest_residual(found)
     solution = found.solution
     frame, place = solution.transit.frames[n], solution.sky.found[n].place
     rows, columns = solution.sky.dark[n]
-    # Of a disc at the field's edge the centre may lie beyond it: the middle of what is dark does not.
+    # The centre of a disc at the field's edge may be outside the field; the middle of its dark pixels is not.
     middle, centre = int(np.median(rows)), place.x_px
     band = slice(max(middle - SLICE_ROWS, 0), middle + SLICE_ROWS + 1)
     first, last = max(int(centre) - _SLICE_PX, 0), min(int(centre) + _SLICE_PX + 1, frame.pixels.shape[1])
@@ -312,7 +241,7 @@ def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
     simulated = [(_BEFORE, simulated_of(found, n))]
     if found.corrected:
         simulated.append((_AFTER, simulated_of(found, n, with_answer=True)))
-    # The disc is what is looked at: light outside may be a hundred times as bright.
+    # Scale to the disc: the light around it may be a hundred times as bright.
     dark = np.isin(np.arange(first, last), columns[rows == middle])
     inner = [seen.mean(axis=0)[dark], *(plane[band, first:last].mean(axis=0)[dark] for _, plane in simulated)]
     top = 2.2 * float(np.max(inner, initial=1e-9))
@@ -335,22 +264,22 @@ def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
 
 
 def largest_residual(found: Diagnosis) -> int:
-    """Position, among all images, of that whose disc leaves the largest residual over its noise."""
+    """Position, among all images, of the image whose disc has the largest residual in units of its noise."""
     size = [abs(disc.share @ disc.residual) / max(disc.mean_noise, 1e-12) for disc in found.evidence.discs]
     return found.evidence.discs[int(np.argmax(size))].index
 
 
 def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> NDArray[np.float64]:
-    """Image n as the model sees it [y, x], DN/s; with_answer: with what the added effects do to it."""
+    """Image n as the model predicts it [y, x], DN/s; with_answer: with the change by the added effects."""
     raw = found.solution.transit.frames[n].pixels
     solution = found.corrected[0].solution if with_answer else found.solution
     seen = solution.optics.field(solution.optics.convolve(solution.blanked_scene(n)))
-    # The images that the effects were taken out of say what they do to them.
+    # The difference between the original and the corrected images is the change by the effects.
     return np.asarray(seen, np.float64) + (raw - solution.transit.frames[n].pixels)
 
 
 def gap_png(found: Diagnosis, report: Report) -> bytes:
-    """All of it as one picture, the sentence above."""
+    """All figures as one picture, below the summary sentence."""
     figure = Figure(figsize=(15.0, 13.2), dpi=100, facecolor="white", layout="constrained")
     words = "\n".join(textwrap.wrap(report["sentence"], 165))
     figure.suptitle(words, fontsize=12.5, color=INK, x=0.012, ha="left", linespacing=1.4)
@@ -369,12 +298,12 @@ def gap_png(found: Diagnosis, report: Report) -> bytes:
 
 
 def has_after(report: Report) -> bool:
-    """Whether there are residuals with the answer's effects in the model."""
+    """Whether the report has residuals with the answer's effects in the model."""
     return any(row["residual_after_pct"] is not None for row in report["images"])
 
 
 def _column(rows: Sequence[dict[str, Any]], name: str) -> Vector:
-    """One number of every image, nan where there is none."""
+    """One number of every image; nan if it is missing."""
     return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
 
 

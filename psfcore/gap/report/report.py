@@ -1,4 +1,4 @@
-"""The gap report: schema gap/1, and the sentence that a person reads first."""
+"""The gap report: schema gap/1, and the summary sentence that a person reads first."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from psfcore.gap.verdict.judge import ALARM, LEAST_IMAGES, TIE, Judgement, Tried
 from psfcore.scatter.inversion import Inversion
 
 SCHEMA = "gap/1"
-MOST_READ = 12  # numbers of an effect that a person reads one by one
+MOST_READ = 12  # an effect with more parameters is summarised
 PROBE_NAMES = {probe.name for probe in PROBES}
 AXIS_WORDS = {
     "detector_x": "along detector x",
@@ -26,11 +26,11 @@ AXIS_WORDS = {
     "time": "in time",
     "pointing": "from pointing to pointing",
     "intensity": "with the intensity",
-    "exposure": "with the exposure",
+    "exposure": "with the exposure time",
     "gain_mode": "with the gain mode",
     "radius_in_disc": "with the radius in the disc",
     "azimuth_in_disc": "with the azimuth in the disc",
-    "scattering_distance": "with the distance that light scatters from",
+    "scattering_distance": "with the distance from which light scatters",
 }
 
 
@@ -73,7 +73,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "expected": {
             "residual_pct": found.expected.residual_pct,
             "disc_chi2_a_cell": found.expected.disc_scale,
-            "lit_chi2_a_block": found.expected.lit_scale,
+            "lit_chi2_a_block": found.expected.unocculted_scale,
         },
         "psf": {
             "shape": found.solution.inversion.shape.name,
@@ -89,8 +89,9 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
 
 
 def _place(found: Diagnosis, tried: Tried) -> tuple[bool, bool]:
-    """Effects of an answer may each do little without the other, and go before what alone does more; of those that act
-    together the one that was measured in the lit parts comes second, for it fits these whatever else acts on them."""
+    """Sort key: the effects of the answer come first, because each may explain little without the other. Of those, an effect
+    that was measured in the unocculted field comes second, because it fits that field whatever else acts on it.
+    """
     best = found.judgement.best
     together = best is not None and len(best.names) > 1
     here = tried.names[0] in found.judgement.answer
@@ -98,12 +99,12 @@ def _place(found: Diagnosis, tried: Tried) -> tuple[bool, bool]:
 
 
 def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """A report's fits of effects together, if there are any, and then of each alone: as they are shown."""
+    """All fits of a report in the order of display: of several effects together, if any, then of each alone."""
     return [*report["together"], *report["effects"]]
 
 
 def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, Any]:
-    """A shape's parameters; errors are those of the fit that the effects are judged by, floor included."""
+    """A shape's parameters, with the errors of the fit that judges the effects, floor included."""
     values, sigma = inversion.values, np.sqrt(np.diag(covariance))
     return {
         p.name: {
@@ -144,7 +145,7 @@ def _interval(interval: Interval | None) -> dict[str, Any] | None:
 
 
 def _images(found: Diagnosis) -> list[dict[str, Any]]:
-    """Every image's disc: where, how bright, what was left, held out, before and after."""
+    """Every image's disc: place, brightness, and held-out residuals before and after the answer is added."""
     before, after = found.residual, found.residual_after
     at_before = {} if before is None else dict(zip(before.images, before.residual_pct, strict=True))
     noise = {} if before is None else dict(zip(before.images, before.noise_pct, strict=True))
@@ -152,11 +153,11 @@ def _images(found: Diagnosis) -> list[dict[str, Any]]:
     noise_after = {} if after is None else dict(zip(after.images, after.noise_pct, strict=True))
     out = []
     for disc in found.evidence.discs:
-        taken = found.evidence.taken[disc.index]
+        taken = found.evidence.image_info[disc.index]
         out.append(
             {
                 "file": taken.file,
-                "fov": taken.fov,
+                "fov": taken.pointing,
                 "x_px": taken.x_px,
                 "y_px": taken.y_px,
                 "time_s": taken.time_s,
@@ -177,7 +178,7 @@ def _number(value: Any) -> float | None:
 
 
 def would_separate(found: Diagnosis) -> str:
-    """What observation would tell tied effects apart, or settle an answer."""
+    """The observations that would separate tied effects; empty for other verdicts."""
     if found.judgement.verdict != "tie":
         return ""
     said = [_by_name(found, name).settled_by for name in found.judgement.tied]
@@ -185,58 +186,65 @@ def would_separate(found: Diagnosis) -> str:
 
 
 def sentence(found: Diagnosis) -> str:
-    """What a person reads first."""
+    """The summary that a person reads first: one to three sentences."""
     judged = found.judgement
     images = len(found.evidence.discs)
     if judged.verdict == "inconclusive" and judged.p_value > ALARM:
         return (
-            f"No gap shows in these {images} images, and they could hide one: nothing can be held out of fewer than "
-            f"{LEAST_IMAGES}, and p = {judged.p_value:.2g} with so few excludes little."
+            f"No gap is visible in these {images} images (p = {judged.p_value:.2g}), but they may hide one. With fewer than "
+            f"{LEAST_IMAGES} images none can be held out, and so few images exclude little."
         )
     left = f"{found.rms.value:.1f} % ({found.rms.low:.1f} to {found.rms.high:.1f})"
     if judged.verdict == "none" and found.residual is None:
         return (
-            f"No gap shows in these {images} images (p = {judged.p_value:.2g}); they are too few to hold any out, so that how "
-            "large a gap could hide in them is not known."
+            f"No gap is visible in these {images} images (p = {judged.p_value:.2g}). They are too few to hold any out, so the "
+            "size of a gap that they may hide is unknown."
         )
     if judged.verdict == "none":
         return (
-            f"No gap beyond noise and the fit's own error: held-out residuals of {left} beyond a noise of "
-            f"{found.noise_pct:.1f} %, p = {judged.p_value:.2g}."
+            f"No gap beyond noise and the error of the fit: on held-out images the gap is {left}, the noise is "
+            f"{found.noise_pct:.1f} %, and p = {judged.p_value:.2g}."
         )
     strongest = found.where[0]
-    pointings = " and ".join(str(p) for p in strongest.at.get("pointings", []))
-    lead = f"A residual of {left} {AXIS_WORDS[strongest.name]}, most in pointings {pointings}"
-    if found.rms.value < found.noise_pct and _lit_alone(found):
+    lead = f"A gap of {left} varies most {AXIS_WORDS[strongest.name]} and is largest in {_pointings(strongest.at)}."
+    if found.rms.value < found.noise_pct and _unocculted_alone(found):
         lead = (
-            f"The lit parts of neighbouring images differ {AXIS_WORDS[strongest.name]}, which the discs hide "
-            f"(a residual of {left} there)"
+            f"A gap in the unocculted field varies most {AXIS_WORDS[strongest.name]}; the discs do not show it "
+            f"(their gap is {left})."
         )
     best = judged.best
     if judged.verdict == "unknown" or best is None:
         like = _by_name(found, judged.probes[0].names[0]).cause if judged.probes else ""
-        close = f"; it looks most like {like}" if like and judged.probes[0].score > 0 else ""
-        return f"{lead}: no effect of the library explains it{close}."
+        close = f"; it most resembles {like}" if like and judged.probes[0].score > 0 else ""
+        return f"{lead} No effect of the library explains it{close}."
     if judged.verdict == "tie":
-        return f"{lead}: {tied_words(judged)}, which these data cannot tell apart; {would_separate(found)} would."
+        return (
+            f"{lead} These data cannot tell which effect causes it: {tied_words(judged)}. To tell them apart, take "
+            f"{would_separate(found)}."
+        )
     if judged.discs_unexplained:
-        return f"{lead}: {discs_unexplained_words(judged)}."
+        return f"{lead} {_capital(discs_unexplained_words(judged))}."
     if judged.verdict == "inconclusive":
         return (
-            f"{lead} is likely (p = {judged.p_value:.2g}), but what causes it depends on what is taken for granted, or is "
-            f"met as well by a form of unknown cause; best so far: {words(best.label)}."
+            f"{lead} This gap is likely (p = {judged.p_value:.2g}), but its cause is uncertain: the answer changes with the "
+            "assumed floor, fails on held-out images, or fits no better than a pattern of unknown cause. "
+            f"The best effect so far is {words(best.label)}."
         )
-    return f"{lead}; {_explained(found, best)}{_excluded(found, best)}."
+    return f"{lead} {_explained(found, best)}.{_excluded(found, best)}"
 
 
-def _lit_alone(found: Diagnosis) -> bool:
-    """Whether the lit blocks show a gap that the discs' cells do not."""
+def _unocculted_alone(found: Diagnosis) -> bool:
+    """Whether the blocks of the unocculted field show a gap that the discs' cells do not."""
     model = found.model
     left = model.left(model.base)
     cells = sum(float(one @ one) for one in left)
     freedom = sum(one.size for one in left)
-    lit = model.evidence.steady_lit
-    return bool(chdtrc(freedom, cells) > ALARM > chdtrc(lit.freedom, max(model.left_lit(model.base), 0.0)))
+    unocculted = model.evidence.steady_unocculted
+    return bool(
+        chdtrc(freedom, cells)
+        > ALARM
+        > chdtrc(unocculted.freedom, max(model.left_unocculted(model.base), 0.0))
+    )
 
 
 def _explained(found: Diagnosis, best: Tried) -> str:
@@ -247,46 +255,63 @@ def _explained(found: Diagnosis, best: Tried) -> str:
     ]
     in_short = in_short_if_many([value for value, _, _ in values.values()])
     return (
-        f"{words(best.label)} explains it ({in_short or ', '.join(numbers)}); held-out gap {found.rms.value:.1f} -> "
-        f"{found.after.value:.1f} %, noise {found.noise_pct:.1f} %"
+        f"It is explained by {words(best.label)} ({in_short or ', '.join(numbers)}): on held-out images the gap falls from "
+        f"{found.rms.value:.1f} % to {found.after.value:.1f} %, with {found.noise_pct:.1f} % noise"
     )
 
 
 def tied_words(judged: Judgement) -> str:
-    """What is tied, as a person writes it, and beside what."""
+    """The tied effects, and the certain ones that act with them."""
     among = " or ".join(words(name) for name in judged.tied)
     beside = " and ".join(words(name) for name in judged.certain)
-    return f"{beside}, and beside it {among}" if beside else among
+    return f"{beside}, together with {among}" if beside else among
 
 
 def discs_unexplained_words(judged: Judgement) -> str:
-    """That what shows in the lit parts does not make the discs' gap."""
-    shown = words(judged.best.label) if judged.best is not None else "a change"
-    return f"{shown} shows in the lit parts, and what leaves a gap in the discs beside it cannot be told"
+    """That an effect explains the unocculted field but not the gap in the discs."""
+    shown = words(judged.best.label) if judged.best is not None else "an effect"
+    return (
+        f"{shown} explains the unocculted field, but the cause of the gap in the discs cannot be identified"
+    )
 
 
 def in_short_if_many(values: Sequence[float]) -> str | None:
-    """What a person reads in place of more numbers than MOST_READ; none of fewer."""
+    """A summary of more than MOST_READ parameters; None for fewer."""
     if len(values) <= MOST_READ:
         return None
-    return f"{len(values)} numbers, root of their summed squares {float(np.linalg.norm(values)):.2g}"
+    return f"{len(values)} parameters, root sum of squares {float(np.linalg.norm(values)):.2g}"
 
 
 def _excluded(found: Diagnosis, best: Tried) -> str:
-    """The next best effect, and by how many sigmas it is worse."""
-    gone = found.judgement.amiss  # said among the cautions
+    """The next best effect and why it was excluded; empty if there is none."""
+    gone = found.judgement.amiss  # these are named in the cautions
     others = [t for t in found.judgement.tried if not set(t.names) & set(best.names) and t.label not in gone]
     if not others:
         return ""
     next_best = max(others, key=lambda t: t.score)
-    if best.score - next_best.score < TIE:  # it was set aside by the images held out
-        return f"; {words(next_best.label)} fits as well, but fails on images held out of its fit"
+    name = words(next_best.label)
+    if best.score - next_best.score < TIE:  # it was excluded by the held-out images
+        return f" {_capital(name)} fits equally well, but fails on images held out of its fit."
     sigmas = (best.score - next_best.score) ** 0.5
     shrunk = found.shrinking[next_best.label].closure
-    closes = "" if shrunk is None else f" closes {100 * max(shrunk.value, 0.0):.0f} % and"
-    return f"; {words(next_best.label)}{closes} is excluded at {sigmas:.1f} sigma"
+    closes = "" if shrunk is None else f" closes {100 * max(shrunk.value, 0.0):.0f} % of the gap and"
+    return f" The next best effect, {name},{closes} is excluded at {sigmas:.1f} sigma."
+
+
+def _pointings(at: dict[str, Any]) -> str:
+    numbers = at.get("pointings", [])
+    return f"pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def words(name: str) -> str:
-    """A name as a person writes it."""
+    """The name of an effect or parameter as a person writes it."""
     return name.replace("_", " ")
+
+
+def best_words(found: Diagnosis) -> str:
+    """The effects of the first full refit."""
+    return " + ".join(words(effect.name) for effect in found.corrected[0].effects)

@@ -1,9 +1,9 @@
-"""The model with an effect added: the images as they would be without it, and the PSF fitted anew.
+"""The model with an effect added: a full refit of the PSF to the images without the effect.
 
-Images minus the effect's change, worked out from the scene and the PSF as they are; a new fit; the change worked out
-again from that, and what is left of the effect fitted beside the PSF. Two or three rounds settle it, as a Gauss-Newton
-step does, and what was a first-order change is one no more. A round that leaves clearly more than one before is not
-taken.
+The change by the effect is computed from the current scene and PSF and subtracted from the images. The PSF is fitted
+again, the change is computed again from that fit, and the remaining effect is fitted together with the PSF. Two or three
+rounds converge, as Gauss-Newton steps do; the result is then no longer limited to first order. A round that leaves
+clearly more chi2 than an earlier one is rejected.
 """
 
 from __future__ import annotations
@@ -16,24 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.gap.effect import Effect, View
+from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.judge import Tried, fitted, label_of, left_chi2
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.transit.transit import Transit
 
 Vector = NDArray[np.float64]
 
 ROUNDS = 3
-SETTLED = 0.3  # of a parameter's error
-WORSE = 9.0  # of chi2: what a round may leave more than the best did
-WORSE_SHARE = 0.05  # and of the effect's gain
+SETTLED = 0.3  # of a parameter's error: smaller steps end the rounds
+WORSE = 9.0  # a round may leave so much more chi2 than the best round,
+WORSE_SHARE = 0.05  # or, if larger, this fraction of the effect's gain
 
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """A fit with an effect added. values: its parameters, all rounds together, with errors. model: about that fit."""
+    """A full refit with effects in the model.
+
+    values: the effects' parameters, summed over all rounds, with errors and units. model: the linear model at that fit.
+    """
 
     effects: tuple[Effect, ...]
     solution: Solution
@@ -44,25 +48,25 @@ class Corrected:
 
     @property
     def label(self) -> str:
-        """The effects' names as a report has them."""
+        """The effects' names as in a report."""
         return label_of([effect.name for effect in self.effects])
 
     @property
     def covariance(self) -> Vector:
-        """Of the PSF's coordinates, the effects' parameters free beside them: (coordinates, coordinates)."""
+        """Covariance of the PSF's coordinates, with the effects' parameters free (coordinates, coordinates)."""
         columns = tuple(c for effect in self.effects for c in self.evidence.columns[effect.name])
         base = len(self.evidence.base)
         return self.model.fit(columns).covariance[:base, :base]
 
 
-def corrected(transit: Transit, view: View, effects: Sequence[Effect], theta: Vector) -> Transit:
-    """The images of a transit less what the effects with these parameters did to them."""
+def images_without(transit: Transit, view: View, effects: Sequence[Effect], theta: Vector) -> Transit:
+    """The transit with the changes by these effects subtracted from its images."""
     changes = [change for effect in effects for change in effect.changes(view)]
     frames = []
     for n, frame in enumerate(transit.frames):
         error = np.zeros(transit.shape)
         for value, change in zip(theta, changes, strict=True):
-            if change.disc:  # what the discs do not answer to is part of each image's own scene
+            if change.disc:  # a change that the discs do not show belongs to each image's own scene
                 error += value * change.change(n, view.expected)
         frames.append(replace(frame, pixels=(frame.pixels - error).astype(np.float32)))
     return replace(transit, frames=tuple(frames))
@@ -77,13 +81,13 @@ def add_to_model(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Corrected:
-    """Fit PSF and effects together, starting from the linear fit `found`.
+    """Fit the PSF and effects together, starting from the linear fit `found`.
 
-    view: of the solution, where there is one. Raises what `invert` raises before a round was good, and DataError
-    "effect-unseen" where none of an effect is left, "bad-effects" of what somebody added.
+    view: of the solution, if there is one. Raises the errors of `invert` if the first round fails, DataError
+    "effect-unseen" if nothing of an effect remains, and "bad-effects" if an added effect fails.
     """
     transit = solution.transit
-    # A form with a place of its own keeps the place that was found: it is looked for once.
+    # An effect that searches for a place keeps the place found first.
     view = view or View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
     names, theta = list(found.values), np.array([value for value, _, _ in found.values.values()])
@@ -96,18 +100,18 @@ def add_to_model(
     for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
         try:
             if in_images.any():
-                images = corrected(transit, here, held, theta)
+                images = images_without(transit, here, held, theta)
                 shape, threads = solution.inversion.shape, solution.threads
                 near = start is not None
                 fit = invert(images, shape, start=start, near=near, threads=threads, progress=progress)
                 here = View(fit)
-            seen = _look(here, held, theta, in_images, model, progress)
+            seen = _fit_remaining(here, held, theta, in_images, model, progress)
         except DataError:
             if taken is None:
                 raise
-            break  # no fit, or nothing of the effect left, after a step that was too long
+            break  # the step was too long: the fit failed, or nothing of the effect remains
         steps, theta, start = seen.theta - theta, seen.theta, seen.start
-        # Where light can be added alone, what would take it away does not act.
+        # An effect that can only add light is dropped if it would remove light.
         acts = ~(_positive(held) & (theta <= 0))
         if not acts.all() and rounds < ROUNDS:
             held = _those_that_act(held, acts)
@@ -137,9 +141,12 @@ def add_to_model(
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """What a fit shows of effects that were partly taken out of its images: the model about it, what is left of them
-    there, their parameters with what was taken out, and where the PSF's coordinates go beside them: as `_stepped`."""
+class _Remaining:
+    """What a fit shows of effects that were partly subtracted from its images.
+
+    model: at that fit. left: the remaining effects there. theta: the total parameters. start: the PSF's coordinates for the
+    next round, as in `_stepped`.
+    """
 
     model: LinearModel
     left: Tried
@@ -148,19 +155,19 @@ class _Seen:
 
     @property
     def sigma(self) -> Vector:
-        """Of theta."""
+        """Errors of theta."""
         return np.array([sigma for _, sigma, _ in self.left.values.values()])
 
 
-def _look(
+def _fit_remaining(
     view: View,
     held: Sequence[Effect],
     out: Vector,
     in_images: NDArray[np.bool_],
     model: LinearModel,
     progress: Progress,
-) -> _Seen:
-    """out: the parameters, of which those in_images were taken out of the images."""
+) -> _Remaining:
+    """Fit the remaining effects. out: the current parameters; those with in_images were subtracted from the images."""
     evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
     again = replace(model, evidence=evidence)
     left = fitted(again, evidence.effects, any_sign=True)
@@ -168,25 +175,25 @@ def _look(
     if found.size != out.size:
         raise DataError(
             "effect-unseen",
-            f"expected the images to show {label_of([e.name for e in held])} once it is taken out; they show "
-            f"{found.size} of {out.size} parameters",
+            f"expected the images to constrain all {out.size} parameters of {label_of([e.name for e in held])} after its "
+            f"subtraction; they constrain {found.size}: the images may not contain this effect",
         )
     base = len(evidence.base)
     out_already = np.concatenate([np.zeros(base), np.where(in_images, out, 0.0)])
     found -= again.pull_of_prior(left.step, out_already)[base:]
-    # What was taken out of the images shows what is left of it, the rest shows all of it.
+    # A subtracted effect shows only its remainder, the others show all of their amount.
     theta = np.where(in_images, out + found, found)
-    return _Seen(again, left, theta, _stepped(view.solution, left.step.values[:base]))
+    return _Remaining(again, left, theta, _stepped(view.solution, left.step.values[:base]))
 
 
 def _stepped(current: Solution, step: Vector) -> Vector | None:
-    """The coordinates of a fit after a step; none where one so long is not to be believed, and the next fit starts anew."""
+    """The coordinates of a fit after a step; None if the step is too long to be trusted, so that the next fit starts anew."""
     step, whole = current.inversion.shape.shortened(step)
     return current.inversion.coordinates + step if whole else None
 
 
 def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:
-    """Which of some effects' changes the discs answer to."""
+    """Which of the effects' changes the discs show."""
     return np.array([change.disc for effect in effects for change in effect.changes(view)], dtype=np.bool_)
 
 
@@ -197,7 +204,7 @@ def _positive(effects: Sequence[Effect]) -> NDArray[np.bool_]:
 
 
 def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[Effect]:
-    """Effects with those of their parameters alone that act, in a row. Raises DataError "effect-unseen" where none does."""
+    """The effects with only those parameters that act, in order. Raises DataError "effect-unseen" if an effect has none left."""
     out, first = [], 0
     for effect in effects:
         count = len(effect.parameters)
@@ -206,7 +213,7 @@ def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[
         if not part:
             raise DataError(
                 "effect-unseen",
-                f"expected {effect.name} to add light beside the fitted PSF; it would take it away",
+                f"expected {effect.name} to add light; its fit would remove light: the images do not contain this effect",
             )
         out.append(_with_part(effect, part))
     return out
@@ -219,9 +226,9 @@ def beyond(
     *,
     progress: Progress = lambda stage, step, steps: None,
 ) -> LinearModel:
-    """The model about a fit with effects in it, which are always fitted, and how it answers to others of a library.
+    """The model of a full refit with its effects, which are always fitted, and with the other effects of a library.
 
-    Raises DataError "bad-effects" of what somebody added.
+    Raises DataError "bad-effects" if an added effect fails.
     """
     names = {effect.name for effect in added.effects}
     others = [effect for effect in library if effect.name not in names]
@@ -233,26 +240,32 @@ def beyond(
 
 
 def hold(effect: Effect, view: View) -> Effect:
-    """The effect with whatever it searches for, as a place, held as these images give it."""
+    """The effect with everything it searches for, such as a place, fixed to the result for these images."""
     return effect if effect.held is None else effect.held(view)
 
 
 def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
-    """The evidence after an effect was taken out, with the noise, and the blocks' floor, of before: the light that is
-    gone left its noise. So are the means that percents are of."""
+    """The evidence `after` an effect was subtracted, with the noise and the blocks' variance from `before`.
+
+    The subtracted light has left its noise in the images. The reference level of percentages also stays.
+    """
     were = {disc.index: disc for disc in before.discs}
     discs = []
     for disc in after.discs:
         was = were.get(disc.index)
         if was is not None:
             same = was.covariance.shape == disc.covariance.shape
-            disc = replace(disc, covariance=was.covariance if same else disc.covariance, untouched=was.level)
+            disc = replace(
+                disc, covariance=was.covariance if same else disc.covariance, level_before=was.level
+            )
         discs.append(disc)
-    return replace(after, discs=tuple(discs), lit=replace(after.lit, variance=before.lit.variance))
+    return replace(
+        after, discs=tuple(discs), unocculted=replace(after.unocculted, variance=before.unocculted.variance)
+    )
 
 
 def _acting(effect: Effect, found: Tried, effects: int) -> Effect:
-    """The effect with those of its parameters alone that take part in a fit."""
+    """The effect with only those parameters that a fit contains."""
     labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
     return _with_part(effect, [k for k, label in enumerate(labels) if label in found.values])
 

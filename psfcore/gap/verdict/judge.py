@@ -1,30 +1,34 @@
 """The verdict: is there a gap, and which effect causes it.
 
-Gains of effects are compared after what their parameters, and a search over many places, gain from noise:
+Effects are compared by their gain (the decrease of chi2), minus what their parameters and a search over many places gain
+from noise:
 
-    score = gain - PENALTY parameters - cost of a field - 2 ln trials       Eq. (1)
+    score = gain - PENALTY parameters - cost of a random field - 2 ln trials       Eq. (1)
 
-There is a gap where patterns that any gap makes (`patterns`), the discs' means, all cells, the lit blocks or an effect's
-gain are less likely than ALARM, counted for how many were looked at. What lies within TIE of the best effect, or
-within TIE_SHARE of its gain, cannot be told from it (more widely where a place was searched for), unless it does
-clearly worse on images held out of its fit.
-An effect is enough where what it leaves is not less likely than ENOUGH, its own forward change taken to be right to
-TEMPLATE_ERROR, or where that is less than LEFT_SHARE of the gap and no rival comes near: an effect whose form is not quite the
-sky's. Another is named beside it where it gains more than a search and that error let it, and more than the first's
-real refit, where one was made, explains by itself.
-The linear model is good for a small gap alone: the best effect that is not enough in it is added to the model for
-real, and what that leaves is looked at. Pairs are searched exhaustively where no single effect is enough.
-Closing much of a gap identifies nothing, for a wrong effect does that too: where no effect and no pair is enough, or
-where a probe, a form of unknown cause, does clearly better, the verdict is unknown; where it does a little better
-and explains more, or the effect's own gain is not unlikely enough, inconclusive. It is repeated with half and twice
-the floor, where gap and effect may be LENIENT times likelier; where it flips, the answer holds both, or is inconclusive.
-So it is where the answer predicts images held out of its fit worse than nothing does. An effect that in the model for
-real explains less than half of what it does to first order is no answer: the verdict is given without it, and where a
-pair does, it is inconclusive. What was measured in the lit parts
-fits them whatever the cause: an effect of few numbers that gains nearly as much goes before it, and where nothing else
-comes near it is the answer, however much it leaves there. A gap of the discs is judged beside it by itself: one effect
-or two are named with it, and where none can be and every occulter was found well, the verdict is inconclusive. Of a
-pair, what would do in place of one is named too; where many would, the other alone.
+- There is a gap if the patterns that any gap makes (`patterns`), the discs' means, all cells, the unocculted blocks or an
+  effect's gain have a p-value below ALARM, corrected for the number of tests.
+- An effect is tied with the best one if its score is within TIE, or within TIE_SHARE of the best gain (more if a place
+  was searched for), unless it predicts held-out images clearly worse.
+- An effect is enough if its residuals have a p-value of at least ENOUGH, with an error TEMPLATE_ERROR of its form
+  allowed; or if less than LEFT_SHARE of the gap remains and no rival comes near, because its form may be slightly wrong.
+- A second effect is named together with it if it gains more than a search and the error of form allow, and more than a
+  full refit of the first explains by itself, if one was made.
+- The linear model holds only for a small gap. If the best effect is not enough in it, the effect is added to the model
+  in a full refit, and the residuals of that refit are judged. Pairs are searched exhaustively if no single effect is
+  enough.
+- Closing much of a gap does not identify its cause, because a wrong effect does that too. The verdict is `unknown` if no
+  effect and no pair is enough, or if a probe (a pattern of unknown cause) does clearly better. It is `inconclusive` if a
+  probe does slightly better and explains more, or if the effect's own gain is not significant enough.
+- The verdict is repeated with half and twice the floor, where gap and effect may be LENIENT times more probable by
+  chance. If it changes, the answer holds both results, or the verdict is `inconclusive`. It is also `inconclusive` if
+  the answer predicts held-out images worse than no effect does.
+- An effect that explains in a full refit less than half of what it explains to first order is excluded, and the verdict
+  is made without it. If a pair fails so, the verdict is `inconclusive`.
+- An effect that was measured in the unocculted field fits that field whatever the cause. An effect of few parameters that
+  gains nearly as much takes precedence. If nothing else comes near, the measured effect is the answer, however much it
+  leaves in that field. A gap in the discs is then judged separately, with that effect in the model: one or two effects
+  are named with it. If none can be named and all occulters' places are reliable, the verdict is `inconclusive`.
+- Effects that could replace one member of a pair are named too. If many could, only the other member is named.
 """
 
 from __future__ import annotations
@@ -47,41 +51,43 @@ from psfcore.gap.verdict.closure import fall, hold_out, time_blocks
 Vector = NDArray[np.float64]
 Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 
-FLOORS = (0.5, 2.0)  # the verdict is repeated with
+FLOORS = (0.5, 2.0)  # factors of the floor with which the verdict is repeated
 ALARM = 0.005
-CONFIDENT = 1e-3  # of an effect that is named, counted for how many were tried
+CONFIDENT = 1e-3  # largest p-value of a named effect, corrected for the number of effects
 ENOUGH = 1e-3
 PENALTY = 2.0
 TIE = 9.0
-HELD_OUT_SIGMA = 1.0  # by so many standard errors an effect does clearly worse on images held out
-TIE_SHARE = 0.03  # of the best gain: no effect's form is so exact that less would tell two apart
+HELD_OUT_SIGMA = 1.0  # by so many standard errors an effect is clearly worse on held-out images
+TIE_SHARE = 0.03  # of the best gain: no effect's form is exact enough to separate two effects by less
 LEFT_SHARE = 0.15
-BEHIND = 0.85  # of the best score: what a rival may reach at most
-NEAR_BEHIND = 0.7  # of the best score: a form whose place was searched for fits anything a little
-UNRIVALLED = 0.1  # of the best score: below it no rival comes near
+BEHIND = 0.85  # of the best score: the most that a rival may reach
+NEAR_BEHIND = 0.7  # the same for an effect whose place was searched for: it fits any gap to some degree
+UNRIVALLED = 0.1  # of the best score: the most of any other effect if the best is unrivalled
 MANY_PLACES = 100
-MOST_SECONDS = 2  # that may act beside an effect that explains most: of more none is named
-CLEAR = 12.0  # by which a pair must beat a single effect that is not enough, and a probe all effects
+MOST_SECONDS = 2  # candidates for a second effect; if there are more, none is named
+CLEAR = 12.0  # a pair must beat a single insufficient effect by this score, and a probe must beat all effects by it
 TEMPLATE_ERROR = 0.05
-LIT_WIDTH = 0.03  # chi2 a degree of freedom that the lit parts may be off by where there is no gap
-LENIENT = 5.0  # times likelier: what shows a gap, and names its cause, may be so under the other floors
-BY_CHANCE = 0.01  # a probe's greater gain is less likely than this to come of its further numbers alone
-MOST_AMISS = (
-    2  # answers that may fail in the model for real before no more is said, and so many of a tie are asked
+UNOCCULTED_WIDTH = 0.03  # tolerance of chi2 per degree of freedom of the unocculted field without a gap
+LENIENT = 5.0  # under the other floors, p-values of a gap and of its cause may be larger by this factor
+BY_CHANCE = (
+    0.01  # a probe explains more if noise gives its further parameters such a gain less often than this
 )
-LEAST_IMAGES = 6  # with fewer nothing can be held out, and that nothing shows says nothing
+MOST_AMISS = 2  # answers that may fail in a full refit before the search stops; also the tied effects that are refitted
+LEAST_IMAGES = (
+    6  # with fewer images none can be held out, and no visible gap does not mean that there is none
+)
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """How much noise alone gains: a chi2 of this mean and half variance, the largest of so many trials."""
+    """How much noise alone gains: the largest of `trials` chi2 variables with this mean and half variance."""
 
     mean: float
     half_variance: float
     trials: float
 
     def beside(self, first: Freedom) -> Freedom:
-        """What this has more than a first that is a part of it."""
+        """The additional freedom compared with a first that is contained in this one."""
         return Freedom(
             max(self.mean - first.mean, 1.0),
             max(self.half_variance - first.half_variance, 1.0),
@@ -89,7 +95,7 @@ class Freedom:
         )
 
     def p_value(self, gain: float) -> float:
-        """How often noise gains as much, by a chi2 whose degrees of freedom have the same mean and variance."""
+        """The probability that noise gains as much, from a chi2 distribution with the same mean and variance."""
         if self.half_variance <= 0:
             return 1.0
         share = self.mean / self.half_variance
@@ -98,12 +104,13 @@ class Freedom:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """One effect, or some together, fitted beside the PSF: values and errors by "effect.parameter", its gain, what is left.
+    """One effect, or several together, fitted together with the PSF.
 
-    p_value: of the gain. left_p_value: of what the patterns, the cells and the lit blocks still show, and left_share:
-    the largest share of what they showed before; none where it was not worth asking. explains: whether of what showed
-    most, little is left. left_for_real: `left_chi2` of a real refit; none where none was asked for, or it is not of the
-    same images.
+    values: value, error and unit by "parameter", or "effect.parameter" if there are several effects. gain: the decrease of
+    chi2. p_value: of the gain. left_p_value: p-value of the residuals in patterns, cells and unocculted blocks. left_share:
+    the largest fraction of the original excess that remains there; both are None if they were not needed. explains:
+    whether little remains of the strongest excess. left_for_real: `left_chi2` of a full refit; None if there was no refit,
+    or if it has other images.
     """
 
     names: tuple[str, ...]
@@ -121,23 +128,24 @@ class Tried:
 
     @property
     def label(self) -> str:
-        """The names as a report has them."""
+        """The names as in a report."""
         return label_of(self.names)
 
 
 def label_of(names: Sequence[str]) -> str:
-    """Names of effects as a report has them."""
+    """Names of effects as in a report."""
     return " + ".join(names)
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """A verdict under one floor. tried: named effects, best first, the answer's pairs before them and what failed in the
-    model for real behind, whose labels amiss holds. probes: best first.
+    """A verdict under one floor.
 
-    answer: of `inconclusive` what would be one, for what fits best and is not sure enough; often none.
-    certain: of a tie the effects that act whichever of the others does beside them; none where one of them does alone.
-    discs_unexplained: of `inconclusive`, whether it is because the discs show a gap that the best does not answer for.
+    tried: named effects, best first; the answer's pairs come before them, and those that failed in a full refit come last,
+    with their labels in amiss. probes: best first. answer: for `inconclusive`, the best fit that is not certain enough;
+    often empty. certain: for a tie, the effects that act together with any of the tied ones; empty if each tied effect acts
+    alone. discs_unexplained: for `inconclusive`, whether the reason is a gap in the discs that the best effect does not
+    explain.
     """
 
     verdict: Verdict
@@ -152,26 +160,26 @@ class Judgement:
 
     @property
     def tied(self) -> tuple[str, ...]:
-        """Of a tie the effects that cannot be told apart."""
+        """For a tie, the effects that cannot be told apart."""
         return (
             tuple(name for name in self.answer if name not in self.certain) if self.verdict == "tie" else ()
         )
 
 
-# The model about a real refit with an effect in it, its columns beside the PSF's; none where there is no such fit.
-Refit = Callable[[Tried], LinearModel | None]
+# Returns the model of a full refit with an effect in it, whose columns follow those of the PSF; None if the fit failed.
+Refitter = Callable[[Tried], LinearModel | None]
 
 
 def no_refit(tried: Tried) -> LinearModel | None:
-    """Where no effect is added to the model for real."""
+    """Use this where no full refits are made."""
     return None
 
 
-def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit) -> Judgement:
-    """The verdict under the model's floor, and twice with others.
+def judge(model: LinearModel, refit: Refitter = no_refit, beyond: Refitter = no_refit) -> Judgement:
+    """The verdict under the model's floor, confirmed with two other floors.
 
-    refit, beyond: the model about a real refit with one effect or some, and the same with the effect always fitted and
-    the rest of the library beside it. Each is asked at most once for the same.
+    refit: returns the model of a full refit with one or several effects. beyond: returns the same model with these effects
+    always fitted and the rest of the library added. Each is called at most once for the same effects.
     """
     once, further = _once(refit), _once(beyond)
     found = first = _judge(model, once, further)
@@ -182,7 +190,7 @@ def judge(model: LinearModel, refit: Refit = no_refit, beyond: Refit = no_refit)
         if len(amiss) == MOST_AMISS or len(best.names) > 1:
             found = replace(found, verdict="inconclusive", answer=(), certain=())
             return replace(found, amiss=(*_labels(amiss), best.label), tried=(*found.tried, *amiss))
-        # What it does to first order it does not do in the model for real: the others are asked.
+        # The full refit does not confirm the linear fit: judge the other effects.
         amiss.append(best)
         gone = {name for tried in amiss for name in tried.names}
         others = tuple(effect for effect in model.evidence.effects if effect.name not in gone)
@@ -203,17 +211,17 @@ def _labels(tried: Sequence[Tried]) -> tuple[str, ...]:
 
 
 def _without_those_that_fail(
-    model: LinearModel, found: Judgement, refit: Refit
+    model: LinearModel, found: Judgement, refit: Refitter
 ) -> tuple[Judgement, list[Tried]]:
-    """A tie without those of its single effects that fail in the model for real, and these; of MOST_AMISS it is asked."""
+    """A tie without the single effects that fail in a full refit, and these effects; at most MOST_AMISS are refitted."""
     alone = [t for t in found.tried if t is not found.best and len(t.names) == 1 and t.label in found.answer]
     fallen = [tried for tried in alone[:MOST_AMISS] if _fails_for_real(model, tried, refit)]
     answer = tuple(name for name in found.answer if name not in _labels(fallen))
     return replace(found, verdict="tie" if len(answer) > 1 else "attributed", answer=answer), fallen
 
 
-def _confirmed(model: LinearModel, found: Judgement, once: Refit, further: Refit) -> Judgement:
-    """A verdict under the model's floor, as it stands on images held out and under other floors."""
+def _confirmed(model: LinearModel, found: Judgement, once: Refitter, further: Refitter) -> Judgement:
+    """The verdict under the model's floor after the tests on held-out images and under other floors."""
     if found.answer and _worse_held_out(model, found, once):
         return replace(found, verdict="inconclusive")
     if found.verdict == "none" and len(model.evidence.discs) < LEAST_IMAGES:
@@ -234,13 +242,15 @@ def _confirmed(model: LinearModel, found: Judgement, once: Refit, further: Refit
     return replace(found, verdict="tie", answer=tuple(sorted(answers)), certain=tuple(sorted(certain)))
 
 
-def _fails_for_real(model: LinearModel, tried: Tried, refit: Refit) -> bool:
-    """Whether of what an effect explains in the linear model, wherever that is most, a real refit explains less than half,
-    or cannot be made."""
+def _fails_for_real(model: LinearModel, tried: Tried, refit: Refitter) -> bool:
+    """Whether a full refit explains less than half of what an effect explains in the linear model, or cannot be made.
+
+    The comparison uses the discs or the unocculted field, whichever the effect explains more of.
+    """
     real = refit(tried)
     if real is None:
         return True
-    # A refit finds the discs anew and may lose one.
+    # A refit locates the discs again and may lose one.
     both = set(model.evidence.images) & set(real.evidence.images)
     real = replace(real, floor=model.floor)
     nothing, linear = (left_chi2(model, step, both) for step in (model.base, tried.step))
@@ -251,18 +261,18 @@ def _fails_for_real(model: LinearModel, tried: Tried, refit: Refit) -> bool:
 
 
 def _acting(found: Judgement) -> int:
-    """How many effects act."""
+    """The number of effects in the best fit."""
     return 0 if found.best is None else len(found.best.names)
 
 
-def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
-    """Whether the answer says less than nothing of images held out of its fit, so that it fits by its freedom alone."""
+def _worse_held_out(model: LinearModel, found: Judgement, refit: Refitter) -> bool:
+    """Whether the answer predicts held-out images worse than no effect does, so that it fits only by its freedom."""
     scheme = time_blocks(model)
     before = hold_out(model, (), scheme)
     if found.best is None or before is None:
         return False
-    if model.evidence.whole_lit.freedom and not before.lit_expected.any():
-        return False  # few images: no two neighbours in one fold, so that nothing is asked of what the lit blocks show
+    if model.evidence.all_unocculted.freedom and not before.unocculted_expected.any():
+        return False  # few images: no fold has two neighbours, so the unocculted blocks are not tested
     linear = hold_out(model, found.best.step.columns[len(model.evidence.base) :], scheme)
     if linear is not None and fall(before, linear) > 0:
         return False
@@ -272,7 +282,7 @@ def _worse_held_out(model: LinearModel, found: Judgement, refit: Refit) -> bool:
     return bool(tried) and all(fall(before, one) <= 0 for one in tried)
 
 
-def _once(ask: Refit) -> Refit:
+def _once(ask: Refitter) -> Refitter:
     asked: dict[str, LinearModel | None] = {}
 
     def once(tried: Tried) -> LinearModel | None:
@@ -283,8 +293,8 @@ def _once(ask: Refit) -> Refit:
     return once
 
 
-def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0) -> Judgement:
-    """lenient: how many times likelier than usual a gap and an effect may be to come by chance."""
+def _judge(model: LinearModel, refit: Refitter, beyond: Refitter, lenient: float = 1.0) -> Judgement:
+    """The verdict under one floor. lenient: factor on the p-values below which a gap and an effect count as significant."""
     evidence = model.evidence
     every = [fitted(model, (effect,)) for effect in evidence.effects]
     named = sorted((t for t in every if t.named), key=lambda t: -t.score)
@@ -293,14 +303,14 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
     p_gap = _p_of_gap(before, named)
     if p_gap > lenient * ALARM or not named:
         return Judgement("none", (), p_gap, tuple(named), probes, named[0] if named else None)
-    # What was measured in the lit parts fits them whatever the cause: it is behind where its score is.
+    # An effect that was measured in the unocculted field fits it whatever the cause: its score does not count as a rival.
     measured = {t.label for t in named if evidence.numbers_of(_own(model, t))}
     outdone = measured if _few_numbers_do(named, measured) else set()
     others, failed = _held_out_first(model, [t for t in named if t.label not in outdone])
     named = [*others, *(t for t in named if t.label in outdone)]
     failed |= outdone
     best = named[0] = _with_left(model, named[0], before, refit)
-    # So does a probe that was measured there; it counts beside another such alone, or where it explains clearly more.
+    # So does a probe that was measured there: it counts only against another such effect, or if it explains clearly more.
     fits_all = {t.label for t in probes if evidence.numbers_of(_own(model, t))}
     probes = tuple(
         t
@@ -317,8 +327,8 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
             return replace(second, p_value=p_gap, tried=(*second.tried, *named), probes=probes)
         of_few = max((t.score for t in others_near if t.label not in fits_all), default=0.0)
         if best.label in measured and of_few < UNRIVALLED * best.score:
-            # A Sun that changes faster than it is followed: much is left in the lit parts, and the discs' places,
-            # found by what the neighbours show, are off.
+            # The Sun changes faster than the images follow: much remains in the unocculted field, and the discs' places,
+            # found by comparison with neighbouring images, are wrong.
             return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
     pair = _best_pair(model, best, before, refit, enough=enough)
     winner = pair or best
@@ -357,16 +367,21 @@ def _judge(model: LinearModel, refit: Refit, beyond: Refit, lenient: float = 1.0
 
 
 def _few_numbers_do(named: Sequence[Tried], measured: set[str]) -> bool:
-    """Whether an effect of few numbers gains nearly as much as the best, which was measured in the lit parts: it would
-    not unless it were the cause."""
+    """Whether the best effect was measured in the unocculted field, and an effect of few parameters gains nearly as much.
+
+    Such an effect would not gain so much if it were not the cause.
+    """
     best = named[0]
     rivals = (t.gain for t in named if t.label not in measured)
     return best.label in measured and max(rivals, default=0.0) >= (1 - LEFT_SHARE) * best.gain
 
 
 def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tried], set[str]]:
-    """Of effects that are about as good as the best, those first that are as good on images held out of their fit; and
-    the labels of those that are clearly not: they fit by their freedom."""
+    """Sort the effects, and return the labels of those that are clearly worse on held-out images.
+
+    Of the effects with about the best score, those come first that predict held-out images as well as the best; those that
+    are clearly worse fit only by their freedom.
+    """
     best = named[0]
     alike = [t for t in named if best.score - t.score < max(TIE, TIE_SHARE * best.gain)]
     scheme = time_blocks(model)
@@ -380,8 +395,8 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
         falls[tried.label] = 0.0 if after is None else fall(before, after)
     most = max(falls.values())
     nearly = max(TIE, TIE_SHARE * most)
-    # The deviance of images that tell two models apart by so much is uncertain by twice its root: by no more than by
-    # that of what the best is told apart from nothing by. Until it is beyond that an effect comes later, and no more.
+    # A difference of deviance between two models has a standard error of about twice its root, at most that of the
+    # difference between the best model and none. Within this error an effect only comes later; beyond it, it fails.
     by_chance = HELD_OUT_SIGMA * 2 * math.sqrt(max(most, 0.0))
     failed = {label for label, down in falls.items() if down < most - max(nearly, by_chance)}
 
@@ -392,36 +407,39 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
     return sorted(named, key=place), failed
 
 
-def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
-    """The verdict where one effect explains most of a gap and not all: is another at work beside it? None where that
-    cannot be said; the one alone where more than MOST_SECONDS could be the other. Its tried are the answer's alone.
+def _beside(model: LinearModel, best: Tried, beyond: Refitter) -> Judgement | None:
+    """The verdict when one effect explains most of a gap but not all: does a second effect act? None if this cannot be decided.
 
-    So too where the best was measured in the lit parts and leaves much there: a Sun that flickers faster than it is
-    followed. The discs do not show that, and what they show is judged by itself: two effects may be at work there, and
-    where it cannot be told which are, the verdict is inconclusive."""
+    It returns the first effect alone if more than MOST_SECONDS could be the second. `tried` holds only the answer's fits.
+    The same applies if the best effect was measured in the unocculted field and leaves much there, as a Sun that flickers
+    faster than the images follow. The discs do not show that effect, so their residuals are judged separately: two effects
+    may act in them, and if they cannot be identified, the verdict is `inconclusive`.
+    """
     rest = beyond(best)
     if rest is None:
         return None
     effects = {effect.name: effect for effect in model.evidence.effects}
     still = tuple(effect for effect in rest.evidence.effects if effect.name in effects)
     rest = replace(rest, evidence=replace(rest.evidence, effects=still))
-    lit = rest.evidence.steady_lit
+    unocculted = rest.evidence.steady_unocculted
     rest = replace(rest, floor=model.floor)
-    # Of so much as the first explained in the lit parts a little is left, its form being not quite the sky's: no form
-    # that fits this remainder by chance may come out of it.
-    excess = rest.left_lit(rest.base) - (lit.freedom - rest.evidence.numbers_of(rest.base.columns))
-    rest = replace(rest, lit_scale=rest.lit_scale * max(excess / CLEAR, 1.0))
+    # The form of the first effect is not exact, so a little of what it explained remains in the unocculted field. This
+    # scale prevents another form from fitting that remainder by chance.
+    excess = rest.left_unocculted(rest.base) - (
+        unocculted.freedom - rest.evidence.numbers_of(rest.base.columns)
+    )
+    rest = replace(rest, unocculted_scale=rest.unocculted_scale * max(excess / CLEAR, 1.0))
     second = _judge(rest, no_refit, no_refit)
     if second.verdict == "none":
         return Judgement("attributed", best.names, second.p_value, (), (), best) if best.explains else None
-    lit_alone = _lit_alone(model, best)
+    unocculted_alone = _unocculted_alone(model, best)
     if second.best is None or second.verdict not in ("attributed", "tie"):
-        # Occulters that are where they were found say that the discs' gap is not made by what changes in the lit parts.
-        found_well = all(model.evidence.taken[n].described for n in model.evidence.images)
-        if not (lit_alone and found_well):
+        # If the occulters' places are reliable, changes in the unocculted field do not cause the gap in the discs.
+        found_well = all(model.evidence.image_info[n].described for n in model.evidence.images)
+        if not (unocculted_alone and found_well):
             return None
         return Judgement("inconclusive", (), second.p_value, (), (), best, discs_unexplained=True)
-    if len(second.best.names) > 1 and not lit_alone:
+    if len(second.best.names) > 1 and not unocculted_alone:
         return None
     if len(second.answer) > MOST_SECONDS and best.explains:
         return Judgement("attributed", best.names, second.p_value, (), (), best)
@@ -440,32 +458,35 @@ def _beside(model: LinearModel, best: Tried, beyond: Refit) -> Judgement | None:
 
 
 def _own(model: LinearModel, tried: Tried) -> list[int]:
-    """The columns of what was tried, without those that are fitted beside it whatever is."""
+    """The columns of a fit that belong to its own effects, without those that are always fitted."""
     return [column for column in tried.step.columns if column not in model.evidence.base]
 
 
-def _lit_alone(model: LinearModel, tried: Tried) -> bool:
-    """Whether an effect was measured in the lit parts and no disc answers to it."""
+def _unocculted_alone(model: LinearModel, tried: Tried) -> bool:
+    """Whether an effect was measured in the unocculted field and changes no disc."""
     own = _own(model, tried)
-    silent = all(not disc.answers[own].any() for disc in model.evidence.discs)
+    silent = all(not disc.jacobian[own].any() for disc in model.evidence.discs)
     return silent and model.evidence.numbers_of(own) > 0
 
 
 def _explains_more(probe: Tried, best: Tried) -> bool:
-    """A probe that is ahead by having fewer numbers alone is a simpler form of the effect: it explains nothing more. Nor
-    does one of many numbers that gains by them no more than noise lets it."""
+    """Whether a probe with a higher score explains more than the best effect.
+
+    It does not if it leads only by having fewer parameters (a simpler form of the effect), or if noise could give its
+    additional parameters the same gain.
+    """
     more = probe.gain - best.gain
     numbers = max(len(probe.values) - len(best.values), 1)
     return probe.score > best.score and more > TIE and float(chdtrc(numbers, more)) < BY_CHANCE
 
 
 def _freer(tried: Tried, best: Tried, measured: set[str]) -> bool:
-    """Whether an effect has more freedom than the best: if it does worse all the same, it is not its form that is amiss."""
+    """Whether an effect has more freedom than the best: if it still does worse, an inexact form is not the reason."""
     return tried.label in measured or len(tried.values) > len(best.values)
 
 
 def _searched(tried: Tried, evidence: Evidence) -> bool:
-    """Whether a place was looked for all over the field."""
+    """Whether an effect's place was searched for over the whole field."""
     return any(effect.trials >= MANY_PLACES for effect in evidence.effects if effect.name in tried.names)
 
 
@@ -475,8 +496,10 @@ def _is_enough(tried: Tried, rival_score: float) -> bool:
     return tried.left_p_value >= ENOUGH or nearly
 
 
-def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, enough: bool) -> Tried | None:
-    """The pair of effects that explains most, if it is clearly better than one and leaves nothing."""
+def _best_pair(
+    model: LinearModel, best: Tried, before: _Left, refit: Refitter, *, enough: bool
+) -> Tried | None:
+    """The pair of effects that explains most, if it is clearly better than a single effect and leaves no significant residuals."""
     couples = itertools.combinations((effect for effect in model.evidence.effects if effect.named), 2)
     if enough:
         with_best = (two for two in couples if best.names[0] in (two[0].name, two[1].name))
@@ -488,15 +511,15 @@ def _best_pair(model: LinearModel, best: Tried, before: _Left, refit: Refit, *, 
     if pair is None:
         return None
     pair = _with_left(model, pair, before, refit)
-    # Two forms that are not quite right fit too much: of a pair nothing may be left.
+    # Two inexact forms can fit almost anything, so a pair may leave no significant residuals.
     return pair if (pair.left_p_value or 0.0) >= ENOUGH else None
 
 
 def _second(model: LinearModel, best: Tried, pairs: Sequence[Tried]) -> Tried | None:
-    """Of pairs with an effect that is enough alone, the one that explains most more; none where that is within what a
-    search finds in noise, or within what the first's own form may be wrong by: a share of what it explains in the discs,
-    and one of what it explains in the lit parts. What the first alone explains in the model for real, and not to first
-    order, is no second's."""
+    """Of the pairs that contain an effect that is enough alone, the one that explains most beyond it; None if that could be
+    noise found by a search, or an error of the first effect's form (a fraction of what it explains in the discs, and of what
+    it explains in the unocculted field). What a full refit of the first effect explains is not credited to a second.
+    """
     alone, nothing = left_chi2(model, best.step), left_chi2(model, model.base)
     if best.left_for_real is not None:
         alone = np.minimum(alone, best.left_for_real)
@@ -515,15 +538,14 @@ def _second(model: LinearModel, best: Tried, pairs: Sequence[Tried]) -> Tried | 
 
 
 def left_chi2(model: LinearModel, step: Step, images: Collection[int] | None = None) -> Vector:
-    """What a step leaves in the discs, of some images (none: all), and in the lit parts."""
+    """chi2 after a step: of the discs, for some images (None: all), and of the unocculted field."""
     discs = zip(model.evidence.images, model.left(step), strict=True)
     left = sum(float(one @ one) for n, one in discs if images is None or n in images)
-    return np.array([left, model.left_lit(step)])
+    return np.array([left, model.left_unocculted(step)])
 
 
 def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tried]]:
-    """For each effect of a pair those others that explain, beside the one that stays, about as much as it does: by name
-    the pairs that they make."""
+    """For each effect of a pair, the other effects that explain about as much together with its partner: pairs by name."""
     effects = {effect.name: effect for effect in model.evidence.effects if effect.named}
     found: dict[str, dict[str, Tried]] = {name: {} for name in pair.names}
     for stays, goes in (pair.names, pair.names[::-1]):
@@ -540,20 +562,20 @@ def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tri
 
 
 def _takes_part(name: str, pair: Tried) -> bool:
-    """Whether any of an effect's numbers is left in a pair."""
+    """Whether the fit of a pair keeps any parameter of an effect."""
     return any(key.startswith(f"{name}.") for key in pair.values)
 
 
 def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> Tried:
-    """The PSF's parameters with these effects.
+    """Fit the PSF's parameters together with these effects.
 
-    A parameter that can be positive alone and would not be is left out, unless any_sign: a step may have either. So
-    is one whose change was measured in the lit parts and gains less than that costs.
+    A parameter that must be positive but would not be is left out, unless any_sign (a step may have either sign). A
+    parameter whose change was measured in the unocculted field is left out if it gains less than that costs.
     """
     columns = {
         column: (effect, parameter)
         for effect in effects
-        # What is fitted by pointing has a change for each that there is: fewer or more than it has parameters.
+        # An effect that is fitted per pointing has one change for each: fewer or more than its parameters.
         for column, parameter in zip(model.evidence.columns[effect.name], effect.parameters, strict=False)
     }
     step = model.fit(tuple(columns))
@@ -597,7 +619,7 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
 
 
 def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
-    """The column of a step that gains least of those that gain less than the numbers in them cost; none where none does."""
+    """Of the columns of a step that gain less than their measured numbers cost, the one that gains least; None if there is none."""
     columns = step.columns[len(model.evidence.base) :]
     idle = {}
     for column in columns:
@@ -609,7 +631,7 @@ def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
 
 
 def _p_of_gap(left: _Left, named: Sequence[Tried]) -> float:
-    """The least of the p-values of patterns, cells, lit blocks and single effects, times how many they are."""
+    """The smallest of the p-values of patterns, means, cells, unocculted blocks and single effects, times their number."""
     effects = min((t.p_value for t in named), default=1.0) * max(len(named), 1)
     tests = (*left.p_values, effects)
     return float(min(1.0, len(tests) * min(tests)))
@@ -617,24 +639,23 @@ def _p_of_gap(left: _Left, named: Sequence[Tried]) -> float:
 
 @dataclass(frozen=True)
 class _Left:
-    """What a step leaves, and of how many degrees of freedom: along patterns, in the discs' means, in all cells, in the
-    lit blocks."""
+    """The chi2 that a step leaves, and its degrees of freedom: along patterns, in the discs' means, in all cells, in the blocks."""
 
     gains: tuple[float, ...]
     freedom: tuple[int, ...]
 
     @property
     def p_values(self) -> tuple[float, ...]:
-        """Of each."""
+        """The p-value of each."""
         return tuple(float(chdtrc(k, gain)) for gain, k in zip(self.gains, self.freedom, strict=True))
 
     @property
     def p_value(self) -> float:
-        """The least of them, counted for how many they are."""
+        """The smallest p-value, times their number."""
         return min(1.0, len(self.gains) * min(self.p_values))
 
     def share_of(self, before: _Left) -> float:
-        """The largest share of the excess that is left, of those that are not likely anyway."""
+        """The largest remaining fraction of the excess, among those that are still significant."""
         shares = [
             max(gain - k, 0.0) / max(gain_before - k_before, 1e-9)
             for gain, k, p, gain_before, k_before in zip(
@@ -645,14 +666,14 @@ class _Left:
         return max(shares, default=0.0)
 
     def of_most(self, before: _Left) -> float:
-        """Of what showed the largest excess before, the share of it that is left."""
+        """The remaining fraction of what had the largest excess before."""
         excess = [gain - k for gain, k in zip(before.gains, before.freedom, strict=True)]
         most = int(np.argmax(excess))
         return max(self.gains[most] - self.freedom[most], 0.0) / max(excess[most], 1e-9)
 
 
-def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refit) -> Tried:
-    """With what is left: in the linear model, and where that is too much, after a real refit."""
+def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refitter) -> Tried:
+    """The fit with its residuals judged: in the linear model and, if they are significant, after a full refit."""
     unsure = np.array(tried.step.values) * TEMPLATE_ERROR
     unsure[: len(model.base.columns)] = 0.0
     left = _left(model, tried.step, unsure)
@@ -674,20 +695,20 @@ def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refit) ->
 
 
 def _left(model: LinearModel, step: Step, unsure: Vector) -> _Left:
-    """What a step leaves, its columns' own answers unsure by so much."""
+    """The residuals of a step, if the Jacobian of its columns times `unsure` is the error of the effects' forms."""
     here = list(step.columns)
-    # An unsure template adds a covariance along its own answer: taken off along that direction, disc by disc.
+    # An inexact template adds a covariance along its own change of the cells: reduce that direction, disc by disc.
     shrink = []
     for disc, left in zip(model.discs, model.left(step), strict=True):
-        answer = disc.answers[here].T @ unsure
+        answer = disc.jacobian[here].T @ unsure
         length = float(answer @ answer)
         shrink.append(left - answer * float(answer @ left) / (1 + length))
     freedom = max(sum(left.size for left in shrink) - len(here), 1)
     cells = sum(float(left @ left) for left in shrink)
     gain, directions = model.gain_of_patterns(step, model.patterns, shrink)
     of_means, images = model.gain_of_patterns(step, model.means, shrink)
-    lit = model.evidence.steady_lit
-    moved = float(unsure @ lit.normal[np.ix_(here, here)] @ unsure) / model.lit_scale
-    of_lit = max(model.left_lit(step) - moved, 0.0) / (1 + LIT_WIDTH)
-    of_lit_freedom = max(lit.freedom - model.evidence.numbers_of(here), 1)
-    return _Left((gain, of_means, cells, of_lit), (directions, images, freedom, of_lit_freedom))
+    unocculted = model.evidence.steady_unocculted
+    moved = float(unsure @ unocculted.normal[np.ix_(here, here)] @ unsure) / model.unocculted_scale
+    of_unocculted = max(model.left_unocculted(step) - moved, 0.0) / (1 + UNOCCULTED_WIDTH)
+    of_unocculted_freedom = max(unocculted.freedom - model.evidence.numbers_of(here), 1)
+    return _Left((gain, of_means, cells, of_unocculted), (directions, images, freedom, of_unocculted_freedom))

@@ -1,9 +1,9 @@
-"""Where a gap lies: what share of it goes with each axis.
+"""Where the gap lies: which share of it varies with each axis.
 
-Axes are confounded: a transit has three pointings and one track, so that place, time and brightness go together. The
-share of an axis is what it adds to the others, averaged over all orders in which they could be taken (Shapley's
-value), of what all axes explain together; its p-value counts how often images with their signs drawn anew fall as far
-with this axis alone, times the number of axes.
+The axes are confounded: a transit has three pointings and one track, so place, time and brightness vary together. The
+share of an axis is its contribution to what all axes explain together, averaged over all orders in which the axes can
+be added (Shapley value). Its p-value is the fraction of random sign flips of the images' residuals for which chi2
+decreases at least as much by this axis alone, times the number of axes.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from psfcore.gap.evidence.cells import DiscCells
-from psfcore.gap.evidence.evidence import Evidence, Taken
+from psfcore.gap.evidence.evidence import Evidence, ImageInfo
 from psfcore.gap.evidence.linear_model import LinearModel, Step
 from psfcore.gap.evidence.patterns import in_disc
 
 Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
-DRAWS = 999
-AS_GOOD = 0.3  # of the best axis' own fall: an axis of the effect that was found may be the strongest if it explains so much
-SIGNIFICANT = 0.05  # an axis that chance explains does not come before one that it does not
-SUSPECT = 2  # pointings that are named
+SIGN_FLIPS = 999
+AS_GOOD = 0.3  # an axis of the best effect comes first if it alone explains this fraction of what the best axis explains
+SIGNIFICANT = 0.05  # axes below this p-value come before the others
+SUSPECT = 2  # number of pointings that are named
 
 
 @dataclass(frozen=True)
 class Axis:
-    """How much of a gap follows one axis, and where along it."""
+    """How much of a gap varies with one axis, and where along it."""
 
     name: str
     share: float
@@ -43,40 +43,40 @@ class Axis:
     at: dict[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """As a gap report has it."""
+        """The axis in the form of the gap report."""
         return {"axis": self.name, "share": self.share, "p_value": self.p_value, "at": self.at}
 
 
 def where(
     model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = (), explained: Step | None = None
 ) -> tuple[Axis, ...]:
-    """All axes, the strongest first: of those that chance does not explain, the one with the largest share.
+    """All axes, the strongest first: of those that are significant, the one with the largest share.
 
-    favoured: axes of the effect that was found; of axes that explain about as much, they come first, for the effect was
-    found by more than its place on the track. explained: the fit of an effect that explains the gap; shares are then of
-    what it explains, which has no noise.
+    favoured: the axes of the best effect. If they explain about as much as others they come first, because the effect was
+    identified by more than its place on the track. explained: the fit of an effect that explains the gap; the shares then
+    refer to what it explains, which has no noise.
     """
     designs = _designs(model.evidence)
-    cells, lit = _of_cells(model, designs), _of_lit(model, designs)
+    cells, unocculted = _of_cells(model, designs), _of_unocculted(model, designs)
     disc = cells.equations([one.residual for one in model.discs])
     seen = disc if explained is None else cells.equations(_explained(model, explained))
     names = list(designs)
     spans = _spans(designs)
     subset = {
-        chosen: _fall(seen, lit, [c for name in chosen for c in spans[name]])
+        chosen: _fall(seen, unocculted, [c for name in chosen for c in spans[name]])
         for size in range(len(names) + 1)
         for chosen in itertools.combinations(names, size)
     }
     shares = _shapley(names, subset)
     total = max(sum(max(share, 0.0) for share in shares.values()), 1e-300)
-    draws = _drawn_scores(model, cells, rng)
+    flips = _sign_flipped_scores(model, cells, rng)
     out = []
     for name in names:
         alone = subset[(name,)]
-        beaten = int((_falls(disc.normal, draws, spans[name]) >= _fall_of(disc, spans[name])).sum())
-        p_value = min(1.0, (1 + beaten) / (1 + DRAWS) * len(names))
-        if _fall_of(lit, spans[name]) > 0:
-            p_value = min(p_value, _p_of_lit(lit, spans[name], len(names)))
+        beaten = int((_falls(disc.normal, flips, spans[name]) >= _fall_of(disc, spans[name])).sum())
+        p_value = min(1.0, (1 + beaten) / (1 + SIGN_FLIPS) * len(names))
+        if _fall_of(unocculted, spans[name]) > 0:
+            p_value = min(p_value, _p_of_unocculted(unocculted, spans[name], len(names)))
         out.append(Axis(name, max(shares[name], 0.0) / total, p_value, alone, _at(model, name)))
     best = max((axis.alone for axis in out), default=0.0)
     return tuple(
@@ -92,8 +92,8 @@ def where(
 
 
 def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
-    """For each axis along which these images differ, a pattern (columns, cells) in DN/s for each disc."""
-    taken = [evidence.taken[disc.index] for disc in evidence.discs]
+    """For each axis along which these images vary: a pattern (columns, cells) in DN/s for each disc."""
+    taken = [evidence.image_info[disc.index] for disc in evidence.discs]
     level = [np.full(disc.expected.size, disc.mean_expected) for disc in evidence.discs]
     out: dict[str, list[Matrix]] = {}
     for name, values in _along(evidence.discs, taken).items():
@@ -106,13 +106,13 @@ def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
     return out
 
 
-def _along(discs: Sequence[DiscCells], taken: Sequence[Taken]) -> dict[str, Vector]:
+def _along(discs: Sequence[DiscCells], taken: Sequence[ImageInfo]) -> dict[str, Vector]:
     """Each image's value on each axis."""
     return {
         "detector_x": np.array([t.x_px for t in taken]),
         "detector_y": np.array([t.y_px for t in taken]),
         "time": np.array([t.time_s for t in taken]),
-        "pointing": np.array([float(t.fov) for t in taken]),
+        "pointing": np.array([float(t.pointing) for t in taken]),
         "intensity": np.log(np.array([max(d.mean_expected, 1e-6) for d in discs])),
         "exposure": np.log(np.array([t.exposure_s for t in taken])),
         "gain_mode": np.array([float((t.gain_mode or "").lower() == "combined") for t in taken]),
@@ -121,7 +121,7 @@ def _along(discs: Sequence[DiscCells], taken: Sequence[Taken]) -> dict[str, Vect
 
 
 def _curve(values: Vector) -> Matrix | None:
-    """A slope and a bend along an axis, (2 or 1, images); none where all images lie at one place of it."""
+    """A slope and a curvature along an axis, (2 or 1, images); None if all images have the same value."""
     spread = float(values.std())
     if spread <= 1e-9 * max(1.0, float(np.abs(values).max())):
         return None
@@ -133,7 +133,7 @@ def _curve(values: Vector) -> Matrix | None:
 
 
 def _kinds(values: Vector) -> Matrix | None:
-    """Which kind an image is of, less the mean: (kinds - 1, images)."""
+    """Indicators of the kind of an image, minus their mean: (kinds - 1, images)."""
     kinds = np.unique(values)
     if kinds.size < 2:
         return None
@@ -156,18 +156,18 @@ class _Normal:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """All discs' cells, whitened: the axes' columns without what the PSF's coordinates take up, and a basis of that."""
+    """All discs' cells, whitened: the axes' columns without the component that the PSF absorbs, and a basis of that component."""
 
     design: Matrix
     absorbed: Matrix
 
     def left(self, of_discs: Sequence[Vector]) -> Vector:
-        """What the PSF's coordinates leave of residuals, disc by disc, in a row."""
+        """The residuals of all discs in one vector, without the component that the PSF's coordinates absorb."""
         residual = np.concatenate(of_discs)
         return np.asarray(residual - self.absorbed @ (self.absorbed.T @ residual))
 
     def equations(self, of_discs: Sequence[Vector]) -> _Normal:
-        """Normal equations of the axes' columns for residuals, disc by disc."""
+        """Normal equations of the axes' columns for these residuals."""
         return _Normal(self.design @ self.design.T, self.design @ self.left(of_discs))
 
 
@@ -178,7 +178,7 @@ def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Cells:
         for k, disc in enumerate(model.discs)
     ]
     design = np.hstack(rows)
-    absorbed = np.linalg.qr(np.hstack([disc.answers[base] for disc in model.discs]).T)[0]
+    absorbed = np.linalg.qr(np.hstack([disc.jacobian[base] for disc in model.discs]).T)[0]
     return _Cells(design - (design @ absorbed) @ absorbed.T, absorbed)
 
 
@@ -186,14 +186,13 @@ def _explained(model: LinearModel, step: Step) -> list[Vector]:
     """What a fit's effects explain in each disc's cells."""
     base = len(model.evidence.base)
     here, values = list(step.columns[base:]), step.values[base:]
-    return [disc.answers[here].T @ values for disc in model.discs]
+    return [disc.jacobian[here].T @ values for disc in model.discs]
 
 
-def _of_lit(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal:
-    """Normal equations of the axes' columns for how bright the images are among those of their pointing: their gains over
-    the width of these."""
-    lit = model.evidence.lit
-    gains = model.evidence.whole_lit.gains[list(model.evidence.images)] / lit.gain_width
+def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal:
+    """Normal equations of the axes' columns for the brightness of the images relative to their pointing, over its usual width."""
+    unocculted = model.evidence.unocculted
+    gains = model.evidence.all_unocculted.gains[list(model.evidence.images)] / unocculted.gain_width
     columns = np.vstack(
         [
             np.array(
@@ -202,16 +201,16 @@ def _of_lit(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal:
             for patterns in designs.values()
         ]
     )
-    fov = lit.fov[list(model.evidence.images)]
-    for one in np.unique(fov):  # brightness is known among images of one pointing alone
-        here = fov == one
+    pointing = unocculted.pointing[list(model.evidence.images)]
+    for one in np.unique(pointing):  # brightness is known only relative to the same pointing
+        here = pointing == one
         columns[:, here] -= columns[:, here].mean(axis=1, keepdims=True)
         gains = np.where(here, gains - gains[here].mean(), gains)
     return _Normal(columns @ columns.T, columns @ gains)
 
 
-def _fall(disc: _Normal, lit: _Normal, columns: list[int]) -> float:
-    return _fall_of(disc, columns) + _fall_of(lit, columns)
+def _fall(disc: _Normal, unocculted: _Normal, columns: list[int]) -> float:
+    return _fall_of(disc, columns) + _fall_of(unocculted, columns)
 
 
 def _fall_of(of: _Normal, columns: list[int]) -> float:
@@ -219,7 +218,7 @@ def _fall_of(of: _Normal, columns: list[int]) -> float:
 
 
 def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
-    """How far chi2 falls by these columns beyond their number, for every row of scores (draws, columns)."""
+    """The decrease of chi2 by these columns minus their number, for every row of scores (flips, columns)."""
     if not columns:
         return np.zeros(scores.shape[0])
     normal, scores = normal[np.ix_(columns, columns)], scores[:, columns]
@@ -229,12 +228,12 @@ def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
     return np.maximum(np.einsum("ni,ij,nj->n", scores, inverse, scores) - len(columns), 0.0)
 
 
-def _p_of_lit(lit: _Normal, columns: list[int], axes: int) -> float:
-    return min(1.0, axes * float(chdtrc(len(columns), _fall_of(lit, columns) + len(columns))))
+def _p_of_unocculted(unocculted: _Normal, columns: list[int], axes: int) -> float:
+    return min(1.0, axes * float(chdtrc(len(columns), _fall_of(unocculted, columns) + len(columns))))
 
 
 def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
-    """What each name adds, averaged over all orders."""
+    """The contribution of each name, averaged over all orders."""
     count = len(names)
     out = dict.fromkeys(names, 0.0)
     for chosen, value in worth.items():
@@ -247,24 +246,24 @@ def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str,
     return out
 
 
-def _drawn_scores(model: LinearModel, cells: _Cells, rng: np.random.Generator) -> Matrix:
-    """Scores of all columns with every image's residuals turned over or not: (DRAWS, columns)."""
+def _sign_flipped_scores(model: LinearModel, cells: _Cells, rng: np.random.Generator) -> Matrix:
+    """Scores of all columns with the residuals of random images sign-flipped: (SIGN_FLIPS, columns)."""
     residual = cells.left([disc.residual for disc in model.discs])
     which = np.repeat(np.arange(len(model.discs)), [d.residual.size for d in model.discs])
-    signs = np.array([rng.choice((-1.0, 1.0), len(model.discs)) for _ in range(DRAWS)])
+    signs = np.array([rng.choice((-1.0, 1.0), len(model.discs)) for _ in range(SIGN_FLIPS)])
     return np.asarray((signs[:, which] * residual) @ cells.design.T)
 
 
 def _at(model: LinearModel, name: str) -> dict[str, Any]:
-    """The pointings where the residuals are largest, and the axis' range in them."""
+    """The pointings with the largest residuals, and the range of the axis in them."""
     evidence = model.evidence
     left = model.left(model.base)
     excess = np.array([float(r @ r) - r.size for r in left])
-    fov = np.array([evidence.taken[d.index].fov for d in evidence.discs])
+    fov = np.array([evidence.image_info[d.index].pointing for d in evidence.discs])
     by_fov = {int(one): float(excess[fov == one].sum()) for one in np.unique(fov)}
     strongest = sorted(by_fov, key=lambda one: -by_fov[one])[:SUSPECT]
     out: dict[str, Any] = {"pointings": sorted(strongest)}
-    taken = [evidence.taken[d.index] for d in evidence.discs]
+    taken = [evidence.image_info[d.index] for d in evidence.discs]
     values = _along(evidence.discs, taken).get(name)
     if values is not None and name not in ("pointing", "gain_mode"):
         here = values[np.isin(fov, strongest)]

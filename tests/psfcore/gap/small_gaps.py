@@ -1,4 +1,4 @@
-"""A small transit with a gap of known cause, diagnosed once with a few effects, for tests of what is made of that."""
+"""A small transit with a gap of known cause, diagnosed once with a few effects; other tests use the result."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from psfcore.transit.transit import Transit
 from tests.transit_files import TRUTH, diffraction
 
 OFFSET_DN = 6.0
-QUICK = patch.object(where, "DRAWS", 99)  # quicker than 999
-# Of each stage one, one that these data cannot show, and a probe: a diagnosis with them takes seconds.
+QUICK = patch.object(where, "SIGN_FLIPS", 99)  # quicker than 999
+# Effects of each stage, one that these data cannot show, and a probe: a diagnosis with them takes seconds.
 FEW = tuple(
     effect
     for effect in LIBRARY
@@ -29,14 +29,14 @@ FEW = tuple(
 
 @cache
 def clean() -> Transit:
-    """Twelve images of 96 px, some tens of photons a pixel in the discs."""
+    """Twelve images of 96 px with some tens of photons per pixel in the discs."""
     plan = default_plan(12, 96, oversampling=1, brightness=6.0)
     return simulate(plan, TRUTH, diffraction(), seed=8).transit
 
 
 @cache
 def with_offset() -> Transit:
-    """The same, OFFSET_DN too much in every readout."""
+    """The same images with OFFSET_DN added to every readout."""
     frames = tuple(
         replace(frame, pixels=(frame.pixels + OFFSET_DN / frame.exposure_s).astype(np.float32))
         for frame in clean().frames
@@ -46,6 +46,6 @@ def with_offset() -> Transit:
 
 @cache
 def found() -> Diagnosis:
-    """The diagnosis of the second: attributed, and added to the model."""
+    """The diagnosis of `with_offset`: attributed, with a full refit."""
     with QUICK:
         return diagnose(with_offset(), library=FEW)

@@ -1,4 +1,4 @@
-"""The PSF with a gap's answer in the model: what optics do is in its kernel, what a detector does is not; its lineage."""
+"""The corrected PSF: its kernel contains effects of the optics but not of the detector, and its file records its origin."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def answered(*effects: Effect, values: tuple[float, ...]) -> Diagnosis:
     names = [f"{one.name}.{p.name}" for one in effects for p in one.parameters]
     numbers = {name: (value, 0.1, "") for name, value in zip(names, values, strict=True)}
     added = found().corrected[0]
-    evidence = replace(added.evidence, columns={one.name: () for one in effects})  # asked for errors alone
+    evidence = replace(added.evidence, columns={one.name: () for one in effects})  # used only for errors
     added = replace(added, effects=effects, values=numbers, evidence=evidence)
     return replace(found(), corrected=(added,))
 
@@ -53,14 +53,14 @@ def of_the_answer() -> Psf:
 
 @cache
 def fitted_kernel() -> np.ndarray:
-    """The PSF fitted beside the effect, without it, worked out anew."""
+    """The PSF fitted together with the effect, computed without the effect."""
     solution = found().corrected[0].solution
     size = (REACH_GRID_PX, REACH_GRID_PX)
     total = TotalPsf(diffraction(), solution.inversion.shape, size)
     return np.maximum(total.kernel(solution.inversion.coordinates), 0.0)
 
 
-def test_a_detector_s_effect_is_no_part_of_the_psf_which_is_nearer_to_the_truth_without_it() -> None:
+def test_a_detector_effect_is_not_in_the_psf_and_the_psf_is_closer_to_the_truth() -> None:
     np.testing.assert_allclose(of_the_answer().kernel, fitted_kernel(), atol=1e-15)
     radii = np.array([5.0, 10.0, 20.0])
     truth = cumulative_curve(total_kernel(TRUTH, diffraction(), REACH_GRID_PX), radii)
@@ -72,7 +72,7 @@ def test_a_detector_s_effect_is_no_part_of_the_psf_which_is_nearer_to_the_truth_
     assert (off_after < off_before).all()
 
 
-def test_its_file_says_where_it_comes_from_and_what_it_did_to_the_gap(tmp_path: Path) -> None:
+def test_its_file_records_its_origin_and_the_gap_before_and_after(tmp_path: Path) -> None:
     write_psf(tmp_path / "psf.fits", of_the_answer())
     back = read_psf(tmp_path / "psf.fits", FitsLimits(max_pixels=2**23))
     history = "".join(back.provenance["history"]).replace(" ", "")
@@ -93,7 +93,7 @@ def test_its_file_says_where_it_comes_from_and_what_it_did_to_the_gap(tmp_path: 
     assert said["inputs_sha256"]["000.fits"] == "ab" * 32
 
 
-def test_its_errors_are_those_with_the_effect_free_beside_the_scatter() -> None:
+def test_its_errors_include_those_of_the_effect() -> None:
     assert of_the_answer().fitted is not None
     covariance = np.array(of_the_answer().fitted.covariance)  # type: ignore[union-attr]
     alone = found().corrected[0].model.base.covariance
@@ -101,8 +101,8 @@ def test_its_errors_are_those_with_the_effect_free_beside_the_scatter() -> None:
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
-def test_a_blur_of_the_core_is_in_the_kernel_with_its_own_value_among_others() -> None:
-    """Half the Laplacian of the kernel for each unit of variance; the dark offset before it is not in it."""
+def test_a_core_blur_is_in_the_kernel_with_its_own_value() -> None:
+    """The change is half the Laplacian of the kernel per unit of variance; the dark offset is not in the kernel."""
     narrow = replace(effect("core_blur"), changes=lambda view: blur_as(view, 0.003, DIRECTIONS[0]), held=None)
     diagnosis = answered(effect("dark_offset"), narrow, values=(5.0, 0.02))
     psf, plain = made(diagnosis), fitted_kernel()
@@ -116,7 +116,7 @@ def test_a_blur_of_the_core_is_in_the_kernel_with_its_own_value_among_others() -
 
 
 def test_stretched_scatter_is_in_the_kernel_along_its_direction() -> None:
-    """To first order that of the true stretched PSF: ln(1 + stretch) along x is p."""
+    """To first order it is the true stretched PSF: p is ln(1 + stretch) along x."""
     stretch = 0.02
     psf = made(answered(effect("anisotropic_scatter"), values=(float(np.log1p(stretch)), 0.0)))
     values = found().corrected[0].solution.inversion.values
@@ -129,7 +129,7 @@ def test_stretched_scatter_is_in_the_kernel_along_its_direction() -> None:
     assert change[40, 60] > 0 > change[60, 40]  # more along x, less along y
 
 
-def test_a_ghost_is_in_the_kernel_where_it_was_found() -> None:
+def test_a_ghost_is_in_the_kernel_at_its_place() -> None:
     ghost = next(one for one in EFFECTS if one.name == "ghost")
     assert ghost.held is not None
     from psfcore.gap.library.optics import _copy
@@ -139,17 +139,17 @@ def test_a_ghost_is_in_the_kernel_where_it_was_found() -> None:
     change = kernel - fitted_kernel()
     peak = np.unravel_index(int(np.argmax(change)), change.shape)
     assert (int(peak[0]), int(peak[1])) == (MIDDLE - 30, MIDDLE + 60)
-    # The copy's light is taken from the rest, for all of it is 1.
+    # The copy's light is taken from the rest of the kernel, whose sum stays the same.
     around = change[MIDDLE - 60 : MIDDLE, MIDDLE + 30 : MIDDLE + 90].sum()
     assert around == pytest.approx(0.03 * fitted_kernel().sum(), rel=0.4)
 
 
-def test_an_effect_that_differs_over_the_field_is_that_of_its_middle() -> None:
+def test_an_effect_that_varies_over_the_field_is_taken_at_its_centre() -> None:
     kernel = made(answered(effect("field_dependent_scatter"), values=(0.5, 0.5, 0.5))).kernel
     assert np.abs(kernel - fitted_kernel()).max() < 1e-3 * fitted_kernel().max()
 
 
-def test_without_an_answer_there_is_none() -> None:
+def test_without_an_answer_there_is_no_corrected_psf() -> None:
     with pytest.raises(DataError, match="got the verdict unknown") as caught:
         made(replace(found(), corrected=(), judgement=replace(found().judgement, verdict="unknown")))
     assert caught.value.code == "no-answer"

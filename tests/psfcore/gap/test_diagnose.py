@@ -1,4 +1,4 @@
-"""The gap on small simulated transits: none where there is none, the effect that was put in where there is one."""
+"""The gap on small simulated transits: clean data show no gap, and a simulated effect is found."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.transit_files import TRUTH, diffraction
 
 @pytest.fixture(scope="module")
 def clean() -> Transit:
-    """Twelve images of 160 px, some tens of photons a pixel in the discs."""
+    """Twelve images of 160 px with some tens of photons per pixel in the discs."""
     plan = default_plan(12, 160, oversampling=1, brightness=4.0)
     return simulate(plan, TRUTH, diffraction(), seed=8).transit
 
@@ -59,8 +59,8 @@ def of_clean(solution: Solution) -> Diagnosis:
 
 def test_clean_images_have_no_gap_and_the_report_is_json(of_clean: Diagnosis) -> None:
     found = of_clean
-    # Loosened from "none": on twelve images of 160 px one seed in a hundred may look like a gap, which is said to be
-    # inconclusive. What must never be is an effect named where there is none.
+    # Not only "none": on twelve images of 160 px one seed in a hundred may look like a gap, and is then called
+    # inconclusive. An effect must never be named on clean data.
     assert found.judgement.verdict in ("none", "inconclusive") and found.judgement.answer == ()
     report = json.loads(json.dumps(gap_report(found), allow_nan=False))
     assert report["schema"] == "gap/1" and report["sentence"].startswith("No gap")
@@ -82,25 +82,25 @@ def test_a_dark_offset_is_found_with_its_size_and_taken_out(
     assert unit == "DN" and value == pytest.approx(offset_dn, abs=max(4 * sigma, 0.05))
     closure = found.shrinking["dark_offset"].closure
     assert closure is not None and closure.value > 0.7
-    # What is left is what images of 160 px leave without it too.
+    # The remaining residuals are no larger than those of clean images of 160 px.
     assert found.after.value < of_clean.rms.value + 0.5
-    # A dark level added to the PSF's fit bends it; with the effect in the model it is straight again.
+    # A wrong dark level biases the fit of the PSF; with the effect in the model the bias is gone.
     bent, straight = (s.inversion.values["total"] for s in (found.solution, fit.solution))
     assert abs(straight - TRUTH.total) < abs(bent - TRUTH.total) + 0.01
 
 
-def test_a_gain_that_differs_between_modes_hides_in_the_discs_and_shows_in_the_lit_part(
+def test_a_gain_mismatch_shows_in_the_unocculted_field_and_hardly_in_the_discs(
     clean: Transit,
 ) -> None:
     found = verdict(changed(clean, lambda n, f: f.pixels * (1.08 if f.gain_mode == "combined" else 1.0)))
     assert found.judgement.answer == ("gain_mismatch",)
     value, sigma, _ = tried(found, "gain_mismatch")["excess"]
     assert value == pytest.approx(0.08, abs=max(5 * sigma, 0.02))
-    assert found.rms.value < 3.0  # percent: the discs hardly know
+    assert found.rms.value < 3.0  # percent: the discs hardly show it
     assert found.where[0].name in ("gain_mode", "exposure")
 
 
-def test_what_earlier_images_left_is_found_however_fast_it_fades(clean: Transit) -> None:
+def test_persistence_is_found_whatever_its_decay_time(clean: Transit) -> None:
     frames = clean.frames
     fades_s = 1.6 * (frames[-1].time_s - frames[0].time_s) / (len(frames) - 1)
 
@@ -118,19 +118,19 @@ def test_what_earlier_images_left_is_found_however_fast_it_fades(clean: Transit)
     assert sum(value for value, _, _ in best.values.values()) == pytest.approx(0.06, rel=0.3)
 
 
-def test_a_flat_field_of_patches_is_found_as_one(clean: Transit) -> None:
+def test_a_patchy_flat_field_error_is_found(clean: Transit) -> None:
     uneven = 1 + 0.15 * patches(clean.shape[0], seed=3, patch=0.2)
     found = verdict(changed(clean, lambda n, f: f.pixels * uneven))
     assert found.judgement.answer == ("flat_field_residual",)
     (best, *_) = found.judgement.tried
     closure = found.shrinking["flat_field_residual"].closure
     assert closure is not None and closure.value > 0.3
-    # Many numbers, each near nothing where the discs say nothing of it: together no more than the patches are.
+    # Parameters that the discs do not constrain stay near 0, so together they are no larger than the patches.
     assert np.linalg.norm([value for value, _, _ in best.values.values()]) < 0.2
-    assert f"{len(best.values)} numbers" in gap_report(found)["sentence"]
+    assert f"{len(best.values)} parameters" in gap_report(found)["sentence"]
 
 
-def test_a_sun_that_changes_faster_than_it_is_followed_is_named_all_the_same() -> None:
+def test_a_sun_that_changes_faster_than_the_images_follow_is_still_named() -> None:
     plan = default_plan(18, 128, oversampling=1, brightness=4.0)
     one, other = (patches(128, seed=seed, patch=0.1) for seed in (3, 4))
 
@@ -143,7 +143,7 @@ def test_a_sun_that_changes_faster_than_it_is_followed_is_named_all_the_same() -
     assert found.judgement.answer == ("scene_evolution",)
 
 
-def test_a_patch_of_light_is_nobodys_effect(clean: Transit) -> None:
+def test_a_patch_of_light_is_not_attributed_to_an_effect(clean: Transit) -> None:
     ny, nx = clean.shape
     glow = 40 * np.exp(-0.5 * ((np.arange(nx) - 60) / 14) ** 2) * np.ones((ny, 1))
     found = verdict(changed(clean, lambda n, f: f.pixels + glow))
@@ -152,7 +152,7 @@ def test_a_patch_of_light_is_nobodys_effect(clean: Transit) -> None:
     assert "patch of added light" in report["looks_like"][0]["form"]
 
 
-def test_a_pattern_of_the_readout_is_nobodys_effect(clean: Transit) -> None:
+def test_a_read_pattern_is_not_attributed_to_an_effect(clean: Transit) -> None:
     x = np.arange(clean.shape[1])
     stripes = 20 * np.sin(2 * np.pi * x / 45) * np.ones((clean.shape[0], 1))
     found = verdict(changed(clean, lambda n, f: f.pixels + stripes / f.exposure_s))
@@ -162,8 +162,8 @@ def test_a_pattern_of_the_readout_is_nobodys_effect(clean: Transit) -> None:
     assert rms[0] == pytest.approx(20 / np.sqrt(2), rel=0.2)
 
 
-def test_light_that_clipping_took_from_a_brightening_is_known_by_its_place(clean: Transit) -> None:
-    """One pointing's images are clipped round a place: nothing shows the scene there as it is."""
+def test_light_lost_by_clipping_is_attributed_to_saturation_fill(clean: Transit) -> None:
+    """One pointing's images are clipped around a place, so no image shows the true scene there."""
     fov = 2
     y, x = np.indices(clean.shape)
     inside = 30 - np.hypot(y - 60, x - 80)
@@ -176,12 +176,12 @@ def test_light_that_clipping_took_from_a_brightening_is_known_by_its_place(clean
     found = verdict(replace(clean, frames=frames))
     assert found.judgement.answer == ("saturation_fill",)
     values = tried(found, "saturation_fill")
-    # More inside than at the rim, as it was taken.
+    # The loss is larger inside than at the rim, as simulated.
     assert values["excess_inside"][0] < -2 * values["excess_inside"][1]
 
 
 @pytest.mark.slow
-def test_brightness_that_wavers_from_image_to_image_is_no_gap(clean: Transit) -> None:
+def test_brightness_that_varies_between_images_is_not_a_gap(clean: Transit) -> None:
     rng = np.random.default_rng(3)
     waver = 1 + 0.01 * rng.standard_normal(len(clean.frames))
     found = verdict(changed(clean, lambda n, f: f.pixels * waver[n]))
@@ -189,7 +189,7 @@ def test_brightness_that_wavers_from_image_to_image_is_no_gap(clean: Transit) ->
 
 
 @pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
-def test_noise_figures_that_are_wrong_are_noticed_and_no_gap(clean: Transit, factor: float) -> None:
+def test_wrong_noise_figures_are_noticed_and_are_not_a_gap(clean: Transit, factor: float) -> None:
     wrong = Noise(clean.noise.photon_gain_dn * factor, clean.noise.read_noise_dn * factor)
     found = verdict(replace(clean, noise=wrong))
     assert found.judgement.verdict in ("none", "inconclusive") and found.judgement.answer == ()
@@ -199,14 +199,14 @@ def test_noise_figures_that_are_wrong_are_noticed_and_no_gap(clean: Transit, fac
 def test_the_noise_of_the_images_is_measured(clean: Transit) -> None:
     found = measured_noise(clean)
     assert found is not None and found.agrees
-    # Loosened from a tenth: of pixels with a few photons the median deviation is less than a normal one's by that.
+    # Not 10 %: for pixels with a few photons the median deviation is smaller than a normal distribution's by that much.
     assert found.noise.photon_gain_dn == pytest.approx(clean.noise.photon_gain_dn, rel=0.2)
     first, second = clean.frames[:2]
     assert measured_noise(replace(clean, frames=(first, replace(second, fov=2)))) is None
 
 
 @pytest.mark.slow
-def test_one_pointing_and_few_images_say_what_they_cannot(clean: Transit) -> None:
+def test_cautions_tell_what_one_pointing_and_few_images_cannot_show(clean: Transit) -> None:
     one = replace(clean, frames=tuple(f for f in clean.frames if f.fov == 2))
     found = verdict(one)
     assert found.judgement.answer == ()
@@ -224,7 +224,7 @@ def test_one_pointing_and_few_images_say_what_they_cannot(clean: Transit) -> Non
     assert raised.value.code == "too-few-frames"
 
 
-def test_a_library_without_effects_is_refused(clean: Transit) -> None:
+def test_a_library_of_probes_alone_is_refused(clean: Transit) -> None:
     probes = tuple(effect for effect in LIBRARY if not effect.named)
     with pytest.raises(DataError) as raised:
         diagnose(clean, library=probes)

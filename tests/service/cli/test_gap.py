@@ -170,7 +170,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
         (["--effects", "mine.py"], "--effects: expected --local with it"),
         (["--effects", "mine.py", "--local"], "effects of mine.py: expected a Python file"),
         (["--effects", "no_such_module_anywhere", "--local"], "No module named 'no_such_module_anywhere'"),
-        (["--effects", "json", "--local"], "effects of json: expected EFFECTS, a tuple of Effect"),
+        (["--effects", "json", "--local"], "effects of json: expected EFFECTS to be a tuple of Effect"),
         (["--noise", "-1", "2", "--local"], "greater than or equal to 0"),
         (["--seed", "-1", "--local"], "not in the range"),
         (["--server", "http://127.0.0.1:9"], "127.0.0.1:9"),
@@ -189,7 +189,7 @@ def test_effects_that_clash_with_the_library_s_are_told(folder: Path, tmp_path: 
     (tmp_path / "mine.py").write_text(EDGE_GLOW.replace("edge_glow", "ghost"))
     done = run(folder, "--local", "--effects", tmp_path / "mine.py")
     assert done.exit_code == 1
-    assert "expected names that nothing else has; got 'ghost' twice" in done.output
+    assert "expected unique effect names; got 'ghost' twice" in done.output
 
 
 def test_a_folder_without_a_transit_and_a_word_that_is_neither_are_told(tmp_path: Path) -> None:

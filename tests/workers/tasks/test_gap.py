@@ -79,7 +79,7 @@ def test_the_answer_and_its_size_are_found_and_what_it_was_made_of_is_told(made:
 def test_its_page_and_picture_are_kept(made: dict[str, Any]) -> None:
     html = (made["folder"] / "r.html").read_text("utf-8")
     check_stands_alone(html)
-    assert "A light leak" not in html and "The dark level taken off every readout is wrong." in html
+    assert "A light leak" not in html and "The dark level subtracted from every readout is wrong." in html
     assert (made["folder"] / "r.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -1,4 +1,4 @@
-"""What is looked for in small patches round the discs: how their cells answer to kernels and to copies of the image."""
+"""The response of the discs' cells to kernels and to copies of the image, computed in small patches around the discs."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import correlations
-from psfcore.gap.effect import View
 from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
 from psfcore.gap.evidence.near_discs import NearDiscs, cut
 from psfcore.gap.evidence.search import displaced, place_search
-from psfcore.gap.library.optics import _blurred, _sought_blur
+from psfcore.gap.library.optics import _best_blur, _blurred
+from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Blur
@@ -43,7 +43,7 @@ def near() -> NearDiscs:
 
 
 def by_whole_field(image: np.ndarray, n: int) -> np.ndarray:
-    """How an image moves the cells of disc n, by sensitivities of the whole field, what goes like the level left out."""
+    """The response of the cells of disc n to an image, by sensitivities of the whole field, without the disc's brightness."""
     solution = view().solution
     place, dark = solution.sky.found[n].place, solution.sky.dark[n]
     cells = cells_of(dark, place.x_px, place.y_px)
@@ -57,13 +57,13 @@ def by_whole_field(image: np.ndarray, n: int) -> np.ndarray:
     return np.asarray(moved - level * float(level @ moved) / float(level @ level))
 
 
-def first_cells(answers: np.ndarray, disc: int) -> np.ndarray:
+def first_cells(responses: np.ndarray, disc: int) -> np.ndarray:
     """The cells of one disc among those of all."""
     sizes = [near()._planes[n].shape[0] for n in view().solution.part]
-    return answers[sum(sizes[:disc]) : sum(sizes[: disc + 1])]
+    return responses[sum(sizes[:disc]) : sum(sizes[: disc + 1])]
 
 
-def test_sums_over_displacements_are_those_of_the_definition() -> None:
+def test_sums_over_displacements_match_the_definition() -> None:
     rng = np.random.default_rng(1)
     planes, scene, reach = rng.normal(size=(2, 6, 7)), rng.normal(size=(12, 13)), 3
     found = correlations(planes, scene, reach)
@@ -74,7 +74,7 @@ def test_sums_over_displacements_are_those_of_the_definition() -> None:
             assert found[:, reach + dy, reach + dx] == pytest.approx(by_hand)
 
 
-def test_a_patch_beyond_the_field_is_dark_there() -> None:
+def test_a_patch_is_zero_outside_the_field() -> None:
     plane = np.arange(20.0).reshape(4, 5)
     assert cut(plane, -1, 3, (3, 3)).tolist() == [[0, 0, 0], [3, 4, 0], [8, 9, 0]]
     assert cut(plane, 2, -1, (2, 3)).tolist() == [[0, 10, 11], [0, 15, 16]]
@@ -82,7 +82,7 @@ def test_a_patch_beyond_the_field_is_dark_there() -> None:
 
 
 @pytest.mark.parametrize("disc", [5, 9])
-def test_kernels_and_copies_move_the_cells_of_a_patch_as_those_of_the_whole_field(disc: int) -> None:
+def test_a_patch_gives_the_same_response_as_the_whole_field(disc: int) -> None:
     n = view().solution.part[disc]
     kernel = crop_or_pad(view().kernel, 129)
     change = _blurred(kernel, 1.5, LINE) - kernel
@@ -99,8 +99,8 @@ def test_kernels_and_copies_move_the_cells_of_a_patch_as_those_of_the_whole_fiel
         assert np.linalg.norm(found[:, k] - expected) < 0.5 * np.linalg.norm(expected)
 
 
-def test_a_core_drawn_out_along_a_line_is_found_along_that_line() -> None:
-    """The discs' means hardly show it; their outermost cells do."""
+def test_the_direction_of_a_directional_blur_is_found() -> None:
+    """The discs' means hardly show it, but their outermost cells do."""
     blurred = tuple(
         replace(
             f,
@@ -108,11 +108,11 @@ def test_a_core_drawn_out_along_a_line_is_found_along_that_line() -> None:
         )
         for f in clean().frames
     )
-    width, steps = _sought_blur(View(invert(replace(clean(), frames=blurred))))
+    width, steps = _best_blur(View(invert(replace(clean(), frames=blurred))))
     assert steps == LINE and width <= 1.5
 
 
-def test_a_copy_s_place_and_blur_are_told_by_the_cells() -> None:
+def test_the_cells_give_the_place_and_blur_of_a_copy() -> None:
     dx, dy = 24, 16
     frames = tuple(
         replace(f, pixels=f.pixels + 0.06 * displaced(gaussian_filter(f.pixels, 8.0), dx, dy))
@@ -122,7 +122,7 @@ def test_a_copy_s_place_and_blur_are_told_by_the_cells() -> None:
     assert (x, y) == pytest.approx((dx, dy), abs=4) and blur in (4.0, 8.0)
 
 
-def test_a_field_smaller_than_a_patch_is_looked_at_whole() -> None:
+def test_a_field_smaller_than_a_patch_is_used_whole() -> None:
     plan = default_plan(12, 76, oversampling=1, brightness=8.0)
     small = View(invert(simulate(plan, TRUTH, diffraction(), seed=3).transit))
     found = place_search(small)._near
@@ -136,7 +136,7 @@ def test_a_field_smaller_than_a_patch_is_looked_at_whole() -> None:
     assert np.linalg.norm(first - moved) < 0.05 * np.linalg.norm(moved)
 
 
-def test_cells_without_noise_of_their_own_say_nothing_of_their_own() -> None:
+def test_whitening_handles_cells_without_independent_noise() -> None:
     assert not whitening(np.zeros((3, 3))).any()
     row = np.array([1.0, 2.0, -1.0])
     white = whitening(np.outer(row, row))

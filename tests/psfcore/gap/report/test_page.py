@@ -1,4 +1,4 @@
-"""The page of a gap diagnosis: sentence, verdict, numbers with their intervals, figures, doubts, every image; alone."""
+"""The page of a gap diagnosis: summary, verdict, figures, intervals, cautions and images, in one file without links."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ import pytest
 
 from psfcore.drawing.page import with_error
 from psfcore.gap.diagnose import Diagnosis, Shrinking
+from psfcore.gap.report import bars
 from psfcore.gap.report import plot as gap_plot
+from psfcore.gap.report.bars import draw_effects
 from psfcore.gap.report.page import gap_page, interval_words, unit_words
-from psfcore.gap.report.plot import cell_means, draw_cells, draw_effects, draw_map, gap_png, simulated_of
+from psfcore.gap.report.plot import cell_means, draw_cells, draw_map, gap_png, simulated_of
 from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict.judge import fitted
 from tests.html_page import Tag, check_stands_alone, read_page
@@ -24,7 +26,7 @@ MADE_BY = {"software_version": "1.2.3", "seed": 5, "libraries": {"numpy": "9.9"}
 
 
 def report_of(diagnosis: Diagnosis) -> dict[str, Any]:
-    """As a job writes it and a reader gets it."""
+    """The report as a job writes it and a reader gets it."""
     said = gap_report(diagnosis) | {"provenance": MADE_BY}
     back: dict[str, Any] = json.loads(json.dumps(said, allow_nan=False))
     return back
@@ -37,12 +39,12 @@ def html() -> str:
 
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures of few pixels: quicker where nobody looks at them."""
+    """Small figures, which are quicker to draw."""
     monkeypatch.setattr(gap_plot, "PLOT_DPI", 40)
 
 
 def judged(verdict: Any, *answer: str) -> Diagnosis:
-    """The same numbers, as if they had been judged otherwise."""
+    """The same numbers with another verdict."""
     changed = replace(found().judgement, verdict=verdict, answer=answer)
     if verdict == "tie":
         return replace(found(), judgement=changed)
@@ -65,31 +67,31 @@ def values(tags: list[Tag]) -> dict[str, str]:
     return dict(zip(names, (t.text.replace("\xa0", " ") for t in tags if t.name == "dd"), strict=True))
 
 
-def test_the_page_stands_alone_and_says_first_what_was_found() -> None:
+def test_the_page_needs_no_other_file_and_begins_with_the_summary() -> None:
     check_stands_alone(html())
     tags = read_page(html())
     lead = next(t for t in tags if t.attributes.get("class") == "lead")
     assert lead.text.replace("\xa0", " ") == report_of(found())["sentence"]
-    assert len(html()) < 1.5e6  # a mail takes it
+    assert len(html()) < 1.5e6  # small enough for an e-mail
 
 
-def test_verdict_gap_before_and_after_and_noise_stand_at_the_top() -> None:
+def test_verdict_gap_and_noise_are_at_the_top() -> None:
     gap, said = report_of(found())["gap"], values(read_page(html()))
     assert said["verdict"] == "attributed" and said["answer"] == "dark offset"
     assert said["gap before the refit"] == f"{interval_words(gap['before_refit_pct'])} %"
     assert said["gap, PSF refitted"] == f"{interval_words(gap['rms_pct'])} %"
     assert said["gap with the answer in the model"] == f"{interval_words(gap['after_pct'])} %"
     assert float(said["noise"].split()[0]) == pytest.approx(gap["noise_pct"], rel=0.05)
-    assert "a dark exposure, or a ladder of exposures" in text_of(html())  # what would settle it
+    assert "To confirm the answer, take a dark exposure" in text_of(html())
 
 
-def test_every_figure_has_its_place_and_all_are_one_picture_too() -> None:
+def test_the_page_has_all_figures_and_one_picture_combines_them() -> None:
     names = pictures(read_page(html()))
     assert [name.split()[0] for name in names] == ["Map", "Residuals", "Bars", "Map", "Bars", "Observed"]
     assert gap_png(found(), report_of(found())).startswith(b"\x89PNG")
 
 
-def test_every_effect_is_in_the_table_with_its_closure_and_what_could_not_be_tried_is_told() -> None:
+def test_the_tables_list_all_effects_with_closure_and_those_not_tested() -> None:
     cells = [t.text.replace("\xa0", " ") for t in read_page(html()) if t.name == "td"]
     for effect in report_of(found())["effects"]:
         row = cells.index(effect["name"].replace("_", " "))
@@ -100,7 +102,7 @@ def test_every_effect_is_in_the_table_with_its_closure_and_what_could_not_be_tri
     assert cells[cells.index("saturation fill") + 1] == "no pixel was filled in"
 
 
-def test_the_psf_stands_before_and_with_the_answer() -> None:
+def test_the_psf_is_shown_before_and_with_the_answer() -> None:
     cells = [t.text.replace("\xa0", " ") for t in read_page(html()) if t.name == "td"]
     at = cells.index("total")
     psf = report_of(found())["psf"]
@@ -110,7 +112,7 @@ def test_the_psf_stands_before_and_with_the_answer() -> None:
     assert float(cells[at + 3]) == pytest.approx(moved / psf["refitted"]["total"]["sigma"], abs=0.06)
 
 
-def test_every_image_and_input_is_listed_and_what_made_the_report() -> None:
+def test_images_inputs_and_provenance_are_listed() -> None:
     cells = [t.text.replace("\xa0", " ") for t in read_page(html()) if t.name == "td"]
     for image in report_of(found())["images"]:
         at = cells.index(image["file"])
@@ -125,13 +127,13 @@ def test_every_image_and_input_is_listed_and_what_made_the_report() -> None:
 @pytest.mark.parametrize(
     ("verdict", "answer", "told"),
     [
-        ("none", (), "Without a gap no effect is needed"),
-        ("unknown", (), "None of them is the answer"),
-        ("inconclusive", (), "changes with what is taken for granted"),
+        ("none", (), "There is no gap, so no effect is needed"),
+        ("unknown", (), "No effect is the answer, and no pair of effects is"),
+        ("inconclusive", (), "changes with the assumed floor"),
         ("tie", ("dark_offset", "gain_mismatch"), "Tied: dark offset or gain mismatch."),
     ],
 )
-def test_every_verdict_has_a_page_that_says_what_it_means(
+def test_every_verdict_is_explained_on_its_page(
     verdict: str, answer: tuple[str, ...], told: str, coarse: None
 ) -> None:
     diagnosis = judged(verdict, *answer)
@@ -140,44 +142,44 @@ def test_every_verdict_has_a_page_that_says_what_it_means(
     text = text_of(page)
     assert told in text and values(read_page(page))["verdict"] == verdict
     assert ("No effect was added to the model" in text) is (verdict != "tie")
-    # Slices before and after are there where something was added.
+    # Slices are shown only if an effect was added to the model.
     assert any(name.startswith("Observed") for name in pictures(read_page(page))) is (verdict == "tie")
-    # And bars of closure where there is a gap to close.
+    # Bars of closure are shown only if there is a gap.
     assert ("Bars of held-out closure by effect" in pictures(read_page(page))) is (verdict != "none")
-    assert ("What would tell them apart: a dark exposure" in text) is (verdict == "tie")
-    assert ("with the answer” is with the best of those that are tied: dark offset" in text) is (
+    assert ("To tell them apart, take a dark exposure" in text) is (verdict == "tie")
+    assert ("with the answer” means with the best of the tied effects: dark offset" in text) is (
         verdict == "tie"
     )
     assert ("a patch of added light" in text) is (verdict in ("unknown", "inconclusive"))
 
 
-def test_a_gap_of_the_discs_beside_what_shows_in_the_lit_parts_is_told_apart(coarse: None) -> None:
+def test_an_unexplained_gap_in_the_discs_is_reported_separately(coarse: None) -> None:
     diagnosis = judged("inconclusive")
     diagnosis = replace(diagnosis, judgement=replace(diagnosis.judgement, discs_unexplained=True))
     report = report_of(diagnosis)
-    told = "dark offset shows in the lit parts, and what leaves a gap in the discs beside it cannot be told"
-    assert told in report["sentence"] and "taken for granted" not in report["sentence"]
+    told = "dark offset explains the unocculted field, but the cause of the gap in the discs cannot be identified"
+    assert told[1:] in report["sentence"] and "assumed floor" not in report["sentence"]
     text = text_of(gap_page(diagnosis, report).html())
-    assert f"No effect is the answer: {told}." in text and "taken for granted" not in text
+    assert f"No effect is the answer: {told}." in text and "assumed floor" not in text
 
 
-def test_a_tie_beside_an_effect_that_is_certain_says_which_is_which(coarse: None) -> None:
+def test_a_tie_names_the_certain_and_the_tied_effects(coarse: None) -> None:
     both = judged("tie", "core_blur", "dark_offset", "gain_mismatch")
     both = replace(both, judgement=replace(both.judgement, certain=("dark_offset",)))
     report = report_of(both)
     assert report["ties"] == [["core_blur", "gain_mismatch"]]
-    told = "dark offset, and beside it core blur or gain mismatch"
-    assert f"{told}, which these data cannot tell apart" in report["sentence"]
+    told = "dark offset, together with core blur or gain mismatch"
+    assert f"These data cannot tell which effect causes it: {told}." in report["sentence"]
     assert "a dark exposure" not in report["would_separate"] and "both gain modes" in report["would_separate"]
     assert f"Tied: {told}." in text_of(gap_page(both, report).html())
     rows = [
         {"name": name}
         for name in ("dark_offset", "core_blur", "core_blur + dark_offset", "persistence + dark_offset")
     ]
-    assert [gap_plot._chosen(row, report) for row in rows] == [False, False, True, False]
+    assert [bars._chosen(row, report) for row in rows] == [False, False, True, False]
 
 
-def test_effects_that_act_together_stand_before_those_that_alone_do_more(coarse: None) -> None:
+def test_effects_of_a_pair_come_before_effects_that_explain_more_alone(coarse: None) -> None:
     judgement = found().judgement
     alone = [one for one in judgement.tried if one.label != "dark_offset"]
     last = alone[-1].label
@@ -193,7 +195,7 @@ def test_effects_that_act_together_stand_before_those_that_alone_do_more(coarse:
     assert [fit["name"] for fit in report["effects"]][:2] == ["dark_offset", last]
     assert len(report["effects"]) == len(judgement.tried)
     assert [fit["name"] for fit in report["together"]] == [pair.label]
-    # What was measured in the lit parts would fit them whatever the other did to them.
+    # An effect measured in the unocculted field comes second, because it fits that field whatever the other does.
     measured = replace(both.evidence, numbers={both.evidence.columns["dark_offset"][0]: 9})
     report_so = report_of(replace(both, model=replace(both.model, evidence=measured)))
     assert [fit["name"] for fit in report_so["effects"]][:2] == [last, "dark_offset"]
@@ -202,7 +204,7 @@ def test_effects_that_act_together_stand_before_those_that_alone_do_more(coarse:
     assert at == sorted(at)
 
 
-def test_without_images_held_out_it_says_so_and_draws_no_residuals(coarse: None) -> None:
+def test_without_held_out_images_the_page_shows_no_residuals(coarse: None) -> None:
     few = replace(judged("none"), residual=None)
     page = gap_page(few, report_of(few)).html()
     check_stands_alone(page)
@@ -211,7 +213,7 @@ def test_without_images_held_out_it_says_so_and_draws_no_residuals(coarse: None)
     assert gap_png(few, report_of(few)).startswith(b"\x89PNG")
 
 
-def test_a_malicious_file_name_is_text(coarse: None) -> None:
+def test_a_malicious_file_name_is_shown_as_text(coarse: None) -> None:
     report = report_of(found())
     name = "<script>alert(1)</script>.fits"
     report["images"][0]["file"] = name
@@ -240,7 +242,7 @@ def test_the_map_shows_every_disc_at_its_place() -> None:
     assert charts[0].collections[0].get_clim() == charts[1].collections[0].get_clim()
 
 
-def test_bars_of_effects_are_their_closure_and_what_leaves_the_chart_is_told() -> None:
+def test_bars_show_closure_and_mark_values_outside_the_chart() -> None:
     from matplotlib.figure import Figure
 
     report = report_of(found())
@@ -255,7 +257,7 @@ def test_bars_of_effects_are_their_closure_and_what_leaves_the_chart_is_told() -
     assert axes.get_yticklabels()[0].get_text() == "dark offset  (answer)"
 
 
-def test_cells_are_means_of_all_discs_and_noise_alone_gets_no_strong_colour() -> None:
+def test_cells_show_means_of_all_discs_and_noise_has_no_strong_colour() -> None:
     from matplotlib.figure import Figure
 
     discs = found().evidence.discs
@@ -281,8 +283,8 @@ def test_cells_are_means_of_all_discs_and_noise_alone_gets_no_strong_colour() ->
     assert colours.min() > 0.75  # near white
 
 
-def test_a_simulated_image_with_the_answer_holds_what_the_effect_does() -> None:
-    """The PSF that was fitted beside it, and the effect itself, so that the observed image stays as it is."""
+def test_a_simulated_image_with_the_answer_contains_the_effect() -> None:
+    """It is the refitted PSF's image plus the change by the effect, comparable with the unchanged observed image."""
     diagnosis = found()
     n = diagnosis.evidence.discs[0].index
     frame, dark = diagnosis.solution.transit.frames[n], diagnosis.solution.sky.dark[n]

@@ -1,13 +1,14 @@
-"""What the lit parts say: images of one pointing show one scene, so blocks of them are compared with each other.
+"""What the unocculted field shows: images of one pointing show the same scene, so their blocks are compared.
 
-The light that the occulter hides is put back. In block b of image n
+The light that the occulter hides is restored first. In block b of image n
 
     U_nb = mu_b (1 + g_n) + sum over parameters of theta e_nb + noise            Eq. (1)
 
-mu_b, the scene, is free in every block, and g_n, the brightness of an image, in every image: the Sun and the shutter
-are not steady to a percent. g_n has a prior, of the width that images of one pointing, gain mode and exposure show among
-themselves, so that a difference between modes can be told from it. A bright block that differs between images far more
-than the others do is the Sun's own, a brightening that flickers: where it is asked what is left, its variance is what it shows.
+The scene mu_b is free in every block. The brightness g_n is free in every image, because the Sun and the shutter vary by
+about a percent. The prior of g_n has the width observed among images of the same pointing, gain mode and exposure, so
+that a difference between modes can be separated from it. A bright block that varies between images far more than the
+other blocks is a change of the Sun, such as a flickering brightening. When the remaining residuals are judged, such a
+block gets its observed variance.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.gap.effect import View
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution
 from psfcore.transit.occulter import disc_distance
 
@@ -27,23 +28,23 @@ Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 BLOCK_PX = 32
-LEAST_BLOCKS = 5  # along the shorter side; smaller images have smaller blocks
+LEAST_BLOCKS = 5  # along the shorter side: small images get smaller blocks
 FREE_OF_DISC_PX = 20.0  # beyond its edge
 WIDEST_GAIN = 0.05
 LEAST_GAIN = 1e-5
-FLOOR = 5e-4  # of a block's level: no template is more exact
+FLOOR = 5e-4  # relative error of a block's level: no template is more exact
 LEAST_IMAGES = 3
-RESTLESS = 4.0  # times the median block's chi2 a degree of freedom
+FLICKERING = 4.0  # a flickering block has more than this times the median chi2 per degree of freedom
 
 
 @dataclass(frozen=True, eq=False)
-class LitBlocks:
-    """Blocks of all images: (images, blocks) in DN/s.
+class UnoccultedBlocks:
+    """Blocks of all images: arrays (images, blocks) in DN/s.
 
-    levels: means, the hidden light put back. variance: of noise, and of a floor. free: which are away from disc and
-    filled pixels. means: of the pointing's mean image. errors: (columns, images, blocks), what a unit of each column
-    does. fov: pointing of each image. kind: images of one pointing, gain mode and exposure have one number. part: images
-    that are used at all.
+    levels: means, with the hidden light restored. variance: of noise, and of a floor. free: whether a block is away from
+    the disc and from filled pixels. means: of the pointing's mean image. errors: (columns, images, blocks), the change by
+    one unit of each column. pointing: of each image. kind: one number for each combination of pointing, gain mode and
+    exposure. part: whether an image is used.
     """
 
     levels: Matrix
@@ -51,17 +52,17 @@ class LitBlocks:
     free: NDArray[np.bool_]
     means: Matrix
     errors: NDArray[np.float64]
-    fov: NDArray[np.int64]
+    pointing: NDArray[np.int64]
     kind: NDArray[np.int64]
     part: NDArray[np.bool_]
 
-    def with_restless_blocks(self) -> LitBlocks:
-        """The same with the variance of restless blocks raised to what they show."""
+    def with_flickering_blocks(self) -> UnoccultedBlocks:
+        """The same blocks, with the variance of flickering blocks raised to the observed one."""
         variance = self.variance.copy()
         gains = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
         steady = self.levels / (1 + gains[:, None])
-        for fov in np.unique(self.fov):
-            here = np.flatnonzero((self.fov == fov) & self.part)
+        for pointing in np.unique(self.pointing):
+            here = np.flatnonzero((self.pointing == pointing) & self.part)
             weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
             images = (weight > 0).sum(axis=0)
             used = images >= LEAST_IMAGES
@@ -70,14 +71,14 @@ class LitBlocks:
             mean = (steady[here] * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
             spread = (weight * (steady[here] - mean) ** 2).sum(axis=0) / np.maximum(images - 1, 1)
             usual = max(float(np.median(spread[used])), 1.0)
-            # What the detector does to faint signals shows in faint blocks: those are left alone.
+            # Faint blocks stay as they are: they show what the detector does to faint signals.
             bright = used & (mean > float(np.median(mean[used])))
-            variance[here] *= np.where(bright & (spread > RESTLESS * usual), spread / usual, 1.0)
+            variance[here] *= np.where(bright & (spread > FLICKERING * usual), spread / usual, 1.0)
         return replace(self, variance=variance)
 
     @cached_property
     def gain_width(self) -> float:
-        """How much the brightness of images of one kind spreads, a share."""
+        """The relative spread of the brightness of images of one kind."""
         free = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
         spread: list[float] = []
         for kind in np.unique(self.kind[self.part]):
@@ -86,19 +87,21 @@ class LitBlocks:
                 spread.extend((free[here] - np.median(free[here])) ** 2 * here.sum() / (here.sum() - 1))
         return max(float(np.sqrt(np.mean(spread))), LEAST_GAIN) if spread else WIDEST_GAIN
 
-    def equations(self, columns: Sequence[int], images: Sequence[int] | None = None) -> LitEquations:
-        """Normal equations of these columns from some images (none: all), scene and brightness free."""
+    def equations(self, columns: Sequence[int], images: Sequence[int] | None = None) -> UnoccultedEquations:
+        """Normal equations of these columns from some images (None: all images), with free scene and brightness."""
         chosen = (
             np.flatnonzero(self.part) if images is None else np.array([n for n in images if self.part[n]])
         )
         return self._equations(chosen, np.asarray(columns, dtype=int), self.gain_width)
 
-    def _equations(self, images: NDArray[np.intp], columns: NDArray[np.intp], width: float) -> LitEquations:
+    def _equations(
+        self, images: NDArray[np.intp], columns: NDArray[np.intp], width: float
+    ) -> UnoccultedEquations:
         size = columns.size
         count = self.levels.shape[0]
         normal, score, chi2, freedom = np.zeros((size + count,) * 2), np.zeros(size + count), 0.0, 0
-        for fov in np.unique(self.fov[images]) if images.size else []:
-            here = images[self.fov[images] == fov]
+        for pointing in np.unique(self.pointing[images]) if images.size else []:
+            here = images[self.pointing[images] == pointing]
             if here.size < LEAST_IMAGES:
                 continue
             weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
@@ -121,14 +124,14 @@ class LitBlocks:
     def held_out(
         self, columns: Sequence[int], images: Sequence[int], fitted: Sequence[int]
     ) -> tuple[Vector, Matrix]:
-        """Images against the scene of others, in units of the noise, and what a unit of each column takes from that.
+        """Held-out images minus the scene of the fitted ones, in units of the noise, and the Jacobian of this difference.
 
-        (n,) and (columns, n): the blocks of each image, and its brightness in units of how much this spreads.
+        (n,) and (columns, n): the blocks of each image, then its brightness in units of `gain_width`.
         """
         errors = self.errors[list(columns)]
-        residuals, answered = [np.zeros(0)], [np.zeros((len(columns), 0))]
+        residuals, jacobians = [np.zeros(0)], [np.zeros((len(columns), 0))]
         for n in images:
-            others = [k for k in fitted if self.fov[k] == self.fov[n] and self.part[k]]
+            others = [k for k in fitted if self.pointing[k] == self.pointing[n] and self.part[k]]
             if not self.part[n] or len(others) < LEAST_IMAGES - 1:
                 continue
             here = np.array(others)
@@ -147,17 +150,17 @@ class LitBlocks:
 
             scene = (self.levels[here] * weight).sum(axis=0)[use] / total[use]
             residuals.append(in_noise(self.levels[n, use] - scene))
-            answered.append(
+            jacobians.append(
                 in_noise(errors[:, n, use] - (errors[:, here] * weight).sum(axis=1)[:, use] / total[use])
             )
-        return np.concatenate(residuals), np.concatenate(answered, axis=1)
+        return np.concatenate(residuals), np.concatenate(jacobians, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
-class LitEquations:
-    """Normal equations of some columns, brightness and scene taken out; chi2 where none acts; degrees of freedom.
+class UnoccultedEquations:
+    """Normal equations of some columns, with brightness and scene eliminated; chi2 and gains without any of the columns.
 
-    gains: brightness of each image, where none acts.
+    freedom: degrees of freedom. gains: brightness of each image.
     """
 
     normal: Matrix
@@ -169,12 +172,12 @@ class LitEquations:
 
 def _without_gains(
     normal: Matrix, score: Vector, chi2: float, freedom: int, size: int, width: float, *, used_images: int
-) -> LitEquations:
+) -> UnoccultedEquations:
     of_gains = normal[size:, size:]
     inverse = np.linalg.inv(of_gains + np.eye(of_gains.shape[0]) / width**2)
     cross = normal[:size, size:]
     gains = inverse @ score[size:]
-    return LitEquations(
+    return UnoccultedEquations(
         normal=normal[:size, :size] - cross @ inverse @ cross.T,
         score=score[:size] - cross @ gains,
         chi2=chi2 - float(score[size:] @ gains),
@@ -184,12 +187,12 @@ def _without_gains(
 
 
 def block_px(shape: tuple[int, int]) -> int:
-    """Edge of a block: BLOCK_PX, less in small images."""
+    """Edge length of a block, px: BLOCK_PX, or less in small images."""
     return max(1, min(BLOCK_PX, min(shape) // LEAST_BLOCKS))
 
 
 def blocks(plane: NDArray[np.floating]) -> Vector:
-    """Means of a plane's blocks; what is left at the far edges is dropped."""
+    """Means of a plane's blocks; an incomplete block at the far edges is dropped."""
     edge = block_px((plane.shape[0], plane.shape[1]))
     rows, columns = (n // edge for n in plane.shape)
     cut = plane[: rows * edge, : columns * edge]
@@ -197,21 +200,21 @@ def blocks(plane: NDArray[np.floating]) -> Vector:
 
 
 def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:
-    """Which pixels [y, x] of image n do not show what its pointing's other images do: round its disc, and filled in."""
+    """Mask [y, x] of the pixels of image n that cannot be compared with other images: around its disc, and filled pixels."""
     place, filled = solution.sky.found[n].place, solution.transit.frames[n].filled
     near = disc_distance(solution.transit.shape, place) < place.radius_px + FREE_OF_DISC_PX
     return near if filled is None else near | filled
 
 
-def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
-    """Blocks of all images, with room for the errors of some columns; the caller fills those in."""
+def unocculted_blocks(view: View, columns: int, progress: Progress) -> UnoccultedBlocks:
+    """Blocks of all images, with zeros for the errors of some columns; the caller fills them in."""
     solution = view.solution
     transit = solution.transit
     levels, variance, free, means = [], [], [], []
     for n, frame in enumerate(transit.frames):
-        progress("lit parts", n, len(transit.frames))
+        progress("unocculted field", n, len(transit.frames))
         levels.append(blocks(view.unocculted[n]))
-        means.append(blocks(view.lit[n]))
+        means.append(blocks(view.pointing_means[n]))
         pixels = block_px(transit.shape) ** 2
         noise = transit.noise.variance(means[-1], frame.exposure_s) / pixels
         variance.append(noise + (FLOOR * levels[-1]) ** 2)
@@ -219,13 +222,13 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
     kinds = [(f.fov, f.gain_mode, f.exposure_s) for f in transit.frames]
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     shape = np.shape(levels)
-    return LitBlocks(
+    return UnoccultedBlocks(
         levels=np.array(levels),
         variance=np.array(variance),
         free=np.array(free),
         means=np.array(means),
         errors=np.zeros((columns, *shape)),
-        fov=np.array([f.fov for f in transit.frames]),
+        pointing=np.array([f.fov for f in transit.frames]),
         kind=np.array([number[kind] for kind in kinds]),
         part=np.ones(len(transit.frames), dtype=bool),
     )

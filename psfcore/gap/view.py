@@ -1,0 +1,220 @@
+"""The view of a solution from which effects are computed: its scenes, its images and its PSF.
+
+The images are the expected ones, not the observed ones: a template made of a pixel's own noise would fit that noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.scatter.inversion import Solution
+from psfcore.scatter.optics import Blur, Lanes, put
+from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, patch_window
+
+Field = NDArray[np.float32]
+Vector = NDArray[np.float64]
+DISC_MARGIN_PX = 2.0
+KEPT_BYTES = 2**25  # of one kind of field; a few fields are kept however large they are
+LEAST_KEPT = 4
+
+
+class _LazyFields(Sequence[Field]):
+    """Fields of all images, each computed when it is first used. Read-only.
+
+    At most KEPT_BYTES are kept (thirty images of 512 px), but always the last LEAST_KEPT.
+    """
+
+    def __init__(self, count: int, field: Callable[[int], Field]) -> None:
+        self._count, self._field = count, field
+        self._kept: dict[int, Field] = {}
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        if index not in self._kept:
+            field = self._field(index)
+            if (len(self._kept) + 1) * field.nbytes > KEPT_BYTES and len(self._kept) >= LEAST_KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[index] = field
+        return self._kept[index]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The data from which effects are computed: the solution, and the images that the model expects.
+
+    The images are the expected ones, not the observed ones: a template made of a pixel's own noise would fit that noise.
+    """
+
+    solution: Solution
+
+    @cached_property
+    def kept(self) -> dict[type, Any]:
+        """Results that are computed once per view, such as searches, by their type."""
+        return {}
+
+    @cached_property
+    def kernel(self) -> Vector:
+        """The total PSF of the solution [y, x]."""
+        return self.solution.total.kernel(self.solution.inversion.coordinates)
+
+    @cached_property
+    def slope_kernels(self) -> tuple[Vector, ...]:
+        """The derivative of the kernel along each coordinate of the PSF's shape [y, x]."""
+        return tuple(self.solution.total.slopes(self.solution.inversion.coordinates))
+
+    @cached_property
+    def slopes(self) -> tuple[Blur, ...]:
+        """The derivatives of the kernel, ready to be convolved with fields."""
+        solution = self.solution
+        return tuple(
+            Blur(slope, solution.transit.shape, threads=solution.threads) for slope in self.slope_kernels
+        )
+
+    @cached_property
+    def expected(self) -> Sequence[Field]:
+        """Every image as the model predicts it [y, x], DN/s."""
+        optics = self.solution.optics
+        return _LazyFields(
+            len(self.solution.transit.frames), lambda n: optics.field(optics.convolve(self.occulted_scene(n)))
+        )
+
+    def behind(self, n: int) -> Field | None:
+        """The scene that the occulter of image n hides [y, x], DN/s, from neighbouring images in time; None if no neighbour shows it."""
+        solution = self.solution
+        places = [found.place for found in solution.sky.found]
+        chosen = neighbours_of(n, solution.transit.frames, places, solution.transit.noise)
+        if not chosen:
+            return None
+        return np.asarray(
+            np.mean([solution.optics.field(solution.sky.scenes[k]) for k in chosen], axis=0), dtype=np.float32
+        )
+
+    @cached_property
+    def unocculted(self) -> Sequence[Field]:
+        """Every image as observed, with the light restored that its occulter hides [y, x], DN/s."""
+        return _LazyFields(len(self.solution.transit.frames), self._put_back)
+
+    def _put_back(self, n: int) -> Field:
+        solution = self.solution
+        optics, seen = solution.optics, solution.transit.frames[n].pixels
+        behind = self.behind(n)
+        if behind is None:
+            return seen
+        hidden = behind * coverage(solution.transit.shape, solution.sky.found[n].place)
+        return seen + optics.field(optics.convolve(optics.lanes(hidden.astype(np.float32))))
+
+    @cached_property
+    def pointing_means(self) -> list[Field]:
+        """For every image the mean unocculted image of its pointing [y, x], DN/s: what all these images show, up to their brightness.
+
+        All images of a pointing get the same array. A template made from it differs between images only where the effect does.
+        """
+        fov = [frame.fov for frame in self.solution.transit.frames]
+        mean: dict[int, Field] = {}
+        for one in sorted(set(fov)):
+            images = [n for n, f in enumerate(fov) if f == one]
+            total = np.zeros(self.solution.transit.shape)
+            for n in images:
+                total += self.unocculted[n]
+            mean[one] = (total / len(images)).astype(np.float32)
+        return [mean[f] for f in fov]
+
+    @cached_property
+    def _scene_sums(self) -> dict[int, tuple[Vector, Vector]]:
+        """For each pointing: the sum of its scenes without the pixels around each disc, and the number of scenes in each pixel."""
+        solution = self.solution
+        sums: dict[int, tuple[Vector, Vector]] = {}
+        for n, frame in enumerate(solution.transit.frames):
+            scene, away = self._own(n)
+            total, count = sums.get(frame.fov, (np.zeros(scene.shape), np.zeros(scene.shape)))
+            sums[frame.fov] = (total + scene * away, count + away)
+        return sums
+
+    def _own(self, n: int) -> tuple[Field, NDArray[np.bool_]]:
+        """The scene of frame n, and a mask of the pixels away from its disc."""
+        solution = self.solution
+        place = solution.sky.found[n].place
+        away = disc_distance(solution.transit.shape, place) > place.radius_px + DISC_MARGIN_PX
+        return solution.optics.field(solution.sky.scenes[n]), away
+
+    def pointing_scene(self, n: int) -> Field:
+        """The mean scene of frame n's pointing, from all its images without their discs [y, x], DN/s."""
+        total, count = self._scene_sums[self.solution.transit.frames[n].fov]
+        own, _ = self._own(n)
+        return np.asarray(np.where(count > 0, total / np.maximum(count, 1), own), dtype=np.float32)
+
+    @cached_property
+    def scenes(self) -> Sequence[Field]:
+        """The scene of every image, from the other images of its pointing, scaled to its own brightness, with nothing hidden [y, x], DN/s.
+
+        A template made from the image's own scene would contain the noise of its residual, and would fit that noise.
+        """
+        return _LazyFields(len(self.solution.transit.frames), self._scene)
+
+    def _scene(self, n: int) -> Field:
+        own, away = self._own(n)
+        total, count = self._scene_sums[self.solution.transit.frames[n].fov]
+        others = count - away
+        mean = (total - own * away) / np.maximum(others, 1)
+        both = (others > 0) & away
+        # Shutter and Sun vary by about a percent: without this scaling an effect would keep that error of brightness.
+        brightness = _ratio(float(own[both].sum(dtype=np.float64)), float(mean[both].sum()))
+        return np.asarray(np.where(others > 0, mean * brightness, own), dtype=np.float32)
+
+    def uncovered(self, n: int) -> Field:
+        """The share of each pixel [y, x] that frame n's occulter leaves open.
+
+        It is 1 where no other image shows the scene: there the scene is the image's own, in which the occulter is already dark.
+        """
+        solution = self.solution
+        shape, place = solution.transit.shape, solution.sky.found[n].place
+        window = patch_window(shape, place, 1.0)
+        shown = self._scene_sums[solution.transit.frames[n].fov][1][window] > 0
+        out = np.ones(shape, np.float32)
+        out[window] -= (coverage(shape, place)[window] * shown).astype(np.float32)
+        return out
+
+    def occulted_scene(self, n: int) -> Lanes:
+        """The scene of image n with its occulter in front, in the engine's memory order. Read-only."""
+        return self._occulted_scenes[n]
+
+    @cached_property
+    def _occulted_scenes(self) -> Sequence[Lanes]:
+        return _LazyFields(len(self.solution.transit.frames), self._occulted_scene)
+
+    def _occulted_scene(self, n: int) -> Lanes:
+        scene = self.solution.optics.lanes(self.scenes[n] * self.uncovered(n))
+        put(scene, self.solution.sky.dark[n], 0.0)
+        return scene
+
+    @cached_property
+    def places(self) -> tuple[Field, Field]:
+        """Detector x and y of each pixel, from -0.5 to 0.5 across the image."""
+        ny, nx = self.solution.transit.shape
+        x = ((np.arange(nx) + 0.5) / nx - 0.5).astype(np.float32)
+        y = ((np.arange(ny) + 0.5) / ny - 0.5).astype(np.float32)
+        return np.broadcast_to(x, (ny, nx)), np.broadcast_to(y[:, None], (ny, nx))
+
+    def exposure_s(self, n: int) -> float:
+        """Exposure time of frame n, s."""
+        return self.solution.transit.frames[n].exposure_s
+
+    def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
+        """dH x for frame n [y, x], DN/s. weight: multiplies the scene, by where its light comes from."""
+        scene = self.occulted_scene(n)
+        if weight is not None:
+            scene = scene * slope.lanes(weight)
+        return slope.field(slope.convolve(scene))
+
+
+def _ratio(one: float, other: float) -> float:
+    """Ratio of two sums of light, not negative; 1 if the second is not positive."""
+    return max(one, 0.0) / other if other > 0 else 1.0

@@ -1,0 +1,27 @@
+"""A small clean transit, its solution, and effects by name, for several tests."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from psfcore.gap.library.registry import LIBRARY
+from psfcore.scatter.inversion import Solution, invert
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.transit import simulate
+from psfcore.transit.transit import Transit
+from tests.transit_files import TRUTH, diffraction
+
+
+@cache
+def clean(images: int = 18) -> Transit:
+    plan = default_plan(images, 128, oversampling=1, brightness=8.0)
+    return simulate(plan, TRUTH, diffraction(), seed=3).transit
+
+
+@cache
+def solution() -> Solution:
+    return invert(clean())
+
+
+def effect(name: str):  # type: ignore[no-untyped-def]
+    return next(one for one in LIBRARY if one.name == name)

@@ -1,0 +1,120 @@
+"""Full refits with effects in the model, and a second effect after the first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from psfcore.errors import DataError
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.evidence import gather
+from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.search import displaced
+from psfcore.gap.library.optics import (
+    _copy,
+)
+from psfcore.gap.verdict import correction
+from psfcore.gap.verdict import judge as judging
+from psfcore.gap.verdict.correction import _with_noise_of, add_to_model, beyond, images_without
+from psfcore.gap.verdict.judge import fitted
+from psfcore.gap.view import View
+from psfcore.scatter.inversion import invert
+from psfcore.transit.transit import Transit
+from tests.psfcore.gap.small_transits import clean, effect
+
+
+@pytest.mark.slow
+def test_a_second_effect_is_found_in_the_discs_after_one_of_the_unocculted_field() -> None:
+    """A gain mismatch, which the discs do not show, and a light leak, which only the discs show."""
+    transit = clean()
+    x = np.indices(transit.shape)[1] / 128 - 0.5
+    frames = tuple(
+        replace(
+            frame,
+            pixels=(
+                (frame.pixels + 6.0 + 20.0 * x) * (1.1 if (frame.gain_mode or "") == "combined" else 1.0)
+            ).astype(np.float32),
+        )
+        for frame in transit.frames
+    )
+    found = invert(replace(transit, frames=frames))
+    library = [effect(name) for name in ("gain_mismatch", "intensity_gradient", "dark_offset", "core_blur")]
+    model = LinearModel(gather(found, library), FLOOR)
+    best = fitted(model, [library[0]])
+    added = add_to_model(found, [library[0]], best, model)
+    second = judging._beside(model, best, lambda tried: beyond(added, library, model))
+    assert second is not None and second.verdict == "attributed"
+    assert second.answer == ("gain_mismatch", "intensity_gradient")
+    nothing = judging._beside(model, best, judging.no_refit)
+    assert nothing is None
+
+
+def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An offset of 1 DN; the second round also subtracts light that was never added."""
+    offset = effect("dark_offset")
+    frames = tuple(
+        replace(frame, pixels=frame.pixels + np.float32(1.0 / frame.exposure_s)) for frame in clean().frames
+    )
+    found = invert(replace(clean(), frames=frames))
+    model = LinearModel(gather(found, [offset]), FLOOR)
+    taken_out: list[float] = []
+    as_it_is = correction.images_without
+
+    def spoiled(
+        transit: Transit, view: View, effects: Sequence[Effect], theta: NDArray[np.float64]
+    ) -> Transit:
+        taken_out.append(float(theta[0]))
+        again = as_it_is(transit, view, effects, theta)
+        if len(taken_out) == 1:
+            return again
+        light = np.linspace(0.0, 40.0, again.shape[1], dtype=np.float32)
+        return replace(again, frames=tuple(replace(f, pixels=f.pixels + light) for f in again.frames))
+
+    monkeypatch.setattr(correction, "images_without", spoiled)
+    monkeypatch.setattr(correction, "SETTLED", 0.0)
+    added = add_to_model(found, [offset], fitted(model, [offset]), model)
+    value, sigma, _ = added.values["offset"]
+    assert len(taken_out) == 2 and added.rounds == 1
+    assert value == pytest.approx(1.0, abs=4 * sigma)
+
+
+def test_a_share_of_light_cannot_be_negative() -> None:
+    """Images that lost a share of their columns' light: a smear that adds light must not explain them."""
+    smear = effect("column_smear")
+    frames = tuple(
+        replace(frame, pixels=frame.pixels - np.float32(0.03) * frame.pixels.mean(axis=0))
+        for frame in clean().frames
+    )
+    found = invert(replace(clean(), frames=frames))
+    model = LinearModel(gather(found, [smear]), FLOOR)
+    below = fitted(model, [smear], any_sign=True)
+    assert all(value < 0 for value, _, _ in below.values.values())
+    with pytest.raises(DataError, match="expected column_smear to add light") as caught:
+        add_to_model(found, [smear], below, model)
+    assert caught.value.code == "effect-unseen"
+
+
+def test_a_subtracted_effect_scales_with_the_brightness_of_the_image() -> None:
+    """A copy in every image, and brightness that varies by 2 %: after subtraction the images of a pointing agree as well."""
+    rng = np.random.default_rng(4)
+    frames = tuple(
+        replace(
+            frame,
+            pixels=(
+                (frame.pixels + 0.4 * displaced(gaussian_filter(frame.pixels, 12.0), 40, -30))
+                * (1 + 0.02 * rng.standard_normal())
+            ).astype(np.float32),
+        )
+        for frame in clean().frames
+    )
+    found = invert(replace(clean(), frames=frames))
+    view, copy = View(found), replace(effect("ghost"), changes=lambda view: _copy(12.0, 40, -30), held=None)
+    before = gather(found, [copy], view=view)
+    without = invert(images_without(found.transit, view, [copy], np.array([0.4])))
+    after = _with_noise_of(before, gather(without, [copy]))
+    assert after.all_unocculted.chi2 < before.all_unocculted.chi2 * 1.02
