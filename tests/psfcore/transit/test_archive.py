@@ -8,6 +8,7 @@ import shutil
 import stat
 import struct
 import tarfile
+import time
 import tracemalloc
 import warnings
 import zipfile
@@ -20,7 +21,7 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.transit import archive
+from psfcore.transit import admission
 from psfcore.transit.archive import (
     START_BYTES,
     ArchiveLimits,
@@ -293,7 +294,7 @@ def test_more_comes_out_than_goes_in(folder: Path, tmp_path: Path, monkeypatch: 
         path = make(tmp_path / "a", [*members_of(folder), ("x.fits", bytes(5 * MIB))])
         assert len(list_archive(path, LIMITS).files) == 6, "little comes out: the ratio does not count"
         with monkeypatch.context() as patch:
-            patch.setattr(archive, "RATIO_FLOOR_BYTES", MIB)
+            patch.setattr(admission, "RATIO_FLOOR_BYTES", MIB)
             refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_ratio=20))
 
 
@@ -343,6 +344,101 @@ def test_a_name_without_end(tmp_path: Path, kind: bytes) -> None:
     path = endless_gz(tmp_path / "a.tar.gz", tar_header("x", 2**33, kind), mib=32)
     with held_below(8 * MIB):
         refused(path, tmp_path / "out", "archive-broken")
+
+
+def extended(kind: bytes, text: bytes) -> bytes:
+    """An extended header of a tar and its text, filled up to whole blocks."""
+    return tar_header("x", len(text), kind) + text + bytes(-len(text) % 512)
+
+
+def record(key: bytes, value: bytes) -> bytes:
+    """A pax record, whose length counts itself."""
+    length = len(key) + len(value) + 3
+    while len(b"%d" % length) + len(key) + len(value) + 3 != length:
+        length += 1
+    return b"%d %s=%s\n" % (length, key, value)
+
+
+A_FILE = tar_header("x.fits", 4) + b"1234" + bytes(508)
+SPARSE_MAP = record(b"GNU.sparse.major", b"1") + record(b"GNU.sparse.minor", b"0")
+TAR_ATTACKS = {
+    "many headers before one member": (
+        extended(b"x", record(b"comment", b"a")) * 400 + A_FILE,
+        "archive-broken",
+    ),
+    "many long names": (extended(b"L", b"a" * 5000) * 50 + A_FILE, "archive-broken"),
+    "a long run of digits": (extended(b"x", b"1" * 60_000) + A_FILE, "archive-broken"),
+    "digits in a value": (extended(b"x", record(b"comment", b"1" * 60_000)) + A_FILE, "archive-broken"),
+    "records inside each other": (extended(b"x", b"2 " * 30_000 + b"=") + A_FILE, "archive-broken"),
+    "a record that is too long": (extended(b"x", b"99 path=x.fits\n") + A_FILE, "archive-broken"),
+    "a negative header": (tar_header("x", -4096, b"x") + A_FILE, "archive-broken"),
+    "a negative file": (tar_header("x", -4096) + A_FILE, "archive-not-plain"),
+    "a negative size in a record": (extended(b"x", record(b"size", b"-99999")) + A_FILE, "archive-not-plain"),
+    "a size beyond the file": (extended(b"x", record(b"size", b"99999")) + A_FILE, "archive-broken"),
+    "a sparse file of GNU": (tar_header("x.fits", 512, b"S") + b"9" * 2**20, "archive-not-plain"),
+    "a sparse name": (extended(b"x", record(b"GNU.sparse.name", b"y")) + A_FILE, "archive-not-plain"),
+    "a sparse size": (extended(b"g", record(b"GNU.sparse.realsize", b"9")) + A_FILE, "archive-not-plain"),
+    "a sparse map": (
+        extended(b"x", SPARSE_MAP) + tar_header("x.fits", 2**30) + b"9999999\n" + b"1\n" * 2**20,
+        "archive-broken",
+    ),
+    "many global records": (
+        b"".join(extended(b"g", record(b"k%d" % n, b"v")) + tar_header(f".{n}", 0) for n in range(99))
+        + A_FILE,
+        "archive-broken",
+    ),
+    "a path in a record that climbs": (
+        extended(b"x", record(b"path", b"../x.fits")) + A_FILE,
+        "archive-climbs",
+    ),
+    "a path for all that climbs": (extended(b"g", record(b"path", b"/x.fits")) + A_FILE, "archive-climbs"),
+    "a damaged second header": (A_FILE + b"x" * 512 + A_FILE, "archive-broken"),
+    "half a header": (A_FILE + tar_header("y.fits", 0)[:300], "archive-broken"),
+    "no end": (A_FILE, "archive-broken"),
+}
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["tar", "tar.gz"])
+@pytest.mark.parametrize("attack", TAR_ATTACKS)
+def test_headers_of_a_tar_cannot_mislead_tarfile(tmp_path: Path, attack: str, packed: bool) -> None:
+    content, code = TAR_ATTACKS[attack]
+    if attack != "no end" and attack != "half a header":
+        content += bytes(1024)
+    path = tmp_path / "a"
+    path.write_bytes(gzip.compress(content) if packed else content)
+    started = time.perf_counter()
+    with held_below(8 * MIB):
+        refused(path, tmp_path / "out", code)
+    assert time.perf_counter() - started < 2
+
+
+def test_ordinary_extended_headers_are_read(tmp_path: Path) -> None:
+    """A global comment (git archive), times and attributes, a long name of GNU tar."""
+    content = (
+        extended(b"g", record(b"comment", b"0123abcd" * 5))
+        + extended(b"x", record(b"mtime", b"1700000000.25") + record(b"LIBARCHIVE.xattr.a", b"Q" * 5000))
+        + A_FILE
+        + extended(b"x", record(b"path", b"y.fits") + record(b"size", b"4"))
+        + A_FILE
+        + extended(b"L", b"z" * 150 + b"\0")
+        + A_FILE
+    )
+    path = tmp_path / "a.tar"
+    path.write_bytes(content + bytes(1024))
+    assert unpack(path, tmp_path / "out", LIMITS) == ("x.fits", "y.fits", "z" * 150)
+    assert {file.read_bytes() for file in (tmp_path / "out").iterdir()} == {b"1234"}
+
+
+def test_entries_of_a_zip_are_counted_before_objects_are_made_of_them(tmp_path: Path) -> None:
+    """100 000 entries in the table of contents, of 46 bytes each; the number that the archive declares is small."""
+    path = as_zip(tmp_path / "a.zip", [("a", b"")])
+    content = path.read_bytes()
+    at, end = content.index(b"PK\1\2"), content.index(b"PK\5\6")
+    entries = content[at:end] * 100_000
+    tail = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 1, 1, len(entries), at, 0)
+    path.write_bytes(content[:at] + entries + tail)
+    with held_below(24 * MIB):  # the table itself, twice
+        assert "members" in refused(path, tmp_path / "out", "archive-too-large")
 
 
 @pytest.mark.parametrize("declared", [10_000, 30_000])
