@@ -21,10 +21,10 @@ READ_NOISE = {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
 SPOT = (slice(40, 46), slice(60, 68))  # far brighter than the rest
 
 
-def true_rate(fov: int) -> NDArray[np.float64]:
+def true_rate(pointing: int) -> NDArray[np.float64]:
     """DN/s [y, x] of a pointing's scene: a slope, stripes and a bright spot."""
     y, x = np.indices(SHAPE)
-    scene = 100.0 + 20 * fov + 0.5 * x + 10 * np.sin(y / 3.0)
+    scene = 100.0 + 20 * pointing + 0.5 * x + 10 * np.sin(y / 3.0)
     scene[SPOT] = 1000.0
     return scene
 
@@ -48,10 +48,10 @@ def write_transit(
     folder.mkdir(parents=True, exist_ok=True)
     entries = []
     for index in range(images):
-        name, fov = f"{index:03d}.fits", 1 + index // 3
+        name, pointing = f"{index:03d}.fits", 1 + index // 3
         x, y = place_of(index)
-        entries.append({"file": name, "fov": fov, "x": x, "y": y, "r": RADIUS_PX})
-        write_frame(folder / name, index, fov, cards or {})
+        entries.append({"file": name, "fov": pointing, "x": x, "y": y, "r": RADIUS_PX})
+        write_frame(folder / name, index, pointing, cards or {})
     write_kernel(folder / "diffraction.fits")
     content = {
         "schema": "transit/1",
@@ -64,10 +64,10 @@ def write_transit(
     return folder
 
 
-def write_frame(path: Path, index: int, fov: int, cards: dict[str, object]) -> None:
+def write_frame(path: Path, index: int, pointing: int, cards: dict[str, object]) -> None:
     """One image of the transit."""
     exposure_s = 2.0 if index % 2 == 0 else 1.0
-    rate = true_rate(fov)
+    rate = true_rate(pointing)
     y, x = np.indices(SHAPE)
     cx, cy = place_of(index)
     rate[np.hypot(x - cx, y - cy) <= RADIUS_PX] = 10.0

@@ -147,10 +147,12 @@ def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
     shots = []
     for shot in plan.shots:
         x, y = np.clip(
-            (shot.x_px + moves[shot.fov - 1, 0], shot.y_px + moves[shot.fov - 1, 1]), low, size_px - 1 - low
+            (shot.x_px + moves[shot.pointing - 1, 0], shot.y_px + moves[shot.pointing - 1, 1]),
+            low,
+            size_px - 1 - low,
         )
         y = size_px - 1 - y if upside_down else y
-        shots.append(Shot(shot.fov, float(x), float(y), shot.exposure_s, shot.gain_mode, shot.time_s))
+        shots.append(Shot(shot.pointing, float(x), float(y), shot.exposure_s, shot.gain_mode, shot.time_s))
     return dataclasses.replace(plan, shots=tuple(shots))
 
 
@@ -173,16 +175,18 @@ def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
     images: taken in turn; the west limb's is mirrored where there is one alone. Raises DataError "bad-scene".
     """
     scenes = {}
-    for fov in case.plan.fovs:
+    for pointing in case.plan.pointings:
         if images:
-            given = images[(case.number + fov - 1) % len(images)]
-            mirrored = len(images) == 1 and case.plan.views[fov - 1] == WEST
+            given = images[(case.number + pointing - 1) % len(images)]
+            mirrored = len(images) == 1 and case.plan.views[pointing - 1] == WEST
             scene = scene_from_image(given[:, ::-1] if mirrored else given, case.plan)
-            scenes[fov] = _calm(scene)
+            scenes[pointing] = _calm(scene)
         else:
-            scenes[fov] = _with_own_statistics(drawn_scene(case.plan, fov, case.seed), case, fov)
-        if scenes[fov].max() <= 0:
-            raise DataError("bad-scene", f"expected a scene with light for pointing {fov}; got none")
+            scenes[pointing] = _with_own_statistics(
+                drawn_scene(case.plan, pointing, case.seed), case, pointing
+            )
+        if scenes[pointing].max() <= 0:
+            raise DataError("bad-scene", f"expected a scene with light for pointing {pointing}; got none")
     return scenes
 
 
@@ -191,9 +195,9 @@ def _calm(scene: Plane) -> Plane:
     return np.asarray(gaussian_filter(scene, 0.5 * FINE))
 
 
-def _with_own_statistics(scene: Plane, case: Case, fov: int) -> Plane:
+def _with_own_statistics(scene: Plane, case: Case, pointing: int) -> Plane:
     """Broad and fine modulation, compact brightenings whose light follows a power law, and a floor."""
-    rng = np.random.default_rng([case.seed, fov, 4])
+    rng = np.random.default_rng([case.seed, pointing, 4])
     n = scene.shape[0]
     seed = int(rng.integers(2**31))
     broad, fine = patches(n, seed, float(rng.uniform(0.1, 0.4))), patches(n, seed + 1, 0.015)

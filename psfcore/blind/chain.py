@@ -35,18 +35,20 @@ class Sky:
         self._light: dict[int, NDArray[np.float32]] = {}
         self._seen: dict[int, Plane] = {}
 
-    def seen_scene(self, fov: int) -> Plane:
+    def seen_scene(self, pointing: int) -> Plane:
         """A pointing's scene through the PSF, fine, without an occulter."""
-        if fov not in self._seen:
-            self._seen[fov] = np.asarray(self.optics.through.apply(self.scenes[fov]), dtype=np.float64)
-        return self._seen[fov]
+        if pointing not in self._seen:
+            self._seen[pointing] = np.asarray(
+                self.optics.through.apply(self.scenes[pointing]), dtype=np.float64
+            )
+        return self._seen[pointing]
 
     def clean_light(self, index: int) -> Plane:
         """An image's fine light [y, x], DN/s, without any effect."""
         if index not in self._light:
-            fov = self.plan.shots[index].fov
+            pointing = self.plan.shots[index].pointing
             lit = _lit(self, (), Moment(self.plan, index))
-            light = self.seen_scene(fov) + self.optics.through.apply(lit - self.scenes[fov])
+            light = self.seen_scene(pointing) + self.optics.through.apply(lit - self.scenes[pointing])
             self._light[index] = light.astype(np.float32)
         return self._light[index].astype(np.float64)
 
@@ -77,16 +79,18 @@ class Chain:
         return [self.expected(index) for index in range(len(self.plan.shots))]
 
     def _focal_plane(self, moment: Moment) -> Plane:
-        fov, optics = moment.shot.fov, self._telescope(moment)
+        pointing, optics = moment.shot.pointing, self._telescope(moment)
         lit = _lit(self.sky, self.effects, moment)
         if self._varies:
             seen = np.asarray(optics.through.apply(lit), dtype=np.float64)
         else:
-            if fov not in self._seen:
+            if pointing not in self._seen:
                 same = optics is self.sky.optics
-                through = self.sky.seen_scene(fov) if same else optics.through.apply(self.sky.scenes[fov])
-                self._seen[fov] = np.asarray(through, dtype=np.float64)
-            seen = self._seen[fov] + optics.through.apply(lit - self.sky.scenes[fov])
+                through = (
+                    self.sky.seen_scene(pointing) if same else optics.through.apply(self.sky.scenes[pointing])
+                )
+                self._seen[pointing] = np.asarray(through, dtype=np.float64)
+            seen = self._seen[pointing] + optics.through.apply(lit - self.sky.scenes[pointing])
         for effect in self.effects:
             seen = effect.spread(seen, lit, optics, moment)
         return seen
@@ -161,7 +165,7 @@ class Chain:
 
 def _lit(sky: Sky, effects: Sequence[Effect], moment: Moment) -> Plane:
     """The fine scene of an image with its occulter in it."""
-    scene = sky.scenes[moment.shot.fov]
+    scene = sky.scenes[moment.shot.pointing]
     for effect in effects:
         scene = effect.scene(scene, moment)
     lit = scene.copy()

@@ -134,7 +134,7 @@ def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Fr
             Exposure(
                 file=f"{n:03d}.fits",
                 pixels=rate.astype(np.float32),
-                fov=shot.fov,
+                pointing=shot.pointing,
                 place=plan.place(n),
                 exposure_s=shot.exposure_s,
                 time_s=shot.time_s,
@@ -209,7 +209,13 @@ def write_transit(made: Made, plan: Plan, folder: Path) -> None:
         write_plane(folder / f"{n:03d}.fits", dn.astype(np.int32), cards=cards)
     write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(instrument_values()))
     entries = [
-        {"file": f"{n:03d}.fits", "fov": shot.fov, "x": place.x_px, "y": place.y_px, "r": place.radius_px}
+        {
+            "file": f"{n:03d}.fits",
+            "fov": shot.pointing,
+            "x": place.x_px,
+            "y": place.y_px,
+            "r": place.radius_px,
+        }
         for n, (shot, place) in enumerate(zip(plan.shots, made.reported, strict=True))
     ]
     noise = {"photon_gain_dn": plan.noise.photon_gain_dn, "read_noise_dn": plan.noise.read_noise_dn}

@@ -548,7 +548,7 @@ class _Solver:
         frame = self._sky.transit.frames[n]
         return FrameFit(
             file=frame.file,
-            fov=frame.fov,
+            fov=frame.pointing,
             found=self._sky.found[n],
             dark=self._sky.dark[n],
             observed=float((measured.expected + measured.residual).mean()),

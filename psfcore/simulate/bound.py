@@ -145,16 +145,16 @@ def _scatter_information(sky: TrueSky, total_slopes: dict[str, Kernel], threads:
     """F of Eq. (1) for PARAMETERS from the fully dark pixels, and how many there are."""
     plan = sky.plan
     information, dark_pixels = np.zeros((len(PARAMETERS), len(PARAMETERS))), 0
-    for fov in plan.fovs:
-        scene = sky.scenes[fov]
+    for pointing in plan.pointings:
+        scene = sky.scenes[pointing]
         whole = {name: _seen(scene, kernel, plan.margin_px, threads) for name, kernel in total_slopes.items()}
-        for index in (n for n, shot in enumerate(plan.shots) if shot.fov == fov):
+        for index in (n for n, shot in enumerate(plan.shots) if shot.pointing == pointing):
             window = _window(sky, index)
             hidden = _hidden(sky, index, window)
             slopes = np.stack(
                 [whole[name][window] - _through(total_slopes[name], hidden) for name in PARAMETERS]
             )
-            expected = sky.seen_scenes[fov][window] - _through(sky.kernel, hidden)
+            expected = sky.seen_scenes[pointing][window] - _through(sky.kernel, hidden)
             dark = fully_dark(plan.place(index), _first(window), hidden.shape)
             variance = plan.noise.variance(expected[dark], plan.shots[index].exposure_s)  # Eq. (2)
             information += (slopes[:, dark] / variance) @ slopes[:, dark].T  # Eq. (1)
@@ -167,7 +167,7 @@ def _place_bound(sky: TrueSky, index: int) -> tuple[float, float]:
     plan, shot = sky.plan, sky.plan.shots[index]
     place, window = plan.place(index), _window(sky, index)
     hidden = _hidden(sky, index, window)
-    expected = sky.seen_scenes[shot.fov][window] - _through(sky.kernel, hidden)
+    expected = sky.seen_scenes[shot.pointing][window] - _through(sky.kernel, hidden)
     by_place = []
     for slope in sky.behind[index].hidden_slopes(place):
         moved = np.zeros_like(hidden)

@@ -31,13 +31,14 @@ _PAPER_LIMB_SHARE = 24 / 126
 _PAPER_FAR_SHARE = 10 / 24
 _MARGIN_PX = 6.0  # least distance of the disc's edge from the field's
 _MINUTE_S = 60.0
+_KEYS = {"pointing": "fov"}  # the key in truth.json of a field of Shot
 
 
 @dataclass(frozen=True)
 class Shot:
     """One image: its pointing (from 1), the occulter's exact centre (px), exposure (s), gain mode, start (s)."""
 
-    fov: int
+    pointing: int
     x_px: float
     y_px: float
     exposure_s: float
@@ -83,7 +84,9 @@ class Plan:
         _expect(level is None or level > 0, "a saturation level above 0 DN", level)
         _expect(np.isfinite(self.dark_offset_dn), "a finite dark offset", self.dark_offset_dn)
         for shot in self.shots:
-            _expect(1 <= shot.fov <= len(self.views), f"a pointing of 1 to {len(self.views)}", shot.fov)
+            _expect(
+                1 <= shot.pointing <= len(self.views), f"a pointing of 1 to {len(self.views)}", shot.pointing
+            )
             _expect(shot.exposure_s > 0, "an exposure above 0 s", shot.exposure_s)
             low, high = self.radius_px, self.size_px - 1 - self.radius_px
             inside = low <= shot.x_px <= high and low <= shot.y_px <= high
@@ -97,9 +100,9 @@ class Plan:
         return self.size_px // 2 if self.beyond_px is None else self.beyond_px
 
     @property
-    def fovs(self) -> tuple[int, ...]:
+    def pointings(self) -> tuple[int, ...]:
         """The pointings that have images."""
-        return tuple(sorted({shot.fov for shot in self.shots}))
+        return tuple(sorted({shot.pointing for shot in self.shots}))
 
     def place(self, index: int) -> Place:
         """Where the occulter exactly is in an image."""
@@ -107,13 +110,20 @@ class Plan:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; plan_from_json gives the plan back."""
-        return dataclasses.asdict(self)
+        content = dataclasses.asdict(self)
+        content["shots"] = [
+            {_KEYS.get(key, key): value for key, value in shot.items()} for shot in content["shots"]
+        ]
+        return content
 
 
 def plan_from_json(content: dict[str, Any]) -> Plan:
     """The plan that Plan.as_json wrote. Raises DataError "bad-plan"."""
     try:
-        shots = tuple(Shot(**shot) for shot in content["shots"])
+        names = {key: name for name, key in _KEYS.items()}
+        shots = tuple(
+            Shot(**{names.get(key, key): value for key, value in shot.items()}) for shot in content["shots"]
+        )
         known = content | {
             "shots": shots,
             "noise": Noise(**content["noise"]),
@@ -161,7 +171,7 @@ class _Track:
 class _Phase:
     """Images of one kind in a row: pointing, start and end (minutes after 03:42 UT), exposure, gain mode."""
 
-    fov: int
+    pointing: int
     start_min: float
     end_min: float
     exposure_s: float
@@ -188,7 +198,7 @@ def _shots(phase: _Phase, count: int, size_px: int, radius_px: float) -> list[Sh
         times = np.array([(phase.start_min + phase.end_min) / 2])
     else:
         times = np.linspace(phase.start_min, phase.end_min, count)
-    track = _TRACKS[phase.fov - 1]
+    track = _TRACKS[phase.pointing - 1]
     low = radius_px + _MARGIN_PX
     _expect(2 * low < size_px - 1, f"a field of more than {2 * low + 1:.0f} px", size_px)
     start, end = (
@@ -198,7 +208,9 @@ def _shots(phase: _Phase, count: int, size_px: int, radius_px: float) -> list[Sh
     for minute in times:
         x, y = start + (end - start) * (minute - track.start_min) / (track.end_min - track.start_min)
         place = (float(x), float(y))
-        shots.append(Shot(phase.fov, *place, phase.exposure_s, phase.gain_mode, float(minute * _MINUTE_S)))
+        shots.append(
+            Shot(phase.pointing, *place, phase.exposure_s, phase.gain_mode, float(minute * _MINUTE_S))
+        )
     return shots
 
 

@@ -24,14 +24,14 @@ _DISC = Layout(limb_centre=(0.5, 0.5))
 _LAYOUTS = {EAST: _LIMB, DISC: _DISC, WEST: _LIMB}
 
 
-def drawn_scene(plan: Plan, fov: int, seed: int) -> Plane:
+def drawn_scene(plan: Plan, pointing: int, seed: int) -> Plane:
     """A pointing's scene in DN/s on drawn pixels [y, x]: oversampling per detector pixel, margins included.
 
     The west limb is drawn as an east limb of another seed, and mirrored. The same for the same plan and seed.
     """
-    view = plan.views[fov - 1]
+    view = plan.views[pointing - 1]
     edge = plan.size_px * plan.oversampling
-    own = int(np.random.SeedSequence([seed, fov]).generate_state(1)[0])
+    own = int(np.random.SeedSequence([seed, pointing]).generate_state(1)[0])
     margin = plan.margin_px * plan.oversampling
     scene = solar_scene((edge, edge), own, layout=_LAYOUTS[view], margin_px=margin)
     return np.ascontiguousarray(plan.brightness * (scene[:, ::-1] if view == WEST else scene))

@@ -61,7 +61,7 @@ class TrueSky:
 
     def true_scene_and_beyond(self, index: int) -> Plane:
         """The same with what lies beyond the field, plan.margin_px on each side."""
-        scene = self.scenes[self.plan.shots[index].fov].copy()
+        scene = self.scenes[self.plan.shots[index].pointing].copy()
         around = self.behind[index]
         rows, columns = around.window(self.plan.margin_px)
         scene[rows, columns] -= around.hidden(self.plan.place(index))
@@ -73,7 +73,7 @@ class TrueSky:
         hidden = np.zeros((self.plan.size_px, self.plan.size_px))
         hidden[around.window()] = around.hidden(self.plan.place(index))
         return np.asarray(
-            self.seen_scenes[self.plan.shots[index].fov] - self._hiding.apply(hidden)
+            self.seen_scenes[self.plan.shots[index].pointing] - self._hiding.apply(hidden)
         )  # Eq. (1)
 
     @cached_property
@@ -106,14 +106,16 @@ def true_sky(
     coarse: dict[int, Plane] = {}
     seen: dict[int, Plane] = {}
     around: dict[int, Behind] = {}
-    for fov in plan.fovs:
-        fine = drawn_scene(plan, fov, seed) if scenes is None else _given(scenes, fov, plan)
-        for index in (n for n, shot in enumerate(plan.shots) if shot.fov == fov):
+    for pointing in plan.pointings:
+        fine = drawn_scene(plan, pointing, seed) if scenes is None else _given(scenes, pointing, plan)
+        for index in (n for n, shot in enumerate(plan.shots) if shot.pointing == pointing):
             around[index] = behind(fine, plan.place(index), fine=plan.oversampling, margin_px=plan.margin_px)
-        coarse[fov] = binned(fine, plan.oversampling)
+        coarse[pointing] = binned(fine, plan.oversampling)
         del fine
         through = Convolver(kernel, (whole_px, whole_px), dtype=np.float64, threads=threads)
-        seen[fov] = on_field(np.asarray(through.apply(coarse[fov]), dtype=np.float64), plan.margin_px).copy()
+        seen[pointing] = on_field(
+            np.asarray(through.apply(coarse[pointing]), dtype=np.float64), plan.margin_px
+        ).copy()
     return TrueSky(
         plan=plan,
         scatter=scatter,
@@ -133,15 +135,17 @@ def on_field(plane: Plane, margin_px: int) -> Plane:
     return plane[margin_px : ny - margin_px, margin_px : nx - margin_px]
 
 
-def _given(scenes: Mapping[int, Plane], fov: int, plan: Plan) -> Plane:
+def _given(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Plane:
     edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
-    if fov not in scenes or scenes[fov].shape != (edge, edge):
-        got = scenes[fov].shape if fov in scenes else f"scenes of pointings {sorted(scenes)}"
-        raise DataError("bad-scene", f"expected a scene of ({edge}, {edge}) for pointing {fov}; got {got}")
-    scene = np.asarray(scenes[fov], dtype=np.float64)
+    if pointing not in scenes or scenes[pointing].shape != (edge, edge):
+        got = scenes[pointing].shape if pointing in scenes else f"scenes of pointings {sorted(scenes)}"
+        raise DataError(
+            "bad-scene", f"expected a scene of ({edge}, {edge}) for pointing {pointing}; got {got}"
+        )
+    scene = np.asarray(scenes[pointing], dtype=np.float64)
     if not np.isfinite(scene).all() or scene.min() < 0:
         raise DataError(
-            "bad-scene", f"expected finite pixels >= 0; got others in the scene of pointing {fov}"
+            "bad-scene", f"expected finite pixels >= 0; got others in the scene of pointing {pointing}"
         )
     return scene
 

@@ -125,7 +125,7 @@ def observed_transit(sky: TrueSky, seed: int) -> SimulatedTransit:
         Frame(
             file=f"{index:03d}.fits",
             pixels=(_read_out(plan, index, sky.expected(index), seed) / shot.exposure_s).astype(np.float32),
-            fov=shot.fov,
+            pointing=shot.pointing,
             place=reported[index],
             exposure_s=shot.exposure_s,
             time_s=shot.time_s - start_s,

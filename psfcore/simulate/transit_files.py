@@ -42,9 +42,11 @@ def write(simulated: SimulatedTransit, folder: str | Path) -> None:
         noise_free = simulated.sky.expected(index)
         cards = _frame_cards(simulated, index, "DN/s")
         write_plane(folder / "noise_free" / frame.file, noise_free, cards=cards)
-    for fov, scene in simulated.scenes.items():
-        about: dict[str, CardValue] = {"BUNIT": "DN/s", "FOV": fov, "MARGIN": simulated.plan.margin_px}
-        write_plane(folder / "scenes" / f"fov{fov}.fits", scene, cards=_cards(instrument_values() | about))
+    for pointing, scene in simulated.scenes.items():
+        about: dict[str, CardValue] = {"BUNIT": "DN/s", "FOV": pointing, "MARGIN": simulated.plan.margin_px}
+        write_plane(
+            folder / "scenes" / f"fov{pointing}.fits", scene, cards=_cards(instrument_values() | about)
+        )
     write_plane(folder / DIFFRACTION_FILE, simulated.sky.diffraction, cards=_cards(instrument_values()))
     _write_json(folder / "transit.json", _transit_json(simulated))
     _write_json(folder / TRUTH_FILE, simulated.truth.as_json() | {"plan": simulated.plan.as_json()})
@@ -71,7 +73,9 @@ def read_sky(folder: str | Path, *, threads: int = 1) -> TrueSky:
         ) from None
     plan = plan_from_json(plan_json)
     limits = FitsLimits(max_pixels=_LARGEST_PX**2)
-    scenes = {fov: read_plane(folder / "scenes" / f"fov{fov}.fits", limits) for fov in plan.fovs}
+    scenes = {
+        pointing: read_plane(folder / "scenes" / f"fov{pointing}.fits", limits) for pointing in plan.pointings
+    }
     diffraction = read_plane(folder / DIFFRACTION_FILE, limits)
     return true_sky(plan, scatter, diffraction, seed, scenes=scenes, threads=threads)
 
@@ -81,7 +85,7 @@ def _transit_json(simulated: SimulatedTransit) -> dict[str, Any]:
     images = [
         {
             "file": frame.file,
-            "fov": frame.fov,
+            "fov": frame.pointing,
             "x": frame.place.x_px,
             "y": frame.place.y_px,
             "r": frame.place.radius_px,

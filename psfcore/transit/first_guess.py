@@ -48,7 +48,7 @@ class FrameGuess:
     inhomogeneity infinite where the disc's middle is not seen before light."""
 
     file: str
-    fov: int
+    pointing: int
     time_s: float
     centre_dn_s: float
     characteristic_dn_s: Mapping[str, float]
@@ -67,7 +67,7 @@ class PointingGuess:
     inhomogeneity: the median of its images'.
     """
 
-    fov: int
+    pointing: int
     images: int
     mean: Mapping[str, float]
     scatter: Mapping[str, float]
@@ -84,7 +84,7 @@ class FirstGuess:
 
     frames: tuple[FrameGuess, ...]
     pointings: tuple[PointingGuess, ...]
-    best_fov: int
+    best_pointing: int
     share: float
     share_spread: float
     radius_px: float
@@ -92,13 +92,13 @@ class FirstGuess:
     def to_json(self) -> dict[str, Any]:
         """JSON-able; what is not a number is null."""
         return {
-            "best_fov": self.best_fov,
+            "best_fov": self.best_pointing,
             "share": _number(self.share),
             "share_spread": _number(self.share_spread),
             "radius_px": self.radius_px,
             "pointings": [
                 {
-                    "fov": pointing.fov,
+                    "fov": pointing.pointing,
                     "images": pointing.images,
                     "mean": _numbers(pointing.mean),
                     "scatter": _numbers(pointing.scatter),
@@ -109,7 +109,7 @@ class FirstGuess:
             "frames": [
                 {
                     "file": frame.file,
-                    "fov": frame.fov,
+                    "fov": frame.pointing,
                     "time_s": frame.time_s,
                     "centre_dn_s": _number(frame.centre_dn_s),
                     "ratio": _numbers(frame.ratio),
@@ -134,18 +134,20 @@ def first_guess(
         guesses.append(_frame_guess(frame, place))
         if progress is not None:
             progress(done, len(transit.frames))
-    pointings = tuple(_pointing_guess(fov, guesses) for fov in sorted({guess.fov for guess in guesses}))
+    pointings = tuple(
+        _pointing_guess(pointing, guesses) for pointing in sorted({guess.pointing for guess in guesses})
+    )
     telling = [p for p in pointings if math.isfinite(p.inhomogeneity)]
     if not telling:
         message = "expected an image with the occulter's middle inside it, before the Sun; got none"
         raise DataError("no-first-guess", message)
     best = min(telling, key=lambda pointing: pointing.inhomogeneity)
-    ratios = _finite([r for g in guesses if g.fov == best.fov for r in g.ratio.values()])
-    radii = [place.radius_px for g, place in zip(guesses, places, strict=True) if g.fov == best.fov]
+    ratios = _finite([r for g in guesses if g.pointing == best.pointing for r in g.ratio.values()])
+    radii = [place.radius_px for g, place in zip(guesses, places, strict=True) if g.pointing == best.pointing]
     return FirstGuess(
         frames=tuple(guesses),
         pointings=pointings,
-        best_fov=best.fov,
+        best_pointing=best.pointing,
         share=float(ratios.mean()),
         share_spread=float(ratios.std()),
         radius_px=float(np.mean(radii)),
@@ -170,7 +172,7 @@ def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
     shown = centre.size > 0 and all(level > 0 for level in levels.values())
     return FrameGuess(
         file=frame.file,
-        fov=frame.fov,
+        pointing=frame.pointing,
         time_s=frame.time_s,
         centre_dn_s=_mean(centre),
         characteristic_dn_s=levels,
@@ -191,11 +193,11 @@ def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
     return pixels, x[seen] - place.x_px, y[seen] - place.y_px
 
 
-def _pointing_guess(fov: int, guesses: Sequence[FrameGuess]) -> PointingGuess:
-    mine = [guess for guess in guesses if guess.fov == fov]
+def _pointing_guess(pointing: int, guesses: Sequence[FrameGuess]) -> PointingGuess:
+    mine = [guess for guess in guesses if guess.pointing == pointing]
     values = {name: _finite([guess.ratio[name] for guess in mine]) for name in ESTIMATORS}
     return PointingGuess(
-        fov=fov,
+        pointing=pointing,
         images=len(mine),
         mean={name: _mean(ratios) for name, ratios in values.items()},
         scatter={name: float(ratios.std()) if ratios.size else math.nan for name, ratios in values.items()},

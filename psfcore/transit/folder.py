@@ -132,7 +132,7 @@ def _read(folder: Path, look: _Look, limits: FitsLimits) -> tuple[Exposure, floa
     exposure = exposure_of(
         image,
         file=entry.file,
-        fov=entry.fov,
+        pointing=entry.pointing,
         place=Place(entry.x, entry.y, entry.r),
         time_s=look.time_s,
         gain_mode=look.header.gain_mode,

@@ -74,7 +74,7 @@ class ImageEntry(_Frozen):
     """One image of a transit: its file, its pointing, and the occulter's place and radius in it, px."""
 
     file: FileName
-    fov: Annotated[int, Field(strict=True, ge=0, le=10_000)]
+    pointing: Annotated[int, Field(strict=True, ge=0, le=10_000, alias="fov")]
     x: Coordinate
     y: Coordinate
     r: Annotated[Number, Field(gt=0, le=LARGEST_RADIUS_PX)]
@@ -100,7 +100,7 @@ class TransitManifest(_Frozen):
         """How many images each pointing has, by its number."""
         counts: dict[int, int] = {}
         for image in self.images:
-            counts[image.fov] = counts.get(image.fov, 0) + 1
+            counts[image.pointing] = counts.get(image.pointing, 0) + 1
         return dict(sorted(counts.items()))
 
 

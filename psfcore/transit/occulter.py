@@ -133,7 +133,7 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
         k
         for k, (other, there) in enumerate(zip(frames, places, strict=True))
         if k != index
-        and other.fov == frame.fov
+        and other.pointing == frame.pointing
         and max(abs(there.x_px - here.x_px), abs(there.y_px - here.y_px)) > reach + there.radius_px
     ]
     free.sort(key=lambda k: (abs(frames[k].time_s - frame.time_s), k))

@@ -48,7 +48,7 @@ class Exposure:
 
     file: str
     pixels: Pixels
-    fov: int
+    pointing: int
     place: Place
     exposure_s: float
     time_s: float
@@ -105,7 +105,7 @@ def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
 
 
 def exposure_of(
-    image: Image, *, file: str, fov: int, place: Place, time_s: float, gain_mode: str | None
+    image: Image, *, file: str, pointing: int, place: Place, time_s: float, gain_mode: str | None
 ) -> Exposure:
     """An exposure from an image as read; its gaps are the pixels that the mask marks, or that are not finite.
 
@@ -116,7 +116,7 @@ def exposure_of(
     return Exposure(
         file=file,
         pixels=pixels,
-        fov=fov,
+        pointing=pointing,
         place=place,
         exposure_s=exposure_s,
         time_s=time_s,
@@ -142,7 +142,7 @@ def _frame(exposure: Exposure) -> Frame:
     return Frame(
         file=exposure.file,
         pixels=exposure.pixels,
-        fov=exposure.fov,
+        pointing=exposure.pointing,
         place=exposure.place,
         exposure_s=exposure.exposure_s,
         time_s=exposure.time_s,
@@ -198,7 +198,7 @@ def _fill_from_frames(exposure: Exposure, exposures: Sequence[Exposure]) -> Lit:
 
 
 def _donors(exposure: Exposure, exposures: Sequence[Exposure]) -> list[Exposure]:
-    same = [other for other in exposures if other is not exposure and other.fov == exposure.fov]
+    same = [other for other in exposures if other is not exposure and other.pointing == exposure.pointing]
     return sorted(same, key=lambda other: abs(other.time_s - exposure.time_s))
 
 

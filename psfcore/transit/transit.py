@@ -54,7 +54,7 @@ class Frame:
 
     file: str
     pixels: Pixels
-    fov: int
+    pointing: int
     place: Place
     exposure_s: float
     time_s: float

@@ -113,7 +113,7 @@ def transit(
             raise click.ClickException(f"cannot write {output}: {error.strerror or error}") from error
     exposures = sorted({shot.exposure_s for shot in plan.shots})
     click.echo(
-        f"{output}: {images} images of {size} x {size} px, {len(plan.fovs)} pointings, "
+        f"{output}: {images} images of {size} x {size} px, {len(plan.pointings)} pointings, "
         f"{', '.join(f'{t:g}' for t in exposures)} s"
     )
     click.echo(f"scatter b {b_px:g} px, c {c:g}, total {total:g}; the truth is in {output / 'truth.json'}")
@@ -178,11 +178,11 @@ def _scenes(files: tuple[Path, ...], plan: Plan) -> dict[int, NDArray[np.float64
         message = f"expected one image, or {len(plan.views)}, one a pointing; got {len(files)}"
         raise click.BadParameter(message, param_hint="--scene")
     scenes = {}
-    for fov in plan.fovs:
-        image = read_image(files[(fov - 1) % len(files)], limits())
+    for pointing in plan.pointings:
+        image = read_image(files[(pointing - 1) % len(files)], limits())
         rate = image.pixels
         if (image.unit or "").replace(" ", "").lower() == "dn" and image.exposure_s is not None:
             rate = rate / image.exposure_s
-        mirrored = len(files) == 1 and plan.views[fov - 1] == WEST
-        scenes[fov] = scene_from_image(rate[:, ::-1] if mirrored else rate, plan)
+        mirrored = len(files) == 1 and plan.views[pointing - 1] == WEST
+        scenes[pointing] = scene_from_image(rate[:, ::-1] if mirrored else rate, plan)
     return scenes

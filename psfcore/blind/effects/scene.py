@@ -80,7 +80,7 @@ class SceneEvolution(Effect):
             return scene
         phase = 2 * np.pi * moment.elapsed / self.period
         first, second = (
-            patches(scene.shape[0], self.seed + 10 * moment.shot.fov + k, self.patch) for k in (0, 1)
+            patches(scene.shape[0], self.seed + 10 * moment.shot.pointing + k, self.patch) for k in (0, 1)
         )
         change = self.strength * (first * np.sin(phase) + second * (np.cos(phase) - 1))
         return np.asarray(scene * np.exp(change - change.var() / 2))
@@ -122,8 +122,8 @@ class OutOfFieldLight(Effect):
     def light(self, seen: Plane, moment: Moment) -> Plane:
         if self.strength == 0:
             return seen
-        fov = moment.shot.fov
-        edge, level = self.edges[fov - 1], self.levels[fov - 1]
+        pointing = moment.shot.pointing
+        edge, level = self.edges[pointing - 1], self.levels[pointing - 1]
         return seen + self.strength * level * _band(seen.shape[0], edge, self.b_px, self.c, self.a)
 
 
@@ -149,7 +149,7 @@ def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
 class LimbGlint(Effect):
     """Extra light in one pointing: rays that fan out of a point beyond its edge. Not in the library."""
 
-    fov: int = 1
+    pointing: int = 1
     angle_deg: float = 0.0
     rays: int = 3
     phase_deg: float = 0.0
@@ -163,11 +163,11 @@ class LimbGlint(Effect):
 
     @classmethod
     def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        fov = int(rng.choice([1, len(plan.views)]))
-        return cls(strength, fov, angle(rng), int(rng.integers(2, 6)), angle(rng))
+        pointing = int(rng.choice([1, len(plan.views)]))
+        return cls(strength, pointing, angle(rng), int(rng.integers(2, 6)), angle(rng))
 
     def light(self, seen: Plane, moment: Moment) -> Plane:
-        if moment.shot.fov != self.fov or self.strength == 0:
+        if moment.shot.pointing != self.pointing or self.strength == 0:
             return seen
         n = seen.shape[0]
         x = (np.arange(n)[None, :] + 0.5) / n - 0.5 - 0.8 * np.cos(np.deg2rad(self.angle_deg))
@@ -198,7 +198,7 @@ class SaturationFill(Effect):
         if self.strength == 0:
             return scene
         bright = scene > np.quantile(scene[::4, ::4], 0.98)
-        phase = patches(scene.shape[0], self.seed + moment.shot.fov, 0.1)
+        phase = patches(scene.shape[0], self.seed + moment.shot.pointing, 0.1)
         swing = self.flicker * self.strength / (self.strength + 0.005)
         factor = 1 + swing * np.sin(40 * moment.elapsed + 2 * phase)
         return np.where(bright, scene * factor, scene)

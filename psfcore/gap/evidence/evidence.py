@@ -197,7 +197,7 @@ class _Distance:
 def _taken(frame: Frame, found: FoundPlace, distance_px: float) -> Taken:
     return Taken(
         file=frame.file,
-        fov=frame.fov,
+        fov=frame.pointing,
         x_px=found.place.x_px,
         y_px=found.place.y_px,
         time_s=frame.time_s,

@@ -216,7 +216,7 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
         noise = transit.noise.variance(means[-1], frame.exposure_s) / pixels
         variance.append(noise + (FLOOR * levels[-1]) ** 2)
         free.append(blocks(not_compared(solution, n).astype(np.float64)) == 0)
-    kinds = [(f.fov, f.gain_mode, f.exposure_s) for f in transit.frames]
+    kinds = [(f.pointing, f.gain_mode, f.exposure_s) for f in transit.frames]
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     shape = np.shape(levels)
     return LitBlocks(
@@ -225,7 +225,7 @@ def lit_blocks(view: View, columns: int, progress: Progress) -> LitBlocks:
         free=np.array(free),
         means=np.array(means),
         errors=np.zeros((columns, *shape)),
-        fov=np.array([f.fov for f in transit.frames]),
+        fov=np.array([f.pointing for f in transit.frames]),
         kind=np.array([number[kind] for kind in kinds]),
         part=np.ones(len(transit.frames), dtype=bool),
     )

@@ -43,7 +43,7 @@ def optics() -> FineOptics:
 
 @pytest.fixture(scope="module")
 def sky(plan: Plan, optics: FineOptics) -> Sky:
-    return Sky(plan, optics, {fov: drawn_scene(plan, fov, 3) for fov in plan.fovs})
+    return Sky(plan, optics, {pointing: drawn_scene(plan, pointing, 3) for pointing in plan.pointings})
 
 
 @pytest.fixture(scope="module")

@@ -170,7 +170,7 @@ def test_light_that_clipping_took_from_a_brightening_is_known_by_its_place(clean
     filled = inside > 0
     lost = np.where(filled, np.sqrt(np.maximum(inside, 0)) / 7, 0.0)
     frames = tuple(
-        replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=filled) if f.fov == fov else f
+        replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=filled) if f.pointing == fov else f
         for f in clean.frames
     )
     found = verdict(replace(clean, frames=frames))
@@ -202,12 +202,12 @@ def test_the_noise_of_the_images_is_measured(clean: Transit) -> None:
     # Loosened from a tenth: of pixels with a few photons the median deviation is less than a normal one's by that.
     assert found.noise.photon_gain_dn == pytest.approx(clean.noise.photon_gain_dn, rel=0.2)
     first, second = clean.frames[:2]
-    assert measured_noise(replace(clean, frames=(first, replace(second, fov=2)))) is None
+    assert measured_noise(replace(clean, frames=(first, replace(second, pointing=2)))) is None
 
 
 @pytest.mark.slow
 def test_one_pointing_and_few_images_say_what_they_cannot(clean: Transit) -> None:
-    one = replace(clean, frames=tuple(f for f in clean.frames if f.fov == 2))
+    one = replace(clean, frames=tuple(f for f in clean.frames if f.pointing == 2))
     found = verdict(one)
     assert found.judgement.answer == ()
     assert any("One pointing" in c for c in found.cautions) and any(

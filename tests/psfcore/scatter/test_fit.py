@@ -147,7 +147,7 @@ def test_doubts_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [line for line in fitted().limits if "field is 128 px" in line]
     transit, inversion = solved().transit, solved().inversion
     one_pointing = dataclasses.replace(
-        transit, frames=tuple(dataclasses.replace(f, fov=2) for f in transit.frames)
+        transit, frames=tuple(dataclasses.replace(f, pointing=2) for f in transit.frames)
     )
     frames = [dataclasses.replace(f, fov=2) for f in inversion.frames]
     frames[4] = dataclasses.replace(frames[4], found=dataclasses.replace(frames[4].found, settled=False))
@@ -223,7 +223,7 @@ def test_a_report_is_json_and_says_what_the_fit_says() -> None:
     assert [s["name"] for s in content["shapes"]] == [s.name for s in fit.shapes]
     assert content["shapes"][0]["added"]["stretch_p"]["sigma"] > 0
     assert len(content["free_shells"]["weight"]["median"]) == 50
-    assert content["first_guess"]["best_fov"] == fit.first_guess.best_fov
+    assert content["first_guess"]["best_fov"] == fit.first_guess.best_pointing
     assert "stretch" not in content and "as_published" not in content
 
 

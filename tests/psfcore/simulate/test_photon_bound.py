@@ -47,7 +47,7 @@ def plan() -> Plan:
 
 @pytest.fixture(scope="module")
 def scenes(plan: Plan) -> dict[int, Plane]:
-    return {fov: drawn_scene(plan, fov, 5) for fov in plan.fovs}
+    return {pointing: drawn_scene(plan, pointing, 5) for pointing in plan.pointings}
 
 
 @pytest.fixture(scope="module")

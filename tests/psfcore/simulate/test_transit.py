@@ -46,7 +46,7 @@ def beyond() -> TrueSky:
 def flat_sky(plan: Plan, dn_per_s: float) -> TrueSky:
     """Even light in every pointing."""
     edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
-    scenes = {fov: np.full((edge, edge), dn_per_s) for fov in plan.fovs}
+    scenes = {pointing: np.full((edge, edge), dn_per_s) for pointing in plan.pointings}
     return true_sky(plan, SCATTER, DIFFRACTION, 1, scenes=scenes)
 
 
@@ -54,7 +54,7 @@ def flat_sky(plan: Plan, dn_per_s: float) -> TrueSky:
 
 
 def counts(plan: Plan) -> list[tuple[int, float, str, int]]:
-    kinds = [(shot.fov, shot.exposure_s, shot.gain_mode) for shot in plan.shots]
+    kinds = [(shot.pointing, shot.exposure_s, shot.gain_mode) for shot in plan.shots]
     return [(*kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)]
 
 
@@ -80,7 +80,11 @@ def test_any_number_of_images_on_any_field(images: int, size_px: int) -> None:
         assert place.radius_px < min(place.x_px, place.y_px)
         assert max(place.x_px, place.y_px) < size_px - 1 - place.radius_px
     if images == 30:
-        assert [sum(shot.fov == fov for shot in plan.shots) for fov in (1, 2, 3)] == [10, 10, 10]
+        assert [sum(shot.pointing == pointing for shot in plan.shots) for pointing in (1, 2, 3)] == [
+            10,
+            10,
+            10,
+        ]
 
 
 def test_a_plan_is_read_back_from_json() -> None:
@@ -229,8 +233,8 @@ def test_the_occulter_is_dark_in_the_true_scene_and_lit_by_scatter(small: Simula
         assert small.true_scene(index)[dark].max() < 1e-9
         assert small.noise_free[index][dark].min() > 0
         lit = covered_share(small.plan.place(index), (0, 0), (96, 96)) == 0
-        fov = small.plan.shots[index].fov
-        np.testing.assert_array_equal(small.true_scene(index)[lit], small.scenes[fov][lit])
+        pointing = small.plan.shots[index].pointing
+        np.testing.assert_array_equal(small.true_scene(index)[lit], small.scenes[pointing][lit])
 
 
 def test_half_pixels_are_binned_after_the_edge_is_drawn() -> None:
@@ -248,7 +252,7 @@ def test_half_pixels_are_binned_after_the_edge_is_drawn() -> None:
 def test_light_from_beyond_the_field_raises_the_discs(beyond: TrueSky) -> None:
     """The same field with darkness round it: far off the limb the discs lose most."""
     plan = dataclasses.replace(beyond.plan, beyond="dark", beyond_px=None, oversampling=1)
-    fields = {fov: scene[96:-96, 96:-96] for fov, scene in beyond.scenes.items()}
+    fields = {pointing: scene[96:-96, 96:-96] for pointing, scene in beyond.scenes.items()}
     dark = true_sky(plan, SCATTER, DIFFRACTION, 3, scenes=fields)
     ratios = []
     for index in range(6):
@@ -345,7 +349,7 @@ def test_one_seed_gives_one_transit(small: SimulatedTransit) -> None:
 
 def test_the_limb_is_on_the_side_that_the_pointing_says() -> None:
     plan = default_plan(3, 128)
-    east, disc, west = (drawn_scene(plan, fov, 5) for fov in (1, 2, 3))
+    east, disc, west = (drawn_scene(plan, pointing, 5) for pointing in (1, 2, 3))
     assert east[:, -20:].mean() > 20 * east[:, :20].mean()
     assert west[:, :20].mean() > 20 * west[:, -20:].mean()
     assert np.percentile(disc, 1) > 20
@@ -426,7 +430,7 @@ def test_a_folder_holds_the_transit_and_its_truth(tmp_path: Path) -> None:
         assert image.unit == "DN" and image.exposure_s == shot.exposure_s
         np.testing.assert_allclose(image.pixels / shot.exposure_s, frame.pixels, rtol=1e-6, atol=1e-6)
         assert (entry["fov"], entry["x"], entry["y"], entry["r"]) == (
-            frame.fov,
+            frame.pointing,
             frame.place.x_px,
             frame.place.y_px,
             10.75,

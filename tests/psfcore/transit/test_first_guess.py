@@ -49,12 +49,12 @@ def transit_of(*frames: tuple[Flat, int, Place]) -> Transit:
         Frame(
             file=f"{index}.fits",
             pixels=pixels.astype(np.float32),
-            fov=fov,
+            pointing=pointing,
             place=place,
             exposure_s=1.0,
             time_s=60.0 * index,
         )
-        for index, (pixels, fov, place) in enumerate(frames)
+        for index, (pixels, pointing, place) in enumerate(frames)
     )
     return Transit(frames=made, diffraction=wide_kernel(), noise=Noise(1.0, 1.0))
 
@@ -76,11 +76,11 @@ def test_before_an_even_sun_it_is_the_light_beyond_the_radius(two_pointings: Tra
     guess = first_guess(two_pointings)
     truth = float(cumulative_curve(wide_kernel(), RADIUS_PX)) / 100
     assert 0.1 < truth < 0.3
-    assert guess.best_fov == 2 and guess.radius_px == RADIUS_PX
+    assert guess.best_pointing == 2 and guess.radius_px == RADIUS_PX
     assert guess.share == pytest.approx(truth, rel=0.05)
     assert guess.share_spread < 0.02 * guess.share
     limb, even = guess.pointings
-    assert (limb.fov, limb.images, even.fov, even.images) == (1, 3, 2, 3)
+    assert (limb.pointing, limb.images, even.pointing, even.images) == (1, 3, 2, 3)
     assert limb.inhomogeneity > 10 * even.inhomogeneity
     assert all(even.mean[name] == pytest.approx(truth, rel=0.05) for name in ESTIMATORS)
     assert limb.scatter["image_mean"] > 5 * even.scatter["image_mean"]
@@ -140,7 +140,7 @@ def test_what_cannot_be_seen_is_null(two_pointings: Transit) -> None:
     night = (np.full((SIZE, SIZE), -1.0), 4, frame.place)
     good = (frame.pixels.astype(np.float64), 2, frame.place)
     guess = first_guess(transit_of(outside, night, good))
-    assert guess.best_fov == 2 and math.isnan(guess.frames[0].centre_dn_s)
+    assert guess.best_pointing == 2 and math.isnan(guess.frames[0].centre_dn_s)
     content = guess.to_json()
     assert content["frames"][0]["ratio"] == dict.fromkeys(ESTIMATORS)
     assert content["frames"][1]["ratio"] == dict.fromkeys(ESTIMATORS)
@@ -156,6 +156,6 @@ def test_practice(shared: Path) -> None:
     folder = shared / "data/practice/p1"
     guess = first_guess(read_transit(folder, FitsLimits(max_pixels=1024 * 1024)))
     truth = json.loads((folder.parent / "p1.truth.json").read_text())["psf"]
-    assert guess.best_fov == 2 and guess.radius_px == 10.75
+    assert guess.best_pointing == 2 and guess.radius_px == 10.75
     assert 0.5 * truth["total"] < guess.share < 1.5 * truth["total"]
     assert guess.share_spread < 0.5 * guess.share

@@ -63,7 +63,7 @@ def test_a_transit_is_read_in_dn_per_second(folder: Path) -> None:
     assert told == [(done, 6) for done in range(1, 7)]
     assert [frame.file for frame in transit.frames] == [f"{i:03d}.fits" for i in range(6)]
     assert [frame.time_s for frame in transit.frames] == [60.0 * i for i in range(6)]
-    assert [frame.fov for frame in transit.frames] == [1, 1, 1, 2, 2, 2]
+    assert [frame.pointing for frame in transit.frames] == [1, 1, 1, 2, 2, 2]
     assert [frame.exposure_s for frame in transit.frames] == [2, 1, 2, 1, 2, 1]
     assert {frame.gain_mode for frame in transit.frames} == {"high-only"}
     assert transit.shape == SHAPE and transit.noise == Noise(6.0, 2.0)
@@ -73,7 +73,9 @@ def test_a_transit_is_read_in_dn_per_second(folder: Path) -> None:
         assert (frame.place.x_px, frame.place.y_px) == place_of(index)
         y, x = np.indices(SHAPE)
         far = np.hypot(x - frame.place.x_px, y - frame.place.y_px) > 8
-        assert np.allclose(frame.pixels[far], true_rate(frame.fov)[far], atol=0.51)  # whole DN are stored
+        assert np.allclose(
+            frame.pixels[far], true_rate(frame.pointing)[far], atol=0.51
+        )  # whole DN are stored
         assert np.allclose(frame.pixels[20, round(frame.place.x_px)], 10, atol=0.51)
     names = {path.name for path in folder.iterdir()}
     assert transit.sha256 == {
@@ -290,7 +292,7 @@ def test_practice(shared: Path) -> None:
     assert len(transit.frames) == 30 and transit.shape == (512, 512)
     assert transit.diffraction.shape == (1024, 1024) and transit.diffraction.sum() == pytest.approx(1)
     assert transit.noise == Noise(6.0, 2.0) and transit.plate_scale_arcsec == pytest.approx(0.492)
-    assert [frame.fov for frame in transit.frames] == [1] * 10 + [2] * 10 + [3] * 10
+    assert [frame.pointing for frame in transit.frames] == [1] * 10 + [2] * 10 + [3] * 10
     assert all(
         later.time_s > frame.time_s for frame, later in zip(transit.frames, transit.frames[1:], strict=False)
     )

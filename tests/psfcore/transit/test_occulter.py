@@ -257,7 +257,7 @@ def checked_neighbours(transit: Transit) -> list[list[int]]:
         free = [
             k
             for k, other in enumerate(transit.frames)
-            if k != n and other.fov == frame.fov and not overlap(places[n], places[k])
+            if k != n and other.pointing == frame.pointing and not overlap(places[n], places[k])
         ]
         assert set(chosen) <= set(free)
         waits = [abs(transit.frames[k].time_s - frame.time_s) for k in chosen]
@@ -281,12 +281,12 @@ def even_sky(shots: tuple[Shot, ...]) -> TrueSky:
     """A Sun of one brightness, but for a texture of 5 %."""
     plan = dataclasses.replace(default_plan(3, SIZE_PX, oversampling=1), shots=shots)
     rng = np.random.default_rng(1)
-    scenes = {fov: 2000 * rng.normal(1, 0.05, (SIZE_PX, SIZE_PX)) for fov in plan.fovs}
+    scenes = {pointing: 2000 * rng.normal(1, 0.05, (SIZE_PX, SIZE_PX)) for pointing in plan.pointings}
     return true_sky(plan, SCATTER, DIFFRACTION, 1, scenes=scenes)
 
 
-def shot(fov: int, x_px: float, y_px: float) -> Shot:
-    return Shot(fov, x_px, y_px, 1.8, "high-only", 60.0 * fov)
+def shot(pointing: int, x_px: float, y_px: float) -> Shot:
+    return Shot(pointing, x_px, y_px, 1.8, "high-only", 60.0 * pointing)
 
 
 def test_without_neighbours_an_even_sun_gives_the_place_to_a_tenth_of_a_pixel() -> None:
@@ -303,7 +303,7 @@ def test_without_neighbours_an_uneven_sun_leaves_the_place_unsure() -> None:
     of = sky()
     shown = observed(of).transit
     alone = dataclasses.replace(
-        shown, frames=tuple(dataclasses.replace(f, fov=n) for n, f in enumerate(shown.frames, start=1))
+        shown, frames=tuple(dataclasses.replace(f, pointing=n) for n, f in enumerate(shown.frames, start=1))
     )
     on_disc = range(4, 8)
     with_neighbours = found_in(of, shown, on_disc)

@@ -27,7 +27,7 @@ def exposure(
     *,
     saturated: object = None,
     nonfinite: object = None,
-    fov: int = 1,
+    pointing: int = 1,
     time_s: float = 0.0,
     place: Place = AWAY,
 ) -> Exposure:
@@ -40,7 +40,12 @@ def exposure(
         mask[nonfinite] |= int(MaskBit.NONFINITE)
         pixels[nonfinite] = np.nan
     return exposure_of(
-        image(pixels, mask), file=f"{time_s:g}.fits", fov=fov, place=place, time_s=time_s, gain_mode=None
+        image(pixels, mask),
+        file=f"{time_s:g}.fits",
+        pointing=pointing,
+        place=place,
+        time_s=time_s,
+        gain_mode=None,
     )
 
 
@@ -86,7 +91,7 @@ def test_the_nearest_in_time_of_the_same_pointing_is_taken() -> None:
             exposure(marked[0], time_s=0),
             exposure(marked[1], time_s=90),
             exposure(rate, time_s=100, saturated=SPOT),
-            exposure(marked[2], time_s=105, fov=2),  # nearer, but of another pointing
+            exposure(marked[2], time_s=105, pointing=2),  # nearer, but of another pointing
             exposure(rate, time_s=107, saturated=SPOT),  # nearer, but saturated there too
             exposure(marked[3], time_s=111),
         ]
@@ -169,7 +174,7 @@ def test_mostly_saturated_and_nothing_to_fill_it_from() -> None:
     rate = true_rate(1)
     most = (slice(None), slice(0, 41))
     with pytest.raises(DataError, match=r"0\.fits.* 51 %") as caught:
-        prepare([exposure(rate, saturated=most), exposure(rate, time_s=60, fov=2)])
+        prepare([exposure(rate, saturated=most), exposure(rate, time_s=60, pointing=2)])
     assert caught.value.code == "all-saturated"
     frames, _ = prepare([exposure(rate, saturated=most), exposure(rate, time_s=60)])
     y, x = np.indices(SHAPE)
