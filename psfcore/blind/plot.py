@@ -10,7 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from psfcore.blind.effects.registry import KNOWN, UNKNOWN
-from psfcore.blind.scoring import INCONCLUSIVE, NONE, UNKNOWN_VERDICT, Score
+from psfcore.blind.score_table import Score
+from psfcore.blind.scoring import INCONCLUSIVE, NONE, UNKNOWN_VERDICT
 from psfcore.drawing.plots import INK
 
 _VERDICTS = (NONE, UNKNOWN_VERDICT, INCONCLUSIVE)
