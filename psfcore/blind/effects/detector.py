@@ -19,14 +19,14 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class IntensityGradient(Effect):
-    """Light that leaks in, brighter to one side: a plane with a little curvature, 0 in its darkest corner."""
+    """Stray light that increases to one side: a plane with a small curvature, 0 in its darkest corner."""
 
     angle_deg: float = 0.0
     curvature: float = 0.3
 
     name: ClassVar[str] = "intensity_gradient"
     unit: ClassVar[str] = "DN/s at its mean"
-    cause: ClassVar[str] = "sunlight gets past the baffles"
+    cause: ClassVar[str] = "sunlight passes the baffles"
     nominal: ClassVar[float] = 0.5
     largest: ClassVar[float] = 20.0
 
@@ -45,7 +45,7 @@ class IntensityGradient(Effect):
 
 @dataclass(frozen=True)
 class Glow(Effect):
-    """A glow fixed on the detector, brightest at a point of its edge. Not in the library."""
+    """A glow at a fixed place of the detector. Not in the library."""
 
     x: float = 0.0
     y: float = 0.5
@@ -53,7 +53,7 @@ class Glow(Effect):
 
     name: ClassVar[str] = "glow"
     unit: ClassVar[str] = "DN/s at its brightest"
-    cause: ClassVar[str] = "an amplifier beside the pixels shines"
+    cause: ClassVar[str] = "an amplifier beside the pixels emits light"
     nominal: ClassVar[float] = 5.0
     largest: ClassVar[float] = 400.0
 
@@ -72,12 +72,12 @@ class Glow(Effect):
 
 @dataclass(frozen=True)
 class DustShadow(Effect):
-    """Specks with a soft rim that keep light off, on the way of the occulter. Not in the library."""
+    """Specks with a soft rim that block light, on the track of the occulter. Not in the library."""
 
     specks: tuple[tuple[float, float, float], ...] = ((0.5, 0.5, 6.0),)
 
     name: ClassVar[str] = "dust_shadow"
-    unit: ClassVar[str] = "share of light kept off"
+    unit: ClassVar[str] = "share of light blocked"
     cause: ClassVar[str] = "dust settled on the detector after the flat field was taken"
     nominal: ClassVar[float] = 0.1
     largest: ClassVar[float] = 0.9
@@ -109,7 +109,7 @@ class DustShadow(Effect):
 
 @dataclass(frozen=True)
 class FlatFieldResidual(Effect):
-    """Pixels answer unevenly: broad patches, and a grain of half their size. strength: rms of the patches."""
+    """Uneven sensitivity: broad patches, and pixel-to-pixel variation of half their rms. strength: rms of the patches."""
 
     seed: int = 0
     patch: float = 0.1
@@ -137,13 +137,13 @@ def _grain(size: int, seed: int) -> Plane:
 
 @dataclass(frozen=True)
 class ShutterGradient(Effect):
-    """The shutter opens one side for longer: so many seconds between the edges. Not in the library."""
+    """One side of the field is exposed longer; strength: the difference between the edges, s. Not in the library."""
 
     angle_deg: float = 0.0
 
     name: ClassVar[str] = "shutter_gradient"
     unit: ClassVar[str] = "s"
-    cause: ClassVar[str] = "a rolling shutter that is not quite even"
+    cause: ClassVar[str] = "the shutter moves unevenly"
     nominal: ClassVar[float] = 0.05
     largest: ClassVar[float] = 0.6
 
@@ -159,7 +159,7 @@ class ShutterGradient(Effect):
 
 @dataclass(frozen=True)
 class DarkCurrentDrift(Effect):
-    """Dark current that grows through the transit, to `strength` at its end. Not in the library."""
+    """A dark current that grows during the transit, to `strength` at its end. Not in the library."""
 
     steepness: float = 2.0
 
@@ -179,14 +179,14 @@ class DarkCurrentDrift(Effect):
 
 @dataclass(frozen=True)
 class BrighterFatter(Effect):
-    """Charge that is there pushes new charge to the next pixels: light flows from full to empty ones. Not in the library.
+    """Collected charge repels new charge, which then lands in fainter neighbours. Not in the library.
 
-    strength: share of the difference between neighbours that flows for 1000 DN in them.
+    strength: share of the difference between two neighbours that flows if they hold 1000 DN.
     """
 
     name: ClassVar[str] = "brighter_fatter"
     unit: ClassVar[str] = "per 1000 DN"
-    cause: ClassVar[str] = "the field of collected charge repels"
+    cause: ClassVar[str] = "the electric field of the collected charge repels new charge"
     nominal: ClassVar[float] = 0.02
     largest: ClassVar[float] = 0.15
 

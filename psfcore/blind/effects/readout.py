@@ -17,14 +17,14 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DarkOffset(Effect):
-    """A pedestal left in every readout, of either sign, that differs by a twentieth from image to image."""
+    """A constant left in every image, of either sign, that varies by 5 % from image to image."""
 
     sign: int = 1
     seed: int = 0
 
     name: ClassVar[str] = "dark_offset"
     unit: ClassVar[str] = "DN"
-    cause: ClassVar[str] = "the bias that is taken off is not that of the day"
+    cause: ClassVar[str] = "the bias that was subtracted is not that of the day"
     nominal: ClassVar[float] = 1.0
     largest: ClassVar[float] = 12.0
 
@@ -39,13 +39,13 @@ class DarkOffset(Effect):
 
 @dataclass(frozen=True)
 class GainMismatch(Effect):
-    """Combined images too bright or too faint against the high-only ones."""
+    """Combined images are too bright or too faint compared with the high-only images."""
 
     sign: int = 1
 
     name: ClassVar[str] = "gain_mismatch"
     unit: ClassVar[str] = "share"
-    cause: ClassVar[str] = "the ratio of the two gains is not what the combination assumes"
+    cause: ClassVar[str] = "the ratio of the two gains differs from the one that the combination assumes"
     nominal: ClassVar[float] = 0.1
     largest: ClassVar[float] = 0.25
 
@@ -56,23 +56,23 @@ class GainMismatch(Effect):
     def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
         if moment.shot.gain_mode != COMBINED:
             return dn
-        # Faint pixels too, though a combined image has these from the high gain: as the library has it.
+        # Faint pixels too, as in the library, although a combined image takes them from the high gain.
         return dn * (1 + self.sign * self.strength)
 
 
 @dataclass(frozen=True)
 class Nonlinearity(Effect):
-    """Faint signals come out fainter: as a power of the signal below a knee, or as charge that a trap keeps."""
+    """Faint signals are reduced: by a power law below a knee, or by charge that a trap keeps."""
 
     knee_dn: float = 60.0
     trap: bool = False
 
     name: ClassVar[str] = "nonlinearity"
     unit: ClassVar[str] = "share lost at the faint end"
-    cause: ClassVar[str] = "traps hold back the first charges, or the amplifier bends near zero"
+    cause: ClassVar[str] = "traps keep the first charges, or the amplifier is nonlinear near zero"
     nominal: ClassVar[float] = 0.1
     largest: ClassVar[float] = 0.6
-    draws: ClassVar[int] = 12
+    noise_realisations: ClassVar[int] = 12
 
     @classmethod
     def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
@@ -85,20 +85,20 @@ class Nonlinearity(Effect):
         if self.trap:
             kept = self.strength * self.knee_dn * (1 - np.exp(-size / self.knee_dn))
             return np.asarray(np.sign(dn) * (size - kept))
-        # A power 1 + p below the knee: strength is what is lost at a twentieth of it.
+        # A power 1 + p below the knee. The strength is the share lost at a twentieth of the knee.
         power = -np.log1p(-self.strength) / np.log(20)
         return np.asarray(dn * np.minimum(np.maximum(size, 1e-3) / self.knee_dn, 1.0) ** power)
 
 
 @dataclass(frozen=True)
 class ColumnSmear(Effect):
-    """Every pixel gets a share of the light of the pixels that it passed on its way out, and of all its column."""
+    """Every pixel gets a share of the light of its column, and of the pixels that it passes during the readout."""
 
     passed: float = 0.5
 
     name: ClassVar[str] = "column_smear"
     unit: ClassVar[str] = "share of the column's mean"
-    cause: ClassVar[str] = "columns stay lit while they are read"
+    cause: ClassVar[str] = "columns are exposed while they are read out"
     nominal: ClassVar[float] = 0.005
     largest: ClassVar[float] = 0.1
 
@@ -114,12 +114,12 @@ class ColumnSmear(Effect):
 
 @dataclass(frozen=True)
 class Persistence(Effect):
-    """What earlier images left: a share that decays with time, of the last four images, whatever they showed."""
+    """A share of the last four images, of any pointing, remains and decays with time."""
 
     decay_s: float = 300.0
 
     name: ClassVar[str] = "persistence"
-    unit: ClassVar[str] = "share at once"
+    unit: ClassVar[str] = "share at time 0"
     cause: ClassVar[str] = "traps release charge of earlier exposures"
     nominal: ClassVar[float] = 0.01
     largest: ClassVar[float] = 0.3
@@ -138,14 +138,14 @@ class Persistence(Effect):
 
 @dataclass(frozen=True)
 class RowCrosstalk(Effect):
-    """Bright pixels leave an echo in their row, some way behind, fading over a few pixels. Not in the library."""
+    """Bright pixels leave an echo at a fixed distance in their row, a few pixels wide. Not in the library."""
 
     lag: float = 0.2
     above: float = 0.5
 
     name: ClassVar[str] = "row_crosstalk"
     unit: ClassVar[str] = "share"
-    cause: ClassVar[str] = "the readout's channels talk to each other"
+    cause: ClassVar[str] = "electrical crosstalk between the channels of the readout"
     nominal: ClassVar[float] = 0.01
     largest: ClassVar[float] = 0.3
 
@@ -167,7 +167,7 @@ class RowCrosstalk(Effect):
 
 @dataclass(frozen=True)
 class Stripes(Effect):
-    """A pattern of the readout, wider than the disc, the same in all images. Not in the library."""
+    """A periodic pattern of the readout, wider than the disc, the same in all images. Not in the library."""
 
     period_px: float = 60.0
     angle_deg: float = 0.0
@@ -175,7 +175,7 @@ class Stripes(Effect):
 
     name: ClassVar[str] = "stripes"
     unit: ClassVar[str] = "DN"
-    cause: ClassVar[str] = "the power supply's ripple in step with the readout"
+    cause: ClassVar[str] = "a ripple of the power supply, in phase with the readout"
     nominal: ClassVar[float] = 2.0
     largest: ClassVar[float] = 40.0
 
@@ -193,22 +193,22 @@ class Stripes(Effect):
 
 @dataclass(frozen=True)
 class FaintRounding(Effect):
-    """Numbers cut towards zero in steps that grow as the root of the signal. Not in the library.
+    """Values are truncated towards zero, in steps that grow as the square root of the signal. Not in the library.
 
-    strength: the step in units of the root of 6 times the signal, that is of photon noise.
+    strength: the step in units of sqrt(6 signal), which is the photon noise.
     """
 
     name: ClassVar[str] = "faint_rounding"
     unit: ClassVar[str] = "share of the noise"
-    cause: ClassVar[str] = "compression on board drops digits instead of rounding them"
+    cause: ClassVar[str] = "the compression on board truncates values instead of rounding them"
     nominal: ClassVar[float] = 0.3
     largest: ClassVar[float] = 3.0
-    draws: ClassVar[int] = 12
+    noise_realisations: ClassVar[int] = 12
 
     def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
         if self.strength == 0:
             return dn
-        # sqrt(|D|) in even steps of q is D in steps of 2 q sqrt(|D|).
+        # Equal steps q of sqrt(|D|) are steps 2 q sqrt(|D|) of D.
         q = self.strength * np.sqrt(6.0) / 2
         return np.asarray(np.sign(dn) * (q * np.floor(np.sqrt(np.abs(dn)) / q)) ** 2)
 
