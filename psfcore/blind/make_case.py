@@ -27,8 +27,8 @@ from psfcore.blind.effects.effect import Effect
 from psfcore.blind.effects.fine_optics import binned_glass, fine_optics
 from psfcore.blind.leftover import Left, LinearEstimator, refitted, rms_difference
 from psfcore.fits.fits_io import Cards, CardValue, write_plane
+from psfcore.simulate.headers import HRI_EUV
 from psfcore.simulate.plan import HIGH, Plan
-from psfcore.simulate.transit_files import instrument_values, shot_values
 from psfcore.transit.prepare import Exposure, prepare
 from psfcore.transit.transit import Frame, Place
 
@@ -212,7 +212,7 @@ def write_transit(made: Made, plan: Plan, folder: Path) -> None:
     for n, dn in enumerate(made.exposures):
         cards = _frame_cards(plan, n, made.saturation_dn)
         write_plane(folder / f"{n:03d}.fits", dn.astype(np.int32), cards=cards)
-    write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(instrument_values()))
+    write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(HRI_EUV.values()))
     entries = [
         {
             "file": f"{n:03d}.fits",
@@ -226,7 +226,7 @@ def write_transit(made: Made, plan: Plan, folder: Path) -> None:
     noise = {"photon_gain_dn": plan.noise.photon_gain_dn, "read_noise_dn": plan.noise.read_noise_dn}
     content = {
         "schema": SCHEMA,
-        "instrument": "hri_euv",
+        "instrument": HRI_EUV.name,
         "known_psf": "diffraction.fits",
         "noise": noise,
         "images": entries,
@@ -236,7 +236,7 @@ def write_transit(made: Made, plan: Plan, folder: Path) -> None:
 
 def _frame_cards(plan: Plan, index: int, level: float | None) -> Cards:
     shot = plan.shots[index]
-    values = shot_values(shot, "DN")
+    values = HRI_EUV.shot_values(shot, "DN")
     if level is not None and shot.gain_mode == HIGH:
         values["SATURATE"] = level
     return _cards(values)

@@ -58,7 +58,11 @@ def simulate() -> None:
 @click.option("--saturation", type=float, help="DN that high-gain images clip at [default: none]")
 @click.option("--dark-offset", default=0.0, show_default=True, help="DN added to every pixel")
 @click.option(
-    "--instrument", default="hri_euv", show_default=True, metavar="NAME|FILE", help="Its diffraction is built"
+    "--instrument",
+    default="hri_euv",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="Instrument: its diffraction is built, its keywords are written",
 )
 @click.option(
     "--diffraction", type=FILE, help="A known diffraction (FITS), sum 1, in place of the instrument's"
@@ -93,6 +97,8 @@ def transit(
     force: bool,
 ) -> None:
     """Write a simulated transit with its truth into a folder."""
+    from psfcore.instruments.model import load_instrument
+    from psfcore.simulate.headers import imitated
     from psfcore.simulate.plan import default_plan
     from psfcore.simulate.scatter_truth import ScatterTruth
     from psfcore.simulate.transit import simulate as simulated
@@ -106,7 +112,8 @@ def transit(
             diffraction, instrument, diffraction_size or min(2 * size, LARGEST_DIFFRACTION_PX)
         )
         scenes = _scenes(scene_files, plan)
-        made = simulated(plan, scatter, known, seed, scenes=scenes, threads=2)
+        of_instrument = imitated(load_instrument(instrument))
+        made = simulated(plan, scatter, known, seed, scenes=scenes, imitated=of_instrument, threads=2)
         try:
             write(made, output)
         except OSError as error:
