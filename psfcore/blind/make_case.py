@@ -196,7 +196,7 @@ def _clipped(exposures: Sequence[Plane], plan: Plan, level: float | None) -> lis
 
 
 def _reported(case: Case) -> list[Place]:
-    """The occulter's places as the ephemeris gives them, to a tenth of a pixel."""
+    """The places of the occulter from the ephemeris, to a tenth of a pixel."""
     rng = np.random.default_rng([case.seed, _PLACE_STREAM])
     plan = case.plan
     errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))

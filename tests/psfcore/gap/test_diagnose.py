@@ -170,7 +170,9 @@ def test_light_that_clipping_took_from_a_brightening_is_known_by_its_place(clean
     filled = inside > 0
     lost = np.where(filled, np.sqrt(np.maximum(inside, 0)) / 7, 0.0)
     frames = tuple(
-        replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=filled) if f.pointing == fov else f
+        replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=filled)
+        if f.pointing == fov
+        else f
         for f in clean.frames
     )
     found = verdict(replace(clean, frames=frames))

@@ -46,7 +46,7 @@ def test_aia_171_has_the_keywords_of_aia(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "transit.json").read_text())["instrument"] == "aia_171"
     transit = read_transit(tmp_path, LIMITS)
     assert transit.instrument == "aia_171"
-    assert [frame.exposure_s for frame in transit.frames] == [5.0, 1.8, 0.9]
+    assert [frame.exposure_s for frame in transit.frames] == [5.0, 1.8, 5.0]
     assert transit.plate_scale_arcsec == pytest.approx(0.599489, abs=1e-6)
 
 
