@@ -1,11 +1,11 @@
-"""`python -m studies.edges`: how wrong a deconvolved field is along its edges, for each method and each way.
+"""`python -m studies.edges`: errors of a deconvolved field along its edges, by method and treatment of edges.
 
-A scene of 2048 px is seen through a PSF, with noise, and deconvolved whole; its middle is the run without an edge.
-The same pixels cut out and deconvolved alone are compared with it, in bands along the edges:
+A scene of 2048 px is convolved with a PSF, noise is added, and the whole image is deconvolved. Its middle is the reference
+without edges. The same pixels are cut out and deconvolved alone, and compared with the reference in bands along the edges:
 
     bias = sum(x) / sum(x_ref) - 1,    deviation = sum(abs(x - x_ref)) / sum(x_ref),    in percent     Eq. (1)
 
-The bias is what the band's mean is off by, the deviation what its pixels are.
+The bias is the relative error of the mean of a band, the deviation that of its pixels.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ DISTANCE_PX = np.minimum.outer(*(2 * (np.minimum(np.arange(FIELD_PX), np.arange(
 
 @dataclass(frozen=True)
 class Row:
-    """Eq. (1) for one method, way and seed: a number for each of BANDS_PX, in percent."""
+    """Eq. (1) for one method, treatment of edges and seed, in each of BANDS_PX, percent."""
 
     method: str
     edges: str
@@ -49,7 +49,7 @@ class Row:
 
 
 def study_psf() -> Psf:
-    """The paper's diffuse scatter on its full reach, and a small core."""
+    """The diffuse scatter of the paper on its full reach, convolved with a small core."""
     line = np.exp(-((np.arange(17) - 8) ** 2) / (2 * CORE_SIGMA_PX**2))
     core = np.outer(line, line) / line.sum() ** 2
     kernel = linear_convolve(scatter_kernel(6.15, 2.53, 0.411, 2048), core, (2048, 2048))
@@ -59,7 +59,7 @@ def study_psf() -> Psf:
 def rows(
     seed: int, psf: Psf, cache: EngineCache, *, methods: tuple[str, ...], ways: tuple[str | None, ...]
 ) -> Iterator[Row]:
-    """Every method in every way on one scene; a way of None is the method's own."""
+    """Every method with every treatment of edges on one scene; None is the default of the method."""
     scene = solar_scene((SCENE_PX, SCENE_PX), seed)
     whole = observe(
         scene, psf, exposure_s=EXPOSURE_S, photon_gain_dn=PHOTON_GAIN_DN, read_noise_dn=READ_NOISE_DN, seed=seed,
@@ -69,7 +69,7 @@ def rows(
     middle = (slice(first, first + FIELD_PX),) * 2
     for name in methods:
         deconvolve = method_named(name)
-        # Cut out of its scene a field has no edge near; what surrounds the scene itself is zero.
+        # The middle of the scene is far from its edges; outside, the scene is zero.
         whole_way = "extended" if name == "richardson-lucy-extended" else "zero"
         reference = deconvolve(
             _image(whole), psf, Conditions(edges=whole_way, margin_px=0, threads=2, engine_for=cache)

@@ -1,13 +1,13 @@
-"""How good the inversion is, on simulated transits whose truth is known: bias, errors, pulls, places, stretch.
+"""The accuracy of the inversion on simulated transits whose truth is known: bias, errors, pulls, places, stretch.
 
     python -m studies.transits [--seeds 20] [--processes 2] [--published 0] [--stretch 0] [--size 512] [--images 30]
     python -m studies.transits --bands | --shapes
 
-Each seed draws a power law, scenes, an ephemeris and noise of its own. Printed is what the closing table of the fit
-asks for: the total PSF's cumulative curve against truth, its rms beside the photon bound, pulls, the occulter's
-place, the curve without noise on the true scene's places, and on request the published recipe and stretches. --bands: the
-bands of cross-validations against truth. --shapes: what shapes of scatter leave in held-out images, and the light that
-a free fit puts near the centre beyond the power law's; the truth is a power law.
+Each seed has its own power law, scenes, ephemeris and noise. The output compares the cumulative curve of the total PSF with
+the truth, its rms with the photon bound, and lists pulls, the errors of the occulter's place, and the errors of the curve
+without noise at the true places. Options add the published recipe and stretched scatter. --bands: only the bands of
+cross-validations, compared with the truth. --shapes: only the residuals that shapes of scatter leave in held-out images,
+and the light near the centre that a free fit finds in excess of the power law; the truth is a power law.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ BRIGHT_PHOTONS = 30.0
 
 @cache
 def diffraction(size: int) -> NDArray[np.float64]:
-    """HRI_EUV's diffraction on (size, size), sum 1; kept in the temporary folder, because it takes ten seconds."""
+    """The diffraction of HRI_EUV on (size, size), sum 1; kept in the temporary folder, because it takes ten seconds."""
     kept = Path(gettempdir()) / f"heliopsf-study-{size}.npy"
     if not kept.is_file():
         psf = build_psf(load_instrument("hri_euv"), size=size, component="DIFFRACTION")
@@ -57,7 +57,7 @@ def diffraction(size: int) -> NDArray[np.float64]:
 
 
 def drawn_truth(seed: int, stretch: float = 0.0, angle_deg: float = 0.0) -> ScatterTruth:
-    """A power law about the paper's."""
+    """A random power law similar to that of the paper."""
     rng = np.random.default_rng([seed, 77])
     return ScatterTruth(
         b_px=rng.uniform(5.0, 7.5),
@@ -69,7 +69,7 @@ def drawn_truth(seed: int, stretch: float = 0.0, angle_deg: float = 0.0) -> Scat
 
 
 def one(seed: int, size: int, images: int, published: bool, stretch: bool) -> dict[str, Any]:
-    """One seed through everything that is asked."""
+    """All requested figures of one seed."""
     kernel = diffraction(min(2 * size, REACH_GRID_PX))
     truth = drawn_truth(seed)
     simulated = simulate(default_plan(images, size), truth, kernel, seed)
@@ -105,7 +105,7 @@ def one(seed: int, size: int, images: int, published: bool, stretch: bool) -> di
 
 
 def banded(seed: int, size: int, images: int) -> dict[str, Any]:
-    """One seed cross-validated: errors of the median, and half the width of the 1-sigma band."""
+    """The cross-validation of one seed: errors of the median, and half the width of the 1-sigma band."""
     kernel, truth = diffraction(min(2 * size, REACH_GRID_PX)), drawn_truth(seed)
     solution = invert(simulate(default_plan(images, size), truth, kernel, seed).transit)
     radii = solution.inversion.radii_px
@@ -120,7 +120,7 @@ def banded(seed: int, size: int, images: int) -> dict[str, Any]:
 
 
 def shaped(seed: int, size: int, images: int) -> dict[str, Any]:
-    """One seed: shapes by their held-out errors, and the free fit beside the power law in a cross-validation."""
+    """One seed: shapes by their errors in held-out images, and the free fit compared with the power law."""
     kernel, truth = diffraction(min(2 * size, REACH_GRID_PX)), drawn_truth(seed)
     solution = invert(simulate(default_plan(images, size), truth, kernel, seed).transit)
     found = bands(
@@ -137,7 +137,7 @@ def shaped(seed: int, size: int, images: int) -> dict[str, Any]:
 
 
 def shapes_summary(rows: list[dict[str, Any]]) -> str:
-    """A table a seed, and the excesses."""
+    """One table per seed, and the excesses of the free fit."""
     lines = []
     for row in rows:
         lines.append(f"seed {row['seed']}")
@@ -164,7 +164,7 @@ def bands_summary(rows: list[dict[str, Any]]) -> str:
 
 
 def _places(simulated: SimulatedTransit, solution: Solution, bound: Any) -> list[list[float]]:
-    """For each frame: photons a pixel, errors in x and y, stated errors, bounds (px)."""
+    """For each frame: photons per pixel, errors in x and y, stated errors, bounds (px)."""
     rows = []
     for n, frame in zip(solution.part, solution.inversion.frames, strict=True):
         exact, found = simulated.truth.places[n], frame.found
@@ -184,7 +184,7 @@ def _places(simulated: SimulatedTransit, solution: Solution, bound: Any) -> list
 
 
 def _noise_free(simulated: SimulatedTransit, true_curve: NDArray[np.float64]) -> list[float]:
-    """Errors of the curve where the images hold no noise and the ephemeris is exact."""
+    """The errors of the curve for images without noise and with exact places."""
     frames = tuple(
         replace(frame, pixels=seen.astype(np.float32), place=place)
         for frame, seen, place in zip(
@@ -196,7 +196,7 @@ def _noise_free(simulated: SimulatedTransit, true_curve: NDArray[np.float64]) ->
 
 
 def _stretch(seed: int, kernel: NDArray[np.float64], size: int, images: int) -> dict[str, Any]:
-    """15 % at -15 degrees put in, and none: what a fit with a free angle finds, in its own two numbers."""
+    """The stretch that a fit with a free angle finds, for a true stretch of 15 % at -15 degrees and of 0."""
     out = {}
     for name, amount in (("put_in", 0.15), ("none", 0.0)):
         truth = drawn_truth(seed, amount, -15.0)
@@ -215,7 +215,7 @@ def _stretch(seed: int, kernel: NDArray[np.float64], size: int, images: int) -> 
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """The table."""
+    """The table of all seeds."""
     error, sigma, bound = (np.array([row[k] for row in rows]) for k in ("error", "sigma", "bound"))
     pull = error / sigma
     rms, bound_rms = np.sqrt((error**2).mean(0)), np.sqrt((bound**2).mean(0))
@@ -243,13 +243,13 @@ def summary(rows: list[dict[str, Any]]) -> str:
     moderate = places[:, 5] < 0.3
     ratio = np.sqrt((places[moderate, 1:3] ** 2).sum() / (places[moderate, 5:7] ** 2).sum())
     lines.append(
-        f"place: rms {np.sqrt((places[bright, 1:3] ** 2).mean()):.3f} px where a disc has {BRIGHT_PHOTONS:g} photons "
-        f"a pixel or more, bound {np.sqrt((places[bright, 5:7] ** 2).mean()):.3f}; pulls {pulls.mean():.2f} +- "
-        f"{pulls.std():.2f}; where the bound is below 0.3 px rms / bound = {ratio:.2f}"
+        f"place: rms {np.sqrt((places[bright, 1:3] ** 2).mean()):.3f} px for discs with {BRIGHT_PHOTONS:g} photons "
+        f"per pixel or more, bound {np.sqrt((places[bright, 5:7] ** 2).mean()):.3f}; pulls {pulls.mean():.2f} +- "
+        f"{pulls.std():.2f}; for bounds below 0.3 px rms / bound = {ratio:.2f}"
     )
     seconds = [row["seconds"] for row in rows]
     lines.append(
-        f"chi2 a pixel {np.mean([row['chi2'] for row in rows]):.3f}; rounds {np.mean([row['rounds'] for row in rows]):.1f}; "
+        f"chi2 per pixel {np.mean([row['chi2'] for row in rows]):.3f}; rounds {np.mean([row['rounds'] for row in rows]):.1f}; "
         f"converged {sum(row['converged'] for row in rows)}; {np.median(seconds):.1f} s a fit, one thread"
     )
     if "published" in rows[0]:
@@ -281,10 +281,10 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--images", type=int, default=30)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--published", type=int, default=0, help="seeds that the published recipe gets")
-    parser.add_argument("--stretch", type=int, default=0, help="seeds that a stretch is put into")
-    parser.add_argument("--bands", action="store_true", help="cross-validate each seed, and nothing else")
-    parser.add_argument("--shapes", action="store_true", help="compare shapes of each seed, and nothing else")
+    parser.add_argument("--published", type=int, default=0, help="number of seeds for the published recipe")
+    parser.add_argument("--stretch", type=int, default=0, help="number of seeds for stretched scatter")
+    parser.add_argument("--bands", action="store_true", help="only cross-validate each seed")
+    parser.add_argument("--shapes", action="store_true", help="only compare shapes for each seed")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     diffraction(min(2 * asked.size, REACH_GRID_PX))

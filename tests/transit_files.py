@@ -1,4 +1,4 @@
-"""A transit so small that it is written and read in milliseconds, whose every pixel is known."""
+"""A transit so small that it is written and read in milliseconds; all its pixels are known."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ READ_NOISE = {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
 SPOT = (slice(40, 46), slice(60, 68))  # far brighter than the rest
 
 
-def true_rate(fov: int) -> NDArray[np.float64]:
-    """DN/s [y, x] of a pointing's scene: a slope, stripes and a bright spot."""
+def true_rate(pointing: int) -> NDArray[np.float64]:
+    """The scene of a pointing, DN/s [y, x]: a slope, stripes and a bright spot."""
     y, x = np.indices(SHAPE)
-    scene = 100.0 + 20 * fov + 0.5 * x + 10 * np.sin(y / 3.0)
+    scene = 100.0 + 20 * pointing + 0.5 * x + 10 * np.sin(y / 3.0)
     scene[SPOT] = 1000.0
     return scene
 
 
 def place_of(index: int) -> tuple[float, float]:
-    """Where the occulter of an image is, x and y in px."""
+    """The place of the occulter in an image, x and y in px."""
     return 10.0 + 4.0 * index, 20.0
 
 
@@ -41,17 +41,17 @@ def write_transit(
     cards: dict[str, object] | None = None,
     **manifest: Any,
 ) -> Path:
-    """Write images in DN, exposed 2 s and 1 s in turn, of two pointings; with their PSF and transit.json.
+    """Write images in DN, with exposures of 2 s and 1 s in turn and two pointings; with their PSF and transit.json.
 
-    cards: further ones for every image; None takes one away. manifest: keys to replace; None takes one away.
+    cards: further keywords of every image. manifest: keys of transit.json to replace. None removes an entry.
     """
     folder.mkdir(parents=True, exist_ok=True)
     entries = []
     for index in range(images):
-        name, fov = f"{index:03d}.fits", 1 + index // 3
+        name, pointing = f"{index:03d}.fits", 1 + index // 3
         x, y = place_of(index)
-        entries.append({"file": name, "fov": fov, "x": x, "y": y, "r": RADIUS_PX})
-        write_frame(folder / name, index, fov, cards or {})
+        entries.append({"file": name, "fov": pointing, "x": x, "y": y, "r": RADIUS_PX})
+        write_frame(folder / name, index, pointing, cards or {})
     write_kernel(folder / "diffraction.fits")
     content = {
         "schema": "transit/1",
@@ -64,10 +64,10 @@ def write_transit(
     return folder
 
 
-def write_frame(path: Path, index: int, fov: int, cards: dict[str, object]) -> None:
+def write_frame(path: Path, index: int, pointing: int, cards: dict[str, object]) -> None:
     """One image of the transit."""
     exposure_s = 2.0 if index % 2 == 0 else 1.0
-    rate = true_rate(fov)
+    rate = true_rate(pointing)
     y, x = np.indices(SHAPE)
     cx, cy = place_of(index)
     rate[np.hypot(x - cx, y - cy) <= RADIUS_PX] = 10.0
@@ -95,7 +95,7 @@ def write_frame(path: Path, index: int, fov: int, cards: dict[str, object]) -> N
 
 
 def write_kernel(path: Path, kernel: NDArray[np.float64] | None = None) -> None:
-    """A known part of a PSF; by default one of 32 px that sums to 1."""
+    """Write the known part of a PSF; by default one of 32 px with sum 1."""
     if kernel is None:
         y, x = np.indices((32, 32)) - 16
         kernel = np.exp(-0.5 * (x * x + y * y) / 1.5**2)
@@ -104,13 +104,13 @@ def write_kernel(path: Path, kernel: NDArray[np.float64] | None = None) -> None:
 
 
 def load_manifest(folder: Path) -> dict[str, Any]:
-    """What transit.json holds."""
+    """The content of transit.json."""
     content: dict[str, Any] = json.loads((folder / "transit.json").read_text())
     return content
 
 
 def save_manifest(folder: Path, content: object) -> None:
-    """Write transit.json anew."""
+    """Write transit.json again."""
     (folder / "transit.json").write_text(json.dumps(content))
 
 
@@ -118,7 +118,7 @@ TRUTH = ScatterTruth(b_px=6.0, c=2.5, total=0.41)
 
 
 def diffraction(size: int = 64) -> NDArray[np.float64]:
-    """A core that spreads, and arms: sum 1."""
+    """An extended core with arms, sum 1."""
     y, x = np.indices((size, size)) - size // 2
     r = np.hypot(x, y)
     kernel = np.exp(-r / 0.8) + 1e-4 * ((x == 0) | (y == 0)) * np.exp(-r / 12)
@@ -126,7 +126,7 @@ def diffraction(size: int = 64) -> NDArray[np.float64]:
 
 
 def write_simulated(folder: Path) -> Path:
-    """Nine bright images of 128 px, seen through TRUTH and diffraction()."""
+    """Write nine bright images of 128 px, with the PSF of TRUTH and diffraction()."""
     plan = default_plan(9, 128, oversampling=1, brightness=30.0)
     write(simulate(plan, TRUTH, diffraction(), seed=4), folder)
     return folder

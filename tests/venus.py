@@ -1,9 +1,9 @@
-"""`python -m tests.venus`: real occultations by Venus, their dark disc against the ring round it.
+"""`python -m tests.venus`: real occultations by Venus: the light in the dark disc over that in the ring around it.
 
-The disc should be dark: what is in it is scattered, or noise. A PSF that holds the telescope's scatter takes light out
-of it; how much says how far that PSF goes. No PSF of XRT or of AIA's 1600 A channel is known here, so a stated one
-is used: the softened power law, its total chosen by the scan below, and nothing else. The peer's deconvolution
-of the XRT image, with its own PSF, stands beside ours.
+The disc should be dark; its light is scattered light, or noise. Deconvolution with a PSF that contains the scatter of the
+telescope removes light from the disc; the amount shows how complete the PSF is. No PSF of XRT or of AIA's 1600 A channel
+is available here. An assumed PSF is used: only the softened power law, with the totals of the scan below. A published
+deconvolution of the XRT image, with its own PSF, is listed for comparison.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TOTALS = (0.05, 0.10, 0.20, 0.30)
 
 
 def core_and_annulus(pixels: NDArray[np.float64], x: float, y: float, radius: float) -> tuple[float, float]:
-    """Mean of the inner half of the disc, and of the ring from 1.2 to 1.6 radii."""
+    """The means of the inner half of the disc and of the ring from 1.2 to 1.6 radii."""
     yy, xx = np.indices(pixels.shape)
     r = np.hypot(xx - x, yy - y) / radius
     core, ring = pixels[r < 0.5], pixels[(r > 1.2) & (r < 1.6)]
@@ -41,13 +41,13 @@ def core_and_annulus(pixels: NDArray[np.float64], x: float, y: float, radius: fl
 
 
 def stated_psf(total: float) -> Psf:
-    """The softened power law alone."""
+    """A PSF that is only the softened power law."""
     kernel = scatter_kernel(B_PX, C, total, 2048)
     return Psf(kernel, f"power law b={B_PX} c={C} total={total}", "0", None, "draft", None, None)
 
 
 def table(shared: Path) -> list[tuple[str, str, float, float]]:
-    """(image, what was done, core, ring) for each image and each total."""
+    """(image, processing, core, ring) for each image and each total."""
     rows = []
     limits = FitsLimits(max_pixels=2**24)
     for name, (file, x, y, radius) in DISCS.items():
@@ -60,7 +60,7 @@ def table(shared: Path) -> list[tuple[str, str, float, float]]:
             )
         if name == "XRT":
             peer = read_image(shared / FOLDER / PEER, limits)
-            rows.append((name, "the peer's deconvolution", *core_and_annulus(peer.pixels, x, y, radius)))
+            rows.append((name, "published deconvolution", *core_and_annulus(peer.pixels, x, y, radius)))
     return rows
 
 

@@ -1,11 +1,11 @@
-"""A blind set on disk: its folders, its seals, and the making of all its cases.
+"""A blind set on disk: its folders, its seals, and how its cases are made.
 
 DIR/set.json                  how the set was made: seed, sizes, number of cases
-DIR/cases/NNNN/transit/       what a diagnosis gets
-DIR/cases/NNNN/report.json    what it said (gap/1); run.json: time, memory, and why there is no report
+DIR/cases/NNNN/transit/       the input of a diagnosis
+DIR/cases/NNNN/report.json    its report (gap/1); run.json: time, memory, and the reason if there is no report
 DIR/truth/NNNN.json           salt and truth
-DIR/seals.jsonl               {"case", "sha256"}, a line a case
-DIR/score.json, .txt, .png    the figures, the table, the picture; made anew by each run
+DIR/seals.jsonl               {"case", "sha256"}, one line per case
+DIR/score.json, .txt, .png    the figures, the table, the picture; each run writes them again
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SetPlan:
-    """How a set is made. first: the number of its first case; the others: as draw_case has them."""
+    """How a set is made. first: the number of its first case; the other fields: see draw_case."""
 
     cases: int
     seed: int
@@ -53,13 +53,13 @@ class SetPlan:
 
     @property
     def numbers(self) -> range:
-        """The cases' numbers."""
+        """The numbers of the cases."""
         return range(self.first, self.first + self.cases)
 
 
 @dataclass(frozen=True)
 class _Attempt:
-    """A case that was made and sealed, or why it could not be."""
+    """The attempt to make one case: its seal, or the reason why it could not be made."""
 
     case: int
     seconds: float
@@ -69,50 +69,52 @@ class _Attempt:
 
 @dataclass(frozen=True)
 class BlindSet:
-    """A folder that holds a set."""
+    """The folder of a set, and the paths in it."""
 
     folder: Path
 
     def case_folder(self, number: int) -> Path:
-        """Of one case: its transit, then its report."""
+        """The folder of a case: its transit, then its report."""
         return self.folder / "cases" / f"{number:04d}"
 
     def transit(self, number: int) -> Path:
-        """What a diagnosis gets."""
+        """The input of a diagnosis."""
         return self.case_folder(number) / "transit"
 
     def report(self, number: int) -> Path:
-        """What it said."""
+        """The report of a diagnosis."""
         return self.case_folder(number) / "report.json"
 
     def truth_file(self, number: int) -> Path:
-        """Salt and truth."""
+        """The file with salt and truth."""
         return self.folder / "truth" / f"{number:04d}.json"
 
     @property
     def seals_file(self) -> Path:
-        """The seals of all cases."""
+        """The file with the seals of all cases."""
         return self.folder / "seals.jsonl"
 
     def seals(self) -> dict[int, str]:
-        """SHA-256 by case. Raises DataError "bad-seals"."""
+        """The SHA-256 of each case. Raises DataError "bad-seals"."""
         if not self.seals_file.is_file():
             return {}
         found: dict[int, str] = {}
-        # What stands behind the last end of a line was cut when the power went; its case is made again.
+        # A last line without an end was cut by a power failure. Its case is made again.
         for line in self.seals_file.read_text("utf-8").rpartition("\n")[0].splitlines():
             try:
                 entry = json.loads(line)
                 number, seal = int(entry["case"]), str(entry["sha256"])
             except (ValueError, KeyError, TypeError) as error:
-                message = f"expected a case and its sha256 a line; got {line!r:.60}"
+                message = (
+                    f"expected lines with a case and its sha256 in {self.seals_file.name}; got {line!r:.60}"
+                )
                 raise DataError("bad-seals", message) from error
             if found.setdefault(number, seal) != seal:
-                raise DataError("bad-seals", f"expected one seal a case; got two for case {number:04d}")
+                raise DataError("bad-seals", f"expected one seal per case; got two for case {number:04d}")
         return found
 
     def truth(self, number: int) -> dict[str, Any]:
-        """A case's truth, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
+        """The truth of a case; checks its seal. Raises DataError "broken-seal", "bad-seals"."""
         seal = self.seals().get(number)
         try:
             kept = json.loads(self.truth_file(number).read_text("utf-8"))
@@ -123,13 +125,14 @@ class BlindSet:
             ) from error
         if seal is None or seal_of(salt, truth) != seal:
             message = (
-                f"case {number:04d}: expected a truth that hashes to {seal}; it was changed, or never sealed"
+                f"case {number:04d}: expected a truth with the hash {seal}; it was changed after it was sealed, "
+                "or never sealed"
             )
             raise DataError("broken-seal", message)
         return truth
 
     def is_made(self, number: int) -> bool:
-        """Whether a case was made and sealed; its transit may have been deleted after the report.
+        """Whether a case was made and sealed. Its transit may have been deleted after the diagnosis.
 
         Raises DataError "bad-seals".
         """
@@ -144,10 +147,10 @@ def make_set(
     processes: int = 1,
     progress: Progress = lambda line: None,
 ) -> tuple[BlindSet, dict[int, str]]:
-    """Make and seal all cases of a set that are not there yet; the set, and why by case where one cannot be made.
+    """Make and seal the missing cases of a set; returns the set, and the reasons for the cases that failed, by number.
 
-    scenes: images [y, x] in DN/s to take scenes from. Raises DataError "other-set" where the folder holds a set made
-    otherwise or from other scenes, "bad-seals", and what drawing a case raises, before any is made.
+    scenes: images [y, x] in DN/s from which scenes are taken. Raises DataError "other-set" if the folder holds a set
+    made with another plan or other scenes, "bad-seals", and the errors of draw_case, all before a case is made.
     """
     made = BlindSet(folder)
     _remember(made, plan, scenes)
@@ -156,7 +159,7 @@ def make_set(
     missing = [n for n in plan.numbers if not (n in sealed_before and made.truth_file(n).is_file())]
     cases = [_drawn(plan, number) for number in missing]
     for number in missing:
-        shutil.rmtree(made.case_folder(number), ignore_errors=True)  # half made
+        shutil.rmtree(made.case_folder(number), ignore_errors=True)  # left by an interrupted run
     not_made: dict[int, str] = {}
     for done, attempt in enumerate(_made(made, cases, scenes, processes), 1):
         so_far = f"in {attempt.seconds:.1f} s ({done} of {len(missing)})"
@@ -174,15 +177,17 @@ def make_set(
 
 
 def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
-    """Write how the set is made, or see that it is the same."""
+    """Write how the set is made, or check that the set in the folder was made in the same way."""
     about = json.loads(json.dumps(asdict(plan) | {"scenes": [array_sha256(scene) for scene in scenes]}))
     file = made.folder / "set.json"
     if file.is_file():
-        before = {"scenes": []} | json.loads(file.read_text("utf-8"))  # sets made earlier do not say
+        before = {"scenes": []} | json.loads(file.read_text("utf-8"))  # older sets have no "scenes"
         same = {key: value for key, value in before.items() if key != "cases"}
         if same != {key: value for key, value in about.items() if key != "cases"}:
             raise DataError(
-                "other-set", f"expected a folder for {about}; {made.folder} holds a set made with {before}"
+                "other-set",
+                f"expected an empty folder, or one with a set made with {about}; {made.folder} holds a set made "
+                f"with {before}. Choose another folder",
             )
     made.folder.mkdir(parents=True, exist_ok=True)
     write_whole(file, json.dumps(about, indent=1) + "\n")
@@ -190,20 +195,21 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """While it lasts, no other process works on the set in this folder. Raises DataError "set-in-use"."""
+    """Lock the set in this folder against other processes. Raises DataError "set-in-use"."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as held:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise DataError(
-                "set-in-use", f"expected a folder that no other run works on; {folder} is in use"
+                "set-in-use",
+                f"expected a folder that no other run uses; {folder} is in use. Wait until that run ends",
             ) from error
         yield
 
 
 def _end_cut_line(file: Path) -> None:
-    """Take away what a loss of power left of a last line."""
+    """Remove an incomplete last line, which a power failure left."""
     if file.is_file() and not (text := file.read_text("utf-8")).endswith("\n"):
         file.write_text(text.rpartition("\n")[0] + "\n" if "\n" in text else "", "utf-8")
 
@@ -211,11 +217,11 @@ def _end_cut_line(file: Path) -> None:
 def _made(
     made: BlindSet, cases: Sequence[Case], scenes: Sequence[Plane], processes: int
 ) -> Iterator[_Attempt]:
-    """Each case's making, as they come."""
+    """Make the cases; the attempts come in the order in which they end."""
     if processes <= 1 or len(cases) <= 1:
         yield from (_make_one(made, case, scenes) for case in cases)
         return
-    # Fork would carry this process's threads' locks along.
+    # With "fork" the children would inherit locks that threads of this process hold.
     with ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_end_with_parent
     ) as pool:
@@ -225,7 +231,7 @@ def _made(
 
 
 def _end_with_parent() -> None:
-    """A process of the pool would outlive a parent that was killed, and go on making."""
+    """End this process of the pool with its parent; otherwise it would continue after the parent was killed."""
 
     def wait() -> None:
         parent = parent_process()

@@ -1,6 +1,7 @@
-"""Which case is which: drawn from a seed and a number, the same for the same two, in shares that come out even.
+"""What each case of a blind set contains, drawn at random from the seed of the set and the number of the case.
 
-Of every 24 cases in a row 8 are clean, 10 carry one known effect, 2 carry two, 4 carry one that nobody's library has.
+Equal seed and number give the same case. Of each 24 consecutive cases 8 are clean, 10 have one known effect, 2 have two
+known effects, and 4 have one effect that the gap library does not know.
 """
 
 from __future__ import annotations
@@ -29,16 +30,17 @@ CLEAN, SINGLE, PAIR, FOREIGN = "clean", "single", "pair", "unknown"
 KINDS = (CLEAN, SINGLE, PAIR, FOREIGN)
 _BLOCK = (CLEAN,) * 8 + (SINGLE,) * 10 + (PAIR,) * 2 + (FOREIGN,) * 4
 _TARGET_PCT = (0.5, 10.0)
-_BUILT_SHARE = 0.5  # of cases whose diffraction is the instrument's
+_BUILT_SHARE = 0.5  # of cases with the instrument's diffraction
 _SATURATING_SHARE = 0.25
 _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 
 
 @dataclass(frozen=True)
 class Case:
-    """One case before it is made. target_pct: what each of its effects is meant to leave in the discs after a refit.
+    """One case before it is made.
 
-    effects: at their nominal strengths. headroom: saturation level over the brightest pixel, None for none.
+    effects: at their nominal strengths. target_pct: what each effect should leave in the discs after a refit.
+    headroom: saturation level over the brightest pixel; None: no saturation.
     """
 
     number: int
@@ -52,7 +54,7 @@ class Case:
     headroom: float | None
 
     def as_json(self) -> dict[str, Any]:
-        """What the truth says of how it was drawn."""
+        """The part of the truth that tells how the case was drawn."""
         return {
             "number": self.number,
             "seed": self.seed,
@@ -73,11 +75,12 @@ def draw_case(
     built_diffraction: bool = True,
     left_pct: Sequence[float] = (),
 ) -> Case:
-    """Case `number` (from 0) of a set. only: single effects of these names in turn, no others.
+    """Case `number` (from 0) of a set.
 
-    built_diffraction: half of the cases have the instrument's diffraction; else all have a synthetic one. left_pct: what
-    the effects are to leave in the discs after a refit, in turn, each for all of `only`; none: drawn.
-    Raises DataError "unknown-effect", "bad-plan".
+    only: names of effects; every case has one of them, in turn. clean_only: no case has an effect.
+    built_diffraction: half of the cases have the instrument's diffraction, the others a synthetic one; False: all have a
+    synthetic one. left_pct: what an effect should leave in the discs after a refit (percent), in turn, each value for
+    all names of `only`; empty: drawn at random. Raises DataError "unknown-effect", "bad-plan".
     """
     kind, names = _what(seed, number, only, clean_only)
     rng = np.random.default_rng([seed, number, _TRUTH_STREAM])
@@ -96,7 +99,7 @@ def draw_case(
 
 
 def _what(seed: int, number: int, only: Sequence[str], clean_only: bool) -> tuple[str, tuple[str, ...]]:
-    """Kind and names of a case."""
+    """The kind of a case and the names of its effects."""
     if clean_only:
         return CLEAN, ()
     if only:
@@ -106,7 +109,7 @@ def _what(seed: int, number: int, only: Sequence[str], clean_only: bool) -> tupl
     block, place = divmod(number, len(_BLOCK))
     kinds = _kinds(seed, block)
     kind = kinds[place]
-    count = block * _BLOCK.count(kind) + kinds[:place].count(kind)  # how many of its kind came before
+    count = block * _BLOCK.count(kind) + kinds[:place].count(kind)  # earlier cases of this kind
     if kind == SINGLE:
         return kind, (_in_turn(seed, count, KNOWN, 0),)
     if kind == FOREIGN:
@@ -124,14 +127,14 @@ def _kinds(seed: int, block: int) -> list[str]:
 
 
 def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
-    """Each name once, in a random order, before any comes again."""
+    """The names in random order; each occurs once before any occurs again."""
     turn, place = divmod(count, len(names))
     order = np.random.default_rng([seed, turn, _KIND_STREAM, 3 + stream]).permutation(len(names))
     return names[order[place]]
 
 
 def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
-    """The usual transit, upright or upside down, its tracks moved a little, dimmer or brighter."""
+    """The default transit, upright or upside down, with shifted tracks and another brightness."""
     plan = default_plan(
         images,
         size_px,
@@ -147,10 +150,12 @@ def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
     shots = []
     for shot in plan.shots:
         x, y = np.clip(
-            (shot.x_px + moves[shot.fov - 1, 0], shot.y_px + moves[shot.fov - 1, 1]), low, size_px - 1 - low
+            (shot.x_px + moves[shot.pointing - 1, 0], shot.y_px + moves[shot.pointing - 1, 1]),
+            low,
+            size_px - 1 - low,
         )
         y = size_px - 1 - y if upside_down else y
-        shots.append(Shot(shot.fov, float(x), float(y), shot.exposure_s, shot.gain_mode, shot.time_s))
+        shots.append(Shot(shot.pointing, float(x), float(y), shot.exposure_s, shot.gain_mode, shot.time_s))
     return dataclasses.replace(plan, shots=tuple(shots))
 
 
@@ -168,32 +173,36 @@ def _glass(size_px: int, rng: np.random.Generator, built: bool) -> Glass:
 
 
 def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
-    """Fine scenes [y, x], DN/s, by pointing: drawn, or cut out of images [y, x] in DN/s, and given other statistics.
+    """Fine scenes [y, x], DN/s, by pointing: synthetic with varied statistics, or cut out of images [y, x] in DN/s.
 
-    images: taken in turn; the west limb's is mirrored where there is one alone. Raises DataError "bad-scene".
+    images: used in turn; a single image is mirrored for the west limb. Raises DataError "bad-scene".
     """
     scenes = {}
-    for fov in case.plan.fovs:
+    for pointing in case.plan.pointings:
         if images:
-            given = images[(case.number + fov - 1) % len(images)]
-            mirrored = len(images) == 1 and case.plan.views[fov - 1] == WEST
+            given = images[(case.number + pointing - 1) % len(images)]
+            mirrored = len(images) == 1 and case.plan.views[pointing - 1] == WEST
             scene = scene_from_image(given[:, ::-1] if mirrored else given, case.plan)
-            scenes[fov] = _calm(scene)
+            scenes[pointing] = _calm(scene)
         else:
-            scenes[fov] = _with_own_statistics(drawn_scene(case.plan, fov, case.seed), case, fov)
-        if scenes[fov].max() <= 0:
-            raise DataError("bad-scene", f"expected a scene with light for pointing {fov}; got none")
+            scenes[pointing] = _with_own_statistics(
+                drawn_scene(case.plan, pointing, case.seed), case, pointing
+            )
+        if scenes[pointing].max() <= 0:
+            raise DataError(
+                "bad-scene", f"expected light in the scene of pointing {pointing}; all its pixels are 0"
+            )
     return scenes
 
 
 def _calm(scene: Plane) -> Plane:
-    """An image has its telescope's noise in it: smoothed by less than a detector pixel."""
+    """Smooth an image by half a detector pixel, because it contains the noise of its telescope."""
     return np.asarray(gaussian_filter(scene, 0.5 * FINE))
 
 
-def _with_own_statistics(scene: Plane, case: Case, fov: int) -> Plane:
-    """Broad and fine modulation, compact brightenings whose light follows a power law, and a floor."""
-    rng = np.random.default_rng([case.seed, fov, 4])
+def _with_own_statistics(scene: Plane, case: Case, pointing: int) -> Plane:
+    """Add broad and fine modulation, compact brightenings with a power law of light, and a constant."""
+    rng = np.random.default_rng([case.seed, pointing, 4])
     n = scene.shape[0]
     seed = int(rng.integers(2**31))
     broad, fine = patches(n, seed, float(rng.uniform(0.1, 0.4))), patches(n, seed + 1, 0.015)

@@ -1,8 +1,9 @@
-"""From scenes to exposures on fine pixels, with any effects on the way.
+"""From scenes to exposures, on fine pixels, with any effects on the way.
 
-    fine light = spread(P (S - h))  ->  light()  ->  boxed  ->  expected()  ->  photons, readout  ->  read_out()  ->  whole DN
+    fine light = spread(P (S - h))  ->  light()  ->  binned  ->  expected()  ->  photons, read noise  ->  read_out()  ->  whole DN
 
-P is linear: a pointing's scene is seen through it once, what an image adds to or hides of it once an image.
+S is the scene, h what the occulter hides of it, P the convolution with the PSF. P is linear: the scene of a pointing is
+convolved once, and for each image only its difference from that scene is convolved.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from psfcore.transit.transit import Place
 Plane = NDArray[np.float64]
 _SKY_STEPS = ("scene", "covered", "optics", "spread")
 _MOST_MOTION_PX = 5.0  # either way from the middle of an exposure
-_DRAWS_STREAM, _NOISE_STREAM = 2001, 2002
+_REALISATIONS_STREAM, _NOISE_STREAM = 2001, 2002
 
 
-class Sky:
-    """Scenes of a plan through a telescope, without any effect; what is seen once is kept.
+class EffectFree:
+    """The images of a plan without any effect, on fine pixels; every result is kept.
 
     scenes: fine [y, x] in DN/s by pointing, FINE pixels along a detector pixel.
     """
@@ -35,36 +36,38 @@ class Sky:
         self._light: dict[int, NDArray[np.float32]] = {}
         self._seen: dict[int, Plane] = {}
 
-    def seen_scene(self, fov: int) -> Plane:
-        """A pointing's scene through the PSF, fine, without an occulter."""
-        if fov not in self._seen:
-            self._seen[fov] = np.asarray(self.optics.through.apply(self.scenes[fov]), dtype=np.float64)
-        return self._seen[fov]
+    def seen_scene(self, pointing: int) -> Plane:
+        """The scene of a pointing convolved with the PSF, fine, without an occulter."""
+        if pointing not in self._seen:
+            self._seen[pointing] = np.asarray(
+                self.optics.through.apply(self.scenes[pointing]), dtype=np.float64
+            )
+        return self._seen[pointing]
 
     def clean_light(self, index: int) -> Plane:
-        """An image's fine light [y, x], DN/s, without any effect."""
+        """The fine light [y, x] of an image, DN/s."""
         if index not in self._light:
-            fov = self.plan.shots[index].fov
+            pointing = self.plan.shots[index].pointing
             lit = _lit(self, (), Moment(self.plan, index))
-            light = self.seen_scene(fov) + self.optics.through.apply(lit - self.scenes[fov])
+            light = self.seen_scene(pointing) + self.optics.through.apply(lit - self.scenes[pointing])
             self._light[index] = light.astype(np.float32)
         return self._light[index].astype(np.float64)
 
 
 class Chain:
-    """One set of effects on a sky."""
+    """A set of effects, applied to effect-free images."""
 
-    def __init__(self, sky: Sky, effects: Sequence[Effect]) -> None:
-        self.sky, self.plan, self.effects = sky, sky.plan, tuple(effects)
+    def __init__(self, clean: EffectFree, effects: Sequence[Effect]) -> None:
+        self.clean, self.plan, self.effects = clean, clean.plan, tuple(effects)
         self._changes_sky = any(acts_on(effect, *_SKY_STEPS) for effect in self.effects)
         self._varies = any(effect.varies for effect in self.effects)
         self._optics: FineOptics | None = None
         self._seen: dict[int, Plane] = {}
 
     def expected(self, index: int) -> Plane:
-        """Light on detector pixels [y, x], DN/s, as it would be counted on average."""
+        """Light on detector pixels [y, x], DN/s: the mean of many exposures before the readout."""
         moment = Moment(self.plan, index)
-        light = self._focal_plane(moment) if self._changes_sky else self.sky.clean_light(index)
+        light = self._focal_plane(moment) if self._changes_sky else self.clean.clean_light(index)
         for effect in self.effects:
             light = effect.light(light, moment)
         rate = binned(np.maximum(light, 0.0), FINE)
@@ -73,34 +76,38 @@ class Chain:
         return np.maximum(rate, 0.0)
 
     def all_expected(self) -> list[Plane]:
-        """Every image as expected() has it."""
+        """expected() of every image."""
         return [self.expected(index) for index in range(len(self.plan.shots))]
 
     def _focal_plane(self, moment: Moment) -> Plane:
-        fov, optics = moment.shot.fov, self._telescope(moment)
-        lit = _lit(self.sky, self.effects, moment)
+        pointing, optics = moment.shot.pointing, self._telescope(moment)
+        lit = _lit(self.clean, self.effects, moment)
         if self._varies:
             seen = np.asarray(optics.through.apply(lit), dtype=np.float64)
         else:
-            if fov not in self._seen:
-                same = optics is self.sky.optics
-                through = self.sky.seen_scene(fov) if same else optics.through.apply(self.sky.scenes[fov])
-                self._seen[fov] = np.asarray(through, dtype=np.float64)
-            seen = self._seen[fov] + optics.through.apply(lit - self.sky.scenes[fov])
+            if pointing not in self._seen:
+                same = optics is self.clean.optics
+                through = (
+                    self.clean.seen_scene(pointing)
+                    if same
+                    else optics.through.apply(self.clean.scenes[pointing])
+                )
+                self._seen[pointing] = np.asarray(through, dtype=np.float64)
+            seen = self._seen[pointing] + optics.through.apply(lit - self.clean.scenes[pointing])
         for effect in self.effects:
             seen = effect.spread(seen, lit, optics, moment)
         return seen
 
     def _telescope(self, moment: Moment) -> FineOptics:
         if self._optics is None or self._varies:
-            optics = self.sky.optics
+            optics = self.clean.optics
             for effect in self.effects:
                 optics = effect.optics(optics, moment)
             self._optics = optics
         return self._optics
 
     def saturation_dn(self, expected: Sequence[Plane]) -> float | None:
-        """The level that high-only images clip at, the plan's unless an effect sets one."""
+        """The level at which high-only images clip: that of the plan, unless an effect sets one."""
         exposures = [rate * shot.exposure_s for rate, shot in zip(expected, self.plan.shots, strict=True)]
         for effect in self.effects:
             level = effect.saturation_dn(exposures, self.plan)
@@ -109,7 +116,7 @@ class Chain:
         return self.plan.saturation_dn
 
     def read_out(self, expected: Sequence[Plane], seed: int) -> list[Plane]:
-        """Exposures in whole DN [y, x], clipped where they clip, with the noise of a seed."""
+        """Clipped exposures in whole DN [y, x], with the noise realisation of a seed."""
         level = self.saturation_dn(expected)
         noisy = self._through_readout(expected, self._noisy(expected, [seed, _NOISE_STREAM]))
         return [
@@ -118,22 +125,22 @@ class Chain:
         ]
 
     def mean_rate(self, expected: Sequence[Plane], seed: int) -> list[Plane]:
-        """Images [y, x], DN/s, clipped, as the mean of many exposures would be, nearly.
+        """Nearly the mean of many exposures: clipped images [y, x], DN/s.
 
-        Where what the readout does depends on noise, its change is averaged over draws of noise.
+        If the change that an effect makes at readout depends on noise, it is averaged over noise realisations.
         """
-        draws = max((effect.draws for effect in self.effects), default=0)
+        realisations = max((effect.noise_realisations for effect in self.effects), default=0)
         exposures = [rate * shot.exposure_s for rate, shot in zip(expected, self.plan.shots, strict=True)]
-        if not draws:
+        if not realisations:
             mean = self._through_readout(expected, exposures)
         else:
             mean = list(exposures)
-            for draw in range(draws):
-                noisy = self._noisy(expected, [seed, _DRAWS_STREAM, draw])
+            for number in range(realisations):
+                noisy = self._noisy(expected, [seed, _REALISATIONS_STREAM, number])
                 for n, (after, before) in enumerate(
                     zip(self._through_readout(expected, noisy), noisy, strict=True)
                 ):
-                    mean[n] = mean[n] + (after - before) / draws
+                    mean[n] = mean[n] + (after - before) / realisations
         level = self.saturation_dn(expected)
         return [
             (dn if level is None or shot.gain_mode != HIGH else np.minimum(dn, level)) / shot.exposure_s
@@ -159,16 +166,16 @@ class Chain:
         return out
 
 
-def _lit(sky: Sky, effects: Sequence[Effect], moment: Moment) -> Plane:
-    """The fine scene of an image with its occulter in it."""
-    scene = sky.scenes[moment.shot.fov]
+def _lit(clean: EffectFree, effects: Sequence[Effect], moment: Moment) -> Plane:
+    """The fine scene of an image with its occulter."""
+    scene = clean.scenes[moment.shot.pointing]
     for effect in effects:
         scene = effect.scene(scene, moment)
     lit = scene.copy()
-    place = sky.plan.place(moment.index)
+    place = clean.plan.place(moment.index)
     wide = Place(
         place.x_px, place.y_px, place.radius_px + _MOST_MOTION_PX
-    )  # a patch that holds a moving disc
+    )  # the patch must contain a moving disc
     around = behind(scene, wide, fine=FINE, margin_px=0)
     share = None
     for effect in effects:

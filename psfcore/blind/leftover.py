@@ -1,11 +1,13 @@
-"""What an effect leaves in the discs: without noise, seen through the estimator, before and after the PSF is fitted anew.
+"""What an effect leaves in the discs: the residual of noise-free images, before and after the PSF is refitted.
 
     e_i = mean of the fully dark pixels of D [y_i - H (1 - D) x_i], in percent of their mean of y_i     Eq. (1)
     left = rms over images of e_i with the effect minus e_i without                                      Eq. (2)
     after a fit, to first order:  r - A (A^T W A)^-1 A^T W r                                             Eq. (3)
 
-Eq. (3) is quick and sets an effect's strength; what a case's truth says of it is measured with a whole inversion.
-H is the true PSF on detector pixels. A is how the dark pixels answer to the scatter's three parameters.
+y_i is image i, x_i its deconvolved scene, D the mask of the fully dark pixels. H is the convolution with the true PSF on
+detector pixels. A is the Jacobian of the dark pixels with respect to the three parameters of the scatter, W their
+weights, r their residuals. Eq. (3) is quick and serves to set the strength of an effect. The figures in the truth
+of a case come from a full inversion.
 """
 
 from __future__ import annotations
@@ -35,20 +37,20 @@ _LEAST_LEVEL = 0.2
 
 @dataclass(frozen=True)
 class _Discs:
-    """One image without the effect: its dark pixels, scene, residual, answers (parameters, pixels) and weights."""
+    """One image without the effect: its dark pixels, scene, residual, Jacobian (parameters, pixels) and weights."""
 
     dark: Pixels
     scene: Lanes
     residual: Vector
-    answers: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
     weight: Vector
 
 
 @dataclass(frozen=True)
 class Left:
-    """Percent, rms over images: what an effect leaves, and what the sampling leaves without one.
+    """What an effect leaves, and what the sampling leaves without an effect (clean): percent, rms over images.
 
-    by_image_pct: what an effect leaves after the refit, signed, by image.
+    by_image_pct: what the effect leaves after the refit in each image, signed.
     """
 
     before_refit_pct: float
@@ -59,7 +61,7 @@ class Left:
 
 
 class LinearEstimator:
-    """Eq. (1) to (3) about images without effect. frames: these, nearly noise-free, with the exact places."""
+    """Eq. (1) to (3), linearised at images without effect. frames: these images, nearly noise-free, with exact places."""
 
     def __init__(self, frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> None:
         shape = (frames[0].pixels.shape[0], frames[0].pixels.shape[1])
@@ -71,7 +73,7 @@ class LinearEstimator:
         self._discs = [self._look(frame) for frame in frames]
 
     def left(self, images: Mapping[int, Plane]) -> Left:
-        """What changed images [y, x], DN/s, leave; the fit takes the images that are given."""
+        """What an effect leaves. images: those with the effect [y, x], DN/s, by number; the fit uses only these."""
         residuals = {n: self._residual(n, pixels) for n, pixels in images.items()}
         changes = {n: residuals[n][0] - self._discs[n].residual for n in images}
         clean = {n: self._discs[n].residual for n in images}
@@ -85,7 +87,7 @@ class LinearEstimator:
         )
 
     def clean_left_pct(self) -> dict[int, float]:
-        """Eq. (1) of every image without effect, the PSF fitted anew; percent."""
+        """Eq. (1) of every image without effect after the refit, percent."""
         fitted = self._refitted({n: disc.residual for n, disc in enumerate(self._discs)})
         return {n: self._percent(n, residual) for n, residual in fitted.items()}
 
@@ -102,12 +104,12 @@ class LinearEstimator:
             dark=dark,
             scene=scene,
             residual=pick(observed, dark) - expected,
-            answers=np.array([self._answer(blur, lit, dark) for blur in self._slopes]),
+            jacobian=np.array([self._column(blur, lit, dark) for blur in self._slopes]),
             weight=1 / self._noise.variance(level, frame.exposure_s),
         )
 
-    def _answer(self, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
-        """A column of A: the PSF's change seen, and the change of the scene that it brings, seen."""
+    def _column(self, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
+        """A column of A: the direct change of the dark pixels, and the one through the deconvolved scene."""
         changed = slope.convolve(lit)
         scene = _blanked(self._optics.invert_once(changed), dark)
         return pick(changed, dark) - pick(self._optics.convolve(scene), dark)
@@ -121,11 +123,11 @@ class LinearEstimator:
 
     def _refitted(self, residuals: Mapping[int, Vector]) -> dict[int, Vector]:
         """Eq. (3)."""
-        weighted = {n: self._discs[n].answers * self._discs[n].weight for n in residuals}
-        normal = sum(weighted[n] @ self._discs[n].answers.T for n in residuals)
+        weighted = {n: self._discs[n].jacobian * self._discs[n].weight for n in residuals}
+        normal = sum(weighted[n] @ self._discs[n].jacobian.T for n in residuals)
         score = sum(weighted[n] @ residuals[n] for n in residuals)
         step = np.linalg.lstsq(np.asarray(normal), np.asarray(score), rcond=1e-12)[0]
-        return {n: residual - self._discs[n].answers.T @ step for n, residual in residuals.items()}
+        return {n: residual - self._discs[n].jacobian.T @ step for n, residual in residuals.items()}
 
     def _percent(self, n: int, residual: Vector) -> float:
         disc = self._discs[n]
@@ -138,14 +140,14 @@ class LinearEstimator:
 
 @dataclass(frozen=True)
 class Refitted:
-    """A whole inversion of nearly noise-free images: e_i of Eq. (1) in percent and its noise, by image, and the values."""
+    """A full inversion of nearly noise-free images: e_i of Eq. (1) and its noise per image, percent; fitted values."""
 
     residual_pct: dict[int, float]
     noise_pct: dict[int, float]
     values: dict[str, float]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; images by their number."""
+        """Plain values; the keys of images are their numbers."""
         return {
             "residual_pct": {str(n): value for n, value in self.residual_pct.items()},
             "noise_pct": {str(n): value for n, value in self.noise_pct.items()},
@@ -154,7 +156,7 @@ class Refitted:
 
 
 def refitted(frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> Refitted:
-    """The PSF fitted anew, from the truth on. Raises what psfcore.scatter.inversion.invert raises."""
+    """Refit the PSF, starting at the truth. Raises the errors of psfcore.scatter.inversion.invert."""
     transit = Transit(frames=tuple(frames), diffraction=diffraction, noise=noise)
     inversion = invert(transit, start=true_coordinates(law)).inversion
     number = {frame.file: n for n, frame in enumerate(frames)}
@@ -166,13 +168,13 @@ def refitted(frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, no
 
 
 def rms_difference(with_effect: Mapping[int, float], without: Mapping[int, float]) -> float:
-    """Eq. (2) over the images that both have; percent."""
+    """Eq. (2) over the images that are in both; percent."""
     both = sorted(set(with_effect) & set(without))
     return float(np.sqrt(np.mean([(with_effect[n] - without[n]) ** 2 for n in both]))) if both else 0.0
 
 
 def true_coordinates(law: ScatterTruth) -> Vector:
-    """The true power law in the coordinates of the fit."""
+    """The parameters of the true power law in the coordinates of the fit."""
     return SOFTENED_POWER_LAW.coordinates({"b_px": law.b_px, "c": law.c, "total": law.total})
 
 

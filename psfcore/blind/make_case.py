@@ -1,11 +1,11 @@
-"""Making a case: its transit in a folder of its own, its truth apart, and a seal on the truth.
+"""Make a case: its transit in one folder, its truth in another, and a seal on the truth.
 
-    DIR/cases/NNNN/transit/   images, diffraction.fits, transit.json: nothing else, and nothing in them names an effect
+    DIR/cases/NNNN/transit/   only images, diffraction.fits and transit.json; nothing in them names an effect
     DIR/truth/NNNN.json       salt and truth
-    DIR/seals.jsonl           a line a case: SHA-256 of the salt and the truth, made before any diagnosis
+    DIR/seals.jsonl           one line per case: SHA-256 of the salt and the truth, made before any diagnosis
 
-An effect's strength is set so that it leaves about what the case is meant to leave in the discs, within what is
-believed of that effect; what it then does leave is measured and is part of the truth.
+The strength of an effect is set so that the effect leaves about the target of the case in the discs, but not beyond the
+largest plausible strength. What the effect then leaves is measured and is part of the truth.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.blind.cases import Case, case_scenes
-from psfcore.blind.chain import Chain, Sky
+from psfcore.blind.chain import Chain, EffectFree
 from psfcore.blind.effects.effect import Effect
-from psfcore.blind.effects.fine_optics import boxed_glass, fine_optics
+from psfcore.blind.effects.fine_optics import binned_glass, fine_optics
 from psfcore.blind.leftover import Left, LinearEstimator, refitted, rms_difference
 from psfcore.fits.images import Cards, CardValue, write_plane
+from psfcore.simulate.headers import HRI_EUV
 from psfcore.simulate.plan import HIGH, Plan
-from psfcore.simulate.transit_files import instrument_values, shot_values
 from psfcore.transit.prepare import Exposure, prepare
 from psfcore.transit.transit import Frame, Place
 
 Plane = NDArray[np.float64]
 SCHEMA = "transit/1"
 TRIALS = 2
-STRENGTH_WITHIN = 1.4  # of the target: nearer than this, a strength is good
+STRENGTH_WITHIN = 1.4  # factor from the target within which a strength is accepted
 _PLACE_STREAM = 2003
 
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """A case as made: exposures in whole DN, reported places, the level they clip at, the known PSF, the truth."""
+    """A case as made: exposures in whole DN, reported places, saturation level, known PSF, truth."""
 
     exposures: list[Plane]
     reported: list[Place]
@@ -51,22 +51,25 @@ class Made:
 
 
 def make(case: Case, images: Sequence[Plane] = ()) -> Made:
-    """Draw scenes, set strengths, observe, measure. images: to take scenes from.
+    """Make the scenes, set the strengths, simulate the exposures, measure what the effects leave.
 
-    Raises DataError "bad-scene", and as `psfcore.scatter.inversion.invert` does.
+    images: [y, x] in DN/s, from which scenes are taken; empty: synthetic scenes.
+    Raises DataError "bad-scene", and the errors of `psfcore.scatter.inversion.invert`.
     """
-    sky = Sky(case.plan, fine_optics(case.law, case.glass, case.plan.size_px), case_scenes(case, images))
-    diffraction = boxed_glass(case.glass)
-    clean = Chain(sky, ())
+    effect_free = EffectFree(
+        case.plan, fine_optics(case.law, case.glass, case.plan.size_px), case_scenes(case, images)
+    )
+    diffraction = binned_glass(case.glass)
+    clean = Chain(effect_free, ())
     clean_rates = clean.all_expected()
     level = _level(case, clean_rates)
     estimator = LinearEstimator(_frames(case.plan, clean_rates, None), diffraction, case.law, case.plan.noise)
     alone = [
-        _at_target(effect, target, case, sky, estimator)
+        _at_target(effect, target, case, effect_free, estimator)
         for effect, target in zip(case.effects, case.target_pct, strict=True)
     ]
     effects = tuple(effect for effect, _ in alone)
-    chain = Chain(sky, effects)
+    chain = Chain(effect_free, effects)
     expected = chain.all_expected() if effects else clean_rates
     own_level = chain.saturation_dn(expected) or level
     exposures = _clipped(chain.read_out(expected, case.seed), case.plan, own_level)
@@ -82,41 +85,43 @@ def make(case: Case, images: Sequence[Plane] = ()) -> Made:
 
 
 def _at_target(
-    effect: Effect, target_pct: float, case: Case, sky: Sky, estimator: LinearEstimator
+    effect: Effect, target_pct: float, case: Case, effect_free: EffectFree, estimator: LinearEstimator
 ) -> tuple[Effect, Left]:
-    """The effect at a strength that leaves about target_pct, or as near as its largest comes; and what it leaves."""
-    tried, found = effect, _quick_left(effect, case, sky, estimator)
+    """The effect at the strength that leaves about target_pct, at most its largest strength; and what it leaves."""
+    tried, found = effect, _quick_left(effect, case, effect_free, estimator)
     for _ in range(TRIALS):
         short = target_pct / max(found.after_refit_pct, 1e-6)
         if max(short, 1 / short) < STRENGTH_WITHIN:
             break
         wanted = tried.strength * short ** (1 / tried.power)
         strength = float(min(wanted, tried.largest))
-        if strength == tried.strength:  # as strong as is believed, and still too little
+        if strength == tried.strength:  # the largest strength leaves less than the target
             break
         tried = tried.at(strength)
-        found = _quick_left(tried, case, sky, estimator)
+        found = _quick_left(tried, case, effect_free, estimator)
     return tried, found
 
 
-def _quick_left(effect: Effect, case: Case, sky: Sky, estimator: LinearEstimator) -> Left:
-    """What an effect leaves, to first order."""
-    chain = Chain(sky, (effect,))
+def _quick_left(effect: Effect, case: Case, effect_free: EffectFree, estimator: LinearEstimator) -> Left:
+    """What an effect leaves in the discs, to first order."""
+    chain = Chain(effect_free, (effect,))
     expected = chain.all_expected()
     rates = _rates(chain, case, expected, chain.saturation_dn(expected))
     return estimator.left(dict(enumerate(rates)))
 
 
 def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
-    """What an effect leaves after a refit without the case's others, to first order: percent, and chi2 of the discs' means,
-    the sum of its squares over their noise."""
+    """What an effect leaves alone, without the other effects of the case, after a refit and to first order.
+
+    In percent, and as chi2 of the means of the discs: the sum of squares over their noise.
+    """
     noise = left["refitted"]["noise_pct"]
     shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)
     return {"left_alone_pct": by_itself.after_refit_pct, "left_alone_chi2": float(shown)}
 
 
 def _rates(chain: Chain, case: Case, expected: Sequence[Plane], level: float | None) -> list[Plane]:
-    """Nearly noise-free images [y, x], DN/s, as the analysis gets them: clipped pixels filled."""
+    """Nearly noise-free images [y, x], DN/s, as the analysis gets them, with clipped pixels filled."""
     return [
         np.asarray(frame.pixels, dtype=np.float64)
         for frame in _frames(case.plan, chain.mean_rate(expected, case.seed), level)
@@ -124,7 +129,7 @@ def _rates(chain: Chain, case: Case, expected: Sequence[Plane], level: float | N
 
 
 def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Frame, ...]:
-    """Frames with the exact places; pixels at the level are filled as a reader fills them."""
+    """Frames with the exact places; clipped pixels are filled as they are when a transit is read."""
     exposures = []
     for n, (rate, shot) in enumerate(zip(rates, plan.shots, strict=True)):
         gaps = None
@@ -134,7 +139,7 @@ def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Fr
             Exposure(
                 file=f"{n:03d}.fits",
                 pixels=rate.astype(np.float32),
-                fov=shot.fov,
+                pointing=shot.pointing,
                 place=plan.place(n),
                 exposure_s=shot.exposure_s,
                 time_s=shot.time_s,
@@ -154,7 +159,7 @@ def _left(
     diffraction: Plane,
     level: float | None,
 ) -> dict[str, Any]:
-    """What the effects leave in the discs: percent, rms over images, and by image after the refit."""
+    """What the effects leave in the discs: percent, rms over images, and per image after the refit."""
     clean_after = estimator.clean_left_pct()
     clean_rms = float(np.sqrt(np.mean(np.square(list(clean_after.values())))))
     if not chain.effects:
@@ -174,7 +179,7 @@ def _left(
 
 
 def _level(case: Case, rates: Sequence[Plane]) -> float | None:
-    """The level of a transit that could saturate and does not."""
+    """The saturation level of a transit that has one, but whose brightest pixel is below it."""
     if case.headroom is None:
         return None
     brightest = max(
@@ -191,7 +196,7 @@ def _clipped(exposures: Sequence[Plane], plan: Plan, level: float | None) -> lis
 
 
 def _reported(case: Case) -> list[Place]:
-    """Places as the ephemeris has them, to a tenth of a pixel."""
+    """The places of the occulter from the ephemeris, to a tenth of a pixel."""
     rng = np.random.default_rng([case.seed, _PLACE_STREAM])
     plan = case.plan
     errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))
@@ -202,20 +207,26 @@ def _reported(case: Case) -> list[Place]:
 
 
 def write_transit(made: Made, plan: Plan, folder: Path) -> None:
-    """Write a made case's transit, and nothing of its truth, into a new folder."""
+    """Write the transit of a case, without its truth, into a new folder."""
     folder.mkdir(parents=True)
     for n, dn in enumerate(made.exposures):
         cards = _frame_cards(plan, n, made.saturation_dn)
         write_plane(folder / f"{n:03d}.fits", dn.astype(np.int32), cards=cards)
-    write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(instrument_values()))
+    write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(HRI_EUV.values()))
     entries = [
-        {"file": f"{n:03d}.fits", "fov": shot.fov, "x": place.x_px, "y": place.y_px, "r": place.radius_px}
+        {
+            "file": f"{n:03d}.fits",
+            "fov": shot.pointing,
+            "x": place.x_px,
+            "y": place.y_px,
+            "r": place.radius_px,
+        }
         for n, (shot, place) in enumerate(zip(plan.shots, made.reported, strict=True))
     ]
     noise = {"photon_gain_dn": plan.noise.photon_gain_dn, "read_noise_dn": plan.noise.read_noise_dn}
     content = {
         "schema": SCHEMA,
-        "instrument": "hri_euv",
+        "instrument": HRI_EUV.name,
         "known_psf": "diffraction.fits",
         "noise": noise,
         "images": entries,
@@ -225,7 +236,7 @@ def write_transit(made: Made, plan: Plan, folder: Path) -> None:
 
 def _frame_cards(plan: Plan, index: int, level: float | None) -> Cards:
     shot = plan.shots[index]
-    values = shot_values(shot, "DN")
+    values = HRI_EUV.shot_values(shot, "DN")
     if level is not None and shot.gain_mode == HIGH:
         values["SATURATE"] = level
     return _cards(values)
@@ -236,7 +247,7 @@ def _cards(values: dict[str, CardValue]) -> Cards:
 
 
 def sealed(truth: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The seal of a truth, and what is to be kept to open it: a random salt and the truth."""
+    """The seal of a truth, and the content of its truth file: a random salt and the truth."""
     salt = secrets.token_hex(16)
     return seal_of(salt, truth), {"salt": salt, "truth": truth}
 

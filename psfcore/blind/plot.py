@@ -1,4 +1,4 @@
-"""A picture of a blind set's score: confusion matrix, and power against what an effect leaves in the discs."""
+"""A picture of a blind set's score: the confusion matrix, and the power against what an effect leaves in the discs."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from psfcore.blind.effects.registry import KNOWN, UNKNOWN
-from psfcore.blind.scoring import INCONCLUSIVE, NONE, UNKNOWN_VERDICT, Score
+from psfcore.blind.score_table import Score
+from psfcore.blind.scoring import INCONCLUSIVE, NONE, UNKNOWN_VERDICT
 from psfcore.drawing.plots import INK
 
 _VERDICTS = (NONE, UNKNOWN_VERDICT, INCONCLUSIVE)
 
 
 def score_png(found: Score, path: str | Path) -> None:
-    """Two panels: truth against what was said first, and shares noticed and named with Wilson intervals."""
+    """Two panels: truth against the first effect named, and the shares noticed and named with Wilson intervals."""
     figure = Figure(figsize=(17, 9.5), dpi=90, facecolor="white", layout="constrained")
     figure.suptitle(
         f"Blind set: {found.judged} cases judged, {len(found.failures)} failed",
@@ -47,14 +48,18 @@ def _matrix(axes: Axes, found: Score) -> None:
     for (row, column), count in np.ndenumerate(counts):
         if count:
             axes.text(column, row, str(count), ha="center", va="center", fontsize=9, color=INK)
-    for row, name in enumerate(rows):  # where the cases of a row should be
+    for row, name in enumerate(rows):  # frame the columns that are right for a row
         right = _right_columns(name)
         for column in (n for n, label in enumerate(columns) if label in right):
             corner = (column - 0.5, row - 0.5)
             axes.add_patch(_frame(corner))
     axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right", fontsize=9)
     axes.set_yticks(range(len(rows)), [f"{name} *" if name in UNKNOWN else name for name in rows], fontsize=9)
-    axes.set(xlabel="said first", ylabel="truth (* not in the library)", title="Cases; framed where right")
+    axes.set(
+        xlabel="first effect named, or verdict",
+        ylabel="truth (* not in the library)",
+        title="Cases; framed: right",
+    )
 
 
 def _right_columns(truth: str) -> tuple[str, ...]:
@@ -76,7 +81,7 @@ def _power(axes: Axes, found: Score) -> None:
         labels.append(f"{low:g} -\n{high:g}" if high is not None else f"> {low:g}")
     at = np.arange(len(labels))
     for offset, count, hits, interval, colour, name in (
-        (-0.08, "n", "noticed", "noticed_wilson95", "#1b4f91", "noticed (verdict not none)"),
+        (-0.08, "n", "noticed", "noticed_wilson95", "#1b4f91", "noticed (verdict other than none)"),
         (0.08, "n_known", "contains_truth", "contains_wilson95", "#2b8a6e", "answer contains the truth"),
     ):
         shown = [n for n, row in enumerate(found.power) if row[count]]

@@ -1,8 +1,8 @@
-"""Diagnosing a blind set: every case in a process of its own that sees a copy of the transit and nothing else.
+"""Diagnose a blind set: each case in its own process, which sees only a copy of the transit.
 
-The copy lies in a temporary folder without the case's number, the process runs there, and the report comes back when
-it is whole. A case that has one is not diagnosed again; a failure stands in run.json and is tried again with the
-next run.
+The copy is in a temporary folder whose name does not contain the number of the case. The process runs there, and its
+report is copied back when it is complete. A case that has a report is not diagnosed again. A failure is written to
+run.json, and the next run tries the case again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Run:
-    """How a diagnosis went: wall time, largest memory, exit status, and its last words where it failed."""
+    """One diagnosis: wall time, largest memory, exit status, and its last output if it failed."""
 
     case: int
     wall_s: float
@@ -45,7 +45,7 @@ class Run:
 
     @property
     def failed(self) -> bool:
-        """Whether there is no report."""
+        """Whether the diagnosis gave no report."""
         return self.status != 0 or bool(self.error)
 
 
@@ -59,17 +59,20 @@ def run_set(
     longest_s: float = LONGEST_S,
     progress: Progress = lambda line: None,
 ) -> list[Run]:
-    """Diagnose the cases that have no report yet; the runs of those, by case.
+    """Diagnose the cases that have no report yet; returns their runs in the order of the cases.
 
-    command: a program and its arguments, with {transit} and {report} in place of the paths. keep: transits stay once
-    there is a report. Raises DataError "bad-command", "bad-seals", and "not-sealed" where a case has no seal.
+    command: a program and its arguments, with {transit} and {report} in place of the paths. keep: do not delete a
+    transit after its diagnosis. longest_s: a diagnosis that takes longer is killed.
+    Raises DataError "bad-command", "bad-seals", and "not-sealed" if a case has no seal.
     """
     if not all(any(mark in part for part in command) for mark in ("{transit}", "{report}")):
-        raise DataError("bad-command", f"expected {{transit}} and {{report}} in the command; got {command}")
+        raise DataError(
+            "bad-command", f"expected {{transit}} and {{report}} in the command; got {' '.join(command)}"
+        )
     for number in numbers:
         if not made.is_made(number):
             raise DataError(
-                "not-sealed", f"expected a sealed truth of case {number:04d} before its diagnosis"
+                "not-sealed", f"case {number:04d}: expected a sealed truth before the diagnosis; got no seal"
             )
     missing = [number for number in numbers if not has_report(made, number)]
 
@@ -86,7 +89,7 @@ def run_set(
 
 
 def has_report(made: BlindSet, number: int) -> bool:
-    """Whether a case has a report that is whole."""
+    """Whether a case has a complete report."""
     try:
         report_of(made, number)
     except DataError:
@@ -95,18 +98,18 @@ def has_report(made: BlindSet, number: int) -> bool:
 
 
 def report_of(made: BlindSet, number: int) -> dict[str, Any]:
-    """A case's report. Raises DataError "bad-report" where there is none, or half of one."""
+    """The report of a case. Raises DataError "bad-report" if it is missing or incomplete."""
     return _checked_report(made.report(number))
 
 
 def run_of(made: BlindSet, number: int) -> Run | None:
-    """How a case's last diagnosis went; None where there was none."""
+    """The last diagnosis of a case; None if there was none."""
     file = made.case_folder(number) / "run.json"
     return Run(**json.loads(file.read_text("utf-8"))) if file.is_file() else None
 
 
 def judged_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[Judged], dict[int, str]]:
-    """Every case that has a report beside its truth, whose seal is checked; and why the others have none.
+    """The cases that have a report, with their truth, whose seal is checked; and why the other cases have no report.
 
     Raises DataError "broken-seal", "bad-seals".
     """
@@ -159,14 +162,14 @@ def _diagnose(made: BlindSet, number: int, command: Sequence[str], longest_s: fl
 
 
 def _watched(command: Sequence[str], folder: Path, longest_s: float) -> tuple[int, float, float, str]:
-    """Exit status, wall time (s), largest resident memory (MiB) and last words of a child process."""
+    """Exit status, wall time (s), largest resident memory (MiB) and last output of a child process."""
     started = time.perf_counter()
     words = folder / "words.txt"
     with words.open("wb") as said:
         child = subprocess.Popen(command, cwd=folder, stdout=said, stderr=subprocess.STDOUT)
         late = threading.Timer(longest_s, child.kill)
         late.start()
-        # wait4 gives what this child used; getrusage would give the most of all children.
+        # wait4 tells what this child used; getrusage would tell the maximum over all children.
         _, status, usage = os.wait4(child.pid, 0)
         late.cancel()
         child.returncode = os.waitstatus_to_exitcode(status)
@@ -174,4 +177,4 @@ def _watched(command: Sequence[str], folder: Path, longest_s: float) -> tuple[in
     text = words.read_text("utf-8", errors="replace")[-_LAST_WORDS:].strip()
     if wall_s >= longest_s:
         text = f"killed after {longest_s:.0f} s. {text}"
-    return child.returncode, wall_s, usage.ru_maxrss / _KIB, text or "nothing was said"
+    return child.returncode, wall_s, usage.ru_maxrss / _KIB, text or "no output"

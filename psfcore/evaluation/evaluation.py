@@ -122,8 +122,8 @@ def _sharing(kernels: Sequence[Kernel]) -> list[list[int]]:
 def _sliced(frames: Sequence[Frame]) -> set[int]:
     """Frames whose slices are kept: SLICES_A_POINTING per pointing, evenly spaced in its images."""
     chosen: set[int] = set()
-    for fov in {frame.fov for frame in frames}:
-        here = [n for n, frame in enumerate(frames) if frame.fov == fov]
+    for pointing in {frame.pointing for frame in frames}:
+        here = [n for n, frame in enumerate(frames) if frame.pointing == pointing]
         middles = (np.arange(SLICES_A_POINTING) + 0.5) / SLICES_A_POINTING * len(here)
         chosen.update(here[int(at)] for at in middles)
     return chosen
@@ -213,7 +213,7 @@ def _compared(
     return FrameEvaluation(
         index=n,
         file=frame.file,
-        fov=frame.fov,
+        pointing=frame.pointing,
         time_s=frame.time_s,
         found=found,
         dark=dark,

@@ -49,7 +49,7 @@ class FrameEvaluation:
 
     index: int
     file: str
-    fov: int
+    pointing: int
     time_s: float
     found: FoundPlace
     dark: Pixels

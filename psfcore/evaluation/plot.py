@@ -98,8 +98,8 @@ def sentence(evaluation: Evaluation) -> str:
 def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
     """One image per pointing, the middle one of those with slices; at most `most` images."""
     kept = [f for f in evaluation.frames if f.along_x is not None]
-    fovs = sorted({f.fov for f in kept})
-    by_fov = [[f for f in kept if f.fov == fov] for fov in fovs]
+    fovs = sorted({f.pointing for f in kept})
+    by_fov = [[f for f in kept if f.pointing == fov] for fov in fovs]
     return [frames[len(frames) // 2] for frames in by_fov][:most]
 
 
@@ -121,7 +121,7 @@ def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
         ylim=(min(0.0, float(middle.min())) - 0.05 * top, 1.45 * top),
         xlabel="Offset from the centre of the occulter (px)",
         ylabel="Intensity (DN/s)",
-        title=f"Pointing {frame.fov}: {frame.file:.24}, {frame.time_s / 60:.0f} min",
+        title=f"Pointing {frame.pointing}: {frame.file:.24}, {frame.time_s / 60:.0f} min",
     )
     axes.title.set_fontsize(11)
     axes.legend(fontsize=8.5, loc="upper center", frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
@@ -220,7 +220,7 @@ def draw_errors(
     axes: Any, frames: Sequence[FrameEvaluation], where: Vector, values: Vector, noise: Vector
 ) -> None:
     """Errors of images with their noise, coloured by pointing. Values of nan are not drawn."""
-    fovs = np.array([f.fov for f in frames])
+    fovs = np.array([f.pointing for f in frames])
     axes.axhline(0, color="#555555", linewidth=1.0)
     for n, fov in enumerate(sorted(set(fovs.tolist()))):
         here = fovs == fov

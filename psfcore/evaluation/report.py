@@ -82,8 +82,8 @@ class Trend:
 
 def summaries(evaluation: Evaluation) -> tuple[Summary, ...]:
     """One summary per pointing, in order, and a last one for all images."""
-    fovs = sorted({frame.fov for frame in evaluation.frames})
-    parts = [summary_of([f for f in evaluation.frames if f.fov == fov], fov) for fov in fovs]
+    fovs = sorted({frame.pointing for frame in evaluation.frames})
+    parts = [summary_of([f for f in evaluation.frames if f.pointing == fov], fov) for fov in fovs]
     return (*parts, summary_of(evaluation.frames, None))
 
 
@@ -113,8 +113,8 @@ def summary_of(frames: Sequence[FrameEvaluation], fov: int | None) -> Summary:
 def trends(evaluation: Evaluation) -> tuple[Trend, ...]:
     """Slopes along x and y, for pointings with at least LEAST_TREND_FRAMES images at different positions."""
     found = []
-    for fov in sorted({frame.fov for frame in evaluation.frames}):
-        frames = [f for f in evaluation.frames if f.fov == fov]
+    for fov in sorted({frame.pointing for frame in evaluation.frames}):
+        frames = [f for f in evaluation.frames if f.pointing == fov]
         for against in ("x", "y"):
             where = np.array([getattr(f.found.place, f"{against}_px") for f in frames])
             if len(frames) < LEAST_TREND_FRAMES or np.ptp(where) < 1.0:
@@ -163,7 +163,7 @@ def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict
         "slices": [
             {
                 "file": frame.file,
-                "fov": frame.fov,
+                "fov": frame.pointing,
                 "along_x": _slice_json(frame.along_x),
                 "along_y": _slice_json(frame.along_y),
             }
@@ -182,7 +182,7 @@ def _frame_json(frame: FrameEvaluation) -> dict[str, Any]:
     return _plain(
         {
             "file": frame.file,
-            "fov": frame.fov,
+            "fov": frame.pointing,
             "time_s": frame.time_s,
             "x": frame.found.place.x_px,
             "y": frame.found.place.y_px,

@@ -117,15 +117,15 @@ class View:
 
         All images of a pointing get the same array. A template made from it differs between images only where the effect does.
         """
-        fov = [frame.fov for frame in self.solution.transit.frames]
+        pointing = [frame.pointing for frame in self.solution.transit.frames]
         mean: dict[int, Field] = {}
-        for one in sorted(set(fov)):
-            images = [n for n, f in enumerate(fov) if f == one]
+        for one in sorted(set(pointing)):
+            images = [n for n, f in enumerate(pointing) if f == one]
             total = np.zeros(self.solution.transit.shape)
             for n in images:
                 total += self.unocculted[n]
             mean[one] = (total / len(images)).astype(np.float32)
-        return [mean[f] for f in fov]
+        return [mean[f] for f in pointing]
 
     @cached_property
     def _scene_sums(self) -> dict[int, tuple[Vector, Vector]]:
@@ -134,8 +134,8 @@ class View:
         sums: dict[int, tuple[Vector, Vector]] = {}
         for n, frame in enumerate(solution.transit.frames):
             scene, away = self._own(n)
-            total, count = sums.get(frame.fov, (np.zeros(scene.shape), np.zeros(scene.shape)))
-            sums[frame.fov] = (total + scene * away, count + away)
+            total, count = sums.get(frame.pointing, (np.zeros(scene.shape), np.zeros(scene.shape)))
+            sums[frame.pointing] = (total + scene * away, count + away)
         return sums
 
     def _own(self, n: int) -> tuple[Field, NDArray[np.bool_]]:
@@ -147,7 +147,7 @@ class View:
 
     def pointing_scene(self, n: int) -> Field:
         """The mean scene of frame n's pointing, from all its images without their discs [y, x], DN/s."""
-        total, count = self._scene_sums[self.solution.transit.frames[n].fov]
+        total, count = self._scene_sums[self.solution.transit.frames[n].pointing]
         own, _ = self._own(n)
         return np.asarray(np.where(count > 0, total / np.maximum(count, 1), own), dtype=np.float32)
 
@@ -161,7 +161,7 @@ class View:
 
     def _scene(self, n: int) -> Field:
         own, away = self._own(n)
-        total, count = self._scene_sums[self.solution.transit.frames[n].fov]
+        total, count = self._scene_sums[self.solution.transit.frames[n].pointing]
         others = count - away
         mean = (total - own * away) / np.maximum(others, 1)
         both = (others > 0) & away
@@ -177,7 +177,7 @@ class View:
         solution = self.solution
         shape, place = solution.transit.shape, solution.sky.found[n].place
         window = patch_window(shape, place, 1.0)
-        shown = self._scene_sums[solution.transit.frames[n].fov][1][window] > 0
+        shown = self._scene_sums[solution.transit.frames[n].pointing][1][window] > 0
         out = np.ones(shape, np.float32)
         out[window] -= (coverage(shape, place)[window] * shown).astype(np.float32)
         return out

@@ -119,7 +119,7 @@ _MAPS_CAPTION = (
 
 
 def _summary_row(of: Summary, evaluation: Evaluation) -> list[str]:
-    frames = [f for f in evaluation.frames if of.fov in (None, f.fov)]
+    frames = [f for f in evaluation.frames if of.fov in (None, f.pointing)]
     largest = max(frames, key=lambda f: abs(f.residual_pct))
     mean_noise_dn_s = math.sqrt(sum(f.noise_dn_s**2 for f in frames)) / len(frames)
     return [
@@ -238,7 +238,7 @@ def _images(report: PsfReport) -> list[Part]:
 def _image_row(frame: FrameEvaluation, exposure_s: float) -> list[str]:
     return [
         frame.file,
-        str(frame.fov),
+        str(frame.pointing),
         f"{frame.time_s / 60:.1f}",
         f"{exposure_s:g}",
         with_error(frame.found.place.x_px, frame.found.sigma_x_px),

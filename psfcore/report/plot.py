@@ -249,7 +249,7 @@ def slices_png(evaluation: Evaluation) -> bytes:
     for axes, frame in zip(charts, shown, strict=False):
         draw_slices(axes, frame)
         axes.legend(fontsize=7, loc="upper center", frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
-        axes.set_title(f"Pointing {frame.fov}: {frame.file:.20}", fontsize=10)
+        axes.set_title(f"Pointing {frame.pointing}: {frame.file:.20}", fontsize=10)
     for axes in charts[len(shown) :]:
         axes.set_visible(False)
     tidy(charts)

@@ -288,7 +288,7 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
     inversion, out = solution.inversion, []
     if not inversion.converged:
         out.append(f"the fit did not converge in {len(inversion.rounds)} rounds")
-    pointings = {frame.fov for frame in inversion.frames}
+    pointings = {frame.pointing for frame in inversion.frames}
     if inversion.left_out:
         out.append(
             f"the fit did not use {len(inversion.left_out)} image{'s' if len(inversion.left_out) > 1 else ''}: "

@@ -189,7 +189,7 @@ def _draw_residuals(axes: Any, fit: TransitFit, where: Vector, label: str, title
     frames = fit.inversion.frames
     residual = np.array([f.residual_pct for f in frames])
     noise = np.array([100 * f.noise / abs(f.observed) for f in frames])
-    fovs = np.array([f.fov for f in frames])
+    fovs = np.array([f.pointing for f in frames])
     axes.axhline(0, color="#555555", linewidth=1.0)
     size = 5.5 if len(frames) < _MANY_IMAGES else 3.5
     for n, fov in enumerate(sorted(set(fovs.tolist()))):
@@ -244,7 +244,7 @@ def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
     """
     guess = fit.first_guess
     time_min = np.array([f.time_s for f in guess.frames]) / 60
-    fovs = np.array([f.fov for f in guess.frames])
+    fovs = np.array([f.pointing for f in guess.frames])
     ratios = {name: np.array([100 * f.ratio[name] for f in guess.frames]) for name in ESTIMATORS}
     size = 5.0 if len(guess.frames) < _MANY_IMAGES else 3.2
     for n, fov in enumerate(sorted(set(fovs.tolist()))):

@@ -47,7 +47,7 @@ def fit_json(fit: TransitFit) -> dict[str, Any]:
         "frames": [
             {
                 "file": f.file,
-                "fov": f.fov,
+                "fov": f.pointing,
                 "x": f.found.place.x_px,
                 "y": f.found.place.y_px,
                 "r": f.found.place.radius_px,

@@ -1,1 +1,1 @@
-"""Scenes and observations whose truth is known."""
+"""Synthetic scenes, observations and transits whose truth is known."""

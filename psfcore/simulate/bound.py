@@ -1,26 +1,27 @@
-"""The photon bound: how well a transit can say anything at all, whoever analyses it.
+"""The photon bound: the smallest standard errors that any analysis of a transit can reach.
 
-Fisher information with the true scenes and the diffraction given, and only photon and read noise:
+It is the Fisher information with the true scenes and the diffraction given, and only photon and read noise:
 
     F_jk = sum over pixels of (dm / dp_j) (dm / dp_k) / var(m)       Eq. (1)
     var(m) = (g m t + r^2) / t^2                                      Eq. (2)
     dm / dp_j = (ds / dp_j) * d * (S - h)                             Eq. (3)
     sigma^2(f) = (df / dp)^T F^-1 (df / dp)                           Eq. (4)
 
-A pixel's information is 1 / var: what an estimator linear in the pixels can take from it. The whole likelihood of
-a Poisson count with Gaussian readout holds no more than g / (m t) a pixel, which is 5 % more at 2.5 photons and 2 DN.
+The information of a pixel is 1 / var: the most that an estimator which is linear in the pixels can use. The full
+likelihood of a Poisson count with Gaussian read noise contains at most g / (m t) per pixel, which is 5 % more at 2.5
+photons and 2 DN.
 
-What counts as data: for the scatter, every fully dark pixel (all four corners within the radius) of every image. The
-pixels round the disc are left out, as the method leaves them out: they are the scene, and the scene is given here. For
-an occulter's place, all pixels whose centre is within the radius and 5 px of its centre, the PSF given; of
-high-only images those that do not clip.
+The data for the scatter are the fully dark pixels (all four corners within the radius) of every image. The pixels around
+the disc are not used, neither here nor by the method: they belong to the scene, which is given here. The data for the
+place of an occulter are the pixels with centres up to 5 px beyond its radius, with the PSF given; in high-only images
+only those that do not clip.
 
 | symbol | name | unit |
 |---|---|---|
 | m | expected pixel | DN/s |
 | p | b, c, total; and the stretch with all three free | px, -, -, - |
 | s, d | scatter kernel, diffraction; * is linear convolution | - |
-| S, h | scene, what the disc hides of it | DN/s |
+| S, h | scene, light hidden by the disc | DN/s |
 | g, r, t | photon_gain_dn, read_noise_dn, exposure_s | DN, DN, s |
 """
 
@@ -60,7 +61,7 @@ _LAW = 3  # the first of PARAMETERS: b, c, total
 
 @dataclass(frozen=True)
 class CurveBound:
-    """A cumulative curve at one radius, the total PSF's and the scatter's own: percent, and percentage points."""
+    """The cumulative curves of the total PSF and of the scatter (diffuse) at one radius, percent; errors in points."""
 
     radius_px: float
     total_pct: float
@@ -71,11 +72,11 @@ class CurveBound:
 
 @dataclass(frozen=True)
 class PhotonBound:
-    """Smallest standard errors that photons and readout allow.
+    """The smallest standard errors that photon noise and read noise allow.
 
-    b_px, c, total, a: errors of the power law's parameters, fitted together. covariance: of b, c, total.
-    stretch: error of the stretch along stretch_angle_deg, b, c and total free too. places_px: of the occulter's x
-    and y in each image. dark_pixels: how many pixels there were, of images images.
+    b_px, c, total, a: errors of the parameters of the power law, fitted together. covariance: of b, c, total.
+    stretch: error of the stretch along stretch_angle_deg, fitted together with b, c and total. places_px: errors of
+    the occulter's x and y in each image. dark_pixels: number of dark pixels in all images.
     """
 
     images: int
@@ -104,19 +105,19 @@ class PhotonBound:
 
 
 def photon_bound(simulated: SimulatedTransit, *, threads: int = 1) -> PhotonBound:
-    """The bound of a simulated transit. Raises DataError "no-bound" where the dark pixels fix nothing."""
+    """The bound of a simulated transit. Raises DataError "no-bound" if the dark pixels do not determine a parameter."""
     return bound_of_sky(simulated.sky, threads=threads)
 
 
 def bound_of_folder(folder: str | Path, *, threads: int = 1) -> PhotonBound:
-    """The bound of a folder that psfcore.simulate.transit_files.write wrote; raises as read_sky does too."""
+    """The bound of a folder that psfcore.simulate.transit_files.write wrote. Raises also the errors of read_sky."""
     return bound_of_sky(read_sky(folder, threads=threads), threads=threads)
 
 
 def bound_of_sky(sky: TrueSky, *, threads: int = 1) -> PhotonBound:
-    """The bound of one more transit of a sky."""
+    """The bound of any transit of a sky."""
     slopes = kernel_slopes(sky.scatter)
-    sizes = (*[REACH_GRID_PX] * _LAW, sky.kernel.shape[0])  # of the stretch only what reaches a disc is asked
+    sizes = (*[REACH_GRID_PX] * _LAW, sky.kernel.shape[0])  # the stretch is needed only near the discs
     total_slopes = {
         name: convolved(slope, sky.diffraction, size, threads=threads)
         for (name, slope), size in zip(slopes.items(), sizes, strict=True)
@@ -142,19 +143,19 @@ def bound_of_sky(sky: TrueSky, *, threads: int = 1) -> PhotonBound:
 
 
 def _scatter_information(sky: TrueSky, total_slopes: dict[str, Kernel], threads: int) -> tuple[Plane, int]:
-    """F of Eq. (1) for PARAMETERS from the fully dark pixels, and how many there are."""
+    """F of Eq. (1) for PARAMETERS from the fully dark pixels, and the number of these pixels."""
     plan = sky.plan
     information, dark_pixels = np.zeros((len(PARAMETERS), len(PARAMETERS))), 0
-    for fov in plan.fovs:
-        scene = sky.scenes[fov]
+    for pointing in plan.pointings:
+        scene = sky.scenes[pointing]
         whole = {name: _seen(scene, kernel, plan.margin_px, threads) for name, kernel in total_slopes.items()}
-        for index in (n for n, shot in enumerate(plan.shots) if shot.fov == fov):
+        for index in (n for n, shot in enumerate(plan.shots) if shot.pointing == pointing):
             window = _window(sky, index)
             hidden = _hidden(sky, index, window)
             slopes = np.stack(
                 [whole[name][window] - _through(total_slopes[name], hidden) for name in PARAMETERS]
             )
-            expected = sky.seen_scenes[fov][window] - _through(sky.kernel, hidden)
+            expected = sky.seen_scenes[pointing][window] - _through(sky.kernel, hidden)
             dark = fully_dark(plan.place(index), _first(window), hidden.shape)
             variance = plan.noise.variance(expected[dark], plan.shots[index].exposure_s)  # Eq. (2)
             information += (slopes[:, dark] / variance) @ slopes[:, dark].T  # Eq. (1)
@@ -163,11 +164,11 @@ def _scatter_information(sky: TrueSky, total_slopes: dict[str, Kernel], threads:
 
 
 def _place_bound(sky: TrueSky, index: int) -> tuple[float, float]:
-    """Errors of x and y (px) of one image's occulter."""
+    """The errors of x and y (px) of the occulter in one image."""
     plan, shot = sky.plan, sky.plan.shots[index]
     place, window = plan.place(index), _window(sky, index)
     hidden = _hidden(sky, index, window)
-    expected = sky.seen_scenes[shot.fov][window] - _through(sky.kernel, hidden)
+    expected = sky.seen_scenes[shot.pointing][window] - _through(sky.kernel, hidden)
     by_place = []
     for slope in sky.behind[index].hidden_slopes(place):
         moved = np.zeros_like(hidden)
@@ -187,7 +188,7 @@ def _place_bound(sky: TrueSky, index: int) -> tuple[float, float]:
 def _curve(
     sky: TrueSky, law: Plane, slopes: dict[str, Kernel], total_slopes: dict[str, Kernel], threads: int
 ) -> tuple[CurveBound, ...]:
-    """Both curves with their errors, Eq. (4)."""
+    """Both cumulative curves with their errors, Eq. (4)."""
     diffuse = anisotropic_kernel(sky.scatter)
     total = convolved(diffuse, sky.diffraction, REACH_GRID_PX, threads=threads)
     radii = np.array(CURVE_RADII_PX)
@@ -209,14 +210,18 @@ def _curve(
 
 
 def _inverse(information: Plane) -> Plane:
-    """F^-1, of parameters brought to one scale first."""
+    """F^-1; the parameters are scaled first, so that the inverse is accurate."""
     scale = np.sqrt(np.diag(information))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
-        raise DataError("no-bound", "expected dark pixels that every parameter changes; got none for some")
+        raise DataError(
+            "no-bound",
+            "expected dark pixels that depend on every parameter; got a parameter that changes no dark pixel",
+        )
     correlation = information / np.outer(scale, scale)
     if np.linalg.cond(correlation) > 1 / np.finfo(np.float64).eps:
         raise DataError(
-            "no-bound", "expected parameters that the dark pixels tell apart; got a singular matrix"
+            "no-bound",
+            "expected dark pixels that distinguish the parameters; got a singular matrix. Use more images or larger discs",
         )
     return np.asarray(np.linalg.inv(correlation) / np.outer(scale, scale))
 
@@ -228,13 +233,13 @@ def _seen(scene: Plane, kernel: Kernel, margin_px: int, threads: int) -> Plane:
 
 
 def _through(kernel: Kernel, patch: Plane) -> Plane:
-    """A patch seen through a kernel, on the patch itself."""
+    """A patch convolved with a kernel, on the patch itself."""
     shape = (patch.shape[0], patch.shape[1])
     return np.asarray(Convolver(kernel, shape, dtype=np.float64).apply(patch), dtype=np.float64)
 
 
 def _window(sky: TrueSky, index: int) -> Window:
-    """The part of the field that holds the occulter, what it hides, and all pixels that show its place."""
+    """The part of the field that contains the occulter and all pixels that depend on its place."""
     place, size = sky.plan.place(index), sky.plan.size_px
     half = int(np.ceil(place.radius_px + PLACE_MARGIN_PX)) + 1
     row, column = int(np.rint(place.y_px)), int(np.rint(place.x_px))
@@ -249,14 +254,14 @@ def _first(window: Window) -> tuple[int, int]:
 
 
 def _inside(sky: TrueSky, index: int, window: Window) -> Window:
-    """Where, in a window, the patch lies that the occulter can hide."""
+    """The part of a window that the occulter can hide."""
     rows, columns = sky.behind[index].window()
     top, left = _first(window)
     return slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
 
 
 def _hidden(sky: TrueSky, index: int, window: Window) -> Plane:
-    """What the occulter hides, DN/s, on a window."""
+    """The light that the occulter hides in a window, DN/s."""
     plane = np.zeros((window[0].stop - window[0].start, window[1].stop - window[1].start))
     plane[_inside(sky, index, window)] = sky.behind[index].hidden(sky.plan.place(index))
     return plane

@@ -1,7 +1,7 @@
-"""The light that a dark disc hides, to the fraction of a pixel.
+"""The light that a dark disc hides, exact to fractions of a pixel.
 
-A pixel's share behind the disc is the area of a circle cut by the pixel's square, in closed form: with F(x, y) the
-circle's area left of x and below y,
+The share of a pixel behind the disc is the area that the circle and the square of the pixel have in common. In closed
+form, with F(x, y) the area of the circle left of x and below y:
 
     share = F(x1, y1) - F(x0, y1) - F(x1, y0) + F(x0, y0)                              Eq. (1)
     F(x, y) = integral from -r to x of max(0, min(y, s) + s) dX,  s = sqrt(r^2 - X^2)   Eq. (2)
@@ -24,14 +24,14 @@ from psfcore.transit.transit import Place
 Plane = NDArray[np.float64]
 
 _PLACE_STEP_PX = 1e-3
-_ROUNDING = 1e-11  # of a share: differences of areas of 100 px^2
+_ROUNDING = 1e-11  # of a share, for differences of areas of 100 px^2
 
 
 def covered_share(place: Place, first: tuple[int, int], shape: tuple[int, int], fine: int = 1) -> Plane:
     """Share (0 to 1) of each pixel behind the disc, Eq. (1); shape (fine * ny, fine * nx).
 
-    first: (row, column) of the first of `shape` detector pixels. fine: pixels drawn per detector pixel and axis.
-    Exact to rounding; a pixel wholly within or without gets 1 or 0.
+    first: (row, column) of the first of `shape` detector pixels. fine: fine pixels per detector pixel and axis.
+    Exact except for rounding; a pixel entirely inside or outside the disc gets exactly 1 or 0.
     """
     y = first[0] - 0.5 + np.arange(fine * shape[0] + 1) / fine - place.y_px
     x = first[1] - 0.5 + np.arange(fine * shape[1] + 1) / fine - place.x_px
@@ -59,7 +59,7 @@ def _half_segment(x: Plane, r: float) -> Plane:
 
 
 def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels [y, x] all of whose corners lie within the disc's radius."""
+    """True for pixels [y, x] with all four corners inside the disc."""
     y = np.abs(first[0] + np.arange(shape[0]) - place.y_px) + 0.5
     x = np.abs(first[1] + np.arange(shape[1]) - place.x_px) + 0.5
     return np.asarray(np.hypot(x[None, :], y[:, None]) <= place.radius_px)
@@ -67,7 +67,7 @@ def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Behind:
-    """The scene round one place of the disc: fine pixels [y, x] in DN/s, `fine` per detector pixel and axis.
+    """The scene around one place of the disc: fine pixels [y, x] in DN/s, `fine` per detector pixel and axis.
 
     first: (row, column) of its first detector pixel on the field.
     """
@@ -82,7 +82,7 @@ class Behind:
         return self.scene.shape[0] // self.fine, self.scene.shape[1] // self.fine
 
     def window(self, margin_px: int = 0) -> tuple[slice, slice]:
-        """Where the patch lies in a plane that has margin_px more than the field on each side."""
+        """The slices of the patch in a plane that is margin_px larger than the field on each side."""
         (top, left), (ny, nx) = self.first, self.shape
         return (
             slice(top + margin_px, top + margin_px + ny),
@@ -90,11 +90,11 @@ class Behind:
         )
 
     def hidden(self, place: Place) -> Plane:
-        """Light that a disc at `place` hides from each detector pixel of the patch, DN/s."""
+        """The light that a disc at `place` hides in each detector pixel of the patch, DN/s."""
         return binned(self.scene * covered_share(place, self.first, self.shape, self.fine), self.fine)
 
     def hidden_slopes(self, place: Place) -> tuple[Plane, Plane]:
-        """What a pixel to the right, and one up, add to it: DN/s a px, by differences of 0.001 px."""
+        """The derivatives of ``hidden`` with respect to x and y, DN/s per px, from differences of 0.001 px."""
         return self._slope(place, _PLACE_STEP_PX, 0.0), self._slope(place, 0.0, _PLACE_STEP_PX)
 
     def _slope(self, place: Place, dx: float, dy: float) -> Plane:
@@ -104,7 +104,7 @@ class Behind:
 
 
 def behind(fine_scene: Plane, place: Place, *, fine: int, margin_px: int) -> Behind:
-    """The part of a scene that a disc at `place`, or less than a pixel off, can hide on the field.
+    """The part of a scene that a disc at `place`, or less than a pixel away from it, can hide in the field.
 
     fine_scene: pixels [y, x], DN/s, `fine` per detector pixel and axis, margin_px detector pixels beyond the
     field on each side.
@@ -119,7 +119,7 @@ def behind(fine_scene: Plane, place: Place, *, fine: int, margin_px: int) -> Beh
 
 
 def binned(fine_plane: Plane, fine: int) -> Plane:
-    """Mean of each block of (fine, fine) pixels."""
+    """The mean of each block of (fine, fine) pixels."""
     if fine == 1:
         return fine_plane
     ny, nx = fine_plane.shape

@@ -1,9 +1,9 @@
-"""An observation of a known scene: blurred by a PSF, counted in photons, read out with noise.
+"""An observation of a known scene: convolved with a PSF, with photon noise and read noise.
 
 | symbol | name | unit |
 |---|---|---|
-| gain | photon_gain_dn: DN a detected photon | DN |
-| read | read_noise_dn: rms of the readout | DN |
+| gain | photon_gain_dn: DN per detected photon | DN |
+| read | read_noise_dn: rms of the read noise | DN |
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def observe(
     seed: int,
     threads: int = 1,
 ) -> NDArray[np.float64]:
-    """What the camera gives of `scene` [y, x] (DN/s): PSF, photon noise, read noise; in DN/s.
+    """The image [y, x] of `scene` [y, x], both in DN/s: convolved, then with photon noise and read noise.
 
-    The scene is dark outside its field. Noise-free where both noises are 0.
+    The scene is dark outside its field. If both noise figures are 0, the image is noise-free.
     """
     rng = np.random.default_rng(seed)
     field = (scene.shape[0], scene.shape[1])
     seen_dn = Convolver(psf.kernel, field, dtype=np.float64, threads=threads).apply(scene) * exposure_s
-    seen_dn = np.maximum(seen_dn, 0.0)  # transforms leave rounding below zero in the dark
+    seen_dn = np.maximum(seen_dn, 0.0)  # rounding of the transforms gives values below zero in dark pixels
     if photon_gain_dn > 0:
         seen_dn = rng.poisson(seen_dn / photon_gain_dn) * photon_gain_dn
     noise_dn = rng.normal(0.0, read_noise_dn, field) if read_noise_dn > 0 else 0.0
@@ -53,7 +53,7 @@ def observe(
 
 
 def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1, threads: int = 1) -> None:
-    """Write a simulated image of (size, size) px that looks like HRI_EUV level 2 and says it is not."""
+    """Write a simulated image of (size, size) px with the header of an HRI_EUV level 2 file, marked as simulated."""
     scene = solar_scene((size, size), seed)
     pixels = observe(
         scene,
@@ -67,12 +67,12 @@ def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1, t
     mask = np.zeros(pixels.shape, dtype=np.uint8)
     header = _demo_header(size, psf)
     image = Image(pixels=pixels, mask=mask, header=header, unit="DN/s", exposure_s=DEMO_EXPOSURE_S)
-    history = [f"simulated scene, seed {seed}, seen through PSF {psf.name} {psf.version}"]
+    history = [f"simulated scene, seed {seed}, convolved with PSF {psf.name} {psf.version}"]
     write_image(path, image, cards={}, history=history)
 
 
 def _demo_header(size: int, psf: Psf) -> fits.Header:
-    """Cards as EUI level 2 has them; ORIGIN, CREATOR and COMMENT say that the image is simulated."""
+    """The keywords of EUI level 2; ORIGIN, CREATOR and COMMENT say that the image is simulated."""
     header = fits.Header()
     scale = psf.plate_scale_arcsec or 0.492
     radius_arcsec = float(np.arcsin(_SOLAR_RADIUS_M / _DEMO_DISTANCE_M) * _ARCSEC_PER_RADIAN)

@@ -1,8 +1,9 @@
-"""The plan of a simulated transit: which images are taken where, how long, and with what errors.
+"""The plan of a simulated transit: the place, exposure and errors of each image.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The observations": three pointings, the planet far
-off the east limb and approaching it, across the disc, and away from the west limb; 5 s exposures in combined gain far
-off the limb, 0.9 s in high gain near it, 1.8 s in high gain on the disc.
+Hofmeister et al., The point-spread function of HRI_EUV, section "The observations": there are three pointings. In the
+first the planet approaches the east limb from far off, in the second it crosses the disc, in the third it leaves
+the west limb. Exposures are 5 s in combined gain far off the limb, 0.9 s in high gain near it, and 1.8 s in high gain on
+the disc.
 """
 
 from __future__ import annotations
@@ -19,25 +20,26 @@ from psfcore.transit.transit import Place
 
 RADIUS_PX = 10.75
 SMALLEST_SIZE_PX = 64
-LARGEST_FINE_SIZE_PX = 1024  # of a field drawn on half pixels by default
+LARGEST_FINE_SIZE_PX = 1024  # the largest field that is simulated on half pixels by default
 EAST, DISC, WEST = "east_limb", "disc", "west_limb"
 VIEWS = (EAST, DISC, WEST)
 DARK, ON = "dark", "on"
 COMBINED, HIGH = "combined", "high-only"
 CAMERA = Noise(photon_gain_dn=6.0, read_noise_dn=2.0)
 
-_THIRDS_UP_TO = 60  # images; more are shared out as the paper's 126
+_THIRDS_UP_TO = 60  # images; larger numbers are divided as the paper's 126
 _PAPER_LIMB_SHARE = 24 / 126
 _PAPER_FAR_SHARE = 10 / 24
-_MARGIN_PX = 6.0  # least distance of the disc's edge from the field's
+_MARGIN_PX = 6.0  # least distance between the edges of disc and field
 _MINUTE_S = 60.0
+_KEYS = {"pointing": "fov"}  # the key in truth.json of a field of Shot
 
 
 @dataclass(frozen=True)
 class Shot:
     """One image: its pointing (from 1), the occulter's exact centre (px), exposure (s), gain mode, start (s)."""
 
-    fov: int
+    pointing: int
     x_px: float
     y_px: float
     exposure_s: float
@@ -47,12 +49,12 @@ class Shot:
 
 @dataclass(frozen=True)
 class Plan:
-    """All that decides a simulated transit but the PSF and the seed.
+    """Everything that determines a simulated transit except the PSF and the seed.
 
-    views: what each pointing shows, fov 1 first, each of VIEWS. ephemeris_error_px: rms on each axis.
-    saturation_dn: level that high-only images clip at, None for none; combined ones do not saturate.
-    brightness: factor on the scenes. oversampling: drawn pixels per detector pixel and axis, 1 or 2.
-    beyond: "dark" where the scene ends with the field; "on" where the Sun goes on for beyond_px on each side
+    views: what each pointing shows, beginning with pointing 1, each of VIEWS. ephemeris_error_px: rms per axis.
+    saturation_dn: level at which high-only images clip, None: no saturation; combined images do not saturate.
+    brightness: factor on the scenes. oversampling: scene pixels per detector pixel and axis, 1 or 2.
+    beyond: "dark" if the scene ends at the edge of the field; "on" if the Sun continues for beyond_px on each side
     (None: half the field). Raises DataError "bad-plan".
     """
 
@@ -83,7 +85,9 @@ class Plan:
         _expect(level is None or level > 0, "a saturation level above 0 DN", level)
         _expect(np.isfinite(self.dark_offset_dn), "a finite dark offset", self.dark_offset_dn)
         for shot in self.shots:
-            _expect(1 <= shot.fov <= len(self.views), f"a pointing of 1 to {len(self.views)}", shot.fov)
+            _expect(
+                1 <= shot.pointing <= len(self.views), f"a pointing of 1 to {len(self.views)}", shot.pointing
+            )
             _expect(shot.exposure_s > 0, "an exposure above 0 s", shot.exposure_s)
             low, high = self.radius_px, self.size_px - 1 - self.radius_px
             inside = low <= shot.x_px <= high and low <= shot.y_px <= high
@@ -91,29 +95,36 @@ class Plan:
 
     @property
     def margin_px(self) -> int:
-        """How far the scene goes on beyond the field on each side."""
+        """How far the scene extends beyond the field on each side."""
         if self.beyond == DARK:
             return 0
         return self.size_px // 2 if self.beyond_px is None else self.beyond_px
 
     @property
-    def fovs(self) -> tuple[int, ...]:
+    def pointings(self) -> tuple[int, ...]:
         """The pointings that have images."""
-        return tuple(sorted({shot.fov for shot in self.shots}))
+        return tuple(sorted({shot.pointing for shot in self.shots}))
 
     def place(self, index: int) -> Place:
-        """Where the occulter exactly is in an image."""
+        """The exact place of the occulter in an image."""
         return Place(self.shots[index].x_px, self.shots[index].y_px, self.radius_px)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; plan_from_json gives the plan back."""
-        return dataclasses.asdict(self)
+        """Plain values; plan_from_json reads them."""
+        content = dataclasses.asdict(self)
+        content["shots"] = [
+            {_KEYS.get(key, key): value for key, value in shot.items()} for shot in content["shots"]
+        ]
+        return content
 
 
 def plan_from_json(content: dict[str, Any]) -> Plan:
     """The plan that Plan.as_json wrote. Raises DataError "bad-plan"."""
     try:
-        shots = tuple(Shot(**shot) for shot in content["shots"])
+        names = {key: name for name, key in _KEYS.items()}
+        shots = tuple(
+            Shot(**{names.get(key, key): value for key, value in shot.items()}) for shot in content["shots"]
+        )
         known = content | {
             "shots": shots,
             "noise": Noise(**content["noise"]),
@@ -122,16 +133,17 @@ def plan_from_json(content: dict[str, Any]) -> Plan:
         return Plan(**known)
     except (KeyError, TypeError) as error:
         raise DataError(
-            "bad-plan", f"expected a plan as `heliopsf simulate` writes it; got: {error}"
+            "bad-plan", f"expected a plan written by `heliopsf simulate transit`; got: {error}"
         ) from None
 
 
 def default_plan(images: int = 30, size_px: int = 512, **changes: Any) -> Plan:
-    """A transit like the paper's: any number of images, a third a pointing up to 60, else as its 24, 78, 24.
+    """A transit like that of the paper, with any number of images.
 
-    Of a limb pointing's images 10 in 24 are taken far off the limb (5 s, combined), the others near it (0.9 s,
-    high-only); on the disc all are 1.8 s, high-only. changes: fields of Plan other than its size and images.
-    Fields above 1024 px are drawn on whole pixels. Raises DataError "bad-plan".
+    Up to 60 images, each pointing has a third; above, they are divided as the paper's 24, 78 and 24. Of the images of a
+    limb pointing 10 in 24 are far off the limb (5 s, combined), the others near it (0.9 s, high-only); on the disc all
+    are 1.8 s, high-only. changes: fields of Plan other than its size and images. Fields above 1024 px are simulated on
+    whole pixels. Raises DataError "bad-plan".
     """
     _expect(images >= 1, "at least one image", images)
     limb = images // 3 if images <= _THIRDS_UP_TO else round(images * _PAPER_LIMB_SHARE)
@@ -149,7 +161,7 @@ def default_plan(images: int = 30, size_px: int = 512, **changes: Any) -> Plan:
 
 @dataclass(frozen=True)
 class _Track:
-    """Where the occulter enters and leaves a pointing (field edges), and when (minutes after 03:42)."""
+    """Where the occulter enters and leaves a pointing (in field edges), and when (minutes after 03:42)."""
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -159,9 +171,9 @@ class _Track:
 
 @dataclass(frozen=True)
 class _Phase:
-    """Images of one kind in a row: pointing, start and end (minutes after 03:42 UT), exposure, gain mode."""
+    """Consecutive images of one kind: pointing, start and end (minutes after 03:42 UT), exposure, gain mode."""
 
-    fov: int
+    pointing: int
     start_min: float
     end_min: float
     exposure_s: float
@@ -183,12 +195,12 @@ _PHASES = (
 
 
 def _shots(phase: _Phase, count: int, size_px: int, radius_px: float) -> list[Shot]:
-    """Images evenly in time; the planet moves evenly along its track, kept off the field's edge."""
+    """Images at equal intervals; the planet moves uniformly along its track, away from the edge of the field."""
     if count == 1:
         times = np.array([(phase.start_min + phase.end_min) / 2])
     else:
         times = np.linspace(phase.start_min, phase.end_min, count)
-    track = _TRACKS[phase.fov - 1]
+    track = _TRACKS[phase.pointing - 1]
     low = radius_px + _MARGIN_PX
     _expect(2 * low < size_px - 1, f"a field of more than {2 * low + 1:.0f} px", size_px)
     start, end = (
@@ -198,7 +210,9 @@ def _shots(phase: _Phase, count: int, size_px: int, radius_px: float) -> list[Sh
     for minute in times:
         x, y = start + (end - start) * (minute - track.start_min) / (track.end_min - track.start_min)
         place = (float(x), float(y))
-        shots.append(Shot(phase.fov, *place, phase.exposure_s, phase.gain_mode, float(minute * _MINUTE_S)))
+        shots.append(
+            Shot(phase.pointing, *place, phase.exposure_s, phase.gain_mode, float(minute * _MINUTE_S))
+        )
     return shots
 
 

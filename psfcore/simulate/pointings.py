@@ -1,4 +1,4 @@
-"""Scenes of a transit's pointings: limb to the east, disc, limb to the west; drawn, or taken from an image."""
+"""The scenes of a transit's pointings: east limb, disc, west limb; synthetic, or taken from an image."""
 
 from __future__ import annotations
 
@@ -24,24 +24,25 @@ _DISC = Layout(limb_centre=(0.5, 0.5))
 _LAYOUTS = {EAST: _LIMB, DISC: _DISC, WEST: _LIMB}
 
 
-def drawn_scene(plan: Plan, fov: int, seed: int) -> Plane:
-    """A pointing's scene in DN/s on drawn pixels [y, x]: oversampling per detector pixel, margins included.
+def drawn_scene(plan: Plan, pointing: int, seed: int) -> Plane:
+    """The synthetic scene of a pointing, DN/s [y, x]: oversampling pixels per detector pixel and axis, with margins.
 
-    The west limb is drawn as an east limb of another seed, and mirrored. The same for the same plan and seed.
+    The west limb is a mirrored east limb of another seed. Equal plans and seeds give equal scenes.
     """
-    view = plan.views[fov - 1]
+    view = plan.views[pointing - 1]
     edge = plan.size_px * plan.oversampling
-    own = int(np.random.SeedSequence([seed, fov]).generate_state(1)[0])
+    own = int(np.random.SeedSequence([seed, pointing]).generate_state(1)[0])
     margin = plan.margin_px * plan.oversampling
     scene = solar_scene((edge, edge), own, layout=_LAYOUTS[view], margin_px=margin)
     return np.ascontiguousarray(plan.brightness * (scene[:, ::-1] if view == WEST else scene))
 
 
 def scene_from_image(image: Plane, plan: Plan) -> Plane:
-    """A scene on drawn pixels from an image's pixels [y, x] in DN/s, its middle where it is larger.
+    """A scene, as drawn_scene returns it, from the pixels of an image [y, x] in DN/s.
 
-    Pixels that are not finite or below zero become 0. An image smaller than what is drawn is enlarged
-    (bilinear, light per pixel kept), its shorter edge to the scene's. Raises DataError "bad-scene".
+    If the image is larger than the scene, its middle is used. If it is smaller, it is enlarged until its shorter edge is
+    that of the scene (bilinear, light per pixel unchanged). Pixels that are not finite or below zero become 0.
+    Raises DataError "bad-scene".
     """
     if image.ndim != 2 or min(image.shape) < 2:
         raise DataError("bad-scene", f"expected an image of two axes; got shape {image.shape}")

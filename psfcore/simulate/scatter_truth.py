@@ -1,7 +1,8 @@
-"""Scatter as a simulator knows it: a softened power law that may be stretched and lopsided.
+"""The true scatter of a simulation: a softened power law that may be stretched and lopsided.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light", and beyond it: the
-paper's scatter has no direction. Written apart from the fit, so that neither hides the other's errors.
+Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light". The paper's scatter is
+isotropic; stretch and dipole are additions. This code is independent of the fit, so that neither hides errors of the
+other.
 
     s(u, v) = a F(u, v)  off the centre,  s(0) = 1 - total                            Eq. (1)
     F = (b + r')^-c (1 + d cos(theta - t)),  r'^2 = (u / (1 + s))^2 + (v (1 + s))^2    Eq. (2)
@@ -12,7 +13,7 @@ paper's scatter has no direction. Written apart from the fit, so that neither hi
 | b, c, total | b_px, c, total | px, -, - |
 | s | stretch along t | - |
 | t | angle_deg, from +x towards +y | degrees |
-| d | dipole: light lands farther towards t | - |
+| d | dipole: more light is scattered towards t | - |
 | u, v | offset from the centre along t and across it | px |
 | theta | angle of the offset, from +x towards +y | - |
 """
@@ -35,7 +36,7 @@ PARAMETERS = ("b", "c", "total", "stretch")
 
 @dataclass(frozen=True)
 class ScatterTruth:
-    """The true scatter. Raises DataError "bad-scatter" where it would be no PSF."""
+    """The true scatter. Raises DataError "bad-scatter" if the parameters do not describe a PSF."""
 
     b_px: float
     c: float
@@ -60,7 +61,7 @@ class ScatterTruth:
 
 
 def anisotropic_kernel(scatter: ScatterTruth, size: int = REACH_GRID_PX) -> Kernel:
-    """Eq. (1) on (size, size), size <= 2048, centre at [size // 2, size // 2]; sums to 1 on 2048."""
+    """Eq. (1) on (size, size), size <= 2048, centre at [size // 2, size // 2]; the sum is 1 for size 2048."""
     falloff = _falloff(scatter)
     kernel = falloff * (scatter.total / falloff.sum())  # Eq. (1), Eq. (3)
     kernel[REACH_GRID_PX // 2, REACH_GRID_PX // 2] = 1 - scatter.total
@@ -70,7 +71,7 @@ def anisotropic_kernel(scatter: ScatterTruth, size: int = REACH_GRID_PX) -> Kern
 def total_kernel(
     scatter: ScatterTruth, diffraction: Kernel, size: int = REACH_GRID_PX, *, threads: int = 1
 ) -> Kernel:
-    """Scatter convolved linearly with diffraction on (size, size), cut to the full reach, not renormalised.
+    """The linear convolution of scatter and diffraction on (size, size), cut to the full reach, not renormalised.
 
     diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1.
     """
@@ -78,17 +79,17 @@ def total_kernel(
 
 
 def convolved(full_kernel: Kernel, diffraction: Kernel, size: int, *, threads: int = 1) -> Kernel:
-    """A kernel on the full reach with diffraction, on (size, size); only the part that reaches it is transformed."""
+    """A kernel on the full reach convolved with diffraction, on (size, size); only the needed part is transformed."""
     needed = size + max(diffraction.shape) + 2
     part = full_kernel if needed >= REACH_GRID_PX else crop_centred(full_kernel, (needed, needed))
     return linear_convolve(part, diffraction, (size, size), threads=threads)
 
 
 def kernel_slopes(scatter: ScatterTruth) -> dict[str, Kernel]:
-    """What a unit of each of PARAMETERS adds to the kernel, on the full reach; its sum is kept by Eq. (3)."""
+    """The derivatives of the kernel with respect to PARAMETERS, on the full reach; Eq. (3) conserves its sum."""
     falloff = _falloff(scatter)
     norm = falloff.sum()
-    # The centre holds 1 - total whatever the shape: the falloff is 0 there, and so are its slopes.
+    # The centre is 1 - total for every shape: there the falloff and its slopes are 0.
     found = {
         name: (scatter.total / norm) * (slope - falloff * (slope.sum() / norm))
         for name, slope in _falloff_slopes(scatter, falloff).items()
@@ -99,7 +100,7 @@ def kernel_slopes(scatter: ScatterTruth) -> dict[str, Kernel]:
 
 
 def amplitude_slopes(scatter: ScatterTruth) -> dict[str, float]:
-    """What a unit of each of PARAMETERS adds to the amplitude a, Eq. (3)."""
+    """The derivatives of the amplitude a of Eq. (3) with respect to PARAMETERS."""
     falloff = _falloff(scatter)
     norm = float(falloff.sum())
     sums = {name: float(slope.sum()) for name, slope in _falloff_slopes(scatter, falloff).items()}
@@ -108,7 +109,7 @@ def amplitude_slopes(scatter: ScatterTruth) -> dict[str, float]:
 
 
 def _falloff_slopes(scatter: ScatterTruth, falloff: Kernel) -> dict[str, Kernel]:
-    """What a unit of b, of c and of the stretch adds to F."""
+    """The derivatives of F with respect to b, c and the stretch."""
     radius = _radius(scatter)
     by_b = -scatter.c * falloff / (scatter.b_px + radius)
     by_c = -np.log(scatter.b_px + radius) * falloff
@@ -133,7 +134,7 @@ def _radius(scatter: ScatterTruth) -> Kernel:
 
 
 def _radius_slope(scatter: ScatterTruth, radius: Kernel) -> Kernel:
-    """What a unit of stretch adds to r'."""
+    """The derivative of r' with respect to the stretch."""
     along, across = _offsets(scatter.angle_deg)
     factor = 1 + scatter.stretch
     return (across**2 * factor - along**2 / factor**3) / np.maximum(radius, 1e-300)

@@ -1,9 +1,9 @@
-"""A synthetic EUV scene of the Sun: made up, yet with the contrasts and scales that a PSF acts on.
+"""A synthetic EUV scene of the Sun, with realistic contrasts and spatial scales.
 
-Everything is drawn in units of the field's longer edge, so that a scene keeps its look at any size:
-quiet-Sun texture (lognormal, power over many scales), two active regions with bright moss and thin loops,
-a dark coronal hole, a filament, a limb, and a corona beyond it that falls off with height. A layout says which of
-them, and where; a margin draws on beyond the field.
+All lengths are in units of the field's longer edge, so that a scene looks the same at any size. It consists of quiet Sun
+(lognormal, with power on many scales), two active regions with bright moss and thin loops, a dark coronal hole, a
+filament, a limb, and a corona whose brightness decreases with height. A layout selects and places these parts. A margin
+extends the scene beyond the field.
 """
 
 from __future__ import annotations
@@ -34,8 +34,7 @@ class _Region:
 
 @dataclass(frozen=True)
 class _Bundle:
-    """Loops side by side: middle between the feet, half distance of the feet, height (field edges), tilt
-    (radians), and light."""
+    """Parallel loops: middle between the footpoints, half their distance, height (field edges), tilt (radians), light."""
 
     x: float
     y: float
@@ -50,8 +49,8 @@ _REGIONS = (_Region(0.78, 0.24, 0.13, 2300.0, 34), _Region(0.44, 0.31, 0.075, 18
 
 @dataclass(frozen=True)
 class Layout:
-    """What is where in a field: limb (x, y, radius in field edges), corona (DN/s at the limb, height in field
-    edges), sky (DN/s), and which of the rest there is."""
+    """The parts of a scene: limb (x, y, radius in field edges), corona (DN/s at the limb, scale height in field edges),
+    sky (DN/s), active regions, and whether there is a filament."""
 
     limb_centre: tuple[float, float] = (1.52, 0.30)
     limb_radius: float = 1.33
@@ -67,8 +66,7 @@ LIMB_AND_REGIONS = Layout()
 
 @dataclass(frozen=True)
 class _Canvas:
-    """What is drawn on: shape of all of it, the field's longer edge, and the margin before the field's first
-    pixel; px."""
+    """The array of a scene: its whole shape, the longer edge of the field, and the margin before the field, px."""
 
     shape: tuple[int, int]
     edge: int
@@ -76,7 +74,7 @@ class _Canvas:
 
     @property
     def fields(self) -> float:
-        """Its area in fields."""
+        """The area of the array over that of the field."""
         inner = (self.shape[0] - 2 * self.margin) * (self.shape[1] - 2 * self.margin)
         return self.shape[0] * self.shape[1] / inner
 
@@ -89,9 +87,9 @@ class _Canvas:
 def solar_scene(
     shape: tuple[int, int], seed: int, *, layout: Layout = LIMB_AND_REGIONS, margin_px: int = 0
 ) -> Plane:
-    """True intensities [y, x] in DN/s, positive, the same for the same shape, layout, margin and seed.
+    """True intensities [y, x] in DN/s, positive. Equal arguments give equal scenes.
 
-    shape: of the field. The result is margin_px larger on each side: what the Sun shows beyond the field.
+    shape: of the field. The result is margin_px larger on each side, with the Sun beyond the field.
     """
     rng = np.random.default_rng(seed)
     canvas = _Canvas((shape[0] + 2 * margin_px, shape[1] + 2 * margin_px), max(shape), margin_px)
@@ -113,7 +111,7 @@ def solar_scene(
 def _octaves(canvas: _Canvas, rng: np.random.Generator, *, slope: float, coarsest: float) -> Plane:
     """Gaussian noise, rms 1, whose amplitude grows with scale to the power `slope`.
 
-    A sum of smooth random planes, each on half the scale of the one before, down to a pixel.
+    It is a sum of smooth random planes; each has half the scale of the previous one, down to a pixel.
     """
     shape, edge = canvas.shape, canvas.edge
     total = np.zeros(shape)
@@ -129,21 +127,21 @@ def _octaves(canvas: _Canvas, rng: np.random.Generator, *, slope: float, coarses
 
 
 def _texture(canvas: _Canvas, rng: np.random.Generator) -> Plane:
-    """Network and cells: lognormal, mean about 1."""
+    """Network and cells of the quiet Sun: lognormal, mean about 1."""
     fine = _octaves(canvas, rng, slope=0.45, coarsest=0.10)
     ridges = 1 - np.minimum(np.abs(_octaves(canvas, rng, slope=0.9, coarsest=0.07)), 1)
     return np.exp(0.5 * fine - 0.13) * (0.75 + 0.5 * ridges**2)
 
 
 def _large_scale(x: Plane, y: Plane) -> Plane:
-    """A coronal hole at the top right, dark to a tenth, and a brighter belt where the regions are."""
+    """A coronal hole at the top right, a tenth as bright, and a brighter belt around the active regions."""
     hole = np.exp(-((((x - 0.80) / 0.19) ** 2 + ((y - 0.80 + 0.3 * (x - 0.8)) / 0.17) ** 2) ** 2))
     belt = 1 + 0.9 * np.exp(-(((y - 0.27) / 0.20) ** 2))
     return (1 - 0.88 * hole) * belt
 
 
 def _corona(x: Plane, y: Plane, height: Plane, layout: Layout, rng: np.random.Generator) -> Plane:
-    """Off the limb: falls off with height, streaked along the radius."""
+    """The corona beyond the limb: its brightness decreases with height and has radial streaks."""
     angle = np.arctan2(y - layout.limb_centre[1], layout.limb_centre[0] - x)
     bins = np.linspace(-0.9, 0.9, 4000)
     rays = gaussian_filter(rng.standard_normal(bins.size), 12) * 5
@@ -156,7 +154,7 @@ def _corona(x: Plane, y: Plane, height: Plane, layout: Layout, rng: np.random.Ge
 
 
 def _moss(x: Plane, y: Plane, region: _Region, canvas: _Canvas, rng: np.random.Generator) -> Plane:
-    """Fine bright patches where loops are rooted, and the haze of the region."""
+    """Small bright patches at the footpoints of loops, and the diffuse light of the region."""
     r = np.hypot(x - region.x, (y - region.y) * 1.5) / region.size
     patches = np.exp(1.1 * _octaves(canvas, rng, slope=0.5, coarsest=0.05) - 1.0)
     outline = np.exp(-((r + 0.35 * _octaves(canvas, rng, slope=1.1, coarsest=0.2)) ** 2))
@@ -165,7 +163,7 @@ def _moss(x: Plane, y: Plane, region: _Region, canvas: _Canvas, rng: np.random.G
 
 
 def _loops(canvas: _Canvas, region: _Region, rng: np.random.Generator) -> Plane:
-    """Bundles of thin arcs that share their footpoints, most strands about one pixel wide."""
+    """Bundles of thin arcs with common footpoints; most strands are about one pixel wide."""
     shape, edge = canvas.shape, canvas.edge
     layers = [np.zeros(shape) for _ in range(3)]
     for _ in range(region.bundles):
@@ -182,7 +180,7 @@ def _loops(canvas: _Canvas, region: _Region, rng: np.random.Generator) -> Plane:
 
 
 def _draw_bundle(region: _Region, rng: np.random.Generator) -> _Bundle:
-    """Long bundles are rarer, rooted nearer the edge of the region, and fainter."""
+    """A random bundle. Long bundles are rarer, fainter, and nearer to the edge of the region."""
     reach = rng.random() ** 2
     span = region.size * (0.18 + 1.1 * reach)
     return _Bundle(
@@ -196,7 +194,7 @@ def _draw_bundle(region: _Region, rng: np.random.Generator) -> _Bundle:
 
 
 def _strand(bundle: _Bundle, edge: int, rng: np.random.Generator) -> tuple[Plane, Plane, Plane]:
-    """Points along one strand, about three a pixel, in field edges, with their light."""
+    """Points along one strand, about three per pixel, in field edges, with their light."""
     span = bundle.span * rng.normal(1, 0.05)
     rise = bundle.rise * rng.normal(1, 0.13)
     t = np.linspace(0, np.pi, max(16, int(3 * (2 * span + 2 * rise) * edge)))
@@ -204,14 +202,14 @@ def _strand(bundle: _Bundle, edge: int, rng: np.random.Generator) -> tuple[Plane
     lean = bundle.lean + rng.normal(0, 0.03)
     x = bundle.x + along * np.cos(lean) - up * np.sin(lean + 0.3) + rng.normal(0, 0.03) * bundle.span
     y = bundle.y + along * np.sin(lean) + up * np.cos(lean + 0.3) + rng.normal(0, 0.03) * bundle.span
-    # Brightest at the feet, and unevenly filled along the way.
+    # Brightest at the footpoints, and irregular along the strand.
     filling = np.exp(0.7 * np.interp(t, np.linspace(0, np.pi, 9), rng.standard_normal(9)))
     light = bundle.light * rng.lognormal(0, 0.7) * (0.12 + 0.88 * np.abs(np.cos(t)) ** 2) * filling
     return x, y, np.asarray(0.4 * light)
 
 
 def _bright_points(canvas: _Canvas, rng: np.random.Generator) -> Plane:
-    """Scattered compact brightenings."""
+    """Compact brightenings at random places."""
     shape, edge = canvas.shape, canvas.edge
     plane = np.zeros(shape)
     count = round(_BRIGHT_POINTS * canvas.fields)
@@ -221,7 +219,7 @@ def _bright_points(canvas: _Canvas, rng: np.random.Generator) -> Plane:
 
 
 def _filament(x: Plane, y: Plane) -> Plane:
-    """0 to 1: a dark winding channel across the disc."""
+    """The depth, 0 to 1, of a dark winding channel across the disc."""
     spine = 0.52 + 0.035 * np.sin(9 * x) + 0.018 * np.sin(23 * x + 1)
     ends = np.exp(-(((x - 0.62) / 0.15) ** 4))
     return np.asarray(ends * np.exp(-(((y - spine) / 0.013) ** 2)))

@@ -1,13 +1,13 @@
-"""The sky of a simulated transit, and what a camera without noise sees of it.
+"""The sky of a simulated transit, and its noise-free images.
 
-    I_i = P (S_f - h_i),   h_i what the disc hides of the scene S_f in image i    Eq. (1)
+    I_i = P (S_f - h_i),   h_i the light of the scene S_f that the disc hides in image i    Eq. (1)
 
-P is linear: a pointing's whole scene is seen through it once, what the disc hides once an image. Its kernel is
-scatter convolved with diffraction, cut to the full reach, a grid of 2048 px.
+P is the convolution with the PSF: scatter convolved with diffraction, cut to the full reach, a grid of 2048 px. P is
+linear: the scene of a pointing is convolved once, the hidden light once per image.
 
 | symbol | name | unit |
 |---|---|---|
-| S_f | scenes[f]: static scene of pointing f, what lies beyond the field included | DN/s |
+| S_f | scenes[f]: static scene of pointing f, including its part beyond the field | DN/s |
 | P S_f | seen_scenes[f] | DN/s |
 | h_i | Behind.hidden | DN/s |
 | I_i | expected(i), noise_free[i] | DN/s |
@@ -40,9 +40,9 @@ _SUM_TOLERANCE = 1e-3
 class TrueSky:
     """Scenes, occulter and PSF of a transit; all planes float64 [y, x] in DN/s on detector pixels.
 
-    diffraction, kernel: weights [y, x], centre at [n // 2, n // 2]; kernel is the total PSF, as far as the scenes
-    need it. scenes: by pointing, plan.margin_px larger than the field on each side. seen_scenes: by pointing,
-    through the PSF, without the occulter, on the field. behind: the scene round the occulter of each image.
+    diffraction, kernel: weights [y, x], centre at [n // 2, n // 2]; kernel is the total PSF, as large as the scenes
+    need. scenes: by pointing, plan.margin_px larger than the field on each side. seen_scenes: by pointing, convolved
+    with the PSF, without the occulter, on the field. behind: the scene around the occulter of each image.
     """
 
     plan: Plan
@@ -56,29 +56,29 @@ class TrueSky:
     threads: int = 1
 
     def true_scene(self, index: int) -> Plane:
-        """Scene of an image with its occulter dark, on the field."""
+        """The scene of an image with its dark occulter, on the field."""
         return on_field(self.true_scene_and_beyond(index), self.plan.margin_px)
 
     def true_scene_and_beyond(self, index: int) -> Plane:
-        """The same with what lies beyond the field, plan.margin_px on each side."""
-        scene = self.scenes[self.plan.shots[index].fov].copy()
+        """The same with plan.margin_px beyond the field on each side."""
+        scene = self.scenes[self.plan.shots[index].pointing].copy()
         around = self.behind[index]
         rows, columns = around.window(self.plan.margin_px)
         scene[rows, columns] -= around.hidden(self.plan.place(index))
-        return np.asarray(np.maximum(scene, 0.0))  # a hidden pixel is 0, not 1e-14 below it
+        return np.asarray(np.maximum(scene, 0.0))  # rounding gives -1e-14 for a hidden pixel
 
     def expected(self, index: int) -> Plane:
-        """What a camera without noise sees of an image, Eq. (1), on the field."""
+        """The noise-free image, Eq. (1), on the field."""
         around = self.behind[index]
         hidden = np.zeros((self.plan.size_px, self.plan.size_px))
         hidden[around.window()] = around.hidden(self.plan.place(index))
         return np.asarray(
-            self.seen_scenes[self.plan.shots[index].fov] - self._hiding.apply(hidden)
+            self.seen_scenes[self.plan.shots[index].pointing] - self._hiding.apply(hidden)
         )  # Eq. (1)
 
     @cached_property
     def noise_free(self) -> tuple[Plane, ...]:
-        """Every image as expected() has it; computed at first use and kept, 8 bytes a pixel and image."""
+        """expected() of every image; computed at first use and kept, 8 bytes per pixel and image."""
         return tuple(self.expected(index) for index in range(len(self.plan.shots)))
 
     @cached_property
@@ -96,7 +96,7 @@ def true_sky(
     scenes: Mapping[int, Plane] | None = None,
     threads: int = 1,
 ) -> TrueSky:
-    """The sky of a plan: scenes drawn from `seed`, or `scenes` by pointing as scene_from_image gives them.
+    """The sky of a plan, with synthetic scenes from `seed`, or with `scenes` by pointing as scene_from_image returns them.
 
     diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. Raises DataError "bad-diffraction", "bad-scene".
     """
@@ -106,14 +106,16 @@ def true_sky(
     coarse: dict[int, Plane] = {}
     seen: dict[int, Plane] = {}
     around: dict[int, Behind] = {}
-    for fov in plan.fovs:
-        fine = drawn_scene(plan, fov, seed) if scenes is None else _given(scenes, fov, plan)
-        for index in (n for n, shot in enumerate(plan.shots) if shot.fov == fov):
+    for pointing in plan.pointings:
+        fine = drawn_scene(plan, pointing, seed) if scenes is None else _given(scenes, pointing, plan)
+        for index in (n for n, shot in enumerate(plan.shots) if shot.pointing == pointing):
             around[index] = behind(fine, plan.place(index), fine=plan.oversampling, margin_px=plan.margin_px)
-        coarse[fov] = binned(fine, plan.oversampling)
+        coarse[pointing] = binned(fine, plan.oversampling)
         del fine
         through = Convolver(kernel, (whole_px, whole_px), dtype=np.float64, threads=threads)
-        seen[fov] = on_field(np.asarray(through.apply(coarse[fov]), dtype=np.float64), plan.margin_px).copy()
+        seen[pointing] = on_field(
+            np.asarray(through.apply(coarse[pointing]), dtype=np.float64), plan.margin_px
+        ).copy()
     return TrueSky(
         plan=plan,
         scatter=scatter,
@@ -128,20 +130,22 @@ def true_sky(
 
 
 def on_field(plane: Plane, margin_px: int) -> Plane:
-    """A plane without what lies beyond the field."""
+    """The part of a plane that is on the field."""
     ny, nx = plane.shape
     return plane[margin_px : ny - margin_px, margin_px : nx - margin_px]
 
 
-def _given(scenes: Mapping[int, Plane], fov: int, plan: Plan) -> Plane:
+def _given(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Plane:
     edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
-    if fov not in scenes or scenes[fov].shape != (edge, edge):
-        got = scenes[fov].shape if fov in scenes else f"scenes of pointings {sorted(scenes)}"
-        raise DataError("bad-scene", f"expected a scene of ({edge}, {edge}) for pointing {fov}; got {got}")
-    scene = np.asarray(scenes[fov], dtype=np.float64)
+    if pointing not in scenes or scenes[pointing].shape != (edge, edge):
+        got = scenes[pointing].shape if pointing in scenes else f"scenes of pointings {sorted(scenes)}"
+        raise DataError(
+            "bad-scene", f"pointing {pointing}: expected a scene of shape ({edge}, {edge}); got {got}"
+        )
+    scene = np.asarray(scenes[pointing], dtype=np.float64)
     if not np.isfinite(scene).all() or scene.min() < 0:
         raise DataError(
-            "bad-scene", f"expected finite pixels >= 0; got others in the scene of pointing {fov}"
+            "bad-scene", f"expected finite pixels >= 0; got others in the scene of pointing {pointing}"
         )
     return scene
 

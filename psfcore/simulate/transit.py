@@ -1,9 +1,9 @@
-"""A transit whose truth is known: a sky seen through a PSF, counted in photons, read out, in whole DN.
+"""A transit whose truth is known: a sky convolved with a PSF, with photon noise and read noise, in whole DN.
 
     D_i = round(min(g Poisson(I_i t / g) + read + dark, saturation)),  frame i = D_i / t     Eq. (1)
 
-The plan says where and how long (psfcore.simulate.plan), the sky what a camera without noise sees (sky.py), and
-transit_files.py writes the folder.
+The plan (plan.py) gives places and exposures, the sky (sky.py) the noise-free images, and transit_files.py writes the
+folder.
 
 | symbol | name | unit |
 |---|---|---|
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.simulate.headers import HRI_EUV, Imitated
 from psfcore.simulate.plan import HIGH, Plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import TrueSky, true_sky
@@ -29,14 +30,12 @@ from psfcore.transit.transit import Frame, Place, Transit
 Plane = NDArray[np.float64]
 Kernel = NDArray[np.float64]
 
-INSTRUMENT = "hri_euv"
-PLATE_SCALE_ARCSEC = 0.492
-_EPHEMERIS, _NOISE = 1001, 1002  # streams of random numbers, so that one does not move another
+_EPHEMERIS, _NOISE = 1001, 1002  # independent streams of random numbers
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulated transit was made with. places: the occulter's exact ones, an image each."""
+    """What a simulated transit was made with. places: exact places of the occulter, one per image."""
 
     scatter: ScatterTruth
     places: tuple[Place, ...]
@@ -45,7 +44,7 @@ class Truth:
     effects: tuple[Any, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """As truth.json has it, but for the plan."""
+        """The content of truth.json, except for the plan."""
         law = self.scatter
         return {
             "effects": list(self.effects),
@@ -68,30 +67,32 @@ class Truth:
 class SimulatedTransit:
     """A transit in memory, and its truth.
 
-    transit: frames in DN/s (float32), whole DN over the exposure, places as the ephemeris has them.
+    transit: frames in DN/s (float32), made from whole DN; places from the ephemeris, with its errors.
+    imitated: the instrument whose keywords the headers get.
     """
 
     transit: Transit
     truth: Truth
     sky: TrueSky
+    imitated: Imitated = HRI_EUV
 
     @property
     def plan(self) -> Plan:
-        """What was planned."""
+        """The plan of the transit."""
         return self.sky.plan
 
     @property
     def noise_free(self) -> tuple[Plane, ...]:
-        """What a camera without noise sees, DN/s, float64, an image each; computed at first use and kept."""
+        """The noise-free images, DN/s, float64; computed at first use and kept."""
         return self.sky.noise_free
 
     @property
     def scenes(self) -> Mapping[int, Plane]:
-        """Scene without occulter of each pointing, DN/s, plan.margin_px larger than the field on each side."""
+        """The scene of each pointing without occulter, DN/s, plan.margin_px larger than the field on each side."""
         return self.sky.scenes
 
     def true_scene(self, index: int) -> Plane:
-        """Scene of an image with its occulter dark, on the field: [y, x] in DN/s, float64."""
+        """The scene of an image with its dark occulter, on the field: [y, x] in DN/s, float64."""
         return self.sky.true_scene(index)
 
 
@@ -103,21 +104,23 @@ def simulate(
     *,
     scene_seed: int | None = None,
     scenes: Mapping[int, Plane] | None = None,
+    imitated: Imitated = HRI_EUV,
     threads: int = 1,
 ) -> SimulatedTransit:
-    """A transit of `plan` seen through scatter convolved with diffraction; the same for the same arguments.
+    """A transit of `plan` with the PSF that is scatter convolved with diffraction; equal arguments give equal results.
 
-    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: of scenes, ephemeris and noise.
-    scene_seed: another one for the scenes. scenes: by pointing, in place of drawn ones, as drawn_scene and
-    scene_from_image of psfcore.simulate.pointings give them. Raises DataError "bad-diffraction", "bad-scene".
+    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: for scenes, ephemeris and noise.
+    scene_seed: another seed for the scenes. scenes: by pointing, instead of synthetic ones, as drawn_scene and
+    scene_from_image of psfcore.simulate.pointings return them. imitated: the instrument in the headers.
+    Raises DataError "bad-diffraction", "bad-scene".
     """
     of_scenes = seed if scene_seed is None else scene_seed
     sky = true_sky(plan, scatter, diffraction, of_scenes, scenes=scenes, threads=threads)
-    return observed_transit(sky, seed)
+    return observed_transit(sky, seed, imitated)
 
 
-def observed_transit(sky: TrueSky, seed: int) -> SimulatedTransit:
-    """One more transit of the same sky: other noise, other errors of the ephemeris. Quick."""
+def observed_transit(sky: TrueSky, seed: int, imitated: Imitated = HRI_EUV) -> SimulatedTransit:
+    """Another transit of the same sky, with another noise realisation and other errors of the ephemeris. Quick."""
     plan = sky.plan
     reported = _ephemeris(plan, seed)
     start_s = plan.shots[0].time_s
@@ -125,7 +128,7 @@ def observed_transit(sky: TrueSky, seed: int) -> SimulatedTransit:
         Frame(
             file=f"{index:03d}.fits",
             pixels=(_read_out(plan, index, sky.expected(index), seed) / shot.exposure_s).astype(np.float32),
-            fov=shot.fov,
+            pointing=shot.pointing,
             place=reported[index],
             exposure_s=shot.exposure_s,
             time_s=shot.time_s - start_s,
@@ -137,11 +140,11 @@ def observed_transit(sky: TrueSky, seed: int) -> SimulatedTransit:
         frames=frames,
         diffraction=sky.diffraction,
         noise=plan.noise,
-        instrument=INSTRUMENT,
-        plate_scale_arcsec=PLATE_SCALE_ARCSEC,
+        instrument=imitated.name,
+        plate_scale_arcsec=imitated.plate_scale_arcsec,
     )
     places = tuple(plan.place(index) for index in range(len(plan.shots)))
-    return SimulatedTransit(transit, Truth(sky.scatter, places, seed, sky.seed), sky)
+    return SimulatedTransit(transit, Truth(sky.scatter, places, seed, sky.seed), sky, imitated)
 
 
 def _read_out(plan: Plan, index: int, expected: Plane, seed: int) -> Plane:
@@ -155,7 +158,7 @@ def _read_out(plan: Plan, index: int, expected: Plane, seed: int) -> Plane:
 
 
 def _ephemeris(plan: Plan, seed: int) -> list[Place]:
-    """Exact places with the ephemeris' error, to a tenth of a pixel."""
+    """The exact places plus errors of the ephemeris, rounded to a tenth of a pixel."""
     rng = np.random.default_rng([seed, _EPHEMERIS])
     errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))
     return [

@@ -1,14 +1,13 @@
-"""A simulated transit as a folder, in the format of a real one, with its truth beside it.
+"""A simulated transit as a folder: in the format of a real transit, with its truth beside it.
 
-NNN.fits            images, whole DN      noise_free/NNN.fits  the same without noise, DN/s
-diffraction.fits    known part of the PSF scenes/fovN.fits     scenes without occulter, DN/s, margins included
-transit.json        what a real one has   truth.json           PSF, exact places, seeds, the plan
+NNN.fits            images, whole DN       noise_free/NNN.fits  the same without noise, DN/s
+diffraction.fits    known part of the PSF  scenes/fovN.fits     scenes of the pointings without occulter, DN/s, with margins
+transit.json        as for a real transit  truth.json           PSF, exact places, seeds, the plan
 """
 
 from __future__ import annotations
 
 import json
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +16,21 @@ import numpy as np
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import Cards, CardValue, read_plane, write_plane
-from psfcore.simulate.plan import HIGH, Shot, plan_from_json
+from psfcore.simulate.headers import commented
+from psfcore.simulate.plan import HIGH, plan_from_json
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import TrueSky, true_sky
-from psfcore.simulate.transit import PLATE_SCALE_ARCSEC, SimulatedTransit
+from psfcore.simulate.transit import SimulatedTransit
 
 SCHEMA = "transit/1"
 TRUTH_FILE = "truth.json"
 DIFFRACTION_FILE = "diffraction.fits"
 
-_START = datetime(2023, 1, 3, 3, 42)
 _LARGEST_PX = 16384
 
 
 def write(simulated: SimulatedTransit, folder: str | Path) -> None:
-    """Write a simulated transit into `folder`, which is made where there is none; files there are replaced."""
+    """Write a simulated transit into `folder`, which is created if needed; existing files are replaced."""
     folder = Path(folder)
     for name in (".", "noise_free", "scenes"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -42,18 +41,19 @@ def write(simulated: SimulatedTransit, folder: str | Path) -> None:
         noise_free = simulated.sky.expected(index)
         cards = _frame_cards(simulated, index, "DN/s")
         write_plane(folder / "noise_free" / frame.file, noise_free, cards=cards)
-    for fov, scene in simulated.scenes.items():
-        about: dict[str, CardValue] = {"BUNIT": "DN/s", "FOV": fov, "MARGIN": simulated.plan.margin_px}
-        write_plane(folder / "scenes" / f"fov{fov}.fits", scene, cards=_cards(instrument_values() | about))
-    write_plane(folder / DIFFRACTION_FILE, simulated.sky.diffraction, cards=_cards(instrument_values()))
+    of_instrument = simulated.imitated.values()
+    for pointing, scene in simulated.scenes.items():
+        about: dict[str, CardValue] = {"BUNIT": "DN/s", "FOV": pointing, "MARGIN": simulated.plan.margin_px}
+        write_plane(folder / "scenes" / f"fov{pointing}.fits", scene, cards=commented(of_instrument | about))
+    write_plane(folder / DIFFRACTION_FILE, simulated.sky.diffraction, cards=commented(of_instrument))
     _write_json(folder / "transit.json", _transit_json(simulated))
     _write_json(folder / TRUTH_FILE, simulated.truth.as_json() | {"plan": simulated.plan.as_json()})
 
 
 def read_sky(folder: str | Path, *, threads: int = 1) -> TrueSky:
-    """The sky of a folder that `write` wrote; scenes on detector pixels, so that a pixel's light counts as even.
+    """The sky of a folder that `write` wrote. Its scenes are on detector pixels: light is uniform within a pixel.
 
-    Raises DataError "not-simulated" where the truth is not there, and what FITS files may raise.
+    Raises DataError "not-simulated" if the truth is missing, and the errors of reading FITS files.
     """
     folder = Path(folder)
     try:
@@ -67,11 +67,13 @@ def read_sky(folder: str | Path, *, threads: int = 1) -> TrueSky:
             raise
         wanted = f"{TRUTH_FILE} in {folder.name}, as `heliopsf simulate transit` writes it"
         raise DataError(
-            "not-simulated", f"expected {wanted}; got {type(error).__name__}: {error!s:.120}"
+            "not-simulated", f"expected a file {wanted}; got {type(error).__name__}: {error!s:.120}"
         ) from None
     plan = plan_from_json(plan_json)
     limits = FitsLimits(max_pixels=_LARGEST_PX**2)
-    scenes = {fov: read_plane(folder / "scenes" / f"fov{fov}.fits", limits) for fov in plan.fovs}
+    scenes = {
+        pointing: read_plane(folder / "scenes" / f"fov{pointing}.fits", limits) for pointing in plan.pointings
+    }
     diffraction = read_plane(folder / DIFFRACTION_FILE, limits)
     return true_sky(plan, scatter, diffraction, seed, scenes=scenes, threads=threads)
 
@@ -81,7 +83,7 @@ def _transit_json(simulated: SimulatedTransit) -> dict[str, Any]:
     images = [
         {
             "file": frame.file,
-            "fov": frame.fov,
+            "fov": frame.pointing,
             "x": frame.place.x_px,
             "y": frame.place.y_px,
             "r": frame.place.radius_px,
@@ -99,57 +101,11 @@ def _transit_json(simulated: SimulatedTransit) -> dict[str, Any]:
 
 def _frame_cards(simulated: SimulatedTransit, index: int, unit: str) -> Cards:
     shot = simulated.plan.shots[index]
-    values = shot_values(shot, unit)
+    values = simulated.imitated.shot_values(shot, unit)
     level = simulated.plan.saturation_dn
     if level is not None and shot.gain_mode == HIGH and unit == "DN":
         values["SATURATE"] = float(np.rint(level)) if simulated.plan.whole_dn else level
-    return _cards(values)
-
-
-def shot_values(shot: Shot, unit: str) -> dict[str, CardValue]:
-    """What the header of a simulated image says of how it was taken."""
-    begin = (_START + timedelta(seconds=shot.time_s)).isoformat(timespec="milliseconds")
-    return instrument_values() | {
-        "DATE-BEG": begin,
-        "XPOSURE": shot.exposure_s,
-        "GAINCOMB": shot.gain_mode,
-        "BUNIT": unit,
-    }
-
-
-def instrument_values() -> dict[str, CardValue]:
-    """What every header says of the instrument that is imitated."""
-    return {
-        "ORIGIN": "SIMULATED by heliopsf",
-        "TELESCOP": "SOLO/EUI/HRI_EUV",
-        "INSTRUME": "EUI",
-        "DETECTOR": "HRI_EUV",
-        "WAVELNTH": 174,
-        "CDELT1": PLATE_SCALE_ARCSEC,
-        "CDELT2": PLATE_SCALE_ARCSEC,
-    }
-
-
-_COMMENTS = {
-    "ORIGIN": "not an observation",
-    "TELESCOP": "telescope imitated",
-    "INSTRUME": "instrument imitated",
-    "DETECTOR": "detector imitated",
-    "WAVELNTH": "[Angstrom] wavelength",
-    "CDELT1": "[arcsec] pixel scale along axis 1",
-    "CDELT2": "[arcsec] pixel scale along axis 2",
-    "DATE-BEG": "[UTC] start of exposure, made up",
-    "XPOSURE": "[s] exposure time",
-    "GAINCOMB": "gain mode imitated",
-    "BUNIT": "unit of the pixels",
-    "SATURATE": "[DN] level at which pixels clip",
-    "FOV": "pointing",
-    "MARGIN": "[pixel] beyond the field on each side",
-}
-
-
-def _cards(values: dict[str, CardValue]) -> dict[str, tuple[CardValue, str]]:
-    return {key: (value, _COMMENTS[key]) for key, value in values.items()}
+    return commented(values)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

@@ -1,1 +1,1 @@
-"""Transits: an occulter before the Sun, its place, its pixels, and what they say of scattered light."""
+"""Transits, in which an occulter crosses the Sun: reading, preparing, places of the occulter, first guess of scatter."""

@@ -1,8 +1,8 @@
-"""Which images are held out together: sequential blocks, and a guard on both sides.
+"""Folds of a cross-validation: sequential blocks of held-out images, with a guard on both sides.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness": ten sequential blocks of
-126 images, three images on each side left out. On N images: min(10, N // 3) blocks and round(3 N / 126) images of
-guard, at least one from 12 images on.
+Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness": 126 images are divided into
+ten sequential blocks, and three images on each side of a block are not used. For N images: min(10, N // 3) blocks and a
+guard of round(3 N / 126) images, at least one image if N >= 12.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ GUARD_FROM = 12
 
 @dataclass(frozen=True)
 class Fold:
-    """Images held out, and those that may be fitted: all others but the guard. Indices in the order of time."""
+    """The held-out images, and the images to fit: all others except the guard. Indices in the order of time."""
 
     held_out: tuple[int, ...]
     fitted: tuple[int, ...]
 
 
 def folds(images: int) -> tuple[Fold, ...]:
-    """One fold a block; none where there are fewer than six images (two blocks)."""
+    """One fold per block; empty if there are fewer than six images (two blocks)."""
     count = min(MOST_BLOCKS, images // IMAGES_A_BLOCK)
     if count < 2:
         return ()

@@ -1,13 +1,13 @@
-"""A first guess of how much light is diffracted and scattered far, straight from the occulted pixels.
+"""A first guess of the light that is diffracted and scattered to large distances, directly from the occulted pixels.
 
-Paper (Hofmeister et al.), section "A first guess on the amount of scattered and diffracted light": before a
-homogeneous Sun, the intensity in the middle of a small dark disc is all light that came farther than its radius:
+Paper (Hofmeister et al.), section "A first guess on the amount of scattered and diffracted light": if the Sun is
+homogeneous, all light in the centre of a small dark disc comes from farther than its radius:
 
     I_o,dc = I_t sum over dr > r_disk of psf(dr),  mean I_o = I_t
     sum over dr > r_disk of psf(dr) = I_o,dc / mean I_o                     Eq. (1)
 
-The characteristic intensity, mean I_o, is taken three ways: the image's mean, its median, and the mean in a shell of
-50 px round the disc.
+There are three estimators of the characteristic intensity, mean I_o: the mean of the image, its median, and the mean in
+a shell of 50 px around the disc.
 
 | symbol | name | unit |
 |---|---|---|
@@ -16,8 +16,8 @@ The characteristic intensity, mean I_o, is taken three ways: the image's mean, i
 | I_o,dc / mean I_o | ratio | 1 |
 | r_disk | radius_px | px |
 
-How homogeneous a Sun is, the paper tells by eye. Here it is a figure: the larger of how far the three estimators lie
-apart and how far the shell's four quadrants do, each over its mean.
+The paper judges by eye how homogeneous the Sun is. Here it is a number: the range of the three estimators over their
+mean, or the range of the four quadrants of the shell over their mean, whichever is larger.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ from psfcore.transit.transit import Frame, Place, Transit
 
 CENTRE_PX = 2.0
 SHELL_PX = 50.0
-EDGE_PX = 2.0  # a departure: the shell leaves out the disc's blurred edge, and an ephemeris' error of a pixel
+EDGE_PX = (
+    2.0  # departure from the paper: the shell excludes the blurred edge, and ephemeris errors of a pixel
+)
 ESTIMATORS = ("image_mean", "image_median", "shell")
 
 Progress = Callable[[int, int], None]
@@ -44,11 +46,13 @@ Flat = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrameGuess:
-    """One image: intensities in DN/s; ratio and characteristic intensity by estimator, NaN where there is none;
-    inhomogeneity infinite where the disc's middle is not seen before light."""
+    """One image: intensities in DN/s; characteristic intensity and ratio by estimator, NaN if there is none.
+
+    inhomogeneity: infinite if the centre of the disc is not in the image, or the Sun behind it is dark.
+    """
 
     file: str
-    fov: int
+    pointing: int
     time_s: float
     centre_dn_s: float
     characteristic_dn_s: Mapping[str, float]
@@ -56,18 +60,18 @@ class FrameGuess:
 
     @property
     def ratio(self) -> dict[str, float]:
-        """The share of light from farther than the disc's radius, by estimator."""
+        """The fraction of light from farther than the radius of the disc, by estimator."""
         return {name: _ratio(self.centre_dn_s, level) for name, level in self.characteristic_dn_s.items()}
 
 
 @dataclass(frozen=True)
 class PointingGuess:
-    """One pointing: mean and scatter (standard deviation over its images) of the ratio, by estimator.
+    """One pointing: mean and standard deviation (scatter) of the ratio over its images, by estimator.
 
-    inhomogeneity: the median of its images'.
+    inhomogeneity: the median over its images.
     """
 
-    fov: int
+    pointing: int
     images: int
     mean: Mapping[str, float]
     scatter: Mapping[str, float]
@@ -76,40 +80,40 @@ class PointingGuess:
 
 @dataclass(frozen=True)
 class FirstGuess:
-    """All images in the order of time, all pointings, and what they imply.
+    """The first guess from all images, in the order of time, and all pointings.
 
-    best_fov: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratio over its
-    images and the three estimators: the light beyond radius_px, as a fraction.
+    best_pointing: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratio over its
+    images and the three estimators. The ratio is 1 - encircled energy at radius_px, a fraction.
     """
 
     frames: tuple[FrameGuess, ...]
     pointings: tuple[PointingGuess, ...]
-    best_fov: int
+    best_pointing: int
     share: float
     share_spread: float
     radius_px: float
 
     def to_json(self) -> dict[str, Any]:
-        """JSON-able; what is not a number is null."""
+        """Plain values; NaN and infinity become null. The key "fov" is the pointing."""
         return {
-            "best_fov": self.best_fov,
+            "best_fov": self.best_pointing,
             "share": _number(self.share),
             "share_spread": _number(self.share_spread),
             "radius_px": self.radius_px,
             "pointings": [
                 {
-                    "fov": pointing.fov,
-                    "images": pointing.images,
-                    "mean": _numbers(pointing.mean),
-                    "scatter": _numbers(pointing.scatter),
-                    "inhomogeneity": _number(pointing.inhomogeneity),
+                    "fov": guess.pointing,
+                    "images": guess.images,
+                    "mean": _numbers(guess.mean),
+                    "scatter": _numbers(guess.scatter),
+                    "inhomogeneity": _number(guess.inhomogeneity),
                 }
-                for pointing in self.pointings
+                for guess in self.pointings
             ],
             "frames": [
                 {
                     "file": frame.file,
-                    "fov": frame.fov,
+                    "fov": frame.pointing,
                     "time_s": frame.time_s,
                     "centre_dn_s": _number(frame.centre_dn_s),
                     "ratio": _numbers(frame.ratio),
@@ -123,10 +127,10 @@ class FirstGuess:
 def first_guess(
     transit: Transit, *, places: Sequence[Place] | None = None, progress: Progress | None = None
 ) -> FirstGuess:
-    """The first guess of a transit. places: exact ones, one a frame; none: the ephemeris'.
+    """The first guess of a transit.
 
-    progress(done, of) is called after each image.
-    Raises DataError "no-first-guess" where no image shows the middle of the occulter before light.
+    places: exact places of the occulter, one per frame; None: those of the ephemeris. progress(done, of) is called after
+    each image. Raises DataError "no-first-guess" if no image shows the centre of the occulter in front of the Sun.
     """
     places = [frame.place for frame in transit.frames] if places is None else places
     guesses = []
@@ -134,18 +138,20 @@ def first_guess(
         guesses.append(_frame_guess(frame, place))
         if progress is not None:
             progress(done, len(transit.frames))
-    pointings = tuple(_pointing_guess(fov, guesses) for fov in sorted({guess.fov for guess in guesses}))
+    pointings = tuple(
+        _pointing_guess(pointing, guesses) for pointing in sorted({guess.pointing for guess in guesses})
+    )
     telling = [p for p in pointings if math.isfinite(p.inhomogeneity)]
     if not telling:
-        message = "expected an image with the occulter's middle inside it, before the Sun; got none"
+        message = "expected at least one image with the centre of the occulter in the field, in front of the Sun; got none"
         raise DataError("no-first-guess", message)
-    best = min(telling, key=lambda pointing: pointing.inhomogeneity)
-    ratios = _finite([r for g in guesses if g.fov == best.fov for r in g.ratio.values()])
-    radii = [place.radius_px for g, place in zip(guesses, places, strict=True) if g.fov == best.fov]
+    best = min(telling, key=lambda guess: guess.inhomogeneity)
+    ratios = _finite([r for g in guesses if g.pointing == best.pointing for r in g.ratio.values()])
+    radii = [place.radius_px for g, place in zip(guesses, places, strict=True) if g.pointing == best.pointing]
     return FirstGuess(
         frames=tuple(guesses),
         pointings=pointings,
-        best_fov=best.fov,
+        best_pointing=best.pointing,
         share=float(ratios.mean()),
         share_spread=float(ratios.std()),
         radius_px=float(np.mean(radii)),
@@ -170,7 +176,7 @@ def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
     shown = centre.size > 0 and all(level > 0 for level in levels.values())
     return FrameGuess(
         file=frame.file,
-        fov=frame.fov,
+        pointing=frame.pointing,
         time_s=frame.time_s,
         centre_dn_s=_mean(centre),
         characteristic_dn_s=levels,
@@ -179,7 +185,7 @@ def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
 
 
 def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
-    """Pixels (one axis, none of them filled in) out to the shell's edge, and their x and y from the centre."""
+    """The pixels out to the edge of the shell (one axis, without filled ones), and their x and y from the centre."""
     reach = place.radius_px + EDGE_PX + SHELL_PX + 2
     ny, nx = frame.pixels.shape
     top, bottom = (min(max(int(place.y_px + side * reach), 0), ny) for side in (-1, 1))
@@ -191,11 +197,11 @@ def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
     return pixels, x[seen] - place.x_px, y[seen] - place.y_px
 
 
-def _pointing_guess(fov: int, guesses: Sequence[FrameGuess]) -> PointingGuess:
-    mine = [guess for guess in guesses if guess.fov == fov]
+def _pointing_guess(pointing: int, guesses: Sequence[FrameGuess]) -> PointingGuess:
+    mine = [guess for guess in guesses if guess.pointing == pointing]
     values = {name: _finite([guess.ratio[name] for guess in mine]) for name in ESTIMATORS}
     return PointingGuess(
-        fov=fov,
+        pointing=pointing,
         images=len(mine),
         mean={name: _mean(ratios) for name, ratios in values.items()},
         scatter={name: float(ratios.std()) if ratios.size else math.nan for name, ratios in values.items()},
@@ -208,7 +214,7 @@ def _ratio(centre_dn_s: float, level_dn_s: float) -> float:
 
 
 def _range_over_mean(values: list[float]) -> float:
-    """Largest minus smallest over the mean of those that are numbers; infinite for a mean that is not above 0."""
+    """The range of the finite values over their mean; infinite if the mean is not above 0."""
     known = _finite(values)
     if known.size == 0 or known.mean() <= 0:
         return math.inf

@@ -1,7 +1,7 @@
-"""A transit read from its folder: transit.json, its images one after the other, and the known part of the PSF.
+"""Read a transit from its folder: transit.json, its images one after the other, and the known part of the PSF.
 
-Headers are looked at first, all of them, so that a file that is missing or of another shape is told before the
-minutes of reading pixels. Only float32 pixels are kept: 126 images of 2048 px are 2.1 GiB.
+All headers are read first, so that a missing file or a wrong shape is reported at once, before the pixels, which take
+minutes. Pixels are kept as float32: 126 images of 2048 px take 2.1 GiB.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from psfcore.transit.transit import Kernel, Place, Transit, check_reaches_in
 
 KNOWN_PSF_SUM_TOLERANCE = 1e-3
 SMALLEST_KNOWN_PSF_PX = 16
-LARGEST_RADIUS_SHARE = 0.25  # of the frame's smaller side
-_NEGATIVE_TOLERANCE = 1e-6  # of the peak: what rounding leaves below zero
+LARGEST_RADIUS_SHARE = 0.25  # of the smaller side of an image
+_NEGATIVE_TOLERANCE = 1e-6  # of the peak; rounding gives such values below zero
 
 Progress = Callable[[int, int], None]
 KernelSource = Kernel | Callable[[str | None, tuple[int, int]], Kernel]
@@ -46,7 +46,7 @@ def read_transit(
     noise: Noise | None = None,
     saturation_dn: float | None = None,
 ) -> Transit:
-    """The transit in a folder, prepared: as ``read_prepared``, without the counts."""
+    """The transit in a folder: as ``read_prepared``, without the counts."""
     return read_prepared(
         folder,
         limits,
@@ -66,17 +66,17 @@ def read_prepared(
     noise: Noise | None = None,
     saturation_dn: float | None = None,
 ) -> tuple[Transit, Prepared]:
-    """The transit in a folder, in DN/s, frames in the order of time; and what was done to saturated pixels.
+    """The transit in a folder, in DN/s, frames in the order of time; and the counts of saturated and filled pixels.
 
-    progress(done, of) is called after each image. diffraction: weights [y, x], or a function of (instrument's
-    name or None, shape of the images) that makes them, used where transit.json names no known_psf. noise:
-    instead of transit.json's. saturation_dn: level in DN of one exposure, besides those of the headers;
-    none: the instrument's for the image's gain mode, where known. Times come from DATE-BEG or DATE-OBS; where one
-    image has neither, the order of transit.json counts, a second an image.
+    progress(done, of) is called after each image. diffraction: weights [y, x], or a function of (name of the instrument
+    or None, shape of the images) that makes them; used if transit.json has no known_psf. noise: replaces that of
+    transit.json. saturation_dn: level in DN of one exposure, in addition to those of the headers; None: the
+    instrument's level for the gain mode of the image, if known. Times come from DATE-BEG or DATE-OBS. If one image has
+    neither, the order of transit.json is used, with one second between images.
 
     Raises DataError: "no-manifest", "bad-manifest", "missing-file", "transit-shapes", "occulter-outside",
-    "occulter-too-large", "no-noise-figures", "no-known-psf", "known-psf-..." (see ``checked_kernel``), what
-    ``read_image`` raises with the file's name, what ``prepare`` raises; HeaderError for what headers show.
+    "occulter-too-large", "no-noise-figures", "no-known-psf", "known-psf-..." (see ``checked_kernel``), the errors of
+    ``read_image`` with the name of the file, the errors of ``prepare``; HeaderError for faults of a header.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -116,7 +116,7 @@ def read_prepared(
 
 @dataclass(frozen=True)
 class _Look:
-    """What is known of an image before its pixels are read."""
+    """What is known about an image before its pixels are read."""
 
     entry: ImageEntry
     time_s: float
@@ -132,7 +132,7 @@ def _read(folder: Path, look: _Look, limits: FitsLimits) -> tuple[Exposure, floa
     exposure = exposure_of(
         image,
         file=entry.file,
-        fov=entry.fov,
+        pointing=entry.pointing,
         place=Place(entry.x, entry.y, entry.r),
         time_s=look.time_s,
         gain_mode=look.header.gain_mode,
@@ -142,7 +142,7 @@ def _read(folder: Path, look: _Look, limits: FitsLimits) -> tuple[Exposure, floa
 
 @contextmanager
 def _naming(file: str) -> Iterator[None]:
-    """Put the file's name before the message of what it raises."""
+    """Put the name of the file before the message of an error."""
     try:
         yield
     except DataError as error:
@@ -158,7 +158,9 @@ def _check_present(folder: Path, manifest: TransitManifest) -> None:
     missing = [name for name in manifest.files if not (folder / name).is_file()]
     if missing:
         named = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
-        raise DataError("missing-file", f"expected every file that {MANIFEST_NAME} names; missing: {named}")
+        raise DataError(
+            "missing-file", f"expected all files that {MANIFEST_NAME} names in the folder; missing: {named}"
+        )
 
 
 def _check_frames(images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]) -> None:
@@ -167,17 +169,17 @@ def _check_frames(images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]
         label = f"images[{index}] ({image.file})"
         ny, nx = header.shape
         if header.shape != first:
-            size = f"{first[1]} x {first[0]} px as {images[0].file}"
+            size = f"{first[1]} x {first[0]} px, as {images[0].file} has"
             raise DataError("transit-shapes", f"{label}: expected {size}; got {nx} x {ny}")
         largest = LARGEST_RADIUS_SHARE * min(ny, nx)
         if image.r > largest:
-            message = f"expected an occulter's radius r of at most {largest:g} px in {nx} x {ny} px"
+            message = f"expected a radius r of at most {largest:g} px in images of {nx} x {ny} px"
             raise DataError("occulter-too-large", f"{label}: {message}; got {image.r:g}")
         check_reaches_in(Place(image.x, image.y, image.r), header.shape, label)
 
 
 def _times_s(headers: Sequence[HeaderSummary]) -> list[float]:
-    """Start of each image, s after the first; the index where any of them has no readable date."""
+    """Start of each image, s after the first; the index of each image if one of them has no readable date."""
     starts = [_instant(header.date_obs) for header in headers]
     known = [start for start in starts if start is not None]
     if len(known) < len(starts):
@@ -187,7 +189,7 @@ def _times_s(headers: Sequence[HeaderSummary]) -> list[float]:
 
 
 def _instant(text: str | None) -> datetime | None:
-    """A date of a header, in UTC unless it says otherwise."""
+    """A date of a header, in UTC unless it has another time zone."""
     if text is None:
         return None
     try:
@@ -198,7 +200,7 @@ def _instant(text: str | None) -> datetime | None:
 
 
 def _level_dn(header: HeaderSummary, saturation_dn: float | None) -> float | None:
-    """Level of one exposure in DN: the one given, or the instrument's for the image's gain mode."""
+    """The saturation level of one exposure in DN: the given one, or the instrument's for the gain mode of the image."""
     if saturation_dn is not None or header.gain_mode is None or header.instrument not in instrument_names():
         return saturation_dn
     return saturation_for(_instrument(header.instrument), Header({"GAINCOMB": header.gain_mode}))
@@ -222,7 +224,7 @@ def _noise(manifest: TransitManifest) -> Noise:
         raise DataError(
             "no-noise-figures",
             f'expected "noise": {{"photon_gain_dn": ..., "read_noise_dn": ...}} in {MANIFEST_NAME}, or both '
-            "figures with the request (DN a detected photon, DN rms of the readout); got none",
+            "figures in the request (DN per detected photon, rms read noise in DN); got neither",
         )
     return Noise(manifest.noise.photon_gain_dn, manifest.noise.read_noise_dn)
 
@@ -240,27 +242,31 @@ def _known_psf(
             kernel = read_plane(folder / manifest.known_psf, limits)
         return checked_kernel(kernel, manifest.known_psf)
     if fallback is None:
-        wanted = f'expected "known_psf" in {MANIFEST_NAME}, or an instrument that diffraction is known of'
-        raise DataError("no-known-psf", f"{wanted}; got none")
+        wanted = (
+            f'expected "known_psf" in {MANIFEST_NAME}, or an instrument whose diffraction can be computed'
+        )
+        raise DataError("no-known-psf", f"{wanted}; got neither")
     return checked_kernel(fallback(instrument, shape) if callable(fallback) else fallback, "diffraction")
 
 
 def checked_kernel(kernel: Kernel, label: str) -> Kernel:
-    """A known part of a PSF [y, x] that sums to 1 exactly, centre at [ny // 2, nx // 2]; label names it in errors.
+    """Check the known part of a PSF [y, x], centre at [ny // 2, nx // 2], and normalise it to sum 1.
 
-    A sum within KNOWN_PSF_SUM_TOLERANCE of 1 is rounding and divided out.
+    A sum that differs from 1 by at most KNOWN_PSF_SUM_TOLERANCE counts as rounding. label: its name in errors.
     Raises DataError "known-psf-small", "known-psf-nonfinite", "known-psf-negative", "known-psf-sum",
     "known-psf-not-centred".
     """
     if kernel.ndim != 2 or min(kernel.shape) < SMALLEST_KNOWN_PSF_PX:
-        message = f"expected at least {SMALLEST_KNOWN_PSF_PX} px a side"
+        message = f"expected at least {SMALLEST_KNOWN_PSF_PX} px on each side"
         raise DataError("known-psf-small", f"{label}: {message}; got shape {kernel.shape}")
     if not np.isfinite(kernel).all():
         bad = int(np.count_nonzero(~np.isfinite(kernel)))
-        raise DataError("known-psf-nonfinite", f"{label}: expected finite weights; got {bad} that are not")
+        raise DataError(
+            "known-psf-nonfinite", f"{label}: expected finite weights; got {bad} NaN or infinite ones"
+        )
     smallest, largest = float(kernel.min()), float(kernel.max())
     if smallest < -_NEGATIVE_TOLERANCE * max(largest, 0.0):
-        message = f"expected weights >= 0; the smallest is {smallest:.3g}"
+        message = f"expected weights >= 0; got a smallest weight of {smallest:.3g}"
         raise DataError("known-psf-negative", f"{label}: {message}")
     total = float(kernel.sum(dtype=np.float64))
     if abs(total - 1) > KNOWN_PSF_SUM_TOLERANCE:

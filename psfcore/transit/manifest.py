@@ -1,12 +1,12 @@
-"""transit.json: which files a transit is made of, and where the ephemeris puts the occulter in each.
+"""transit.json: the files of a transit, and the place of the occulter in each image according to the ephemeris.
 
-No numerics are loaded here, so that the web process may look into an upload. Keys that are not known are
-ignored, so that a newer writer's file can be read.
+This module loads no numerics, so that the web process can check an upload. Unknown keys are ignored, so that files of a
+newer version can be read.
 
-| symbol | name | unit |
+| key | meaning | unit |
 |---|---|---|
-| x, y | where the ephemeris puts the occulter's centre, first pixel's centre at 0 | px |
-| r | the occulter's radius | px |
+| x, y | centre of the occulter from the ephemeris; the centre of the first pixel is 0 | px |
+| r | radius of the occulter | px |
 | fov | the pointing | |
 """
 
@@ -30,7 +30,7 @@ _DRIVE = re.compile(r"[A-Za-z]:")
 
 
 def is_plain_name(name: str) -> bool:
-    """True for the name of a file inside a folder: no path, no climbing, no drive, nothing unprintable."""
+    """True for the name of a file inside a folder: no path, no "..", no drive letter, only printable characters."""
     return (
         0 < len(name.encode("utf-8", "replace")) <= 255
         and name.isprintable()
@@ -54,7 +54,7 @@ def _printable(text: str) -> str:
 
 
 FileName = Annotated[str, AfterValidator(_plain)]
-# Strict, so that neither "12.5" nor true passes for a number.
+# Strict: neither "12.5" nor true is accepted as a number.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Coordinate = Annotated[Number, Field(ge=-FARTHEST_PX, le=FARTHEST_PX)]
 
@@ -71,17 +71,17 @@ class NoiseEntry(_Frozen):
 
 
 class ImageEntry(_Frozen):
-    """One image of a transit: its file, its pointing, and the occulter's place and radius in it, px."""
+    """One image of a transit: its file, its pointing, and the place and radius of the occulter, px."""
 
     file: FileName
-    fov: Annotated[int, Field(strict=True, ge=0, le=10_000)]
+    pointing: Annotated[int, Field(strict=True, ge=0, le=10_000, alias="fov")]
     x: Coordinate
     y: Coordinate
     r: Annotated[Number, Field(gt=0, le=LARGEST_RADIUS_PX)]
 
 
 class TransitManifest(_Frozen):
-    """What transit.json says, in its own order of images."""
+    """The content of transit.json; the images are in its order."""
 
     schema_: Literal["transit/1"] = Field(alias="schema")
     instrument: Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_printable)] | None = None
@@ -91,27 +91,29 @@ class TransitManifest(_Frozen):
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Every file named: the images in their order, then the known PSF."""
+        """All named files: the images in their order, then the known PSF."""
         known = () if self.known_psf is None else (self.known_psf,)
         return (*(image.file for image in self.images), *known)
 
     @property
     def pointings(self) -> dict[int, int]:
-        """How many images each pointing has, by its number."""
+        """The number of images of each pointing."""
         counts: dict[int, int] = {}
         for image in self.images:
-            counts[image.fov] = counts.get(image.fov, 0) + 1
+            counts[image.pointing] = counts.get(image.pointing, 0) + 1
         return dict(sorted(counts.items()))
 
 
 def read_manifest(folder: str | Path) -> TransitManifest:
     """The transit.json of a folder.
 
-    Raises DataError "no-manifest" where there is none, else as ``parse_manifest``.
+    Raises DataError "no-manifest" if there is none, and the errors of ``parse_manifest``.
     """
     path = Path(folder) / MANIFEST_NAME
     if not path.is_file():
-        raise DataError("no-manifest", f"expected a file {MANIFEST_NAME} in {Path(folder).name}; got none")
+        raise DataError(
+            "no-manifest", f"expected a file {MANIFEST_NAME} in the folder {Path(folder).name}; add it"
+        )
     with path.open("rb") as file:
         return parse_manifest(file.read(MAX_MANIFEST_BYTES + 1))
 
@@ -119,9 +121,9 @@ def read_manifest(folder: str | Path) -> TransitManifest:
 def parse_manifest(content: bytes) -> TransitManifest:
     """A manifest from the bytes of transit.json.
 
-    Raises DataError "bad-manifest": what was expected and got, naming the image by index and file, for JSON that
-    cannot be read, a wrong schema, missing or wrong values, more than MAX_IMAGES images or none, a name that is
-    no plain file name or stands twice, noise figures that are both zero.
+    Raises DataError "bad-manifest" for JSON that cannot be read, a wrong schema, missing or wrong values, no image or
+    more than MAX_IMAGES, a name that is not a plain file name or occurs twice, noise figures that are both zero. The
+    message says what was expected and what came, and names the image by index and file.
     """
     if len(content) > MAX_MANIFEST_BYTES:
         raise _bad(f"expected at most {MAX_MANIFEST_BYTES} bytes; got more")
@@ -137,7 +139,7 @@ def parse_manifest(content: bytes) -> TransitManifest:
         raise _bad(_first_problem(error, data)) from None
     _check_once(manifest)
     if manifest.noise is not None and not (manifest.noise.photon_gain_dn or manifest.noise.read_noise_dn):
-        raise _bad("noise: expected photon_gain_dn and read_noise_dn not both zero; got 0 and 0")
+        raise _bad("noise: expected photon_gain_dn or read_noise_dn above zero; got 0 and 0")
     return manifest
 
 
@@ -149,11 +151,11 @@ def _check_once(manifest: TransitManifest) -> None:
     seen: dict[str, int] = {}
     for index, image in enumerate(manifest.images):
         if image.file in seen:
-            message = f"expected each file once; got it in images[{seen[image.file]}] too"
+            message = f"expected each file once; got the same file as images[{seen[image.file]}]"
             raise _bad(f"images[{index}] ({image.file}): {message}")
         if image.file in (MANIFEST_NAME, manifest.known_psf):
             raise _bad(
-                f"images[{index}] ({image.file}): expected an image's file; got the {_role(manifest, image)}"
+                f"images[{index}] ({image.file}): expected the file of an image; got that of the {_role(manifest, image)}"
             )
         seen[image.file] = index
     if manifest.known_psf == MANIFEST_NAME:
@@ -161,7 +163,7 @@ def _check_once(manifest: TransitManifest) -> None:
 
 
 def _role(manifest: TransitManifest, image: ImageEntry) -> str:
-    return "known PSF's" if image.file == manifest.known_psf else "manifest"
+    return "known PSF" if image.file == manifest.known_psf else "manifest"
 
 
 def _first_problem(error: ValidationError, data: dict[str, Any]) -> str:
@@ -177,7 +179,7 @@ def _first_problem(error: ValidationError, data: dict[str, Any]) -> str:
 
 
 def _where(location: tuple[int | str, ...], data: dict[str, Any]) -> str:
-    """A place in the file as people read it, an image with the name of its file."""
+    """A place in transit.json for a message; an image is named by its index and file."""
     match location:
         case ("images", int() as index, *rest):
             entry = data["images"][index]

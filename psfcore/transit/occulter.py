@@ -1,22 +1,22 @@
-"""Where the occulter is: found by simulating it on what its neighbours in time show.
+"""The place of the occulter, found by simulating the occulter in front of the scene that other images show.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", step (e). The scene
-behind the occulter of frame i is taken from frames of the same pointing that show it unocculted, the nearest in
-time; it is blanked by a disc and seen through the PSF:
+Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", step (e). The scene behind
+the occulter of frame i is taken from the frames of the same pointing that are nearest in time and show it unocculted.
+A disc is removed from it, and the result is convolved with the PSF:
 
     m = scale Q + level - H (P c)                         Eq. (1)
     chi2 = sum (y - m)^2 / var + ((x - x0)^2 + (y - y0)^2) / s^2   Eq. (2)
 
-Q is the mean of the neighbours as observed, P that of their deconvolved scenes, c the share of a pixel that the
-disc covers, H the PSF near its centre. Scale and level are free: they take up what is smooth over the disc's
-neighbourhood (light of the neighbours' own occulter, a gain that differs), and leave the place alone.
-The paper moves the disc until the simulation looks best; here Eq. (2) is minimised by Gauss-Newton steps.
+Q is the mean of these neighbours as observed, P that of their deconvolved scenes, c the share of a pixel that the disc
+covers, H the convolution with the PSF near its centre. Scale and level are free. They absorb smooth differences around
+the disc (light that the occulters of the neighbours hide, another gain), so that these do not shift the place.
+The paper moves the disc until the simulation looks best; here Gauss-Newton steps minimise Eq. (2).
 
-Where no neighbour shows the place, the disc's surroundings in the frame itself stand in: the mean of a ring.
+If no neighbour shows the scene, the mean of a ring around the disc in the frame itself replaces it.
 
 | symbol | name | unit |
 |---|---|---|
-| y, var | observed, variance: patch round the ephemeris' place | DN/s, (DN/s)^2 |
+| y, var | observed, variance: patch around the place of the ephemeris | DN/s, (DN/s)^2 |
 | c | coverage | - |
 | s | ephemeris_sigma_px | px |
 """
@@ -39,31 +39,33 @@ Plane = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 EPHEMERIS_SIGMA_PX = 1.0
-LEAST_NEIGHBOURS = 4  # a mean of four adds a quarter to the frame's own noise; the paper's two add half
-ENOUGH_PHOTONS = 300.0  # a pixel, in all neighbours together: fainter places are taken from more of them
-LARGEST_TEMPLATE_NOISE = 0.3  # of its mean, else it is smoothed: the disc would be moved to fit its noise
+LEAST_NEIGHBOURS = 4  # their mean adds a quarter to the variance of the frame; the paper's two add half
+ENOUGH_PHOTONS = 300.0  # per pixel, in all neighbours together: faint places need more neighbours
+LARGEST_TEMPLATE_NOISE = (
+    0.3  # of the mean; noisier templates are smoothed, else the disc would fit their noise
+)
 LARGEST_SMOOTHING_PX = 8.0
 PATCH_MARGIN_PX = 9
 LARGEST_SHIFT_PX = 5.0
 SETTLED_PX = 1e-3
 STEPS = 30
 LEAST_DEPTH = 0.5
-SCALE_SIGMA = 0.02  # images of one pointing are as bright as each other, but for a percent or two
+SCALE_SIGMA = 0.02  # the brightness of images of one pointing differs by one or two percent
 DOUBT_SIGMAS = 3.0
-UNDESCRIBED = 4.0  # chi2 a pixel
-DAMPED_FROM = 6  # steps: before a faint scene they may swing to and fro
-DECONVOLUTION_NOISE = 2.3  # how much a deconvolution adds to it, for a core weight of 0.43
+UNDESCRIBED = 4.0  # chi2 per pixel above which the simulation does not describe a patch
+DAMPED_FROM = 6  # steps: in front of a faint scene they may oscillate
+DECONVOLUTION_NOISE = 2.3  # factor by which a deconvolution increases noise, for a core weight of 0.43
 _STRIPS = 32
 _DIFFERENCE_PX = 0.05
 
 
 @dataclass(frozen=True)
 class FoundPlace:
-    """An occulter's place with its error (px, each axis), and how it was found.
+    """The place of an occulter with its errors (px, each axis), and how it was found.
 
-    The patch's share of the errors is larger by sqrt(chi2_per_pixel) where that is above 1.
-    neighbours: how many frames showed the scene behind it; 0: the disc's own surroundings stood in. depth: how much
-    of the light that a disc would hide is missing, 1 for an occulter and 0 for none, with its error.
+    The errors from the patch are multiplied by sqrt(chi2_per_pixel) if that is above 1. neighbours: number of frames
+    that show the scene behind the occulter; 0: the surroundings of the disc were used. depth: the missing light over the
+    light that a disc would hide, 1 for an occulter and 0 without one, with its error.
     """
 
     place: Place
@@ -79,14 +81,17 @@ class FoundPlace:
 
     @property
     def seen(self) -> bool:
-        """Whether an occulter may be there: False where the light is not missing, beyond doubt, or where the search
-        ran to the end of LARGEST_SHIFT_PX, or farther than DOUBT_SIGMAS of the ephemeris by what it cannot describe."""
+        """Whether an occulter may be there.
+
+        False if, by more than DOUBT_SIGMAS, too little light is missing; if the search reached LARGEST_SHIFT_PX; or if
+        a patch that the simulation does not describe put the place more than DOUBT_SIGMAS from the ephemeris.
+        """
         return self.within_reach and self.depth + DOUBT_SIGMAS * self.depth_sigma >= LEAST_DEPTH
 
 
 def coverage(shape: tuple[int, int], place: Place) -> Plane:
-    """Share of each pixel [y, x] that a disc covers, 0 to 1: chords exact in x, a mean of strips in y."""
-    rows, columns = patch_window(shape, place, 1.0)  # elsewhere nothing is covered
+    """The share of each pixel [y, x] that a disc covers, 0 to 1: exact chords in x, averaged over strips in y."""
+    rows, columns = patch_window(shape, place, 1.0)  # outside it no pixel is covered
     strip = (np.arange(rows.start * _STRIPS, rows.stop * _STRIPS) + 0.5) / _STRIPS - 0.5
     half = np.sqrt(np.maximum(place.radius_px**2 - (strip - place.y_px) ** 2, 0.0))
     left = np.arange(columns.start, columns.stop)[None, :] - 0.5
@@ -99,21 +104,21 @@ def coverage(shape: tuple[int, int], place: Place) -> Plane:
 
 
 def fully_dark(shape: tuple[int, int], place: Place, margin_px: float = 0.0) -> NDArray[np.bool_]:
-    """True for pixels [y, x] that lie whole within the disc, less a margin: their farthest corner counts."""
+    """True for pixels [y, x] whose farthest corner is inside the disc by at least margin_px."""
     y = np.abs(np.arange(shape[0]) - place.y_px)[:, None] + 0.5
     x = np.abs(np.arange(shape[1]) - place.x_px)[None, :] + 0.5
     return np.asarray(np.hypot(y, x) <= place.radius_px - margin_px)
 
 
 def disc_distance(shape: tuple[int, int], place: Place) -> Plane:
-    """Distance of each pixel's centre [y, x] from the occulter's, px."""
+    """The distance of the centre of each pixel [y, x] from that of the occulter, px."""
     y = np.arange(shape[0]) - place.y_px
     x = np.arange(shape[1]) - place.x_px
     return np.asarray(np.hypot(y[:, None], x[None, :]))
 
 
 def patch_window(shape: tuple[int, int], place: Place, margin_px: float = PATCH_MARGIN_PX) -> Window:
-    """Rows and columns of the square round a disc, cut to the frame."""
+    """The rows and columns of the square around a disc, cut to the frame."""
     reach = place.radius_px + margin_px
     bounds = [
         slice(min(max(0, round(centre - reach)), size), min(max(0, round(centre + reach) + 1), size))
@@ -123,9 +128,9 @@ def patch_window(shape: tuple[int, int], place: Place, margin_px: float = PATCH_
 
 
 def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], noise: Noise) -> list[int]:
-    """The frames of the same pointing, nearest in time, whose own disc leaves this one's patch free.
+    """The frames of the same pointing, nearest in time, whose occulters do not overlap the patch of this one.
 
-    Four, or as many more as it takes until a pixel of all together holds ENOUGH_PHOTONS.
+    Four, or more until a pixel has ENOUGH_PHOTONS in all of them together.
     """
     here, frame = places[index], frames[index]
     reach = here.radius_px + PATCH_MARGIN_PX
@@ -133,7 +138,7 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
         k
         for k, (other, there) in enumerate(zip(frames, places, strict=True))
         if k != index
-        and other.fov == frame.fov
+        and other.pointing == frame.pointing
         and max(abs(there.x_px - here.x_px), abs(there.y_px - here.y_px)) > reach + there.radius_px
     ]
     free.sort(key=lambda k: (abs(frames[k].time_s - frame.time_s), k))
@@ -144,7 +149,7 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
         if len(chosen) >= LEAST_NEIGHBOURS and photons >= ENOUGH_PHOTONS:
             break
         level = float(frames[k].pixels[window].mean(dtype=np.float64))
-        # Signal over noise, squared: photons, or what readout noise leaves them worth.
+        # The square of signal over noise: the number of photons, reduced by the read noise.
         photons += level**2 / float(noise.variance(np.array(max(level, 0.0)), frames[k].exposure_s))
         chosen.append(k)
     return chosen
@@ -162,8 +167,8 @@ def find_occulter(
 ) -> FoundPlace:
     """The place of the occulter in frame `index`.
 
-    scenes: deconvolved frames [y, x], DN/s. places: the best known of all frames, to see which show what.
-    psf_kernel: weights [y, x], centre at [n // 2, n // 2].
+    scenes: deconvolved frames [y, x], DN/s. places: the best known places in all frames; they decide which frames are
+    neighbours. psf_kernel: weights [y, x], centre at [n // 2, n // 2].
     """
     frame, start = frames[index], frames[index].place
     window = patch_window(frame.pixels.shape, start)
@@ -196,7 +201,7 @@ def find_occulter(
     sigma = np.sqrt(np.diag(scaled_inverse(solved.normal)))
     chi2_per_pixel = solved.chi2 / observed.size
     described = chi2_per_pixel < UNDESCRIBED
-    # By a patch that is not described a place is moved anywhere: far from the ephemeris it is not believed.
+    # A patch that the simulation does not describe can move the place anywhere: then only a place near the ephemeris counts.
     reach_px = LARGEST_SHIFT_PX - 1e-6 if described else DOUBT_SIGMAS * ephemeris_sigma_px
     return FoundPlace(
         place=place,
@@ -215,7 +220,7 @@ def find_occulter(
 def _shares(
     chosen: Sequence[int], frames: Sequence[Frame], window: Window, noise: Noise
 ) -> NDArray[np.float64]:
-    """Weights of the neighbours in their mean, sum 1: long exposures count for more."""
+    """The weights of the neighbours in their mean, sum 1; long exposures have larger weights."""
     level = np.mean([frames[k].pixels[window].mean(dtype=np.float64) for k in chosen])
     weight = np.array(
         [1 / float(noise.variance(np.array(max(level, 0.0)), frames[k].exposure_s)) for k in chosen]
@@ -224,7 +229,7 @@ def _shares(
 
 
 class _SimulatedDisc:
-    """Eq. (1) on a patch, and what its four numbers (x, y, scale, level) change."""
+    """Eq. (1) on a patch."""
 
     def __init__(self, seen: Plane, behind: Plane, psf_kernel: Plane) -> None:
         self.seen, self.behind = seen, behind
@@ -232,14 +237,14 @@ class _SimulatedDisc:
         self._blur = Convolver(psf_kernel, (ny, nx), dtype=np.float64)
 
     def hidden(self, x_px: float, y_px: float, radius_px: float) -> Plane:
-        """H (P c): the light that a disc takes away."""
+        """H (P c): the light that a disc removes."""
         covered = coverage((self.seen.shape[0], self.seen.shape[1]), Place(x_px, y_px, radius_px))
         return np.asarray(self._blur.apply(self.behind * covered))
 
 
 @dataclass(frozen=True)
 class _Solved:
-    """Eq. (2) at its least: normal is the inverse covariance of x, y, scale and level."""
+    """The minimum of Eq. (2). normal: the inverse covariance of x, y, scale and level."""
 
     at: NDArray[np.float64]
     normal: NDArray[np.float64]
@@ -257,10 +262,10 @@ def _solve(
     start: Place,
     sigma_px: float,
 ) -> _Solved:
-    """Gauss-Newton on Eq. (2), the weights by what the simulation expects and not by what happened to come."""
+    """Gauss-Newton on Eq. (2). The weights come from the simulation, because observed noise would bias them."""
     at = np.array([start.x_px, start.y_px, 1.0, 0.0])
     origin, radius = at.copy(), start.radius_px
-    # A scale that is free is diluted by the noise of the neighbours, and what is left of their slope moves the disc.
+    # Noise of the neighbours biases a free scale towards 0; the remaining gradient of the scene would then shift the disc.
     prior = np.diag([sigma_px**-2, sigma_px**-2, SCALE_SIGMA**-2, 0.0])
     h = _DIFFERENCE_PX
     settled, done = False, 0
@@ -278,8 +283,8 @@ def _solve(
         ).reshape(4, -1)
         weighted = slopes * weight.ravel()
         normal = weighted @ slopes.T
-        # Where the Sun changed between the images the neighbours do not describe the patch: of the place it says less,
-        # and the ephemeris more.
+        # If the Sun changed between the images, the neighbours do not describe the patch. Then the patch gets a smaller
+        # weight and the ephemeris a larger one.
         held = prior.copy()
         held[:2, :2] *= _excess(weight, misfit)
         step = np.linalg.lstsq(normal + held, weighted @ misfit.ravel() + held @ (origin - at), rcond=None)[0]
@@ -291,7 +296,7 @@ def _solve(
     hidden = disc.hidden(at[0], at[1], radius)
     model = at[2] * disc.seen + at[3] - hidden
     misfit, weight = observed - model, 1 / variance(model)
-    # What is missing beside what a disc hides, the scale free with it: both dim the patch as a whole.
+    # The depth is fitted together with the scale, because both dim the whole patch.
     templates = np.array([-hidden, disc.seen]).reshape(2, -1)
     normal_2 = (templates * weight.ravel()) @ templates.T
     inverse = scaled_inverse(normal_2)
@@ -309,13 +314,15 @@ def _solve(
 
 
 def _excess(weight: Plane, misfit: Plane) -> float:
-    """By how much a patch's misfit exceeds its noise, in variance; 1 where it does not. As where the disc's surroundings
-    stand in for the scene, or the scene changed."""
+    """The variance of the misfit over that of the noise, at least 1.
+
+    It is above 1 if the ring replaces the scene, or if the scene changed.
+    """
     return max(float(np.mean(weight * misfit**2)), 1.0)
 
 
 def _ring_mean(frame: Frame, place: Place, window: Window) -> float:
-    """Mean of the lit ring 3 to 9 px outside the disc."""
+    """The mean of the unocculted ring from 3 to 9 px outside the disc."""
     local = Place(place.x_px - window[1].start, place.y_px - window[0].start, place.radius_px)
     patch = frame.pixels[window]
     distance = disc_distance((patch.shape[0], patch.shape[1]), local) - place.radius_px
@@ -323,17 +330,17 @@ def _ring_mean(frame: Frame, place: Place, window: Window) -> float:
 
 
 def _level(plane: Plane) -> Plane:
-    """Expected intensity: smoothed over 3 px, and not below a twentieth of its mean."""
+    """The expected intensity: smoothed over 3 px, at least a twentieth of the mean."""
     return np.asarray(np.maximum(gaussian_filter(plane, 3.0), 0.05 * max(float(plane.mean()), 0.0)))
 
 
-def _quiet(plane: Plane, noise_a_pixel: float) -> Plane:
-    """The plane, smoothed where its noise would be more than LARGEST_TEMPLATE_NOISE of its mean.
+def _quiet(plane: Plane, noise_per_pixel: float) -> Plane:
+    """The plane, smoothed if its noise is more than LARGEST_TEMPLATE_NOISE of its mean.
 
-    White noise falls by 2 sqrt(pi) sigma under a Gaussian of width sigma.
+    A Gaussian of width sigma reduces white noise by a factor 2 sqrt(pi) sigma.
     """
     wanted = LARGEST_TEMPLATE_NOISE * max(float(plane.mean()), 1e-30)
-    sigma = noise_a_pixel / wanted / (2 * np.sqrt(np.pi))
+    sigma = noise_per_pixel / wanted / (2 * np.sqrt(np.pi))
     if sigma * 2 * np.sqrt(np.pi) <= 1:
         return plane
     return np.asarray(gaussian_filter(plane, min(sigma, LARGEST_SMOOTHING_PX)))

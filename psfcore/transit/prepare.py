@@ -1,18 +1,18 @@
-"""From exposures to frames: DN/s everywhere, and no pixel without a value.
+"""From exposures to frames: all pixels in DN/s, and none without a value.
 
-Paper (Hofmeister et al.), section "The observations": images are normalised by their exposure time, and pixels that
-are saturated are replaced by those of the nearest-in-time, unsaturated image. Here that image is of the same
-pointing, because the scene moves over the detector with the pointing, and its values are scaled:
+Paper (Hofmeister et al.), section "The observations": images are normalised by their exposure time, and saturated
+pixels are replaced by those of the unsaturated image that is nearest in time. Here that image must have the same
+pointing, because the scene moves on the detector with the pointing, and its values are scaled:
 
     s = median of I_i / I_j over the bright pixels near the gap, unsaturated in both    Eq. (1)
     I_i(gap) = s I_j(gap)                                                               Eq. (2)
 
 | symbol | name | unit |
 |---|---|---|
-| I_i, I_j | pixels of the frame with the gap, of the frame it is filled from | DN/s |
+| I_i, I_j | pixels of the frame with the gap, and of the frame from which it is filled | DN/s |
 | s | scale | 1 |
 
-Whatever was replaced is marked in ``Frame.filled`` and takes no part in an analysis of the occulter.
+``Frame.filled`` marks the replaced pixels; analyses of the occulter do not use them.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from scipy import ndimage
 
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
-from psfcore.transit.transit import Frame, Lit, Pixels, Place
+from psfcore.transit.transit import Frame, PixelMask, Pixels, Place
 
-NEAR_PX = 16  # how far from a gap the pixels lie that set the scale
+NEAR_PX = 16  # the scale is measured on pixels up to this distance from a gap
 FEWEST_SCALE_PIXELS = 100
-OCCULTER_MARGIN_PX = 5.0  # the ephemeris' pixel, and the blurred edge
+OCCULTER_MARGIN_PX = 5.0  # for the error of the ephemeris and the blurred edge
 NEIGHBOUR_PX = 2  # half width of the window of the local median
 _CHUNK = 65_536
 
@@ -42,26 +42,26 @@ Places = NDArray[np.intp]
 class Exposure:
     """An image as read, normalised: pixels [y, x] in DN/s, with gaps.
 
-    gaps: True where a pixel is saturated or not finite, None where none is; saturated: how many of them are. The
-    pixels are changed in place when gaps are filled.
+    gaps: True for pixels that are saturated or not finite; None: no such pixel. saturated: the number of saturated
+    pixels. The pixels are changed in place when gaps are filled.
     """
 
     file: str
     pixels: Pixels
-    fov: int
+    pointing: int
     place: Place
     exposure_s: float
     time_s: float
     gain_mode: str | None = None
-    gaps: Lit | None = None
+    gaps: PixelMask | None = None
     saturated: int = 0
 
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """What was wrong with the pixels of one frame, and what became of it; all in pixels.
+    """The numbers of saturated and not finite pixels of one frame, and how they were filled.
 
-    unfilled: saturated pixels that no frame of the pointing shows, kept as they are.
+    unfilled: saturated pixels that no frame of the pointing shows; they keep their values.
     """
 
     file: str
@@ -80,19 +80,19 @@ class Prepared:
 
     @property
     def unfilled(self) -> int:
-        """Saturated pixels over all frames that had to stay."""
+        """The number of unfilled saturated pixels in all frames."""
         return sum(frame.unfilled for frame in self.frames)
 
     def to_json(self) -> dict[str, Any]:
-        """JSON-able: only frames with something to tell, and how many there are in all."""
+        """Plain values: the number of frames, and the counts of those with saturated or not finite pixels."""
         told = [asdict(frame) for frame in self.frames if frame.saturated or frame.nonfinite]
         return {"images": len(self.frames), "unfilled": self.unfilled, "frames": told}
 
 
 def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
-    """Pixels [y, x] in DN/s (float32) of an image in DN or DN/s, and its exposure, s.
+    """The pixels [y, x] in DN/s (float32) of an image in DN or DN/s, and its exposure, s.
 
-    Raises DataError "no-exposure", and "unknown-unit" where BUNIT is neither.
+    Raises DataError "no-exposure", and "unknown-unit" if BUNIT is neither.
     """
     unit = (image.unit or "").replace(" ", "").lower()
     if unit not in ("dn", "dn/s"):
@@ -100,23 +100,23 @@ def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
     if image.exposure_s is None:
         raise DataError("no-exposure", f"{file}: expected XPOSURE or EXPTIME above 0 s; got neither")
     rate = image.pixels if unit == "dn/s" else image.pixels / image.exposure_s
-    with np.errstate(over="ignore"):  # beyond float32 it is not finite, and a gap like any other
+    with np.errstate(over="ignore"):  # a value beyond float32 becomes infinite, hence a gap
         return rate.astype(np.float32), image.exposure_s
 
 
 def exposure_of(
-    image: Image, *, file: str, fov: int, place: Place, time_s: float, gain_mode: str | None
+    image: Image, *, file: str, pointing: int, place: Place, time_s: float, gain_mode: str | None
 ) -> Exposure:
-    """An exposure from an image as read; its gaps are the pixels that the mask marks, or that are not finite.
+    """An exposure from an image; its gaps are the pixels that the mask marks or that are not finite.
 
-    Raises as ``to_rate``.
+    Raises the errors of ``to_rate``.
     """
     pixels, exposure_s = to_rate(image, file)
     gaps = (image.mask != 0) | ~np.isfinite(pixels)
     return Exposure(
         file=file,
         pixels=pixels,
-        fov=fov,
+        pointing=pointing,
         place=place,
         exposure_s=exposure_s,
         time_s=time_s,
@@ -127,12 +127,12 @@ def exposure_of(
 
 
 def prepare(exposures: Sequence[Exposure]) -> tuple[tuple[Frame, ...], Prepared]:
-    """Frames without gaps, in the order given, and what was done to each.
+    """Frames without gaps, in the given order, and the counts of each.
 
-    A gap is filled from the frame of the same pointing nearest in time that has none there, then from the next.
-    Gaps that no frame fills: a saturated pixel keeps its value, any other takes the median of its neighbours.
-    The exposures' pixels are changed in place and become the frames'.
-    Raises DataError "all-saturated" where more than half of a frame's pixels are saturated and stay so.
+    A gap is filled from the frame of the same pointing that is nearest in time and has no gap there, then from the next.
+    If no frame can fill it, a saturated pixel keeps its value, and any other pixel gets the median of its neighbours.
+    The pixels of the exposures are changed in place and become those of the frames.
+    Raises DataError "all-saturated" if more than half of the pixels of a frame stay saturated.
     """
     done = [(_frame(exposure), counts) for exposure, counts in ((e, _fill(e, exposures)) for e in exposures)]
     return tuple(frame for frame, _ in done), Prepared(tuple(counts for _, counts in done))
@@ -142,7 +142,7 @@ def _frame(exposure: Exposure) -> Frame:
     return Frame(
         file=exposure.file,
         pixels=exposure.pixels,
-        fov=exposure.fov,
+        pointing=exposure.pointing,
         place=exposure.place,
         exposure_s=exposure.exposure_s,
         time_s=exposure.time_s,
@@ -161,9 +161,14 @@ def _fill(exposure: Exposure, exposures: Sequence[Exposure]) -> FrameCounts:
     kept = left & np.isfinite(exposure.pixels)
     unfilled = int(np.count_nonzero(kept))
     if 2 * unfilled > kept.size:
-        message = "expected an image with unsaturated pixels, or another of its pointing to fill it from"
+        message = (
+            "expected mostly unsaturated pixels, or another image of the same pointing to fill them from"
+        )
         share = 100 * unfilled / kept.size
-        raise DataError("all-saturated", f"{exposure.file}: {message}; {share:.0f} % stay saturated")
+        raise DataError(
+            "all-saturated",
+            f"{exposure.file}: {message}; got {share:.0f} % saturated pixels that cannot be filled",
+        )
     _fill_from_neighbours(exposure.pixels, left & ~kept, exposure.gaps)
     return FrameCounts(
         file=exposure.file,
@@ -175,12 +180,12 @@ def _fill(exposure: Exposure, exposures: Sequence[Exposure]) -> FrameCounts:
     )
 
 
-def _fill_from_frames(exposure: Exposure, exposures: Sequence[Exposure]) -> Lit:
-    """Fill what other frames show; returns the gaps [y, x] that are left."""
+def _fill_from_frames(exposure: Exposure, exposures: Sequence[Exposure]) -> PixelMask:
+    """Fill the gaps from other frames; returns the remaining gaps [y, x]."""
     assert exposure.gaps is not None
     left = exposure.gaps.copy()
     rows, columns = np.nonzero(left)
-    # Another frame shows the Sun where this one has its occulter.
+    # Gaps on the occulter stay: another frame shows the Sun there.
     off = ~_on_disc(exposure.place, rows, columns)
     rows, columns = rows[off], columns[off]
     for donor in _donors(exposure, exposures):
@@ -198,18 +203,18 @@ def _fill_from_frames(exposure: Exposure, exposures: Sequence[Exposure]) -> Lit:
 
 
 def _donors(exposure: Exposure, exposures: Sequence[Exposure]) -> list[Exposure]:
-    same = [other for other in exposures if other is not exposure and other.fov == exposure.fov]
+    same = [other for other in exposures if other is not exposure and other.pointing == exposure.pointing]
     return sorted(same, key=lambda other: abs(other.time_s - exposure.time_s))
 
 
-def _on_disc(place: Place, rows: Places, columns: Places) -> Lit:
-    """Which of the places lie on the occulter or in a margin round it."""
+def _on_disc(place: Place, rows: Places, columns: Places) -> PixelMask:
+    """True for places on the occulter or in a margin around it."""
     dy, dx = rows - place.y_px, columns - place.x_px
     return np.asarray(dx * dx + dy * dy <= (place.radius_px + OCCULTER_MARGIN_PX) ** 2)
 
 
 def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> float:
-    """How much brighter the frame is than the donor, near the gaps and else over the whole; 1 where nothing tells."""
+    """The brightness of the frame over that of the donor, Eq. (1): near the gaps, else in the whole image, else 1."""
     wanted = np.zeros(exposure.pixels.shape, dtype=bool)
     wanted[here] = True
     known = np.ones_like(wanted)
@@ -228,8 +233,8 @@ def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> 
     return 1.0
 
 
-def _fill_from_neighbours(pixels: Pixels, wanted: Lit, gaps: Lit) -> None:
-    """Each wanted pixel becomes the median of the valid ones near it; far from any, of those near the nearest."""
+def _fill_from_neighbours(pixels: Pixels, wanted: PixelMask, gaps: PixelMask) -> None:
+    """Fill each wanted pixel with the median of the valid pixels near it, or, if there are none, near the closest one."""
     if not wanted.any():
         return
     rows, columns = np.nonzero(wanted)
@@ -243,7 +248,7 @@ def _fill_from_neighbours(pixels: Pixels, wanted: Lit, gaps: Lit) -> None:
 
 
 def _local_median(known: Pixels, rows: Places, columns: Places) -> NDArray[np.float32]:
-    """Median of the known (not NaN) pixels in a window round each of the places; NaN where there is none."""
+    """The median of the known (not NaN) pixels in a window around each place; NaN if there are none."""
     padded = np.pad(known, NEIGHBOUR_PX, constant_values=np.nan)
     side = 2 * NEIGHBOUR_PX + 1
     windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))

@@ -1,8 +1,8 @@
-"""A transit, ready for analysis: images of a dark disc before the Sun, all in DN/s.
+"""A transit, ready for analysis: images of a dark disc in front of the Sun, all in DN/s.
 
 | symbol | name | unit |
 |---|---|---|
-| x, y | x_px, y_px: centre of the occulter, first pixel's centre at 0 | px |
+| x, y | x_px, y_px: centre of the occulter; the centre of the first pixel is 0 | px |
 | r | radius_px of the occulter | px |
 """
 
@@ -18,12 +18,12 @@ from psfcore.noise import Noise
 
 Pixels = NDArray[np.float32]
 Kernel = NDArray[np.float64]
-Lit = NDArray[np.bool_]
+PixelMask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where an occulter is: centre and radius, px."""
+    """The place of an occulter: centre and radius, px."""
 
     x_px: float
     y_px: float
@@ -31,7 +31,7 @@ class Place:
 
 
 def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
-    """Raise DataError "occulter-outside" where the square round a disc lies off the (ny, nx) px; label comes first."""
+    """Raise DataError "occulter-outside" if the square around a disc is outside (ny, nx) px; label begins the message."""
     ny, nx = shape
     out_x = max(-0.5 - place.x_px, place.x_px - (nx - 0.5))
     out_y = max(-0.5 - place.y_px, place.y_px - (ny - 0.5))
@@ -39,32 +39,34 @@ def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
         got = f"x = {place.x_px:g}, y = {place.y_px:g}, r = {place.radius_px:g}"
         raise DataError(
             "occulter-outside",
-            f"{label}: expected an occulter that reaches into the {nx} x {ny} px; got {got}",
+            f"{label}: expected an occulter at least partly inside the {nx} x {ny} px; got {got}",
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image of a transit: pixels [y, x] in DN/s (float32, finite), and where the ephemeris puts the occulter.
+    """One image of a transit: pixels [y, x] in DN/s (float32, finite), and the occulter's place from the ephemeris.
 
-    fov: the pointing. time_s: since the first frame's start. filled: pixels [y, x] whose value was taken from
-    another frame (saturated) or from neighbours (not finite); none of them may lie in the occulter's analysis.
+    time_s: since the start of the first frame. filled: True for pixels [y, x] whose value comes from another frame
+    (saturated) or from neighbours (not finite); an analysis of the occulter must not use them.
     Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure", "occulter-outside".
     """
 
     file: str
     pixels: Pixels
-    fov: int
+    pointing: int
     place: Place
     exposure_s: float
     time_s: float
     gain_mode: str | None = None
-    filled: Lit | None = None
+    filled: PixelMask | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pixels", np.ascontiguousarray(self.pixels, dtype=np.float32))
         if self.pixels.ndim != 2 or (self.filled is not None and self.filled.shape != self.pixels.shape):
-            raise DataError("frame-shape", f"{self.file}: expected two axes; got {self.pixels.shape}")
+            raise DataError(
+                "frame-shape", f"{self.file}: expected pixels with two axes; got shape {self.pixels.shape}"
+            )
         if not np.isfinite(self.pixels).all():
             raise DataError(
                 "frame-nonfinite", f"{self.file}: expected finite pixels; got NaN or infinite ones"
@@ -78,10 +80,10 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Transit:
-    """All frames of a transit, in the order of time, of one shape; the known part of the PSF; the noise.
+    """All frames of a transit, in the order of time and of equal shape; the known part of the PSF; the noise.
 
     diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1 on its own grid. sha256: of each input file.
-    Raises DataError "transit-shapes" where frames differ in shape, "transit-empty" where there is none.
+    Raises DataError "transit-shapes" if the shapes differ, "transit-empty" if there is no frame.
     """
 
     frames: tuple[Frame, ...]
@@ -96,7 +98,7 @@ class Transit:
             raise DataError("transit-empty", "expected at least one image; got none")
         shapes = {frame.pixels.shape for frame in self.frames}
         if len(shapes) > 1:
-            raise DataError("transit-shapes", f"expected images of one shape; got {sorted(shapes)}")
+            raise DataError("transit-shapes", f"expected images of equal shape; got {sorted(shapes)}")
 
     @property
     def shape(self) -> tuple[int, int]:

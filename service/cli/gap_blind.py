@@ -108,7 +108,7 @@ def _score(made: BlindSet, numbers: list[int], not_made: dict[int, str]) -> str:
     """Open the seals, write score.json, score.txt and score.png beside the cases; the table."""
     from psfcore.blind.plot import score_png
     from psfcore.blind.run_set import judged_cases
-    from psfcore.blind.scoring import score, table
+    from psfcore.blind.score_table import score, table
 
     judged, failures = judged_cases(made, numbers)
     found = score(judged, not_made | failures)

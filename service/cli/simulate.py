@@ -58,7 +58,11 @@ def simulate() -> None:
 @click.option("--saturation", type=float, help="DN that high-gain images clip at [default: none]")
 @click.option("--dark-offset", default=0.0, show_default=True, help="DN added to every pixel")
 @click.option(
-    "--instrument", default="hri_euv", show_default=True, metavar="NAME|FILE", help="Its diffraction is built"
+    "--instrument",
+    default="hri_euv",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="Instrument: its diffraction is built, its keywords are written",
 )
 @click.option(
     "--diffraction", type=FILE, help="A known diffraction (FITS), sum 1, in place of the instrument's"
@@ -93,6 +97,8 @@ def transit(
     force: bool,
 ) -> None:
     """Write a simulated transit with its truth into a folder."""
+    from psfcore.instruments.model import load_instrument
+    from psfcore.simulate.headers import imitated
     from psfcore.simulate.plan import default_plan
     from psfcore.simulate.scatter_truth import ScatterTruth
     from psfcore.simulate.transit import simulate as simulated
@@ -106,14 +112,15 @@ def transit(
             diffraction, instrument, diffraction_size or min(2 * size, LARGEST_DIFFRACTION_PX)
         )
         scenes = _scenes(scene_files, plan)
-        made = simulated(plan, scatter, known, seed, scenes=scenes, threads=2)
+        of_instrument = imitated(load_instrument(instrument))
+        made = simulated(plan, scatter, known, seed, scenes=scenes, imitated=of_instrument, threads=2)
         try:
             write(made, output)
         except OSError as error:
             raise click.ClickException(f"cannot write {output}: {error.strerror or error}") from error
     exposures = sorted({shot.exposure_s for shot in plan.shots})
     click.echo(
-        f"{output}: {images} images of {size} x {size} px, {len(plan.fovs)} pointings, "
+        f"{output}: {images} images of {size} x {size} px, {len(plan.pointings)} pointings, "
         f"{', '.join(f'{t:g}' for t in exposures)} s"
     )
     click.echo(f"scatter b {b_px:g} px, c {c:g}, total {total:g}; the truth is in {output / 'truth.json'}")
@@ -178,11 +185,11 @@ def _scenes(files: tuple[Path, ...], plan: Plan) -> dict[int, NDArray[np.float64
         message = f"expected one image, or {len(plan.views)}, one a pointing; got {len(files)}"
         raise click.BadParameter(message, param_hint="--scene")
     scenes = {}
-    for fov in plan.fovs:
-        image = read_image(files[(fov - 1) % len(files)], limits())
+    for pointing in plan.pointings:
+        image = read_image(files[(pointing - 1) % len(files)], limits())
         rate = image.pixels
         if (image.unit or "").replace(" ", "").lower() == "dn" and image.exposure_s is not None:
             rate = rate / image.exposure_s
-        mirrored = len(files) == 1 and plan.views[fov - 1] == WEST
-        scenes[fov] = scene_from_image(rate[:, ::-1] if mirrored else rate, plan)
+        mirrored = len(files) == 1 and plan.views[pointing - 1] == WEST
+        scenes[pointing] = scene_from_image(rate[:, ::-1] if mirrored else rate, plan)
     return scenes

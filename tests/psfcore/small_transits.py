@@ -1,4 +1,4 @@
-"""Transits so small that a fit takes a second, their truth, and fits of them that many tests look at."""
+"""Transits so small that a fit takes a second, their truth, and fits of them that many tests use."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from tests.psfcore.conftest import gaussian
 Plane = NDArray[np.float64]
 
 IMAGES, SIZE_PX, BRIGHTNESS = 12, 128, 5.0
-BRIGHT = 200.0  # enough light that the places do not follow the ephemeris
+BRIGHT = 200.0  # enough light that the images determine the places, not the ephemeris
 SCATTER = ScatterTruth(6.15, 2.53, 0.411)
 STRETCHED = ScatterTruth(6.15, 2.53, 0.411, stretch=0.15, angle_deg=-15.0)
 TRUE_VALUES = {"b_px": 6.15, "c": 2.53, "total": 0.411}
-# A hundredth of the light goes farther than 50 px.
+# One percent of the light is scattered farther than 50 px.
 COMPACT = ScatterTruth(6.0, 4.0, 0.4)
-FAINT = 0.3  # times the brightness of a sky: discs of a few DN/s
+FAINT = 0.3  # factor on the brightness of a sky: discs of a few DN/s
 
 
 def diffraction() -> Plane:
-    """A core as sharp as HRI_EUV's and a tenth of the light in wings, 31 px, sum 1."""
+    """A core as sharp as that of HRI_EUV, with a tenth of the light in wings, 31 px, sum 1."""
     y, x = np.indices((31, 31)) - 15
     wings = (1 + (x**2 + y**2) / 9) ** -1.6
     return np.asarray(0.9 * gaussian(31, 0.4) + 0.1 * wings / wings.sum())
@@ -53,7 +53,7 @@ def sky(
     brightness: float = BRIGHTNESS,
     ephemeris_error_px: float = 0.6,
 ) -> TrueSky:
-    """A sky in whole pixels, dark beyond the field."""
+    """A sky on whole pixels, dark beyond the field."""
     plan = default_plan(
         images, size_px, oversampling=1, brightness=brightness, ephemeris_error_px=ephemeris_error_px
     )
@@ -68,7 +68,7 @@ def observed(of: TrueSky, seed: int = 3) -> SimulatedTransit:
 
 @cache
 def noise_free(of: TrueSky, seed: int = 3) -> Transit:
-    """The same transit as a camera without noise sees it; the ephemeris errs as in the noisy one."""
+    """The same transit without noise; the errors of the ephemeris are those of the noisy one."""
     transit = observed(of, seed).transit
     return with_pixels(transit, of.noise_free)
 
@@ -88,20 +88,20 @@ def solved() -> Solution:
 
 @cache
 def solved_noise_free() -> Solution:
-    """The inversion of one without noise, of a brighter sky."""
+    """The inversion of a transit without noise, of a brighter sky."""
     return invert(noise_free(sky(brightness=BRIGHT)))
 
 
 @cache
 def faint() -> Transit:
-    """Nine faint images through compact scatter, the known part of the PSF on an array about as large as they are."""
+    """Nine faint images with compact scatter; the known part of the PSF has an array about as large as the images."""
     made = observed(sky(COMPACT, images=9, size_px=96, brightness=FAINT)).transit
     return dataclasses.replace(made, diffraction=crop_or_pad(DIFFRACTION, 95))
 
 
 @cache
 def recipe(choices: Choices) -> tuple[Published, list[str]]:
-    """What the published recipe finds in the faint ones, and the stages that it told of."""
+    """The result of the published recipe for the faint images, and the stages that it reported."""
     seen: list[str] = []
     found = invert_as_published(faint(), choices, subsets=3, progress=lambda stage, *_: seen.append(stage))
     return found, seen

@@ -144,7 +144,7 @@ def _save(
     }
     with context.store.temporary() as text, context.store.temporary() as picture:
         write_json(text, said)
-        cross_validation_png(found, fits, [frame.fov for frame in transit.frames], picture)
+        cross_validation_png(found, fits, [frame.pointing for frame in transit.frames], picture)
         keep_report(
             context,
             identity,

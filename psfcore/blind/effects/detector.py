@@ -1,4 +1,4 @@
-"""Effects of the detector and its readout, and of light that comes to it another way."""
+"""Effects on the light that reaches the detector, and on how its pixels collect it."""
 
 from __future__ import annotations
 
@@ -8,48 +8,25 @@ from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
-from psfcore.blind.effects.effect import Earlier, Effect, Moment, angle, unit_coordinates
+from psfcore.blind.effects.effect import Effect, Moment, angle, unit_coordinates
 from psfcore.blind.effects.fine_optics import FINE
 from psfcore.blind.effects.scene import patches
-from psfcore.simulate.plan import COMBINED, Plan
+from psfcore.simulate.plan import Plan
 
 Plane = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class DarkOffset(Effect):
-    """A pedestal left in every readout, of either sign, that differs by a twentieth from image to image."""
-
-    sign: int = 1
-    seed: int = 0
-
-    name: ClassVar[str] = "dark_offset"
-    unit: ClassVar[str] = "DN"
-    cause: ClassVar[str] = "the bias that is taken off is not that of the day"
-    nominal: ClassVar[float] = 1.0
-    largest: ClassVar[float] = 12.0
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, int(rng.choice([-1, 1])), int(rng.integers(2**31)))
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        own = np.random.default_rng([self.seed, moment.index]).normal(1.0, 0.05)
-        return dn + self.sign * self.strength * own
-
-
-@dataclass(frozen=True)
 class IntensityGradient(Effect):
-    """Light that leaks in, brighter to one side: a plane with a little curvature, 0 in its darkest corner."""
+    """Stray light that increases to one side: a plane with a small curvature, 0 in its darkest corner."""
 
     angle_deg: float = 0.0
     curvature: float = 0.3
 
     name: ClassVar[str] = "intensity_gradient"
     unit: ClassVar[str] = "DN/s at its mean"
-    cause: ClassVar[str] = "sunlight gets past the baffles"
+    cause: ClassVar[str] = "sunlight passes the baffles"
     nominal: ClassVar[float] = 0.5
     largest: ClassVar[float] = 20.0
 
@@ -68,7 +45,7 @@ class IntensityGradient(Effect):
 
 @dataclass(frozen=True)
 class Glow(Effect):
-    """A glow fixed on the detector, brightest at a point of its edge. Not in the library."""
+    """A glow at a fixed place of the detector. Not in the library."""
 
     x: float = 0.0
     y: float = 0.5
@@ -76,7 +53,7 @@ class Glow(Effect):
 
     name: ClassVar[str] = "glow"
     unit: ClassVar[str] = "DN/s at its brightest"
-    cause: ClassVar[str] = "an amplifier beside the pixels shines"
+    cause: ClassVar[str] = "an amplifier beside the pixels emits light"
     nominal: ClassVar[float] = 5.0
     largest: ClassVar[float] = 400.0
 
@@ -95,12 +72,12 @@ class Glow(Effect):
 
 @dataclass(frozen=True)
 class DustShadow(Effect):
-    """Specks with a soft rim that keep light off, on the way of the occulter. Not in the library."""
+    """Specks with a soft rim that block light, on the track of the occulter. Not in the library."""
 
     specks: tuple[tuple[float, float, float], ...] = ((0.5, 0.5, 6.0),)
 
     name: ClassVar[str] = "dust_shadow"
-    unit: ClassVar[str] = "share of light kept off"
+    unit: ClassVar[str] = "share of light blocked"
     cause: ClassVar[str] = "dust settled on the detector after the flat field was taken"
     nominal: ClassVar[float] = 0.1
     largest: ClassVar[float] = 0.9
@@ -132,7 +109,7 @@ class DustShadow(Effect):
 
 @dataclass(frozen=True)
 class FlatFieldResidual(Effect):
-    """Pixels answer unevenly: broad patches, and a grain of half their size. strength: rms of the patches."""
+    """Uneven sensitivity: broad patches, and pixel-to-pixel variation of half their rms. strength: rms of the patches."""
 
     seed: int = 0
     patch: float = 0.1
@@ -160,13 +137,13 @@ def _grain(size: int, seed: int) -> Plane:
 
 @dataclass(frozen=True)
 class ShutterGradient(Effect):
-    """The shutter opens one side for longer: so many seconds between the edges. Not in the library."""
+    """One side of the field is exposed longer; strength: the difference between the edges, s. Not in the library."""
 
     angle_deg: float = 0.0
 
     name: ClassVar[str] = "shutter_gradient"
     unit: ClassVar[str] = "s"
-    cause: ClassVar[str] = "a rolling shutter that is not quite even"
+    cause: ClassVar[str] = "the shutter moves unevenly"
     nominal: ClassVar[float] = 0.05
     largest: ClassVar[float] = 0.6
 
@@ -182,7 +159,7 @@ class ShutterGradient(Effect):
 
 @dataclass(frozen=True)
 class DarkCurrentDrift(Effect):
-    """Dark current that grows through the transit, to `strength` at its end. Not in the library."""
+    """A dark current that grows during the transit, to `strength` at its end. Not in the library."""
 
     steepness: float = 2.0
 
@@ -202,14 +179,14 @@ class DarkCurrentDrift(Effect):
 
 @dataclass(frozen=True)
 class BrighterFatter(Effect):
-    """Charge that is there pushes new charge to the next pixels: light flows from full to empty ones. Not in the library.
+    """Collected charge repels new charge, which then lands in fainter neighbours. Not in the library.
 
-    strength: share of the difference between neighbours that flows for 1000 DN in them.
+    strength: share of the difference between two neighbours that flows if they hold 1000 DN.
     """
 
     name: ClassVar[str] = "brighter_fatter"
     unit: ClassVar[str] = "per 1000 DN"
-    cause: ClassVar[str] = "the field of collected charge repels"
+    cause: ClassVar[str] = "the electric field of the collected charge repels new charge"
     nominal: ClassVar[float] = 0.02
     largest: ClassVar[float] = 0.15
 
@@ -226,196 +203,12 @@ class BrighterFatter(Effect):
         return out
 
 
-@dataclass(frozen=True)
-class GainMismatch(Effect):
-    """Combined images too bright or too faint against the high-only ones."""
-
-    sign: int = 1
-
-    name: ClassVar[str] = "gain_mismatch"
-    unit: ClassVar[str] = "share"
-    cause: ClassVar[str] = "the ratio of the two gains is not what the combination assumes"
-    nominal: ClassVar[float] = 0.1
-    largest: ClassVar[float] = 0.25
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, int(rng.choice([-1, 1])))
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        if moment.shot.gain_mode != COMBINED:
-            return dn
-        # Faint pixels too, though a combined image has these from the high gain: as the library has it.
-        return dn * (1 + self.sign * self.strength)
-
-
-@dataclass(frozen=True)
-class Nonlinearity(Effect):
-    """Faint signals come out fainter: as a power of the signal below a knee, or as charge that a trap keeps."""
-
-    knee_dn: float = 60.0
-    trap: bool = False
-
-    name: ClassVar[str] = "nonlinearity"
-    unit: ClassVar[str] = "share lost at the faint end"
-    cause: ClassVar[str] = "traps hold back the first charges, or the amplifier bends near zero"
-    nominal: ClassVar[float] = 0.1
-    largest: ClassVar[float] = 0.6
-    draws: ClassVar[int] = 12
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, float(rng.uniform(30, 150)), bool(rng.random() < 0.5))
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        if self.strength == 0:
-            return dn
-        size = np.abs(dn)
-        if self.trap:
-            kept = self.strength * self.knee_dn * (1 - np.exp(-size / self.knee_dn))
-            return np.asarray(np.sign(dn) * (size - kept))
-        # A power 1 + p below the knee: strength is what is lost at a twentieth of it.
-        power = -np.log1p(-self.strength) / np.log(20)
-        return np.asarray(dn * np.minimum(np.maximum(size, 1e-3) / self.knee_dn, 1.0) ** power)
-
-
-@dataclass(frozen=True)
-class ColumnSmear(Effect):
-    """Every pixel gets a share of the light of the pixels that it passed on its way out, and of all its column."""
-
-    passed: float = 0.5
-
-    name: ClassVar[str] = "column_smear"
-    unit: ClassVar[str] = "share of the column's mean"
-    cause: ClassVar[str] = "columns stay lit while they are read"
-    nominal: ClassVar[float] = 0.005
-    largest: ClassVar[float] = 0.1
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, float(rng.uniform(0, 0.5)))
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        passed = 2 * np.cumsum(dn, axis=0) / dn.shape[0]
-        smear = (1 - self.passed) * dn.mean(axis=0)[None, :] + self.passed * passed
-        return np.asarray(dn + self.strength * smear)
-
-
-@dataclass(frozen=True)
-class Persistence(Effect):
-    """What earlier images left: a share that decays with time, of the last four images, whatever they showed."""
-
-    decay_s: float = 300.0
-
-    name: ClassVar[str] = "persistence"
-    unit: ClassVar[str] = "share at once"
-    cause: ClassVar[str] = "traps release charge of earlier exposures"
-    nominal: ClassVar[float] = 0.01
-    largest: ClassVar[float] = 0.3
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        cadence = (plan.shots[-1].time_s - plan.shots[0].time_s) / max(len(plan.shots) - 1, 1)
-        return cls(strength, float(cadence * rng.uniform(0.5, 2.0)))
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        left = np.zeros_like(dn)
-        for image in earlier[-4:]:
-            left += np.exp(-(moment.shot.time_s - image.time_s) / self.decay_s) * image.dn
-        return dn + self.strength * left
-
-
-@dataclass(frozen=True)
-class RowCrosstalk(Effect):
-    """Bright pixels leave an echo in their row, some way behind, fading over a few pixels. Not in the library."""
-
-    lag: float = 0.2
-    above: float = 0.5
-
-    name: ClassVar[str] = "row_crosstalk"
-    unit: ClassVar[str] = "share"
-    cause: ClassVar[str] = "the readout's channels talk to each other"
-    nominal: ClassVar[float] = 0.01
-    largest: ClassVar[float] = 0.3
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, float(rng.uniform(-0.35, 0.35)), float(rng.uniform(0.2, 1.0)))
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        bright = np.maximum(dn - self.above * max(float(dn.mean()), 0.0), 0.0)
-        late = uniform_filter1d(bright, 5, axis=1, mode="constant")
-        shift = round(self.lag * dn.shape[1])
-        echo = np.zeros_like(dn)
-        if shift >= 0:
-            echo[:, shift:] = late[:, : dn.shape[1] - shift]
-        else:
-            echo[:, :shift] = late[:, -shift:]
-        return dn + self.strength * echo
-
-
-@dataclass(frozen=True)
-class Stripes(Effect):
-    """A pattern of the readout, wider than the disc, the same in all images. Not in the library."""
-
-    period_px: float = 60.0
-    angle_deg: float = 0.0
-    phase_deg: float = 0.0
-
-    name: ClassVar[str] = "stripes"
-    unit: ClassVar[str] = "DN"
-    cause: ClassVar[str] = "the power supply's ripple in step with the readout"
-    nominal: ClassVar[float] = 2.0
-    largest: ClassVar[float] = 40.0
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        across = float(rng.choice([0.0, 90.0])) + float(rng.normal(0, 5))
-        return cls(strength, float(rng.uniform(25, 90)), across, angle(rng))
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        y, x = np.mgrid[: dn.shape[0], : dn.shape[1]]
-        along = x * np.cos(np.deg2rad(self.angle_deg)) + y * np.sin(np.deg2rad(self.angle_deg))
-        wave = np.sin(2 * np.pi * along / self.period_px + np.deg2rad(self.phase_deg))
-        return np.asarray(dn + self.strength * (wave + 0.3 * wave**3))
-
-
-@dataclass(frozen=True)
-class FaintRounding(Effect):
-    """Numbers cut towards zero in steps that grow as the root of the signal. Not in the library.
-
-    strength: the step in units of the root of 6 times the signal, that is of photon noise.
-    """
-
-    name: ClassVar[str] = "faint_rounding"
-    unit: ClassVar[str] = "share of the noise"
-    cause: ClassVar[str] = "compression on board drops digits instead of rounding them"
-    nominal: ClassVar[float] = 0.3
-    largest: ClassVar[float] = 3.0
-    draws: ClassVar[int] = 12
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        if self.strength == 0:
-            return dn
-        # sqrt(|D|) in even steps of q is D in steps of 2 q sqrt(|D|).
-        q = self.strength * np.sqrt(6.0) / 2
-        return np.asarray(np.sign(dn) * (q * np.floor(np.sqrt(np.abs(dn)) / q)) ** 2)
-
-
 DETECTOR_EFFECTS: tuple[type[Effect], ...] = (
-    DarkOffset,
     IntensityGradient,
-    GainMismatch,
-    Nonlinearity,
-    FlatFieldResidual,
-    ColumnSmear,
-    Persistence,
     Glow,
     DustShadow,
+    FlatFieldResidual,
     ShutterGradient,
     DarkCurrentDrift,
     BrighterFatter,
-    RowCrosstalk,
-    Stripes,
-    FaintRounding,
 )

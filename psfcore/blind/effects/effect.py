@@ -1,8 +1,8 @@
-"""What an effect of the blind set is: a strength, what it is due to, and where along the light's way it acts.
+"""The base of the effects of the blind set: a strength, a cause, and the steps of the light's path on which it acts.
 
     scene -> occulter -> optics -> light on fine pixels -> light on detector pixels -> photons -> readout
 
-An effect changes one or two of these steps and leaves the others as they are. Strength 0 changes nothing.
+An effect changes one or two of these steps and no other. Strength 0 changes nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Moment:
-    """One image of a plan. elapsed: 0 at the first image to 1 at the last."""
+    """One image of a plan."""
 
     plan: Plan
     index: int
@@ -35,14 +35,14 @@ class Moment:
 
     @property
     def elapsed(self) -> float:
-        """How much of the transit has passed."""
+        """Elapsed share of the transit: 0 at the first image, 1 at the last."""
         first, last = self.plan.shots[0].time_s, self.plan.shots[-1].time_s
         return (self.shot.time_s - first) / max(last - first, 1e-9)
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """An image that was read before: DN [y, x] without its noise, and when, s."""
+    """An earlier image: DN [y, x] without noise, and its time, s."""
 
     dn: Plane
     time_s: float
@@ -50,11 +50,12 @@ class Earlier:
 
 @dataclass(frozen=True)
 class Effect:
-    """The base: every step handed through.
+    """The base class, which changes no step.
 
-    name, stage, unit (of strength), cause: in words. nominal: a strength that shows; largest: as far as it is believed.
-    power: how what it leaves grows with its strength. varies: its optics differ from image to image.
-    draws: noise draws that its mean change is taken over (0: the change does not depend on noise).
+    name, stage, unit (of the strength), cause: in words. nominal: a strength that shows in the discs. largest: the
+    largest plausible strength. power: what an effect leaves grows as strength to this power. varies: its optics differ
+    from image to image. noise_realisations: number over which its mean change is computed; 0 if the change does not
+    depend on noise.
     """
 
     strength: float
@@ -67,11 +68,11 @@ class Effect:
     largest: ClassVar[float] = 1.0
     power: ClassVar[float] = 1.0
     varies: ClassVar[bool] = False
-    draws: ClassVar[int] = 0
+    noise_realisations: ClassVar[int] = 0
 
     @classmethod
     def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        """This effect at a strength, its other parameters at random."""
+        """This effect at a given strength, with its other parameters drawn at random."""
         return cls(strength)
 
     def at(self, strength: float) -> Self:
@@ -84,7 +85,7 @@ class Effect:
         return {"name": self.name, "strength": self.strength, "unit": self.unit, "parameters": values}
 
     def scene(self, scene: Plane, moment: Moment) -> Plane:
-        """Fine scene [y, x], DN/s."""
+        """Change the fine scene [y, x], DN/s."""
         return scene
 
     def covered(
@@ -95,45 +96,45 @@ class Effect:
         shape: tuple[int, int],
         moment: Moment,
     ) -> Plane | None:
-        """Share of each fine pixel that the occulter hides in a window; None where it is the disc at rest."""
+        """Change the share of each fine pixel of a window that the occulter hides; None: the disc at rest."""
         return share
 
     def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        """The telescope."""
+        """Change the telescope."""
         return optics
 
     def spread(self, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment) -> Plane:
-        """Fine light [y, x] of a fine lit scene, DN/s, where the PSF differs from place to place."""
+        """Change the fine light [y, x], DN/s, of the fine scene `lit`, for a PSF that varies over the field."""
         return seen
 
     def light(self, seen: Plane, moment: Moment) -> Plane:
-        """Fine light in the focal plane [y, x], DN/s."""
+        """Change the fine light in the focal plane [y, x], DN/s."""
         return seen
 
     def expected(self, rate: Plane, moment: Moment) -> Plane:
-        """Light on detector pixels [y, x], DN/s, before it is counted."""
+        """Change the light on detector pixels [y, x], DN/s, before photon noise."""
         return rate
 
     def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        """DN of one exposure [y, x], noise in them."""
+        """Change the DN of one exposure [y, x], which contain noise. earlier: the images read before it."""
         return dn
 
     def saturation_dn(self, exposures: list[Plane], plan: Plan) -> float | None:
-        """The level that high-only images clip at, of their DN; None where the effect sets none."""
+        """The level in DN at which high-only images clip; None if the effect sets none."""
         return None
 
 
 def acts_on(effect: Effect, *steps: str) -> bool:
-    """Whether an effect changes one of these steps."""
+    """Whether an effect changes at least one of these steps."""
     return any(getattr(type(effect), step) is not getattr(Effect, step) for step in steps)
 
 
 def unit_coordinates(shape: tuple[int, int]) -> tuple[Plane, Plane]:
-    """u (1, nx) and v (ny, 1): place along x and y, -0.5 to 0.5."""
+    """u (1, nx) and v (ny, 1): coordinates along x and y, -0.5 to 0.5."""
     ny, nx = shape
     return (np.arange(nx)[None, :] + 0.5) / nx - 0.5, (np.arange(ny)[:, None] + 0.5) / ny - 0.5
 
 
 def angle(rng: np.random.Generator) -> float:
-    """A direction, degrees."""
+    """A random direction, degrees."""
     return float(rng.uniform(0, 360))

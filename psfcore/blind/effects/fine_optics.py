@@ -1,11 +1,11 @@
-"""The PSF on fine pixels: FINE of them along a detector pixel, boxed down only at the detector.
+"""The PSF on fine pixels, FINE of them along a detector pixel; it is binned only at the detector.
 
     K[o] = mean over fine pixels s of a source pixel, sum over fine pixels t of a target pixel, of k[FINE o + t - s]   Eq. (1)
     s_fine(r) = a / FINE^2 / (b + r)^c off the centre                                                    Eq. (2)
 
-k is the fine kernel, K what an evenly lit detector pixel sends to another. The fine centre takes what makes the
-boxed centre 1 - total, so that the boxed scatter is a law on detector pixels but for its curvature within
-a pixel.
+k is the fine kernel. K is the share of light that an evenly lit detector pixel sends to another. The fine central pixel
+is set such that the binned centre is 1 - total. Then the binned scatter follows the power law on detector pixels,
+except for its curvature within a pixel.
 
 | symbol | name | unit |
 |---|---|---|
@@ -30,17 +30,18 @@ from psfcore.simulate.scatter_truth import ScatterTruth
 Kernel = NDArray[np.float64]
 FINE = 2
 SYNTHETIC, INSTRUMENT = "synthetic", "hri_euv"
-_ORDERS = 40  # of a synthetic mesh, each way
+_ORDERS = 40  # of a synthetic mesh, in each direction
 _LARGEST_BUILT_PX = 2048
 
 
 @dataclass(frozen=True)
 class Glass:
-    """The known part of the PSF: a pupil's pattern and a mesh's orders, sum 1 on size_px detector pixels.
+    """The known part of the PSF: the pattern of a pupil and the orders of a mesh, sum 1 on size_px detector pixels.
 
-    kind: SYNTHETIC or the name of an instrument whose mount and meshes are built. Of a synthetic one: the scales of
-    its core, far below a pixel as a telescope's is at this wavelength, and of its wing; the light in the wing and in
-    the mesh's orders, and the orders' spacing.
+    kind: SYNTHETIC, or the name of the instrument whose mount and meshes are built. The other fields are for a
+    synthetic one. core_px, wing_px: scales of its core, far below a pixel as for a telescope at this wavelength,
+    and of its wing. wing_share, arm_share: light in the wing and in the orders of the mesh. pitch_px: spacing of
+    the orders.
     """
 
     kind: str
@@ -52,7 +53,7 @@ class Glass:
     pitch_px: float = 5.7
 
     def fine(self, turn_deg: float = 0.0, pitch_factor: float = 1.0) -> Kernel:
-        """Fine weights [y, x], sum 1, with the mesh turned and its orders' spacing times pitch_factor."""
+        """Fine weights [y, x], sum 1, with the mesh rotated and the spacing of its orders multiplied by pitch_factor."""
         size = FINE * self.size_px
         if self.kind == SYNTHETIC:
             kernel = self._drawn(size, turn_deg, pitch_factor)
@@ -61,7 +62,7 @@ class Glass:
         return np.asarray(kernel / kernel.sum())
 
     def _drawn(self, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
-        """A core with wings, and orders along two axes that fall off with their number."""
+        """A core with wings, and orders along two axes whose light decreases with their number."""
         d = (np.arange(size) - size // 2) / FINE
         x, y = d[None, :], d[:, None]
         core, wing = (np.exp(-np.hypot(x, y) / scale) for scale in (self.core_px, self.wing_px))
@@ -78,7 +79,7 @@ class Glass:
 
 
 def _add_spot(plane: Kernel, x_px: float, y_px: float, light: float) -> None:
-    """A Gaussian of 0.45 px at an offset from the centre, in the place of an order."""
+    """Add an order: a Gaussian of 0.45 px at an offset from the centre."""
     size = plane.shape[0]
     column, row = (round(at * FINE) + size // 2 for at in (x_px, y_px))
     reach = 3 * FINE
@@ -93,10 +94,10 @@ def _add_spot(plane: Kernel, x_px: float, y_px: float, light: float) -> None:
 
 
 def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
-    """Mount, entrance mesh and filter-wheel mesh of an instrument convolved; its entrance mesh may be off.
+    """Mount, entrance mesh and filter-wheel mesh of an instrument, convolved; the entrance mesh may be changed.
 
-    The mesh in front is taken as a pattern of its own, which blurs its orders by the pupil once more: known to
-    whoever gets the file, and it lets the mesh be turned against the rest.
+    The pattern of the entrance mesh is computed alone, so that the mesh can be rotated against the rest. Its orders are
+    therefore blurred by the pupil a second time; the known PSF of the case contains this blur, too.
     """
     instrument = load_instrument(name)
     entrance = next(mesh for mesh in instrument.meshes if mesh.place == "entrance")
@@ -115,7 +116,7 @@ def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel
 
 @cache
 def _pupil(name: str, size: int) -> Kernel:
-    """What of an instrument's diffraction is not its entrance mesh, on fine pixels: seconds, so it is kept."""
+    """An instrument's diffraction without its entrance mesh, on fine pixels. It takes seconds, so it is kept."""
     fine = _with_fine_pixels(load_instrument(name))
     built = min(size, _LARGEST_BUILT_PX)
     parts = [build_psf(fine, size=built, component=part).kernel for part in ("MOUNT", "FILTER_WHEEL")]
@@ -135,7 +136,7 @@ def _with_fine_pixels(instrument: Instrument) -> Instrument:
 class FineOptics:
     """A telescope: fine scatter and fine diffraction, kernels [y, x] with centre at [n // 2, n // 2].
 
-    law, glass: what they were made of, for effects that make them anew.
+    law, glass: what the two were made from, for effects that make them again.
     """
 
     law: ScatterTruth
@@ -145,40 +146,38 @@ class FineOptics:
 
     @cached_property
     def total(self) -> Kernel:
-        """Fine total PSF on the scatter's array."""
+        """The fine total PSF, on the array of the scatter."""
         n = self.scatter.shape[0]
         return linear_convolve(self.scatter, self.diffraction, (n, n))
 
     @cached_property
     def through(self) -> Convolver:
-        """The total PSF on a fine field of half the scatter's array."""
+        """The convolution with the total PSF, on a fine field of half the scatter's array."""
         return Convolver(self.total, self.field, dtype=np.float64)
 
     @cached_property
     def more_scatter(self) -> Convolver:
-        """What scattering all of the scattered light once more would add: light to the wings, out of the core."""
+        """The change if the scatter were doubled: light moves from the core to the wings."""
         moved, middle = self.scatter.copy(), self.scatter.shape[0] // 2
         moved[middle, middle] = 0.0
-        moved[middle, middle] = (
-            self.scatter[middle, middle] - 1
-        )  # all the light that is scattered, to any distance
+        moved[middle, middle] = self.scatter[middle, middle] - 1  # minus all scattered light, at any distance
         n = moved.shape[0]
         return Convolver(linear_convolve(moved, self.diffraction, (n, n)), self.field, dtype=np.float64)
 
     @property
     def field(self) -> tuple[int, int]:
-        """Shape of the fine field that the kernels can serve."""
+        """Shape of the largest fine field that the kernels cover."""
         return self.scatter.shape[0] // 2, self.scatter.shape[1] // 2
 
     @property
     def offsets_px(self) -> tuple[Kernel, Kernel]:
-        """x (1, n) and y (n, 1) of each fine pixel of the scatter's array, detector px from its centre."""
+        """x (1, n) and y (n, 1) of each fine pixel of the scatter's array, in detector px from its centre."""
         d = (np.arange(self.scatter.shape[0]) - self.scatter.shape[0] // 2) / FINE
         return d[None, :], d[:, None]
 
 
 def fine_optics(law: ScatterTruth, glass: Glass, size_px: int) -> FineOptics:
-    """The telescope without any effect, as far as a field of size_px can see."""
+    """The telescope without any effect, with kernels that cover a field of size_px detector pixels."""
     n = 2 * FINE * size_px
     d = (np.arange(n) - n // 2) / FINE
     falloff = (law.b_px + np.hypot(d[:, None], d[None, :])) ** -law.c
@@ -186,7 +185,7 @@ def fine_optics(law: ScatterTruth, glass: Glass, size_px: int) -> FineOptics:
 
 
 def scaled_scatter(falloff: Kernel, law: ScatterTruth, amplitude: float) -> Kernel:
-    """Eq. (2) of a falloff [y, x], and the centre that makes the boxed one 1 - total."""
+    """Eq. (2) for a falloff [y, x], with the central pixel that makes the binned centre 1 - total."""
     scatter = amplitude * falloff
     middle = scatter.shape[0] // 2
     scatter[middle, middle] = 0.0
@@ -195,8 +194,8 @@ def scaled_scatter(falloff: Kernel, law: ScatterTruth, amplitude: float) -> Kern
     return scatter
 
 
-def boxed_kernel(fine: Kernel) -> Kernel:
-    """Eq. (1): what the detector's own pixels know of a fine kernel [y, x] of even size; sum kept but for edges."""
+def binned_kernel(fine: Kernel) -> Kernel:
+    """Eq. (1): a fine kernel [y, x] of even size on detector pixels; the sum is conserved, except at the edges."""
     n = fine.shape[0]
     columns = sum(
         weight * _shifted(fine, shift, 1)[:, ::FINE]
@@ -209,19 +208,19 @@ def boxed_kernel(fine: Kernel) -> Kernel:
     return np.asarray(rows).reshape(n // FINE, n // FINE)
 
 
-def boxed_glass(glass: Glass) -> Kernel:
-    """The known PSF as a transit's folder has it: detector pixels, sum 1."""
-    kernel = boxed_kernel(glass.fine())
+def binned_glass(glass: Glass) -> Kernel:
+    """The known PSF as a transit's folder contains it: on detector pixels, sum 1."""
+    kernel = binned_kernel(glass.fine())
     return np.asarray(kernel / kernel.sum())
 
 
 def _triangle() -> NDArray[np.float64]:
-    """Eq. (1) along one axis: how often a fine offset joins two fine pixels of two given detector pixels."""
+    """Eq. (1) along one axis: the share of pairs of fine pixels of two detector pixels that have a given fine offset."""
     return np.asarray(1 - np.abs(np.arange(1 - FINE, FINE)) / FINE)
 
 
 def _shifted(plane: Kernel, by: int, axis: int) -> Kernel:
-    """Element n becomes n + by, 0 beyond the edge."""
+    """Element n of the result is element n + by; 0 beyond the edge."""
     moved = np.roll(plane, -by, axis=axis)
     lost = [slice(None), slice(None)]
     lost[axis] = slice(-by, None) if by > 0 else slice(0, -by)
@@ -231,12 +230,12 @@ def _shifted(plane: Kernel, by: int, axis: int) -> Kernel:
 
 
 def turned_offsets(optics: FineOptics, angle_deg: float) -> tuple[Kernel, Kernel]:
-    """Offsets along and across an angle (from +x towards +y), detector px."""
+    """Offsets along and across an angle (from +x towards +y), in detector px."""
     x, y = optics.offsets_px
     cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
     return x * cos + y * sin, y * cos - x * sin
 
 
 def small_kernel(weights: Kernel) -> Kernel:
-    """A kernel [y, x] scaled to sum 1."""
+    """A kernel [y, x] normalised to sum 1."""
     return np.asarray(weights / weights.sum())

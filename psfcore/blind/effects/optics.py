@@ -1,4 +1,4 @@
-"""Effects of the optics: where light goes that the fitted PSF does not send there."""
+"""Effects of the optics: light that goes where the fitted PSF does not send it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AnisotropicScatter(Effect):
-    """Scatter stretched along an angle, the more the farther: the stretch grows as r / (r + b)."""
+    """Scatter stretched along an angle; the stretch grows with distance as r / (r + b)."""
 
     angle_deg: float = 0.0
 
@@ -49,7 +49,7 @@ class AnisotropicScatter(Effect):
 
 @dataclass(frozen=True)
 class OneSidedScatter(Effect):
-    """More scatter to one side than to the other, as coma has it, out to some tens of pixels. Not in the library."""
+    """More scatter to one side than to the other, as by coma, out to some tens of pixels. Not in the library."""
 
     angle_deg: float = 0.0
     reach_px: float = 40.0
@@ -77,7 +77,7 @@ class OneSidedScatter(Effect):
 
 
 def _rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
-    """The telescope with another falloff, the same light scattered."""
+    """The telescope with another falloff and the same scattered light."""
     amplitude = optics.law.a / FINE**2 * float(before.sum() / falloff.sum())
     return dataclasses.replace(optics, scatter=scaled_scatter(falloff, optics.law, amplitude))
 
@@ -92,7 +92,9 @@ class WideHalo(Effect):
     name: ClassVar[str] = "wide_halo"
     stage: ClassVar[str] = "optics"
     unit: ClassVar[str] = "share of light"
-    cause: ClassVar[str] = "particles or a second surface scatter far, apart from the mirrors' roughness"
+    cause: ClassVar[str] = (
+        "particles or a second surface scatter to large distances, besides the roughness of the mirrors"
+    )
     nominal: ClassVar[float] = 0.02
     largest: ClassVar[float] = 0.3
 
@@ -115,7 +117,7 @@ class WideHalo(Effect):
 
 @dataclass(frozen=True)
 class CoreBlur(Effect):
-    """The core widened: by a Moffat (defocus, figure), or drawn out along a line (jitter)."""
+    """A wider core: blurred by a Moffat profile (defocus, figure), or spread along a straight line (jitter)."""
 
     angle_deg: float = 0.0
     jitter: bool = False
@@ -123,7 +125,7 @@ class CoreBlur(Effect):
     name: ClassVar[str] = "core_blur"
     stage: ClassVar[str] = "optics"
     unit: ClassVar[str] = "px"
-    cause: ClassVar[str] = "the telescope is out of focus, or shakes during the exposure"
+    cause: ClassVar[str] = "the telescope is out of focus, or moves during the exposure"
     nominal: ClassVar[float] = 1.0
     largest: ClassVar[float] = 3.0
     power: ClassVar[float] = 1.5
@@ -141,7 +143,7 @@ class CoreBlur(Effect):
 
 @dataclass(frozen=True)
 class FocusDrift(Effect):
-    """An even disc of blur whose diameter grows from nothing to `strength` at the last image. Not in the library."""
+    """Blur by a uniform disc whose diameter grows from 0 to `strength` at the last image. Not in the library."""
 
     name: ClassVar[str] = "focus_drift"
     stage: ClassVar[str] = "optics"
@@ -163,7 +165,7 @@ def _blurred(optics: FineOptics, blur: Plane) -> FineOptics:
 
 
 def _square(reach_px: float, finer: int) -> tuple[Plane, Plane]:
-    """x and y of sub-samples of fine pixels, detector px, out to reach_px."""
+    """x and y of samples within fine pixels, `finer` per axis, in detector px, out to reach_px."""
     half = int(np.ceil(reach_px * FINE)) + 1
     at = (np.arange((2 * half + 1) * finer) + 0.5) / finer - half - 0.5
     return at[None, :] / FINE, at[:, None] / FINE
@@ -175,21 +177,21 @@ def _collected(samples: Plane, finer: int) -> Plane:
 
 
 def _moffat(width_px: float) -> Plane:
-    """A Moffat of exponent 3 whose full width at half maximum is width_px."""
+    """A Moffat profile of exponent 3 with a full width at half maximum of width_px."""
     x, y = _square(8 * width_px + 1, 5)
     core = width_px / (2 * np.sqrt(2 ** (1 / 3) - 1))
     return _collected((1 + (x**2 + y**2) / core**2) ** -3.0, 5)
 
 
 def _pillbox(diameter_px: float) -> Plane:
-    """An even disc."""
+    """A uniform disc."""
     x, y = _square(diameter_px / 2 + 0.5, 9)
     inside = np.clip((diameter_px / 2 - np.hypot(x, y)) * 9 * FINE + 0.5, 0.0, 1.0)
     return _collected(inside if inside.sum() > 0 else np.exp(-((x**2 + y**2) * 400.0)), 9)
 
 
 def _line(length_px: float, angle_deg: float) -> Plane:
-    """Light drawn out evenly along a line."""
+    """Light spread evenly along a straight line."""
     half = int(np.ceil(length_px / 2 * FINE)) + 2
     plane = np.zeros((2 * half + 1, 2 * half + 1))
     for s in (np.arange(200) + 0.5) / 200 - 0.5:
@@ -204,7 +206,7 @@ def _line(length_px: float, angle_deg: float) -> Plane:
 
 @dataclass(frozen=True)
 class MeshRotation(Effect):
-    """The mesh stands turned against where it is taken to be."""
+    """The mesh is rotated against its assumed angle."""
 
     sign: int = 1
 
@@ -227,14 +229,14 @@ class MeshRotation(Effect):
 
 @dataclass(frozen=True)
 class MeshPitch(Effect):
-    """The mesh's orders lie farther out, or nearer, than they are taken to."""
+    """The orders of the mesh are farther out, or nearer, than assumed."""
 
     sign: int = 1
 
     name: ClassVar[str] = "mesh_pitch"
     stage: ClassVar[str] = "optics"
     unit: ClassVar[str] = "share of the spacing"
-    cause: ClassVar[str] = "the mesh's pitch, or the wavelength, is not what is assumed"
+    cause: ClassVar[str] = "the pitch of the mesh, or the wavelength, differs from the assumed one"
     nominal: ClassVar[float] = 0.05
     largest: ClassVar[float] = 0.3
 
@@ -251,7 +253,7 @@ class MeshPitch(Effect):
 
 @dataclass(frozen=True)
 class FieldDependentScatter(Effect):
-    """The amount of scatter depends on where the light comes from: a tilt by `strength` at the edge, and a bowl."""
+    """The amount of scatter depends on the field position of its source: a tilt of `strength` at the edge, and a bowl."""
 
     angle_deg: float = 0.0
     bowl: float = 0.5
@@ -259,7 +261,7 @@ class FieldDependentScatter(Effect):
     name: ClassVar[str] = "field_dependent_scatter"
     stage: ClassVar[str] = "optics"
     unit: ClassVar[str] = "share of the scatter"
-    cause: ClassVar[str] = "light of another field angle meets another, rougher part of the mirrors"
+    cause: ClassVar[str] = "light from another field angle meets a rougher part of the mirrors"
     nominal: ClassVar[float] = 0.2
     largest: ClassVar[float] = 0.8
 
@@ -278,7 +280,7 @@ class FieldDependentScatter(Effect):
 
 @dataclass(frozen=True)
 class Ghost(Effect):
-    """A faint copy of the focal plane: displaced, out of focus, a little turned and magnified."""
+    """A faint copy of the image: displaced, out of focus, slightly rotated and magnified."""
 
     shift_x: float = 0.1
     shift_y: float = 0.0

@@ -1,15 +1,16 @@
-"""All effects of the blind set: those that the library is expected to have, by the same names, and others."""
+"""All effects of the blind set: those that the gap library should know, by the same names, and unknown ones."""
 
 from __future__ import annotations
 
 from psfcore.blind.effects.detector import DETECTOR_EFFECTS
 from psfcore.blind.effects.effect import Effect
 from psfcore.blind.effects.optics import OPTICS_EFFECTS
+from psfcore.blind.effects.readout import READOUT_EFFECTS
 from psfcore.blind.effects.scene import SCENE_EFFECTS
 from psfcore.errors import DataError
 
 EFFECTS: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (*SCENE_EFFECTS, *OPTICS_EFFECTS, *DETECTOR_EFFECTS)
+    effect.name: effect for effect in (*SCENE_EFFECTS, *OPTICS_EFFECTS, *DETECTOR_EFFECTS, *READOUT_EFFECTS)
 }
 KNOWN = (
     "dark_offset",
@@ -35,7 +36,7 @@ UNKNOWN = tuple(sorted(set(EFFECTS) - set(KNOWN)))
 
 
 def effect_named(name: str) -> type[Effect]:
-    """The effect of a name. Raises DataError "unknown-effect"."""
+    """The effect with this name. Raises DataError "unknown-effect"."""
     if name not in EFFECTS:
         raise DataError("unknown-effect", f"expected one of {', '.join(sorted(EFFECTS))}; got {name!r}")
     return EFFECTS[name]

@@ -1,4 +1,4 @@
-"""Effects of the scene: what the Sun and the occulter do."""
+"""Effects of the scene: changes of the Sun and of the occulter."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OcculterMotion(Effect):
-    """The disc moves along a line while the shutter is open, in steps of a fifth of a pixel at most."""
+    """The disc moves along a straight line during the exposure, in steps of at most a fifth of a pixel."""
 
     angle_deg: float = 0.0
 
     name: ClassVar[str] = "occulter_motion"
     stage: ClassVar[str] = "scene"
     unit: ClassVar[str] = "px/s"
-    cause: ClassVar[str] = "the occulter crosses the field while an image is exposed"
+    cause: ClassVar[str] = "the occulter moves across the field during the exposure"
     nominal: ClassVar[float] = 0.4
     largest: ClassVar[float] = 1.5
 
@@ -56,7 +56,7 @@ class OcculterMotion(Effect):
 
 @dataclass(frozen=True)
 class SceneEvolution(Effect):
-    """Patches brighten and fade, each with its own phase, all with one period."""
+    """Patches brighten and fade, each with its own phase, all with the same period."""
 
     seed: int = 0
     patch: float = 0.05
@@ -80,7 +80,7 @@ class SceneEvolution(Effect):
             return scene
         phase = 2 * np.pi * moment.elapsed / self.period
         first, second = (
-            patches(scene.shape[0], self.seed + 10 * moment.shot.fov + k, self.patch) for k in (0, 1)
+            patches(scene.shape[0], self.seed + 10 * moment.shot.pointing + k, self.patch) for k in (0, 1)
         )
         change = self.strength * (first * np.sin(phase) + second * (np.cos(phase) - 1))
         return np.asarray(scene * np.exp(change - change.var() / 2))
@@ -88,9 +88,10 @@ class SceneEvolution(Effect):
 
 @dataclass(frozen=True)
 class OutOfFieldLight(Effect):
-    """A lit band beyond one edge of each pointing, as wide as half the field, seen through the scatter alone.
+    """Scattered light of a bright band beyond one edge of each pointing, half as wide as the field.
 
-    strength: its brightness. The nearest of it is a twelfth of the field away; edges: 0 left, 1 right, 2 below, 3 above.
+    strength: brightness of the band. It begins a twelfth of the field beyond the edge. edges: 0 left, 1 right, 2 below,
+    3 above. b_px, c, a: the power law that scatters its light.
     """
 
     edges: tuple[int, ...] = (0, 1, 1)
@@ -102,7 +103,7 @@ class OutOfFieldLight(Effect):
     name: ClassVar[str] = "out_of_field_light"
     stage: ClassVar[str] = "scene"
     unit: ClassVar[str] = "DN/s"
-    cause: ClassVar[str] = "the Sun goes on beyond the detector's edge and scatters in"
+    cause: ClassVar[str] = "light of the Sun beyond the edge of the detector is scattered into the field"
     nominal: ClassVar[float] = 400.0
     largest: ClassVar[float] = 4000.0
 
@@ -122,14 +123,14 @@ class OutOfFieldLight(Effect):
     def light(self, seen: Plane, moment: Moment) -> Plane:
         if self.strength == 0:
             return seen
-        fov = moment.shot.fov
-        edge, level = self.edges[fov - 1], self.levels[fov - 1]
+        pointing = moment.shot.pointing
+        edge, level = self.edges[pointing - 1], self.levels[pointing - 1]
         return seen + self.strength * level * _band(seen.shape[0], edge, self.b_px, self.c, self.a)
 
 
 @cache
 def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
-    """Scattered light of a band of 1 DN/s beyond one edge; drawn coarsely, because it is smooth, and enlarged."""
+    """Scattered light of a band of 1 DN/s beyond one edge; computed on a coarse grid, because it is smooth."""
     size = fine_size // FINE
     step = size / 32
     at = (np.arange(32) + 0.5) * step
@@ -147,9 +148,9 @@ def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
 
 @dataclass(frozen=True)
 class LimbGlint(Effect):
-    """Extra light in one pointing: rays that fan out of a point beyond its edge. Not in the library."""
+    """Extra light in one pointing: rays that spread from a point beyond its edge. Not in the library."""
 
-    fov: int = 1
+    pointing: int = 1
     angle_deg: float = 0.0
     rays: int = 3
     phase_deg: float = 0.0
@@ -157,17 +158,17 @@ class LimbGlint(Effect):
     name: ClassVar[str] = "limb_glint"
     stage: ClassVar[str] = "scene"
     unit: ClassVar[str] = "DN/s"
-    cause: ClassVar[str] = "sunlight glances off an edge of the baffle in one pointing"
+    cause: ClassVar[str] = "in one pointing an edge of the baffle reflects sunlight"
     nominal: ClassVar[float] = 1.0
     largest: ClassVar[float] = 60.0
 
     @classmethod
     def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        fov = int(rng.choice([1, len(plan.views)]))
-        return cls(strength, fov, angle(rng), int(rng.integers(2, 6)), angle(rng))
+        pointing = int(rng.choice([1, len(plan.views)]))
+        return cls(strength, pointing, angle(rng), int(rng.integers(2, 6)), angle(rng))
 
     def light(self, seen: Plane, moment: Moment) -> Plane:
-        if moment.shot.fov != self.fov or self.strength == 0:
+        if moment.shot.pointing != self.pointing or self.strength == 0:
             return seen
         n = seen.shape[0]
         x = (np.arange(n)[None, :] + 0.5) / n - 0.5 - 0.8 * np.cos(np.deg2rad(self.angle_deg))
@@ -178,7 +179,10 @@ class LimbGlint(Effect):
 
 @dataclass(frozen=True)
 class SaturationFill(Effect):
-    """High-only images clip, and what they clip has flickered by the time an image shows it. strength: share of light lost."""
+    """High-only images clip, and the clipped pixels flicker, so that other images show other values there.
+
+    strength: share of light lost by clipping.
+    """
 
     seed: int = 0
     flicker: float = 0.3
@@ -186,7 +190,7 @@ class SaturationFill(Effect):
     name: ClassVar[str] = "saturation_fill"
     stage: ClassVar[str] = "scene"
     unit: ClassVar[str] = "share of the light above the level"
-    cause: ClassVar[str] = "clipped pixels are replaced by those of another image, or stay clipped"
+    cause: ClassVar[str] = "clipped pixels are filled from another image, or stay clipped"
     nominal: ClassVar[float] = 0.03
     largest: ClassVar[float] = 0.15
 
@@ -198,7 +202,7 @@ class SaturationFill(Effect):
         if self.strength == 0:
             return scene
         bright = scene > np.quantile(scene[::4, ::4], 0.98)
-        phase = patches(scene.shape[0], self.seed + moment.shot.fov, 0.1)
+        phase = patches(scene.shape[0], self.seed + moment.shot.pointing, 0.1)
         swing = self.flicker * self.strength / (self.strength + 0.005)
         factor = 1 + swing * np.sin(40 * moment.elapsed + 2 * phase)
         return np.where(bright, scene * factor, scene)
@@ -218,7 +222,7 @@ class SaturationFill(Effect):
 
 @cache
 def patches(size: int, seed: int, patch: float) -> Plane:
-    """A smooth random plane [y, x], mean 0, rms 1, its patches a share of the field across; the same for a seed."""
+    """A smooth random plane [y, x], mean 0, rms 1; patch: size of its patches over that of the field."""
     rng = np.random.default_rng(seed)
     coarse = max(8, int(np.ceil(4 / patch)))
     drawn = gaussian_filter(rng.standard_normal((coarse, coarse)), 1.5)

@@ -208,7 +208,7 @@ class _Distance:
 def _image_info(frame: Frame, found: FoundPlace, distance_px: float) -> ImageInfo:
     return ImageInfo(
         file=frame.file,
-        pointing=frame.fov,
+        pointing=frame.pointing,
         x_px=found.place.x_px,
         y_px=found.place.y_px,
         time_s=frame.time_s,

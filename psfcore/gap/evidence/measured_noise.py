@@ -49,7 +49,11 @@ def measured_noise(transit: Transit) -> MeasuredNoise | None:
     levels, variances = [], []
     frames = transit.frames
     for one, other in itertools.pairwise(frames):
-        if (one.fov, one.gain_mode, one.exposure_s) == (other.fov, other.gain_mode, other.exposure_s):
+        if (one.pointing, one.gain_mode, one.exposure_s) == (
+            other.pointing,
+            other.gain_mode,
+            other.exposure_s,
+        ):
             level, variance = _blocks(one, other)
             levels.append(level)
             variances.append(variance)

@@ -19,18 +19,22 @@ DEGREES = 4  # number of polynomials in time: degrees 0 to 3
 
 def patterns(evidence: Evidence) -> tuple[Matrix, ...]:
     """For each disc the patterns (patterns, cells), as fractions of the expected light, DN/s."""
-    fovs = sorted({taken.pointing for taken in evidence.image_info})
-    times = {fov: [t.time_s for t in evidence.image_info if t.pointing == fov] for fov in fovs}
-    return tuple(_of_disc(evidence, disc, fovs, times) for disc in evidence.discs)
+    pointings = sorted({taken.pointing for taken in evidence.image_info})
+    times = {
+        pointing: [t.time_s for t in evidence.image_info if t.pointing == pointing] for pointing in pointings
+    }
+    return tuple(_of_disc(evidence, disc, pointings, times) for disc in evidence.discs)
 
 
-def _of_disc(evidence: Evidence, disc: DiscCells, fovs: list[int], times: dict[int, list[float]]) -> Matrix:
+def _of_disc(
+    evidence: Evidence, disc: DiscCells, pointings: list[int], times: dict[int, list[float]]
+) -> Matrix:
     taken = evidence.image_info[disc.index]
     first, last = min(times[taken.pointing]), max(times[taken.pointing])
     at = 2 * (taken.time_s - first) / (last - first) - 1 if last > first else 0.0
     level = np.full(disc.expected.size, float(disc.share @ disc.expected))
-    in_time = np.zeros((len(fovs), DEGREES))
-    in_time[fovs.index(taken.pointing)] = [np.polynomial.Legendre.basis(k)(at) for k in range(DEGREES)]
+    in_time = np.zeros((len(pointings), DEGREES))
+    in_time[pointings.index(taken.pointing)] = [np.polynomial.Legendre.basis(k)(at) for k in range(DEGREES)]
     return np.vstack([in_time.ravel()[:, None] * level, in_disc(disc) * level])
 
 

@@ -219,7 +219,7 @@ def unocculted_blocks(view: View, columns: int, progress: Progress) -> Unocculte
         noise = transit.noise.variance(means[-1], frame.exposure_s) / pixels
         variance.append(noise + (FLOOR * levels[-1]) ** 2)
         free.append(blocks(not_compared(solution, n).astype(np.float64)) == 0)
-    kinds = [(f.fov, f.gain_mode, f.exposure_s) for f in transit.frames]
+    kinds = [(f.pointing, f.gain_mode, f.exposure_s) for f in transit.frames]
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     shape = np.shape(levels)
     return UnoccultedBlocks(
@@ -228,7 +228,7 @@ def unocculted_blocks(view: View, columns: int, progress: Progress) -> Unocculte
         free=np.array(free),
         means=np.array(means),
         errors=np.zeros((columns, *shape)),
-        pointing=np.array([f.fov for f in transit.frames]),
+        pointing=np.array([f.pointing for f in transit.frames]),
         kind=np.array([number[kind] for kind in kinds]),
         part=np.ones(len(transit.frames), dtype=bool),
     )

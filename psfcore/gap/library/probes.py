@@ -64,13 +64,15 @@ def _structured(view: View) -> Sequence[Change]:
 def _planes_of_pointings(view: View) -> Sequence[Change]:
     frames = view.solution.transit.frames
 
-    def one(fov: int, plane: Field) -> Change:
+    def one(pointing: int, plane: Field) -> Change:
         nothing = np.zeros_like(plane)
-        return Change(lambda n, images: plane if frames[n].fov == fov else nothing, unocculted=False)
+        return Change(
+            lambda n, images: plane if frames[n].pointing == pointing else nothing, unocculted=False
+        )
 
     x, y = view.places
-    fovs = sorted({f.fov for f in frames})
-    return [one(fov, plane) for fov in fovs for plane in (flat(view), x, y)]
+    pointings = sorted({f.pointing for f in frames})
+    return [one(pointing, plane) for pointing in pointings for plane in (flat(view), x, y)]
 
 
 def _drift(view: View) -> Sequence[Change]:
@@ -148,8 +150,8 @@ def _in_pointings(view: View, readouts: Plane) -> Iterator[tuple[Plane, Plane, P
     1 / exposure and of its weight, with a free scene; and whether each block contributes.
     """
     frames = view.solution.transit.frames
-    for fov in _pointings_of_exposures(view):
-        here = [n for n, frame in enumerate(frames) if frame.fov == fov]
+    for pointing in _pointings_of_exposures(view):
+        here = [n for n, frame in enumerate(frames) if frame.pointing == pointing]
         seen, weight, free = unocculted_on_coarse(view, here)
         total = np.maximum(weight.sum(axis=0), 1)
         scene = (seen * weight).sum(axis=0) / total
@@ -165,9 +167,11 @@ def _in_pointings(view: View, readouts: Plane) -> Iterator[tuple[Plane, Plane, P
 def _pointings_of_exposures(view: View) -> list[int]:
     """Pointings whose images differ in exposure."""
     frames = view.solution.transit.frames
-    kinds = {(frame.fov, frame.exposure_s) for frame in frames}
+    kinds = {(frame.pointing, frame.exposure_s) for frame in frames}
     return [
-        fov for fov in sorted({f.fov for f in frames}) if sum(k[0] == fov for k in kinds) >= LEAST_EXPOSURES
+        pointing
+        for pointing in sorted({f.pointing for f in frames})
+        if sum(k[0] == pointing for k in kinds) >= LEAST_EXPOSURES
     ]
 
 

@@ -55,11 +55,17 @@ def _beyond_field(view: View) -> Sequence[Change]:
     frames = solution.transit.frames
     nothing = np.zeros(solution.transit.shape, np.float32)
 
-    def one(fov: int, side: NDArray[np.bool_]) -> Change:
-        return Change(lambda n, _: change(n, side) if frames[n].fov == fov else nothing, unocculted=False)
+    def one(pointing: int, side: NDArray[np.bool_]) -> Change:
+        return Change(
+            lambda n, _: change(n, side) if frames[n].pointing == pointing else nothing, unocculted=False
+        )
 
     # Each pointing has its own surroundings.
-    return [one(fov, side) for fov in sorted({f.fov for f in frames})[:MOST_POINTINGS] for side in sides]
+    return [
+        one(pointing, side)
+        for pointing in sorted({f.pointing for f in frames})[:MOST_POINTINGS]
+        for side in sides
+    ]
 
 
 def _coarse(plane: Field) -> Field:
@@ -79,7 +85,7 @@ def _motion(view: View) -> Sequence[Change]:
     shape = solution.transit.shape
 
     def change(n: int, longest_px: float) -> Field:
-        near = [k for k, f in enumerate(frames) if f.fov == frames[n].fov and k != n]
+        near = [k for k, f in enumerate(frames) if f.pointing == frames[n].pointing and k != n]
         hidden = view.behind(n)
         if not near or hidden is None:
             return np.zeros(shape, np.float32)
@@ -107,8 +113,8 @@ def _evolution(view: View) -> Sequence[Change]:
     frames = view.solution.transit.frames
     evolving = [
         _smooth_in_time(view, images)
-        for fov in sorted({f.fov for f in frames})
-        if len(images := [n for n, f in enumerate(frames) if f.fov == fov]) >= LEAST_TO_EVOLVE
+        for pointing in sorted({f.pointing for f in frames})
+        if len(images := [n for n, f in enumerate(frames) if f.pointing == pointing]) >= LEAST_TO_EVOLVE
     ]
     nothing = np.zeros(view.solution.transit.shape, np.float32)
 
@@ -200,7 +206,7 @@ def on_pixels(plane: Field, shape: tuple[int, ...]) -> Field:
 
 def _too_few_to_evolve(view: View) -> str | None:
     frames = view.solution.transit.frames
-    most = max(sum(f.fov == fov for f in frames) for fov in {f.fov for f in frames})
+    most = max(sum(f.pointing == pointing for f in frames) for pointing in {f.pointing for f in frames})
     if most >= LEAST_TO_EVOLVE:
         return None
     return f"it needs a pointing with {LEAST_TO_EVOLVE} images; the largest has {most}"

@@ -50,7 +50,7 @@ def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
     rows = report["images"]
     before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
     noise, noise_after = _column(rows, "noise_pct"), _column(rows, "noise_after_pct")
-    fovs = sorted({row["fov"] for row in rows})
+    pointings = sorted({row["fov"] for row in rows})
     along = (
         ("Detector x of the disc (px)", _column(rows, "x_px")),
         ("Detector y of the disc (px)", _column(rows, "y_px")),
@@ -58,9 +58,9 @@ def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
     )
     for axes, (label, at) in zip(charts, along, strict=True):
         axes.axhline(0, color="#555555", linewidth=1.0)
-        for fov in fovs:
+        for fov in pointings:
             here = np.array([row["fov"] == fov for row in rows])
-            colour, symbol = _look(fovs.index(fov))
+            colour, symbol = _look(pointings.index(fov))
             style: dict[str, Any] = {"fmt": symbol, "color": colour}
             axes.errorbar(at[here], before[here], noise[here], ms=5, elinewidth=1.1, mew=0, **style)
             style |= {"mfc": "white", "mew": 1.2}
@@ -68,7 +68,7 @@ def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
         axes.set(xlabel=label)
     charts[0].set(ylabel="Simulated - observed (%)")
     figure.legend(
-        handles=_legend(fovs, after=has_after(report)),
+        handles=_legend(pointings, after=has_after(report)),
         loc="outside upper center",
         ncols=8,
         fontsize=9,
@@ -94,17 +94,17 @@ def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
     before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
     top = _scale(before, _column(rows, "noise_pct"))
     x, y = _column(rows, "x_px"), _column(rows, "y_px")
-    fovs = sorted({row["fov"] for row in rows})
+    pointings = sorted({row["fov"] for row in rows})
     ny, nx = report["shape"]
     drawn = None
     for axes, values, title in zip(charts, (before, after), (_FITTED, _ANSWERED), strict=False):
-        for fov in fovs:
+        for fov in pointings:
             here = np.array([row["fov"] == fov for row in rows]) & np.isfinite(values)
             drawn = axes.scatter(
                 x[here],
                 y[here],
                 c=values[here],
-                marker=_look(fovs.index(fov))[1],
+                marker=_look(pointings.index(fov))[1],
                 s=62,
                 cmap=CHANGE,
                 vmin=-top,
@@ -112,7 +112,7 @@ def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
                 edgecolors="#444444",
                 linewidths=0.6,
             )
-            axes.plot([], [], _look(fovs.index(fov))[1], color="#777777", ms=7, label=f"pointing {fov}")
+            axes.plot([], [], _look(pointings.index(fov))[1], color="#777777", ms=7, label=f"pointing {fov}")
         axes.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal", title=title)
         axes.set(xlabel="Detector x (px)", ylabel="Detector y (px)" if axes is charts[0] else "")
         axes.title.set_fontsize(11)
@@ -311,9 +311,9 @@ def _look(number: int) -> tuple[str, str]:
     return _COLOURS[number % len(_COLOURS)], _SYMBOLS[number % len(_SYMBOLS)]
 
 
-def _legend(fovs: Sequence[int], *, after: bool) -> list[Any]:
+def _legend(pointings: Sequence[int], *, after: bool) -> list[Any]:
     handles = []
-    for number, fov in enumerate(fovs):
+    for number, fov in enumerate(pointings):
         colour, symbol = _look(number)
         handles.append(Line2D([], [], color=colour, marker=symbol, ls="none", ms=6, label=f"pointing {fov}"))
     if after:

@@ -259,14 +259,14 @@ def _at(model: LinearModel, name: str) -> dict[str, Any]:
     evidence = model.evidence
     left = model.left(model.base)
     excess = np.array([float(r @ r) - r.size for r in left])
-    fov = np.array([evidence.image_info[d.index].pointing for d in evidence.discs])
-    by_fov = {int(one): float(excess[fov == one].sum()) for one in np.unique(fov)}
-    strongest = sorted(by_fov, key=lambda one: -by_fov[one])[:SUSPECT]
+    pointing = np.array([evidence.image_info[d.index].pointing for d in evidence.discs])
+    by_pointing = {int(one): float(excess[pointing == one].sum()) for one in np.unique(pointing)}
+    strongest = sorted(by_pointing, key=lambda one: -by_pointing[one])[:SUSPECT]
     out: dict[str, Any] = {"pointings": sorted(strongest)}
     taken = [evidence.image_info[d.index] for d in evidence.discs]
     values = _along(evidence.discs, taken).get(name)
     if values is not None and name not in ("pointing", "gain_mode"):
-        here = values[np.isin(fov, strongest)]
+        here = values[np.isin(pointing, strongest)]
         low, high = float(here.min()), float(here.max())
         if name in ("intensity", "exposure"):
             low, high = math.exp(low), math.exp(high)

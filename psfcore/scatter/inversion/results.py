@@ -34,7 +34,7 @@ class FrameFit:
     """
 
     file: str
-    fov: int
+    pointing: int
     found: FoundPlace
     dark: Pixels
     observed: float

@@ -223,7 +223,7 @@ class Solver:
         frame = self._sky.transit.frames[n]
         return FrameFit(
             file=frame.file,
-            fov=frame.fov,
+            pointing=frame.pointing,
             found=self._sky.found[n],
             dark=self._sky.dark[n],
             observed=float((measured.expected + measured.residual).mean()),

@@ -1,4 +1,4 @@
-"""The blind set's effects: nothing at strength 0, something at their nominal one, and what physics asks of some."""
+"""The effects of the blind set: none at strength 0, visible at the nominal strength, and physically consistent."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from psfcore.blind.chain import Chain, Sky
+from psfcore.blind.chain import Chain, EffectFree
 from psfcore.blind.effects.effect import Earlier, Moment
 from psfcore.blind.effects.fine_optics import (
     FINE,
     SYNTHETIC,
     FineOptics,
     Glass,
-    boxed_glass,
-    boxed_kernel,
+    binned_glass,
+    binned_kernel,
     fine_optics,
 )
 from psfcore.blind.effects.registry import EFFECTS, KNOWN, UNKNOWN, effect_named
@@ -42,16 +42,16 @@ def optics() -> FineOptics:
 
 
 @pytest.fixture(scope="module")
-def sky(plan: Plan, optics: FineOptics) -> Sky:
-    return Sky(plan, optics, {fov: drawn_scene(plan, fov, 3) for fov in plan.fovs})
+def effect_free(plan: Plan, optics: FineOptics) -> EffectFree:
+    return EffectFree(plan, optics, {pointing: drawn_scene(plan, pointing, 3) for pointing in plan.pointings})
 
 
 @pytest.fixture(scope="module")
-def clean(sky: Sky) -> list[np.ndarray]:
-    return Chain(sky, ()).all_expected()
+def clean(effect_free: EffectFree) -> list[np.ndarray]:
+    return Chain(effect_free, ()).all_expected()
 
 
-def test_eighteen_effects_are_known_and_eight_or_more_are_not() -> None:
+def test_there_are_eighteen_known_effects_and_at_least_eight_unknown() -> None:
     assert len(KNOWN) == 18
     assert set(KNOWN) <= set(EFFECTS)
     assert len(UNKNOWN) >= 8
@@ -61,21 +61,23 @@ def test_eighteen_effects_are_known_and_eight_or_more_are_not() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
-def test_an_effect_changes_images_and_at_strength_0_none(
-    name: str, plan: Plan, sky: Sky, clean: list[np.ndarray]
+def test_an_effect_changes_images_unless_its_strength_is_0(
+    name: str, plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
 ) -> None:
     effect = EFFECTS[name].drawn(EFFECTS[name].nominal, plan, np.random.default_rng(8))
-    still, changed = Chain(sky, (effect.at(0.0),)), Chain(sky, (effect,))
+    still, changed = Chain(effect_free, (effect.at(0.0),)), Chain(effect_free, (effect,))
     for before, after in zip(clean, still.all_expected(), strict=True):
         np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
-    for before, after in zip(Chain(sky, ()).read_out(clean, 5), still.read_out(clean, 5), strict=True):
+    for before, after in zip(
+        Chain(effect_free, ()).read_out(clean, 5), still.read_out(clean, 5), strict=True
+    ):
         np.testing.assert_array_equal(after, before)
     moved = changed.mean_rate(changed.all_expected(), 5)
     assert max(np.abs(after / before - 1).max() for before, after in zip(clean, moved, strict=True)) > 1e-3
     assert all(np.isfinite(image).all() for image in moved)
 
 
-def test_a_seed_draws_the_same_effect_and_another_another(plan: Plan) -> None:
+def test_equal_seeds_give_equal_effects_and_other_seeds_others(plan: Plan) -> None:
     for effect in EFFECTS.values():
         first, second, third = (effect.drawn(1.0, plan, np.random.default_rng(seed)) for seed in (1, 1, 2))
         assert first == second
@@ -85,16 +87,16 @@ def test_a_seed_draws_the_same_effect_and_another_another(plan: Plan) -> None:
         )
 
 
-def test_a_boxed_scatter_kernel_is_the_law_on_detector_pixels(optics: FineOptics) -> None:
-    boxed, law = boxed_kernel(optics.scatter), anisotropic_kernel(LAW, 2 * SIZE_PX)
+def test_the_binned_scatter_kernel_follows_the_power_law(optics: FineOptics) -> None:
+    boxed, law = binned_kernel(optics.scatter), anisotropic_kernel(LAW, 2 * SIZE_PX)
     middle = SIZE_PX
     assert boxed[middle, middle] == pytest.approx(1 - LAW.total, abs=1e-9)
     near = (slice(middle - 20, middle + 21), slice(middle + 1, middle + 21))
     np.testing.assert_allclose(boxed[near], law[near], rtol=0.02)
 
 
-def test_an_even_scene_is_seen_the_same_by_fine_and_boxed_kernels() -> None:
-    """A scene without structure within a pixel: boxed after = boxed before the convolution."""
+def test_a_scene_uniform_within_pixels_gives_the_same_with_fine_and_binned_kernels() -> None:
+    """Binning before and after the convolution gives the same if a scene has no structure within a pixel."""
     from psfcore.convolution.convolver import Convolver
 
     rng = np.random.default_rng(4)
@@ -102,12 +104,12 @@ def test_an_even_scene_is_seen_the_same_by_fine_and_boxed_kernels() -> None:
     fine = np.kron(coarse, np.ones((FINE, FINE)))
     kernel = Glass(SYNTHETIC, 32).fine()
     seen = binned(Convolver(kernel, fine.shape, dtype=np.float64).apply(fine), FINE)
-    boxed = Convolver(boxed_kernel(kernel), coarse.shape, dtype=np.float64).apply(coarse)
+    boxed = Convolver(binned_kernel(kernel), coarse.shape, dtype=np.float64).apply(coarse)
     np.testing.assert_allclose(seen, boxed, atol=2e-4)  # the outermost fine row has no partner
 
 
-def test_the_known_psf_sums_to_1_and_its_orders_turn() -> None:
-    kernel = boxed_glass(GLASS)
+def test_the_known_psf_sums_to_1_and_its_orders_rotate() -> None:
+    kernel = binned_glass(GLASS)
     assert kernel.sum() == pytest.approx(1.0, abs=1e-12)
     assert np.unravel_index(kernel.argmax(), kernel.shape) == (32, 32)
     straight, turned = GLASS.fine(), GLASS.fine(turn_deg=90.0)
@@ -116,7 +118,7 @@ def test_the_known_psf_sums_to_1_and_its_orders_turn() -> None:
 
 
 @pytest.mark.parametrize("name", ["anisotropic_scatter", "one_sided_scatter", "core_blur", "focus_drift"])
-def test_light_is_moved_not_made(name: str, plan: Plan, optics: FineOptics) -> None:
+def test_effects_of_the_optics_conserve_light(name: str, plan: Plan, optics: FineOptics) -> None:
     effect = EFFECTS[name].drawn(EFFECTS[name].nominal, plan, np.random.default_rng(2))
     changed = effect.optics(optics, Moment(plan, len(plan.shots) - 1))
     assert changed.scatter.sum() == pytest.approx(optics.scatter.sum(), abs=2e-3)
@@ -132,17 +134,19 @@ def test_scatter_that_depends_on_the_field_moves_light_between_pixels(plan: Plan
     assert added[SIZE_PX + 21, SIZE_PX] > 0  # off the mesh's orders, which follow the core
 
 
-def test_a_moving_disc_lets_light_in_at_its_ends_alone(plan: Plan, sky: Sky, clean: list[np.ndarray]) -> None:
+def test_a_moving_disc_uncovers_light_only_at_its_ends(
+    plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
+) -> None:
     effect = EFFECTS["occulter_motion"](1.0)  # along x
     shot = plan.shots[0]
-    moved = Chain(sky, (effect,)).expected(0) - clean[0]
+    moved = Chain(effect_free, (effect,)).expected(0) - clean[0]
     row, column, radius = round(shot.y_px), round(shot.x_px), int(plan.radius_px)
     ends = moved[row, [column - radius + 1, column + radius - 1]]
     sides = moved[[row - radius + 2, row + radius - 2], column]
     assert ends.min() > 5 * np.abs(sides).max()
 
 
-def test_persistence_is_what_earlier_images_showed(plan: Plan) -> None:
+def test_persistence_adds_a_decaying_share_of_earlier_images(plan: Plan) -> None:
     effect = EFFECTS["persistence"](0.1)
     dn, before = np.zeros((4, 4)), Earlier(np.full((4, 4), 100.0), plan.shots[0].time_s)
     assert np.all(effect.read_out(dn, Moment(plan, 0), []) == 0)
@@ -151,14 +155,16 @@ def test_persistence_is_what_earlier_images_showed(plan: Plan) -> None:
     np.testing.assert_allclose(left, 10.0 * np.exp(-wait / 300.0))
 
 
-def test_a_gain_mismatch_is_in_combined_images_alone(plan: Plan) -> None:
+def test_a_gain_mismatch_changes_only_combined_images(plan: Plan) -> None:
     effect, dn = EFFECTS["gain_mismatch"](0.1), np.full((4, 4), 50.0)
     for index, shot in enumerate(plan.shots):
         factor = {COMBINED: 1.1, HIGH: 1.0}[shot.gain_mode]
         np.testing.assert_allclose(effect.read_out(dn, Moment(plan, index), []), factor * dn)
 
 
-def test_saturation_loses_the_share_of_light_that_it_is_told(plan: Plan, clean: list[np.ndarray]) -> None:
+def test_saturation_loses_the_share_of_light_given_by_its_strength(
+    plan: Plan, clean: list[np.ndarray]
+) -> None:
     exposures = [rate * shot.exposure_s for rate, shot in zip(clean, plan.shots, strict=True)]
     level = SaturationFill(0.03).saturation_dn(exposures, plan)
     assert level is not None
@@ -168,7 +174,7 @@ def test_saturation_loses_the_share_of_light_that_it_is_told(plan: Plan, clean: 
     assert np.maximum(high - level, 0).sum() / high.sum() == pytest.approx(0.03, abs=0.002)
 
 
-def test_faint_signals_lose_what_a_nonlinearity_says(plan: Plan) -> None:
+def test_a_nonlinearity_reduces_only_faint_signals(plan: Plan) -> None:
     effect = dataclasses.replace(EFFECTS["nonlinearity"](0.2), knee_dn=100.0)
     dn = np.array([[5.0, 100.0, 1000.0]])
     np.testing.assert_allclose(effect.read_out(dn, Moment(plan, 0), []), [[4.0, 100.0, 1000.0]])

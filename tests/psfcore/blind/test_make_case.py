@@ -1,4 +1,4 @@
-"""Cases of the blind set: drawn evenly, made readable, their truth apart."""
+"""Cases of the blind set: drawn in equal shares, readable as transits, their truth kept apart."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> BlindSet:
     return make_set(tmp_path_factory.mktemp("blind") / "set", plan)[0]
 
 
-def test_kinds_come_in_their_shares_and_effects_in_turn() -> None:
+def test_kinds_have_their_shares_and_effects_occur_in_turn() -> None:
     cases = [draw_case(1, n, SIZE_PX, IMAGES) for n in range(72)]
     assert Counter(case.kind for case in cases) == {CLEAN: 24, SINGLE: 30, PAIR: 6, FOREIGN: 12}
     names = Counter(case.effects[0].name for case in cases if case.kind == SINGLE)
@@ -46,14 +46,14 @@ def test_a_case_is_the_same_for_its_seed_and_number() -> None:
         draw_case(1, 0, SIZE_PX, IMAGES, only=("gremlins",))
 
 
-def test_what_is_to_be_left_comes_in_turn_for_every_effect() -> None:
+def test_each_target_is_used_in_turn_for_every_effect() -> None:
     names, left_pct = ("ghost", "wide_halo"), (2.0, 4.0, 8.0)
     cases = [draw_case(1, n, SIZE_PX, IMAGES, only=names, left_pct=left_pct) for n in range(7)]
     found = [(case.effects[0].name, *case.target_pct) for case in cases]
     assert found == [(name, pct) for pct in (*left_pct, 2.0) for name in names][:7]
 
 
-def test_a_transit_is_read_as_any_other(made: BlindSet) -> None:
+def test_the_transit_of_a_case_can_be_read(made: BlindSet) -> None:
     transit = read_transit(made.transit(0), FitsLimits(max_pixels=SIZE_PX**2))
     assert (len(transit.frames), transit.shape) == (IMAGES, (SIZE_PX, SIZE_PX))
     truth = made.truth(0)
@@ -65,7 +65,7 @@ def test_a_transit_is_read_as_any_other(made: BlindSet) -> None:
         assert frame.pixels[row - 3 : row + 4, column - 3 : column + 4].mean() < frame.pixels.mean()
 
 
-def test_a_transit_that_saturates_says_at_what_level(made: BlindSet) -> None:
+def test_saturated_images_give_their_level_in_the_header(made: BlindSet) -> None:
     level = made.truth(1)["plan"]["saturation_dn"]
     clipped = 0
     for file in sorted(made.transit(1).glob("0*.fits")):
@@ -78,7 +78,7 @@ def test_a_transit_that_saturates_says_at_what_level(made: BlindSet) -> None:
     assert clipped > 0
 
 
-def test_nothing_of_the_truth_is_in_the_transit(made: BlindSet) -> None:
+def test_the_transit_contains_nothing_of_the_truth(made: BlindSet) -> None:
     words = [*EFFECTS, "clean", "effect", "truth", "strength", "salt"]
     for number in (0, 1):
         folder = made.transit(number)
@@ -99,7 +99,7 @@ def test_nothing_of_the_truth_is_in_the_transit(made: BlindSet) -> None:
         }
 
 
-def test_the_truth_says_what_an_effect_leaves(made: BlindSet) -> None:
+def test_the_truth_contains_what_an_effect_leaves(made: BlindSet) -> None:
     truth = made.truth(0)
     assert truth["effects"][0]["name"] == "intensity_gradient"
     assert truth["left_after_refit_pct"] == pytest.approx(truth["target_pct"][0], rel=0.6)
@@ -108,7 +108,7 @@ def test_the_truth_says_what_an_effect_leaves(made: BlindSet) -> None:
     assert len(truth["refitted"]["residual_pct"]) == IMAGES
 
 
-def test_a_clean_case_is_the_chain_without_effect() -> None:
+def test_a_clean_case_has_no_effect() -> None:
     case = draw_case(4, 0, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
     result = make(case)
     assert result.truth["effects"] == []
@@ -117,7 +117,7 @@ def test_a_clean_case_is_the_chain_without_effect() -> None:
     assert all(np.array_equal(dn, np.rint(dn)) for dn in result.exposures)
 
 
-def test_scenes_come_from_images_too() -> None:
+def test_scenes_can_be_taken_from_images() -> None:
     case = draw_case(4, 0, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
     rng = np.random.default_rng(1)
     image = 100 + 20 * rng.standard_normal((300, 300))
@@ -152,7 +152,7 @@ def test_seals_catch_a_changed_truth(made: BlindSet, tmp_path: Path) -> None:
         copy.seals()
 
 
-def test_a_last_seal_that_was_cut_when_the_power_went_is_none(tmp_path: Path) -> None:
+def test_an_incomplete_last_seal_is_ignored_and_removed(tmp_path: Path) -> None:
     made = BlindSet(tmp_path)
     whole = json.dumps({"case": 0, "sha256": "ab"}) + "\n"
     for cut in ("", '{"case": 1, "sha', '{"case": 1, "sha256": "cd"}'):
@@ -165,10 +165,10 @@ def test_a_last_seal_that_was_cut_when_the_power_went_is_none(tmp_path: Path) ->
     assert made.seals_file.read_text() == ""
 
 
-def test_one_run_at_a_time_works_on_a_set(tmp_path: Path) -> None:
+def test_only_one_run_at_a_time_uses_a_set(tmp_path: Path) -> None:
     with (
         alone_in(tmp_path / "set"),
-        pytest.raises(DataError, match="set-in-use: expected a folder that no other run works on"),
+        pytest.raises(DataError, match="set-in-use: expected a folder that no other run uses"),
         alone_in(tmp_path / "set"),
     ):
         pass
@@ -185,22 +185,22 @@ def test_made_cases_are_not_made_again(made: BlindSet) -> None:
     assert (made.truth_file(0).read_bytes(), made.seals_file.read_bytes()) == before
 
 
-def test_a_case_that_cannot_be_made_is_named_and_the_others_are_made(
+def test_a_case_that_fails_is_named_and_the_others_are_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = SetPlan(3, 3, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
 
     def make_but_one(case: Case, scenes: Sequence[Plane]) -> Made:
         if case.number == 1:
-            raise DataError("bad-scene", "expected a scene with light; got none")
+            raise DataError("bad-scene", "expected light in the scene")
         return make(case, scenes)
 
     monkeypatch.setattr("psfcore.blind.case_set.make", make_but_one)
     said: list[str] = []
     made, not_made = make_set(tmp_path, plan, progress=said.append)
-    assert not_made == {1: "bad-scene: expected a scene with light; got none"}
+    assert not_made == {1: "bad-scene: expected light in the scene"}
     assert [made.is_made(number) for number in plan.numbers] == [True, False, True]
     assert sum("could not make case 0001" in line for line in said) == 1
     monkeypatch.undo()
-    assert make_set(tmp_path, plan)[1] == {}, "the next run tries it again"
+    assert make_set(tmp_path, plan)[1] == {}, "the next run tries again"
     assert made.is_made(1)

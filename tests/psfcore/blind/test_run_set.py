@@ -1,4 +1,4 @@
-"""Diagnosing a blind set: alone with a transit, resumable, failures apart."""
+"""Diagnosing a blind set: only the transit is visible, runs can be resumed, failures are kept apart."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from psfcore.blind.run_set import has_report, judged_cases, report_of, run_of, r
 from psfcore.errors import DataError
 
 TRUTH = {"kind": "clean", "effects": [], "left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0}
-# A diagnosis that notes in a file that it ran, and reports what it could see.
+# A diagnosis that logs its transit and reports the files that it can see.
 DIAGNOSIS = """
 import json, os, pathlib, sys
 transit, report, log = sys.argv[1:4]
@@ -44,7 +44,7 @@ def command(log: Path, code: str = DIAGNOSIS) -> list[str]:
     return [sys.executable, "-c", code, "{transit}", "{report}", str(log)]
 
 
-def test_a_diagnosis_sees_a_copy_of_the_transit_and_nothing_else(blind: BlindSet, tmp_path: Path) -> None:
+def test_a_diagnosis_sees_only_a_copy_of_the_transit(blind: BlindSet, tmp_path: Path) -> None:
     (run,) = run_set(blind, [1], command(tmp_path / "log"), keep=True)
     assert not run.failed
     assert run.wall_s > 0
@@ -57,11 +57,11 @@ def test_a_diagnosis_sees_a_copy_of_the_transit_and_nothing_else(blind: BlindSet
     assert run_of(blind, 1) == run
 
 
-def test_no_case_is_diagnosed_twice_and_a_half_report_is_done_again(blind: BlindSet, tmp_path: Path) -> None:
+def test_only_cases_without_a_complete_report_are_diagnosed(blind: BlindSet, tmp_path: Path) -> None:
     log = tmp_path / "log"
     blind.report(2).write_text('{"schema": "gap/1", "verd')
     run_set(blind, [0, 1], command(log), processes=2)
-    assert not blind.transit(0).exists(), "a transit goes once there is a report"
+    assert not blind.transit(0).exists(), "a transit is deleted after its diagnosis"
     run_set(blind, [0, 1, 2], command(log), processes=2)
     assert sorted(log.read_text().splitlines()) == ["case 0", "case 1", "case 2"]
     assert all(has_report(blind, number) for number in range(3))
@@ -84,7 +84,7 @@ def test_failures_are_kept_apart_and_tried_again(blind: BlindSet, tmp_path: Path
     assert ([case.number for case in judged], list(failures)) == ([0], [1])
 
 
-def test_what_takes_too_long_is_killed(blind: BlindSet, tmp_path: Path) -> None:
+def test_a_diagnosis_that_takes_too_long_is_killed(blind: BlindSet, tmp_path: Path) -> None:
     (late,) = run_set(blind, [0], command(tmp_path / "log", "import time; time.sleep(60)"), longest_s=0.5)
     assert late.failed
     assert "killed after" in late.error

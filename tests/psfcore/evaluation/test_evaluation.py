@@ -163,7 +163,7 @@ def test_a_transit_without_any_occulter_is_refused() -> None:
 def test_slices_run_through_the_middle_of_discs() -> None:
     found = judged(1.1 * SCATTER.total)
     kept = [f for f in found.frames if f.along_x is not None]
-    assert [sum(f.fov == fov for f in kept) for fov in (1, 2, 3)] == [3, 3, 3]
+    assert [sum(f.pointing == fov for f in kept) for fov in (1, 2, 3)] == [3, 3, 3]
     frame = kept[4]
     assert frame.along_x is not None and frame.along_y is not None
     y, x = round(frame.found.place.y_px), round(frame.found.place.x_px)

@@ -49,7 +49,7 @@ def test_a_gradient_over_the_detector_is_found() -> None:
     share = -np.array(left) / added
     assert share.min() > 0.6 and share.max() < 1
     for trend in (t for t in trends(found) if t.against == "x"):
-        here = [n for n, f in enumerate(found.frames) if f.fov == trend.fov]
+        here = [n for n, f in enumerate(found.frames) if f.pointing == trend.fov]
         where, noise = (np.array([get(found.frames[n]) for n in here]) for get in (x_px, noise_dn_s))
         expected = np.polyfit(where, np.array(left)[here], 1, w=1 / noise)[0]
         assert trend.absolute_dn_s.per_100_px == pytest.approx(100 * expected, rel=0.03)

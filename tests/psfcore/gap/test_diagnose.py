@@ -170,7 +170,9 @@ def test_light_lost_by_clipping_is_attributed_to_saturation_fill(clean: Transit)
     filled = inside > 0
     lost = np.where(filled, np.sqrt(np.maximum(inside, 0)) / 7, 0.0)
     frames = tuple(
-        replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=filled) if f.fov == fov else f
+        replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=filled)
+        if f.pointing == fov
+        else f
         for f in clean.frames
     )
     found = verdict(replace(clean, frames=frames))
@@ -202,12 +204,12 @@ def test_the_noise_of_the_images_is_measured(clean: Transit) -> None:
     # Not 10 %: for pixels with a few photons the median deviation is smaller than a normal distribution's by that much.
     assert found.noise.photon_gain_dn == pytest.approx(clean.noise.photon_gain_dn, rel=0.2)
     first, second = clean.frames[:2]
-    assert measured_noise(replace(clean, frames=(first, replace(second, fov=2)))) is None
+    assert measured_noise(replace(clean, frames=(first, replace(second, pointing=2)))) is None
 
 
 @pytest.mark.slow
 def test_cautions_tell_what_one_pointing_and_few_images_cannot_show(clean: Transit) -> None:
-    one = replace(clean, frames=tuple(f for f in clean.frames if f.fov == 2))
+    one = replace(clean, frames=tuple(f for f in clean.frames if f.pointing == 2))
     found = verdict(one)
     assert found.judgement.answer == ()
     assert any("One pointing" in c for c in found.cautions) and any(

@@ -134,9 +134,9 @@ def test_limits_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [line for line in fitted().limits if "field is 128 px" in line]
     transit, inversion = solved().transit, solved().inversion
     one_pointing = dataclasses.replace(
-        transit, frames=tuple(dataclasses.replace(f, fov=2) for f in transit.frames)
+        transit, frames=tuple(dataclasses.replace(f, pointing=2) for f in transit.frames)
     )
-    frames = [dataclasses.replace(f, fov=2) for f in inversion.frames]
+    frames = [dataclasses.replace(f, pointing=2) for f in inversion.frames]
     frames[4] = dataclasses.replace(frames[4], found=dataclasses.replace(frames[4].found, settled=False))
     unsure = with_inversion(
         dataclasses.replace(solved(), transit=one_pointing),

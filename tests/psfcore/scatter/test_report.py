@@ -60,7 +60,7 @@ def test_a_report_is_json_with_the_values_of_the_fit() -> None:
     assert [s["name"] for s in content["shapes"]] == [s.name for s in fit.shapes]
     assert content["shapes"][0]["added"]["stretch_p"]["sigma"] > 0
     assert len(content["free_shells"]["weight"]["median"]) == 50
-    assert content["first_guess"]["best_fov"] == fit.first_guess.best_fov
+    assert content["first_guess"]["best_fov"] == fit.first_guess.best_pointing
     assert "stretch" not in content and "as_published" not in content
 
 

@@ -1,4 +1,4 @@
-"""The photon bound against differences of whole simulations, and against what noise does."""
+"""The photon bound agrees with differences of whole simulations and with the scatter of noisy fits."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def plan() -> Plan:
 
 @pytest.fixture(scope="module")
 def scenes(plan: Plan) -> dict[int, Plane]:
-    return {fov: drawn_scene(plan, fov, 5) for fov in plan.fovs}
+    return {pointing: drawn_scene(plan, pointing, 5) for pointing in plan.pointings}
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def dark_variances(sky: TrueSky) -> Plane:
 
 @pytest.fixture(scope="module")
 def slopes(plan: Plan, scenes: dict[int, Plane]) -> Plane:
-    """What b, c, total and stretch do to the dark pixels, from whole simulations on either side."""
+    """The derivatives of the dark pixels with respect to b, c, total and stretch, from differences of whole simulations."""
     rows = []
     for name, step in STEPS.items():
         sides = [
@@ -100,7 +100,7 @@ def test_kernel_slopes_are_differences_of_kernels() -> None:
         assert of_a[name] == pytest.approx((ahead.a - back.a) / (2 * step), rel=1e-6, abs=1e-9)
 
 
-def test_the_bound_is_the_information_of_whole_simulations(
+def test_the_bound_agrees_with_differences_of_whole_simulations(
     bound: PhotonBound, sky: TrueSky, slopes: Plane
 ) -> None:
     weighted = slopes / dark_variances(sky)
@@ -113,7 +113,7 @@ def test_the_bound_is_the_information_of_whole_simulations(
     assert bound.images == 6
 
 
-def test_noise_scatters_a_fit_as_the_bound_says(bound: PhotonBound, sky: TrueSky, slopes: Plane) -> None:
+def test_a_fit_scatters_by_the_bound(bound: PhotonBound, sky: TrueSky, slopes: Plane) -> None:
     """The best linear fit of b, c, total to 300 noisy transits."""
     weighted = slopes[:3] / dark_variances(sky)
     fit = np.linalg.solve(weighted @ slopes[:3].T, weighted)
@@ -132,11 +132,11 @@ def test_noise_scatters_a_fit_as_the_bound_says(bound: PhotonBound, sky: TrueSky
 
 
 def correlation(bound: PhotonBound) -> float:
-    """Of b with c."""
+    """The correlation of b with c."""
     return bound.covariance[0][1] / (bound.b_px * bound.c)
 
 
-def test_curves_err_as_their_slopes_say(bound: PhotonBound) -> None:
+def test_errors_of_curves_follow_from_their_slopes(bound: PhotonBound) -> None:
     radii = [at.radius_px for at in bound.curve]
     assert radii == [0.5, 2, 5, 10, 20, 50, 100, 200, 300]
     covariance = np.array(bound.covariance)
@@ -160,7 +160,7 @@ def test_curves_err_as_their_slopes_say(bound: PhotonBound) -> None:
     assert bound.curve[0].diffuse_sigma == pytest.approx(100 * bound.total)
 
 
-def test_places_err_as_whole_simulations_say(
+def test_errors_of_places_agree_with_whole_simulations(
     bound: PhotonBound, plan: Plan, scenes: dict[int, Plane], sky: TrueSky
 ) -> None:
     step = 0.002
@@ -196,7 +196,7 @@ def test_four_times_the_light_halves_the_errors(bound: PhotonBound, sky: TrueSky
     assert 1.001 * once.total < bound.total < 1.2 * once.total  # what 2 DN of readout cost
 
 
-def test_clipping_takes_pixels_round_the_disc_away(bound: PhotonBound, sky: TrueSky) -> None:
+def test_clipped_pixels_around_the_disc_are_not_used(bound: PhotonBound, sky: TrueSky) -> None:
     clipped = dataclasses.replace(sky.plan, saturation_dn=600.0)
     found = bound_of_sky(dataclasses.replace(sky, plan=clipped))
     assert found.total == pytest.approx(bound.total, rel=1e-9)  # dark pixels are far below it
@@ -204,7 +204,7 @@ def test_clipping_takes_pixels_round_the_disc_away(bound: PhotonBound, sky: True
     assert found.places_px[0] == pytest.approx(bound.places_px[0])  # combined gain does not clip
 
 
-def test_a_folder_gives_the_bound_of_its_transit(tmp_path: Path) -> None:
+def test_the_bound_of_a_folder_is_that_of_its_transit(tmp_path: Path) -> None:
     simulated = simulate(default_plan(3, 64), dataclasses.replace(SCATTER, stretch=0.1), DIFFRACTION, 2)
     write(simulated, tmp_path)
     kept, read = photon_bound(simulated), bound_of_folder(tmp_path)

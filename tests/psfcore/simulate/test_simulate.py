@@ -26,13 +26,13 @@ def test_a_scene_has_the_contrasts_of_the_sun() -> None:
     assert brightest > 5000
 
 
-def test_without_noise_and_blur_the_scene_is_seen_as_it_is() -> None:
+def test_without_noise_and_blur_the_image_is_the_scene() -> None:
     scene = solar_scene((48, 48), 2)
     seen = observe(scene, make_psf(delta(16)), exposure_s=2.0, photon_gain_dn=0, read_noise_dn=0, seed=1)
     np.testing.assert_allclose(seen, scene, rtol=1e-12)
 
 
-def test_noise_has_the_variance_of_photons_and_readout() -> None:
+def test_noise_has_the_variance_of_photon_and_read_noise() -> None:
     scene = np.full((400, 400), 300.0)
     exposure_s, gain_dn, read_dn = 1.4, 6.0, 2.0
     seen = observe(
@@ -48,7 +48,7 @@ def test_noise_has_the_variance_of_photons_and_readout() -> None:
     assert (seen * exposure_s).var() == pytest.approx(expected_dn2, rel=0.02)
 
 
-def test_blur_moves_light_and_keeps_it() -> None:
+def test_blur_conserves_light() -> None:
     scene = np.zeros((64, 64))
     scene[32, 32] = 1000.0
     seen = observe(

@@ -1,4 +1,4 @@
-"""A simulated transit is what its plan and its truth say it is."""
+"""Simulated transits agree with their plan and their truth."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def small() -> SimulatedTransit:
 
 @pytest.fixture(scope="module")
 def beyond() -> TrueSky:
-    """A field of 96 px, and as much of the Sun again on each side."""
+    """A field of 96 px, with 96 px more of the Sun on each side."""
     return true_sky(default_plan(6, 96, beyond="on", beyond_px=96), SCATTER, DIFFRACTION, 3)
 
 
 def flat_sky(plan: Plan, dn_per_s: float) -> TrueSky:
-    """Even light in every pointing."""
+    """Uniform scenes for all pointings."""
     edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
-    scenes = {fov: np.full((edge, edge), dn_per_s) for fov in plan.fovs}
+    scenes = {pointing: np.full((edge, edge), dn_per_s) for pointing in plan.pointings}
     return true_sky(plan, SCATTER, DIFFRACTION, 1, scenes=scenes)
 
 
@@ -54,11 +54,11 @@ def flat_sky(plan: Plan, dn_per_s: float) -> TrueSky:
 
 
 def counts(plan: Plan) -> list[tuple[int, float, str, int]]:
-    kinds = [(shot.fov, shot.exposure_s, shot.gain_mode) for shot in plan.shots]
+    kinds = [(shot.pointing, shot.exposure_s, shot.gain_mode) for shot in plan.shots]
     return [(*kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)]
 
 
-def test_126_images_are_shared_out_as_in_the_paper() -> None:
+def test_126_images_are_divided_as_in_the_paper() -> None:
     assert counts(default_plan(126, 512)) == [
         (1, 5.0, COMBINED, 10),
         (1, 0.9, HIGH, 14),
@@ -70,7 +70,7 @@ def test_126_images_are_shared_out_as_in_the_paper() -> None:
 
 @pytest.mark.parametrize("images", [1, 2, 3, 7, 30, 61, 200])
 @pytest.mark.parametrize("size_px", [64, 100, 512])
-def test_any_number_of_images_on_any_field(images: int, size_px: int) -> None:
+def test_a_plan_can_have_any_number_of_images_and_any_field(images: int, size_px: int) -> None:
     plan = default_plan(images, size_px)
     assert len(plan.shots) == images
     times = [shot.time_s for shot in plan.shots]
@@ -80,7 +80,11 @@ def test_any_number_of_images_on_any_field(images: int, size_px: int) -> None:
         assert place.radius_px < min(place.x_px, place.y_px)
         assert max(place.x_px, place.y_px) < size_px - 1 - place.radius_px
     if images == 30:
-        assert [sum(shot.fov == fov for shot in plan.shots) for fov in (1, 2, 3)] == [10, 10, 10]
+        assert [sum(shot.pointing == pointing for shot in plan.shots) for pointing in (1, 2, 3)] == [
+            10,
+            10,
+            10,
+        ]
 
 
 def test_a_plan_is_read_back_from_json() -> None:
@@ -100,7 +104,7 @@ def test_a_plan_is_read_back_from_json() -> None:
         {"views": ("disc", "disc")},
     ],
 )
-def test_a_plan_that_cannot_be_is_refused(changes: dict[str, object]) -> None:
+def test_an_impossible_plan_is_refused(changes: dict[str, object]) -> None:
     with pytest.raises(DataError, match="bad-plan"):
         default_plan(6, 64, **changes)
 
@@ -109,7 +113,7 @@ def test_a_plan_that_cannot_be_is_refused(changes: dict[str, object]) -> None:
 
 
 @pytest.mark.parametrize("fine", [1, 2])
-def test_covered_area_is_the_circles(fine: int) -> None:
+def test_the_covered_area_is_that_of_the_circle(fine: int) -> None:
     place = Place(20.3, 18.77, 10.75)
     share = covered_share(place, (0, 0), (40, 41), fine)
     assert share.sum() / fine**2 == pytest.approx(np.pi * 10.75**2, rel=1e-12)
@@ -121,14 +125,14 @@ def test_covered_area_is_the_circles(fine: int) -> None:
     np.testing.assert_allclose(share, counted, atol=0.03)
 
 
-def test_fully_dark_pixels_are_those_covered_whole() -> None:
+def test_fully_dark_pixels_are_completely_covered() -> None:
     place = Place(20.3, 18.77, 10.75)
     dark = fully_dark(place, (3, 5), (36, 35))
     np.testing.assert_array_equal(dark, covered_share(place, (3, 5), (36, 35)) > 1 - 1e-12)
     assert 290 < dark.sum() < 350
 
 
-def test_what_a_shift_hides_is_its_slope() -> None:
+def test_hidden_slopes_agree_with_shifts() -> None:
     rng = np.random.default_rng(1)
     around = Behind((4, 6), rng.uniform(50, 150, (60, 60)), 2)
     by_x, by_y = around.hidden_slopes(Place(20.2, 19.1, 10.75))
@@ -142,13 +146,13 @@ def test_what_a_shift_hides_is_its_slope() -> None:
 # --- the PSF ----------------------------------------------------------------------------------------------
 
 
-def test_without_direction_it_is_the_power_law() -> None:
+def test_isotropic_scatter_is_the_power_law() -> None:
     expected = scatter_kernel(6.15, 2.53, 0.411, 128)
     np.testing.assert_allclose(anisotropic_kernel(SCATTER, 128), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("stretch, dipole", [(0.0, 0.0), (0.15, 0.0), (-0.1, 0.3)])
-def test_light_is_kept(stretch: float, dipole: float) -> None:
+def test_the_kernel_sums_to_1(stretch: float, dipole: float) -> None:
     scatter = dataclasses.replace(SCATTER, stretch=stretch, angle_deg=30.0, dipole=dipole)
     kernel = anisotropic_kernel(scatter)
     assert kernel.sum() == pytest.approx(1, abs=1e-12)
@@ -175,7 +179,7 @@ def test_dipole_follows_its_definition() -> None:
 @pytest.mark.parametrize(
     "changes", [{"b_px": 0.0}, {"c": float("nan")}, {"total": 1.0}, {"stretch": -1.0}, {"dipole": 1.1}]
 )
-def test_a_scatter_that_is_no_psf_is_refused(changes: dict[str, float]) -> None:
+def test_impossible_scatter_is_refused(changes: dict[str, float]) -> None:
     with pytest.raises(DataError, match="bad-scatter"):
         dataclasses.replace(SCATTER, **changes)
 
@@ -188,7 +192,7 @@ def test_a_diffraction_that_loses_light_is_refused() -> None:
 # --- what a camera without noise sees ---------------------------------------------------------------------
 
 
-def test_hiding_a_patch_is_seeing_the_dark_scene(small: SimulatedTransit, beyond: TrueSky) -> None:
+def test_removing_a_patch_equals_convolving_the_dark_scene(small: SimulatedTransit, beyond: TrueSky) -> None:
     for sky in (small.sky, beyond):
         margin = sky.plan.margin_px
         edge = sky.plan.size_px + 2 * margin
@@ -199,8 +203,8 @@ def test_hiding_a_patch_is_seeing_the_dark_scene(small: SimulatedTransit, beyond
             np.testing.assert_allclose(sky.expected(index), direct, rtol=1e-9)
 
 
-def test_a_pixel_is_the_sum_that_the_definition_says(beyond: TrueSky) -> None:
-    """Scene, diffracted without an edge, then the power law written out, pixel by pixel."""
+def test_a_pixel_is_the_sum_of_the_definition(beyond: TrueSky) -> None:
+    """The scene is convolved with the diffraction, then with the power law by an explicit sum over pixels."""
     index, margin = 2, beyond.plan.margin_px
     diffracted = fftconvolve(beyond.true_scene_and_beyond(index), DIFFRACTION)  # 15 px more on each side
     expected = beyond.expected(index)
@@ -229,12 +233,12 @@ def test_the_occulter_is_dark_in_the_true_scene_and_lit_by_scatter(small: Simula
         assert small.true_scene(index)[dark].max() < 1e-9
         assert small.noise_free[index][dark].min() > 0
         lit = covered_share(small.plan.place(index), (0, 0), (96, 96)) == 0
-        fov = small.plan.shots[index].fov
-        np.testing.assert_array_equal(small.true_scene(index)[lit], small.scenes[fov][lit])
+        pointing = small.plan.shots[index].pointing
+        np.testing.assert_array_equal(small.true_scene(index)[lit], small.scenes[pointing][lit])
 
 
-def test_half_pixels_are_binned_after_the_edge_is_drawn() -> None:
-    """Light in one half pixel, the disc's edge between it and the other."""
+def test_half_pixels_are_binned_after_the_disc_is_removed() -> None:
+    """Light in one half pixel; the edge of the disc is between it and the other half."""
     plan = default_plan(1, 64)
     plan = dataclasses.replace(plan, shots=(dataclasses.replace(plan.shots[0], x_px=32 - 10.75, y_px=30.0),))
     fine = np.zeros((128, 128))
@@ -246,9 +250,9 @@ def test_half_pixels_are_binned_after_the_edge_is_drawn() -> None:
 
 
 def test_light_from_beyond_the_field_raises_the_discs(beyond: TrueSky) -> None:
-    """The same field with darkness round it: far off the limb the discs lose most."""
+    """The same field with a dark surrounding: the discs far off the limb lose most light."""
     plan = dataclasses.replace(beyond.plan, beyond="dark", beyond_px=None, oversampling=1)
-    fields = {fov: scene[96:-96, 96:-96] for fov, scene in beyond.scenes.items()}
+    fields = {pointing: scene[96:-96, 96:-96] for pointing, scene in beyond.scenes.items()}
     dark = true_sky(plan, SCATTER, DIFFRACTION, 3, scenes=fields)
     ratios = []
     for index in range(6):
@@ -262,7 +266,7 @@ def test_light_from_beyond_the_field_raises_the_discs(beyond: TrueSky) -> None:
 # --- noise, ephemeris, camera -----------------------------------------------------------------------------
 
 
-def test_noise_has_the_variance_of_photons_and_readout() -> None:
+def test_noise_has_the_variance_of_photon_and_read_noise() -> None:
     plan = default_plan(6, 64, whole_dn=False)
     sky = flat_sky(plan, 60.0)
     pulls: dict[int, list[NDArray[np.float64]]] = {index: [] for index in range(6)}
@@ -309,7 +313,7 @@ def test_a_dark_offset_is_added_to_every_pixel() -> None:
         assert added.mean() == pytest.approx(7.0, abs=4 * added.std() / 64)
 
 
-def test_the_ephemeris_errs_by_its_rms() -> None:
+def test_the_errors_of_the_ephemeris_have_its_rms() -> None:
     sky = flat_sky(default_plan(6, 64), 1.0)
     errors = []
     for seed in range(100):
@@ -325,7 +329,7 @@ def test_the_ephemeris_errs_by_its_rms() -> None:
         assert frame.place.x_px == pytest.approx(place.x_px, abs=0.0501)
 
 
-def test_one_seed_gives_one_transit(small: SimulatedTransit) -> None:
+def test_equal_seeds_give_equal_transits(small: SimulatedTransit) -> None:
     again = simulate(small.plan, SCATTER, DIFFRACTION, 3)
     other = observed_transit(small.sky, 4)
     for one, same, differs in zip(
@@ -343,9 +347,9 @@ def test_one_seed_gives_one_transit(small: SimulatedTransit) -> None:
 # --- scenes -----------------------------------------------------------------------------------------------
 
 
-def test_the_limb_is_on_the_side_that_the_pointing_says() -> None:
+def test_the_limb_is_on_the_side_of_the_pointing() -> None:
     plan = default_plan(3, 128)
-    east, disc, west = (drawn_scene(plan, fov, 5) for fov in (1, 2, 3))
+    east, disc, west = (drawn_scene(plan, pointing, 5) for pointing in (1, 2, 3))
     assert east[:, -20:].mean() > 20 * east[:, :20].mean()
     assert west[:, :20].mean() > 20 * west[:, -20:].mean()
     assert np.percentile(disc, 1) > 20
@@ -353,7 +357,7 @@ def test_the_limb_is_on_the_side_that_the_pointing_says() -> None:
 
 
 def test_discs_are_as_bright_as_in_practice() -> None:
-    """Two or three photons a pixel far off the limb, hundreds of DN on the disc."""
+    """Two or three photons per pixel far off the limb, hundreds of DN on the disc."""
     simulated = simulate(default_plan(6, 192), SCATTER, DIFFRACTION, 2)
     means = []
     for index, shot in enumerate(simulated.plan.shots):
@@ -363,7 +367,7 @@ def test_discs_are_as_bright_as_in_practice() -> None:
     assert min(means[2:4]) > 150 and max(means[2:4]) < 1500
 
 
-def test_the_drawn_scene_without_a_layout_is_what_it_always_was() -> None:
+def test_the_default_scene_has_not_changed() -> None:
     for shape, seed, mean, brightest in (
         ((64, 64), 5, 1806.6784176258332, 57303.802124101276),
         ((33, 128), 5, 1685.2884243856727, 31376.684082156185),
@@ -373,7 +377,7 @@ def test_the_drawn_scene_without_a_layout_is_what_it_always_was() -> None:
         assert scene.max() == pytest.approx(brightest, rel=1e-9)
 
 
-def test_a_margin_draws_on_beyond_the_field() -> None:
+def test_a_margin_extends_the_scene_beyond_the_field() -> None:
     scene = solar_scene((96, 96), 4, margin_px=30)
     assert scene.shape == (156, 156)
     # The limb is where it is without a margin: dim to its left, bright to its right.
@@ -409,7 +413,7 @@ def test_scenes_of_another_shape_are_refused() -> None:
 # --- files ------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_holds_the_transit_and_its_truth(tmp_path: Path) -> None:
+def test_a_folder_contains_the_transit_and_its_truth(tmp_path: Path) -> None:
     plan = default_plan(6, 64, saturation_dn=300.0)
     simulated = simulate(plan, dataclasses.replace(SCATTER, stretch=0.1), DIFFRACTION, 9)
     write(simulated, tmp_path / "t")
@@ -426,7 +430,7 @@ def test_a_folder_holds_the_transit_and_its_truth(tmp_path: Path) -> None:
         assert image.unit == "DN" and image.exposure_s == shot.exposure_s
         np.testing.assert_allclose(image.pixels / shot.exposure_s, frame.pixels, rtol=1e-6, atol=1e-6)
         assert (entry["fov"], entry["x"], entry["y"], entry["r"]) == (
-            frame.fov,
+            frame.pointing,
             frame.place.x_px,
             frame.place.y_px,
             10.75,

@@ -1,4 +1,4 @@
-"""An archive is taken apart whole or not at all, whatever it claims."""
+"""Archives: listed, packed, and unpacked completely or not at all, whatever they declare."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shutil
 import stat
 import struct
 import tarfile
+import time
 import tracemalloc
 import warnings
 import zipfile
@@ -20,7 +21,7 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.transit import archive
+from psfcore.transit import admission
 from psfcore.transit.archive import (
     START_BYTES,
     ArchiveLimits,
@@ -46,7 +47,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(written: Path, tmp_path: Path) -> Path:
-    """A transit of the test's own."""
+    """A transit for one test."""
     return shutil.copytree(written, tmp_path / "transit")
 
 
@@ -58,7 +59,7 @@ def as_zip(path: Path, members: list[Member]) -> Path:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as out:
         for name, content in members:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # a name that stands twice
+                warnings.simplefilter("ignore", UserWarning)  # a name that occurs twice
                 out.writestr(zipfile.ZipInfo(name) if name.endswith("/") else name, content)
     return path
 
@@ -82,7 +83,7 @@ KINDS = [as_zip, as_tar, as_tar_gz]
 def refused(
     path: Path, target: Path, code: str, limits: ArchiveLimits = LIMITS, *, listed: bool = True
 ) -> str:
-    """Refused when unpacked, and when listed where that can show; nothing is left. Returns the message."""
+    """Check that unpacking, and listing if `listed`, refuses an archive and leaves nothing. Returns the message."""
     for look in [lambda: list_archive(path, limits)] if listed else []:
         with pytest.raises(DataError) as caught:
             look()
@@ -91,16 +92,16 @@ def refused(
         unpack(path, target, limits)
     assert caught.value.code == code, caught.value
     assert "expected" in caught.value.message
-    assert not target.exists(), "nothing is left behind"
+    assert not target.exists(), "files were left behind"
     return caught.value.message
 
 
-# --- what is taken ----------------------------------------------------------------------------------------
+# --- accepted --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("make", KINDS)
 @pytest.mark.parametrize("top", ["", "p1/", "./", "./p1/"])
-def test_files_come_out_as_they_went_in(folder: Path, tmp_path: Path, make: Maker, top: str) -> None:
+def test_unpacked_files_equal_the_packed_files(folder: Path, tmp_path: Path, make: Maker, top: str) -> None:
     members = members_of(folder, top)
     path = make(tmp_path / "no-ending", [(top, b""), *members] if top not in ("", "./") else members)
     contents = list_archive(path, LIMITS)
@@ -115,7 +116,7 @@ def test_files_come_out_as_they_went_in(folder: Path, tmp_path: Path, make: Make
 
 
 @pytest.mark.parametrize("make", KINDS)
-def test_what_systems_add_is_left_out(folder: Path, tmp_path: Path, make: Maker) -> None:
+def test_files_that_operating_systems_add_are_skipped(folder: Path, tmp_path: Path, make: Maker) -> None:
     extra = [
         ".DS_Store",
         "__MACOSX/._000.fits",
@@ -138,7 +139,7 @@ def test_long_and_foreign_names_in_a_tar(tmp_path: Path, form: int) -> None:
     assert (tmp_path / "out" / names[0]).read_bytes() == b"1234"
 
 
-def test_a_packed_folder_is_the_same_bytes_each_time_and_comes_back(folder: Path, tmp_path: Path) -> None:
+def test_equal_folders_are_packed_to_equal_bytes_and_can_be_unpacked(folder: Path, tmp_path: Path) -> None:
     (folder / "notes.txt").write_text("not named in transit.json")
     pack(folder, tmp_path / "a.tar")
     again = tmp_path / "elsewhere"
@@ -155,7 +156,7 @@ def test_a_packed_folder_is_the_same_bytes_each_time_and_comes_back(folder: Path
         pack(folder, tmp_path / "c.tar")
 
 
-def test_kinds_are_told_by_their_first_bytes(folder: Path, tmp_path: Path) -> None:
+def test_the_first_bytes_tell_the_kind(folder: Path, tmp_path: Path) -> None:
     for make, kind in ((as_zip, "zip"), (as_tar, "tar"), (as_tar_gz, "gzip")):
         start = make(tmp_path / kind, members_of(folder)).read_bytes()[:START_BYTES]
         assert archive_kind(start) == kind
@@ -164,7 +165,7 @@ def test_kinds_are_told_by_their_first_bytes(folder: Path, tmp_path: Path) -> No
     assert not could_be_archive(b"SIMPLE  =" + bytes(300))
 
 
-# --- what is refused --------------------------------------------------------------------------------------
+# --- refused --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("make", KINDS)
@@ -181,7 +182,9 @@ def test_kinds_are_told_by_their_first_bytes(folder: Path, tmp_path: Path) -> No
         "__MACOSX/../e",
     ],
 )
-def test_names_that_climb(folder: Path, tmp_path: Path, make: Maker, name: str) -> None:
+def test_names_that_lead_out_of_the_folder_are_refused(
+    folder: Path, tmp_path: Path, make: Maker, name: str
+) -> None:
     path = make(tmp_path / "a", [*members_of(folder), (name, b"evil")])
     message = refused(path, tmp_path / "deep/er/out", "archive-climbs")
     assert ascii(name) in message
@@ -201,12 +204,14 @@ def test_names_that_climb(folder: Path, tmp_path: Path, make: Maker, name: str) 
         ["x" * 300],
     ],
 )
-def test_what_is_not_plain(folder: Path, tmp_path: Path, make: Maker, extra: list[str]) -> None:
+def test_names_that_are_not_plain_are_refused(
+    folder: Path, tmp_path: Path, make: Maker, extra: list[str]
+) -> None:
     path = make(tmp_path / "a", [*members_of(folder), *((name, b"") for name in extra)])
     refused(path, tmp_path / "out", "archive-not-plain")
 
 
-def test_two_folders_at_the_top(folder: Path, tmp_path: Path) -> None:
+def test_two_folders_at_the_top_are_refused(folder: Path, tmp_path: Path) -> None:
     path = as_zip(tmp_path / "a", [*members_of(folder, "p1/"), ("p2/x.fits", b"")])
     refused(path, tmp_path / "out", "archive-not-plain")
 
@@ -214,7 +219,7 @@ def test_two_folders_at_the_top(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.FIFOTYPE, b"S", b"Z"]
 )
-def test_links_and_devices_in_a_tar(folder: Path, tmp_path: Path, kind: bytes) -> None:
+def test_links_and_devices_in_a_tar_are_refused(folder: Path, tmp_path: Path, kind: bytes) -> None:
     path = tmp_path / "a.tar"
     as_tar(path, members_of(folder))
     with tarfile.open(path, "a") as out:
@@ -226,7 +231,7 @@ def test_links_and_devices_in_a_tar(folder: Path, tmp_path: Path, kind: bytes) -
 
 @pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFCHR, stat.S_IFIFO])
 @pytest.mark.parametrize("name", ["x.fits", "x/"])
-def test_links_and_devices_in_a_zip(folder: Path, tmp_path: Path, kind: int, name: str) -> None:
+def test_links_and_devices_in_a_zip_are_refused(folder: Path, tmp_path: Path, kind: int, name: str) -> None:
     path = as_zip(tmp_path / "a.zip", members_of(folder))
     with zipfile.ZipFile(path, "a") as out:
         info = zipfile.ZipInfo(name)
@@ -236,7 +241,7 @@ def test_links_and_devices_in_a_zip(folder: Path, tmp_path: Path, kind: int, nam
 
 
 def patched(path: Path, member: str, offset_central: int, offset_local: int, form: str, value: int) -> Path:
-    """A zip with a field of one member overwritten, in its table of contents and before its bytes."""
+    """Overwrite a field of one member of a zip, in the table of contents and in the local header."""
     with zipfile.ZipFile(path) as out:
         at_local = out.getinfo(member).header_offset
     content = bytearray(path.read_bytes())
@@ -247,23 +252,23 @@ def patched(path: Path, member: str, offset_central: int, offset_local: int, for
     return path
 
 
-def test_an_encrypted_zip(folder: Path, tmp_path: Path) -> None:
+def test_an_encrypted_zip_is_refused(folder: Path, tmp_path: Path) -> None:
     path = patched(as_zip(tmp_path / "a.zip", members_of(folder)), "001.fits", 8, 6, "<H", 1)
     assert "encrypted" in refused(path, tmp_path / "out", "archive-not-plain")
 
 
-def test_a_method_that_is_not_taken(folder: Path, tmp_path: Path) -> None:
+def test_other_compression_methods_are_refused(folder: Path, tmp_path: Path) -> None:
     path = patched(as_zip(tmp_path / "a.zip", members_of(folder)), "001.fits", 10, 8, "<H", 12)
     assert "deflated" in refused(path, tmp_path / "out", "archive-not-plain")
 
 
-def test_too_many_members(folder: Path, tmp_path: Path) -> None:
+def test_too_many_members_are_refused(folder: Path, tmp_path: Path) -> None:
     for make in KINDS:
         members = [(f".{i}", b"") for i in range(101)]
         refused(make(tmp_path / "a", members), tmp_path / "out", "archive-too-large", SMALL)
 
 
-def test_a_table_of_contents_too_large(tmp_path: Path) -> None:
+def test_a_table_of_contents_that_is_too_large_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.zip"
     with zipfile.ZipFile(path, "w") as out:
         for index in range(25):
@@ -277,29 +282,31 @@ def test_a_table_of_contents_too_large(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", KINDS)
-def test_a_member_that_is_too_large(folder: Path, tmp_path: Path, make: Maker) -> None:
+def test_a_member_that_is_too_large_is_refused(folder: Path, tmp_path: Path, make: Maker) -> None:
     path = make(tmp_path / "a", [*members_of(folder), ("x.fits", bytes(600_000))])
     refused(path, tmp_path / "out", "archive-too-large", SMALL)
 
 
 @pytest.mark.parametrize("make", KINDS)
-def test_members_that_are_too_large_together(folder: Path, tmp_path: Path, make: Maker) -> None:
+def test_members_that_are_too_large_together_are_refused(folder: Path, tmp_path: Path, make: Maker) -> None:
     path = make(tmp_path / "a", [*members_of(folder), *((f"{i}.x", bytes(400_000)) for i in range(3))])
     refused(path, tmp_path / "out", "archive-too-large", SMALL)
 
 
-def test_more_comes_out_than_goes_in(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_ratio_of_unpacked_to_packed_bytes_is_limited(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for make in (as_zip, as_tar_gz):
         path = make(tmp_path / "a", [*members_of(folder), ("x.fits", bytes(5 * MIB))])
-        assert len(list_archive(path, LIMITS).files) == 6, "little comes out: the ratio does not count"
+        assert len(list_archive(path, LIMITS).files) == 6, "the ratio does not count for small output"
         with monkeypatch.context() as patch:
-            patch.setattr(archive, "RATIO_FLOOR_BYTES", MIB)
+            patch.setattr(admission, "RATIO_FLOOR_BYTES", MIB)
             refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_ratio=20))
 
 
 @contextmanager
 def held_below(limit_bytes: int) -> Iterator[None]:
-    """Fails where more memory was taken than that."""
+    """Fail if more memory is allocated."""
     tracemalloc.start()
     try:
         yield
@@ -309,7 +316,7 @@ def held_below(limit_bytes: int) -> Iterator[None]:
 
 
 def endless_gz(path: Path, start: bytes, mib: int) -> Path:
-    """A gzip of ``start`` and then nothing but zeros."""
+    """A gzip of ``start``, followed by zeros."""
     with gzip.open(path, "wb", compresslevel=1) as out:
         out.write(start)
         for _ in range(mib):
@@ -324,30 +331,125 @@ def tar_header(name: str, size: int, kind: bytes = tarfile.REGTYPE) -> bytes:
 
 
 @pytest.mark.parametrize("name", ["x.fits", ".hidden"])
-def test_a_gzip_without_end_stops_at_the_limit(tmp_path: Path, name: str) -> None:
+def test_an_endless_gzip_is_read_only_to_the_limit(tmp_path: Path, name: str) -> None:
     path = endless_gz(tmp_path / "a.tar.gz", tar_header(name, 2**50), mib=48)
     limits = ArchiveLimits(max_bytes=4 * MIB, max_member_bytes=2**60)
     with held_below(8 * MIB):
         refused(path, tmp_path / "out", "archive-too-large", limits)
 
 
-def test_what_comes_out_is_counted_where_little_is_declared(tmp_path: Path) -> None:
-    """A hundred small members that are left out still have to be inflated."""
+def test_skipped_members_of_a_gzip_count(tmp_path: Path) -> None:
+    """Ninety hidden members are skipped, but must be inflated."""
     inside = b"".join(tar_header(f".{i}", 100_000) + bytes(100_352) for i in range(90))
     path = endless_gz(tmp_path / "a.tar.gz", inside, mib=0)
     refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_bytes=4 * MIB))
 
 
 @pytest.mark.parametrize("kind", [b"x", b"g", b"L"])
-def test_a_name_without_end(tmp_path: Path, kind: bytes) -> None:
+def test_an_endless_name_is_refused(tmp_path: Path, kind: bytes) -> None:
     path = endless_gz(tmp_path / "a.tar.gz", tar_header("x", 2**33, kind), mib=32)
     with held_below(8 * MIB):
         refused(path, tmp_path / "out", "archive-broken")
 
 
+def extended(kind: bytes, text: bytes) -> bytes:
+    """An extended header of a tar and its text, filled up to whole blocks."""
+    return tar_header("x", len(text), kind) + text + bytes(-len(text) % 512)
+
+
+def record(key: bytes, value: bytes) -> bytes:
+    """A pax record, whose length counts itself."""
+    length = len(key) + len(value) + 3
+    while len(b"%d" % length) + len(key) + len(value) + 3 != length:
+        length += 1
+    return b"%d %s=%s\n" % (length, key, value)
+
+
+A_FILE = tar_header("x.fits", 4) + b"1234" + bytes(508)
+SPARSE_MAP = record(b"GNU.sparse.major", b"1") + record(b"GNU.sparse.minor", b"0")
+TAR_ATTACKS = {
+    "many headers before one member": (
+        extended(b"x", record(b"comment", b"a")) * 400 + A_FILE,
+        "archive-broken",
+    ),
+    "many long names": (extended(b"L", b"a" * 5000) * 50 + A_FILE, "archive-broken"),
+    "a long run of digits": (extended(b"x", b"1" * 60_000) + A_FILE, "archive-broken"),
+    "digits in a value": (extended(b"x", record(b"comment", b"1" * 60_000)) + A_FILE, "archive-broken"),
+    "records inside each other": (extended(b"x", b"2 " * 30_000 + b"=") + A_FILE, "archive-broken"),
+    "a record that is too long": (extended(b"x", b"99 path=x.fits\n") + A_FILE, "archive-broken"),
+    "a negative header": (tar_header("x", -4096, b"x") + A_FILE, "archive-broken"),
+    "a negative file": (tar_header("x", -4096) + A_FILE, "archive-not-plain"),
+    "a negative size in a record": (extended(b"x", record(b"size", b"-99999")) + A_FILE, "archive-not-plain"),
+    "a size beyond the file": (extended(b"x", record(b"size", b"99999")) + A_FILE, "archive-broken"),
+    "a sparse file of GNU": (tar_header("x.fits", 512, b"S") + b"9" * 2**20, "archive-not-plain"),
+    "a sparse name": (extended(b"x", record(b"GNU.sparse.name", b"y")) + A_FILE, "archive-not-plain"),
+    "a sparse size": (extended(b"g", record(b"GNU.sparse.realsize", b"9")) + A_FILE, "archive-not-plain"),
+    "a sparse map": (
+        extended(b"x", SPARSE_MAP) + tar_header("x.fits", 2**30) + b"9999999\n" + b"1\n" * 2**20,
+        "archive-broken",
+    ),
+    "many global records": (
+        b"".join(extended(b"g", record(b"k%d" % n, b"v")) + tar_header(f".{n}", 0) for n in range(99))
+        + A_FILE,
+        "archive-broken",
+    ),
+    "a path in a record that climbs": (
+        extended(b"x", record(b"path", b"../x.fits")) + A_FILE,
+        "archive-climbs",
+    ),
+    "a path for all that climbs": (extended(b"g", record(b"path", b"/x.fits")) + A_FILE, "archive-climbs"),
+    "a damaged second header": (A_FILE + b"x" * 512 + A_FILE, "archive-broken"),
+    "half a header": (A_FILE + tar_header("y.fits", 0)[:300], "archive-broken"),
+    "no end": (A_FILE, "archive-broken"),
+}
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["tar", "tar.gz"])
+@pytest.mark.parametrize("attack", TAR_ATTACKS)
+def test_headers_of_a_tar_cannot_mislead_tarfile(tmp_path: Path, attack: str, packed: bool) -> None:
+    content, code = TAR_ATTACKS[attack]
+    if attack != "no end" and attack != "half a header":
+        content += bytes(1024)
+    path = tmp_path / "a"
+    path.write_bytes(gzip.compress(content) if packed else content)
+    started = time.process_time()
+    with held_below(8 * MIB):
+        refused(path, tmp_path / "out", code)
+    assert time.process_time() - started < 10
+
+
+def test_ordinary_extended_headers_are_read(tmp_path: Path) -> None:
+    """A global comment (git archive), times and attributes, a long name of GNU tar."""
+    content = (
+        extended(b"g", record(b"comment", b"0123abcd" * 5))
+        + extended(b"x", record(b"mtime", b"1700000000.25") + record(b"LIBARCHIVE.xattr.a", b"Q" * 5000))
+        + A_FILE
+        + extended(b"x", record(b"path", b"y.fits") + record(b"size", b"4"))
+        + A_FILE
+        + extended(b"L", b"z" * 150 + b"\0")
+        + A_FILE
+    )
+    path = tmp_path / "a.tar"
+    path.write_bytes(content + bytes(1024))
+    assert unpack(path, tmp_path / "out", LIMITS) == ("x.fits", "y.fits", "z" * 150)
+    assert {file.read_bytes() for file in (tmp_path / "out").iterdir()} == {b"1234"}
+
+
+def test_entries_of_a_zip_are_counted_before_objects_are_made_of_them(tmp_path: Path) -> None:
+    """100 000 entries in the table of contents, of 46 bytes each; the number that the archive declares is small."""
+    path = as_zip(tmp_path / "a.zip", [("a", b"")])
+    content = path.read_bytes()
+    at, end = content.index(b"PK\1\2"), content.index(b"PK\5\6")
+    entries = content[at:end] * 100_000
+    tail = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 1, 1, len(entries), at, 0)
+    path.write_bytes(content[:at] + entries + tail)
+    with held_below(24 * MIB):  # the table itself, twice
+        assert "members" in refused(path, tmp_path / "out", "archive-too-large")
+
+
 @pytest.mark.parametrize("declared", [10_000, 30_000])
-def test_a_zip_whose_sizes_lie(tmp_path: Path, declared: int) -> None:
-    """50 KiB that hold 48 MiB, said to hold little: stopped there, and told; at once where it cannot be true."""
+def test_a_zip_that_declares_too_small_a_size_is_refused(tmp_path: Path, declared: int) -> None:
+    """50 KiB that hold 48 MiB: reading stops at the declared size. An impossible size is refused when listed."""
     content = as_zip(tmp_path / "a.zip", [("x.fits", bytes(48 * MIB))])
     path = patched(content, "x.fits", 24, 22, "<I", declared)
     assert path.stat().st_size > 40_000
@@ -355,13 +457,13 @@ def test_a_zip_whose_sizes_lie(tmp_path: Path, declared: int) -> None:
         refused(path, tmp_path / "out", "archive-broken", listed=declared == 10_000)
 
 
-def test_a_zip_that_holds_less_than_it_says(folder: Path, tmp_path: Path) -> None:
+def test_a_zip_that_declares_too_large_a_size_is_refused(folder: Path, tmp_path: Path) -> None:
     path = patched(as_zip(tmp_path / "a.zip", members_of(folder)), "001.fits", 24, 22, "<I", 10**6)
     refused(path, tmp_path / "out", "archive-broken", listed=False)
 
 
-def test_many_names_for_the_same_bytes(tmp_path: Path) -> None:
-    """A table of contents whose entries all name one member's bytes."""
+def test_many_entries_for_the_same_bytes_are_refused(tmp_path: Path) -> None:
+    """All entries of the table of contents point to the bytes of one member."""
     path = as_zip(tmp_path / "a.zip", [("000.fits", bytes(MIB))])
     content = path.read_bytes()
     at, end = content.index(b"PK\1\2"), content.index(b"PK\5\6")
@@ -378,14 +480,14 @@ def test_many_names_for_the_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("make", KINDS)
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.9, 0.97])
-def test_an_archive_that_stops_short(folder: Path, tmp_path: Path, make: Maker, share: float) -> None:
+def test_a_truncated_archive_is_refused(folder: Path, tmp_path: Path, make: Maker, share: float) -> None:
     path = make(tmp_path / "a", members_of(folder))
     content = path.read_bytes().rstrip(b"\0")
     path.write_bytes(content[: int(share * len(content))])
     refused(path, tmp_path / "out", "archive-broken")
 
 
-def test_a_wrong_byte_in_a_zip_is_seen_when_it_is_unpacked(folder: Path, tmp_path: Path) -> None:
+def test_unpacking_a_zip_finds_a_wrong_byte(folder: Path, tmp_path: Path) -> None:
     noise = np.random.default_rng(1).bytes(100_000)
     path = as_zip(tmp_path / "a.zip", [*members_of(folder), ("x.fits", noise)])
     content = bytearray(path.read_bytes())
@@ -396,18 +498,18 @@ def test_a_wrong_byte_in_a_zip_is_seen_when_it_is_unpacked(folder: Path, tmp_pat
 
 
 @pytest.mark.parametrize("content", [b"", b"x", b"PK", b"SIMPLE  =" + bytes(5000), bytes(1024)])
-def test_what_is_no_archive(tmp_path: Path, content: bytes) -> None:
+def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a").write_bytes(content)
     refused(tmp_path / "a", tmp_path / "out", "not-an-archive")
 
 
-def test_a_gzip_of_something_else(tmp_path: Path) -> None:
+def test_a_gzip_that_contains_no_tar_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(gzip.compress(b"SIMPLE  =" + bytes(5000)))
     refused(tmp_path / "a", tmp_path / "out", "not-an-archive")
 
 
 @pytest.mark.parametrize("make", KINDS)
-def test_damage_anywhere_is_told_and_leaves_nothing(tmp_path: Path, make: Maker) -> None:
+def test_random_damage_is_reported_and_leaves_nothing_behind(tmp_path: Path, make: Maker) -> None:
     path = make(tmp_path / "a", [("transit.json", b"{}"), ("000.fits", bytes(range(256)) * 3)])
     whole = path.read_bytes()
     rng = np.random.default_rng(5)
@@ -427,14 +529,14 @@ def test_damage_anywhere_is_told_and_leaves_nothing(tmp_path: Path, make: Maker)
     assert "archive-broken" in told
 
 
-def test_what_the_disk_reports_is_no_fault_of_the_archive(folder: Path, tmp_path: Path) -> None:
+def test_errors_of_the_disk_are_passed_on(folder: Path, tmp_path: Path) -> None:
     path = as_tar(tmp_path / "a", members_of(folder))
     out = tmp_path / "out"
     out.mkdir()
     (out / "001.fits").write_text("was here before")
     with pytest.raises(FileExistsError):
         unpack(path, out, LIMITS)
-    assert [p.name for p in out.iterdir()] == ["001.fits"], "what was there stays, what came goes"
+    assert [p.name for p in out.iterdir()] == ["001.fits"], "existing files stay, new ones are removed"
 
 
 # --- the table of contents --------------------------------------------------------------------------------
@@ -445,7 +547,7 @@ def test_what_the_disk_reports_is_no_fault_of_the_archive(folder: Path, tmp_path
     ("missing", "code"),
     [("transit.json", "no-manifest"), ("001.fits", "missing-file"), ("diffraction.fits", "missing-file")],
 )
-def test_what_is_missing(folder: Path, tmp_path: Path, make: Maker, missing: str, code: str) -> None:
+def test_missing_files_are_named(folder: Path, tmp_path: Path, make: Maker, missing: str, code: str) -> None:
     members = [member for member in members_of(folder) if member[0] != missing]
     with pytest.raises(DataError) as caught:
         list_archive(make(tmp_path / "a", members), LIMITS)
@@ -453,7 +555,7 @@ def test_what_is_missing(folder: Path, tmp_path: Path, make: Maker, missing: str
 
 
 @pytest.mark.parametrize("make", KINDS)
-def test_what_is_no_image(folder: Path, tmp_path: Path, make: Maker) -> None:
+def test_a_file_that_is_not_fits_is_named(folder: Path, tmp_path: Path, make: Maker) -> None:
     (folder / "001.fits").write_bytes(b"hello")
     with pytest.raises(DataError, match=r"001\.fits") as caught:
         list_archive(make(tmp_path / "a", members_of(folder)), LIMITS)
@@ -462,14 +564,14 @@ def test_what_is_no_image(folder: Path, tmp_path: Path, make: Maker) -> None:
 
 @pytest.mark.parametrize("make", KINDS)
 @pytest.mark.parametrize("content", [b"{}", b"{" * 10, b" " * (5 * MIB)])
-def test_a_bad_manifest(folder: Path, tmp_path: Path, make: Maker, content: bytes) -> None:
+def test_a_bad_manifest_is_refused(folder: Path, tmp_path: Path, make: Maker, content: bytes) -> None:
     (folder / "transit.json").write_bytes(content)
     with pytest.raises(DataError) as caught:
         list_archive(make(tmp_path / "a", members_of(folder)), LIMITS)
     assert caught.value.code == "bad-manifest"
 
 
-def test_pixels_are_not_touched_to_list_a_zip(
+def test_listing_a_zip_inflates_no_pixels(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = as_zip(tmp_path / "a.zip", [*members_of(folder), ("x.fits", bytes(48 * MIB))])

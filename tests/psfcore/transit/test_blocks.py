@@ -1,4 +1,4 @@
-"""Held-out blocks and their guard, as the definitions have them."""
+"""Held-out blocks and their guard agree with the definitions."""
 
 from __future__ import annotations
 
@@ -25,5 +25,5 @@ def test_blocks_and_guard(images: int, blocks: int, guard: int) -> None:
 
 
 @pytest.mark.parametrize("images", range(6))
-def test_too_few_images_for_two_blocks_have_none(images: int) -> None:
+def test_too_few_images_for_two_blocks_give_no_fold(images: int) -> None:
     assert folds(images) == ()

@@ -1,4 +1,4 @@
-"""The first guess is the light beyond the occulter's radius, where the Sun is even."""
+"""For a homogeneous Sun the first guess is the light beyond the occulter's radius."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def wide_kernel() -> Flat:
 
 
 def seen(scene: Flat, place: Place, kernel: Flat) -> Flat:
-    """The scene behind a dark disc, through the PSF; what lies beyond the frame is like its edge."""
+    """A scene with a dark disc, convolved with the PSF; beyond the frame it continues with the values of its edge."""
     y, x = np.indices(scene.shape)
     dark = np.hypot(x - place.x_px, y - place.y_px) <= place.radius_px
     pad = 81
@@ -49,19 +49,19 @@ def transit_of(*frames: tuple[Flat, int, Place]) -> Transit:
         Frame(
             file=f"{index}.fits",
             pixels=pixels.astype(np.float32),
-            fov=fov,
+            pointing=pointing,
             place=place,
             exposure_s=1.0,
             time_s=60.0 * index,
         )
-        for index, (pixels, fov, place) in enumerate(frames)
+        for index, (pixels, pointing, place) in enumerate(frames)
     )
     return Transit(frames=made, diffraction=wide_kernel(), noise=Noise(1.0, 1.0))
 
 
 @pytest.fixture(scope="module")
 def two_pointings() -> Transit:
-    """An even Sun in pointing 2, a limb in pointing 1."""
+    """A limb in pointing 1, a homogeneous Sun in pointing 2."""
     even, limb = np.full((SIZE, SIZE), 100.0), np.full((SIZE, SIZE), 100.0)
     limb[:, 90:] = 2.0
     places = [Place(70.0 + 5 * i, 80.0, RADIUS_PX) for i in range(3)]
@@ -72,21 +72,21 @@ def two_pointings() -> Transit:
     )
 
 
-def test_before_an_even_sun_it_is_the_light_beyond_the_radius(two_pointings: Transit) -> None:
+def test_for_a_homogeneous_sun_it_is_the_light_beyond_the_radius(two_pointings: Transit) -> None:
     guess = first_guess(two_pointings)
     truth = float(cumulative_curve(wide_kernel(), RADIUS_PX)) / 100
     assert 0.1 < truth < 0.3
-    assert guess.best_fov == 2 and guess.radius_px == RADIUS_PX
+    assert guess.best_pointing == 2 and guess.radius_px == RADIUS_PX
     assert guess.share == pytest.approx(truth, rel=0.05)
     assert guess.share_spread < 0.02 * guess.share
     limb, even = guess.pointings
-    assert (limb.fov, limb.images, even.fov, even.images) == (1, 3, 2, 3)
+    assert (limb.pointing, limb.images, even.pointing, even.images) == (1, 3, 2, 3)
     assert limb.inhomogeneity > 10 * even.inhomogeneity
     assert all(even.mean[name] == pytest.approx(truth, rel=0.05) for name in ESTIMATORS)
     assert limb.scatter["image_mean"] > 5 * even.scatter["image_mean"]
 
 
-def test_it_is_told_against_time(two_pointings: Transit) -> None:
+def test_images_are_listed_in_the_order_of_time(two_pointings: Transit) -> None:
     told = []
     content = first_guess(two_pointings, progress=lambda done, of: told.append((done, of))).to_json()
     assert told == [(i, 6) for i in range(1, 7)]
@@ -95,7 +95,7 @@ def test_it_is_told_against_time(two_pointings: Transit) -> None:
     json.dumps(content, allow_nan=False)
 
 
-def test_the_estimators_are_what_they_are_called() -> None:
+def test_the_estimators_agree_with_their_names() -> None:
     """Known numbers: 30 in the disc, 100 in the shell, 60 beyond it, and one pixel of 10^6."""
     y, x = np.indices((SIZE, SIZE))
     r = np.hypot(x - 80, y - 75)
@@ -108,7 +108,7 @@ def test_the_estimators_are_what_they_are_called() -> None:
     assert frame.ratio == pytest.approx({"image_mean": 30 / pixels.mean(), "image_median": 0.5, "shell": 0.3})
 
 
-def test_exact_places_go_before_the_ephemeris(two_pointings: Transit) -> None:
+def test_given_places_replace_those_of_the_ephemeris(two_pointings: Transit) -> None:
     frame = two_pointings.frames[4]
     wrong = Place(frame.place.x_px + 15, frame.place.y_px, RADIUS_PX)
     off = transit_of((frame.pixels.astype(np.float64), 2, wrong))
@@ -118,7 +118,7 @@ def test_exact_places_go_before_the_ephemeris(two_pointings: Transit) -> None:
     )
 
 
-def test_filled_pixels_do_not_count(two_pointings: Transit) -> None:
+def test_filled_pixels_are_not_used(two_pointings: Transit) -> None:
     frame = two_pointings.frames[4]
     pixels, filled = frame.pixels.copy(), np.zeros(frame.pixels.shape, dtype=bool)
     filled[80, round(frame.place.x_px)] = filled[80, round(frame.place.x_px) + 20] = True
@@ -133,14 +133,14 @@ def test_filled_pixels_do_not_count(two_pointings: Transit) -> None:
     )
 
 
-def test_what_cannot_be_seen_is_null(two_pointings: Transit) -> None:
-    """An occulter whose middle is off the frame, and a frame without light."""
+def test_missing_ratios_are_null(two_pointings: Transit) -> None:
+    """An occulter whose centre is outside the frame, and a frame without light."""
     frame = two_pointings.frames[4]
     outside = (frame.pixels.astype(np.float64), 3, Place(-5.0, 80.0, RADIUS_PX))
     night = (np.full((SIZE, SIZE), -1.0), 4, frame.place)
     good = (frame.pixels.astype(np.float64), 2, frame.place)
     guess = first_guess(transit_of(outside, night, good))
-    assert guess.best_fov == 2 and math.isnan(guess.frames[0].centre_dn_s)
+    assert guess.best_pointing == 2 and math.isnan(guess.frames[0].centre_dn_s)
     content = guess.to_json()
     assert content["frames"][0]["ratio"] == dict.fromkeys(ESTIMATORS)
     assert content["frames"][1]["ratio"] == dict.fromkeys(ESTIMATORS)
@@ -151,11 +151,11 @@ def test_what_cannot_be_seen_is_null(two_pointings: Transit) -> None:
     assert caught.value.code == "no-first-guess"
 
 
-def test_practice(shared: Path) -> None:
-    """p1 was made without any effect; its PSF's curve at the occulter's radius is known."""
+def test_the_first_guess_of_the_practice_transit_agrees_with_its_truth(shared: Path) -> None:
+    """p1 was made without any effect; the cumulative curve of its PSF at the occulter's radius is known."""
     folder = shared / "data/practice/p1"
     guess = first_guess(read_transit(folder, FitsLimits(max_pixels=1024 * 1024)))
     truth = json.loads((folder.parent / "p1.truth.json").read_text())["psf"]
-    assert guess.best_fov == 2 and guess.radius_px == 10.75
+    assert guess.best_pointing == 2 and guess.radius_px == 10.75
     assert 0.5 * truth["total"] < guess.share < 1.5 * truth["total"]
     assert guess.share_spread < 0.5 * guess.share

@@ -1,4 +1,4 @@
-"""A transit comes out of its folder as it was written, and a folder that cannot be used says why."""
+"""A transit is read as it was written; the error for an unusable folder gives the reason."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_transit_is_read_in_dn_per_second(folder: Path) -> None:
     assert told == [(done, 6) for done in range(1, 7)]
     assert [frame.file for frame in transit.frames] == [f"{i:03d}.fits" for i in range(6)]
     assert [frame.time_s for frame in transit.frames] == [60.0 * i for i in range(6)]
-    assert [frame.fov for frame in transit.frames] == [1, 1, 1, 2, 2, 2]
+    assert [frame.pointing for frame in transit.frames] == [1, 1, 1, 2, 2, 2]
     assert [frame.exposure_s for frame in transit.frames] == [2, 1, 2, 1, 2, 1]
     assert {frame.gain_mode for frame in transit.frames} == {"high-only"}
     assert transit.shape == SHAPE and transit.noise == Noise(6.0, 2.0)
@@ -73,7 +73,9 @@ def test_a_transit_is_read_in_dn_per_second(folder: Path) -> None:
         assert (frame.place.x_px, frame.place.y_px) == place_of(index)
         y, x = np.indices(SHAPE)
         far = np.hypot(x - frame.place.x_px, y - frame.place.y_px) > 8
-        assert np.allclose(frame.pixels[far], true_rate(frame.fov)[far], atol=0.51)  # whole DN are stored
+        assert np.allclose(
+            frame.pixels[far], true_rate(frame.pointing)[far], atol=0.51
+        )  # whole DN are stored
         assert np.allclose(frame.pixels[20, round(frame.place.x_px)], 10, atol=0.51)
     names = {path.name for path in folder.iterdir()}
     assert transit.sha256 == {
@@ -87,7 +89,7 @@ def test_pixels_in_dn_per_second_stay(folder: Path) -> None:
     assert np.array_equal(read_transit(folder, LIMITS).frames[0].pixels, 2 * dn)
 
 
-def test_frames_come_in_the_order_of_time_and_equal_times_in_that_of_the_manifest(folder: Path) -> None:
+def test_frames_are_sorted_by_time_then_by_the_manifest(folder: Path) -> None:
     for index, date in (
         (0, "2023-01-03T05:00:00Z"),
         (4, "2023-01-03T04:01:00.000"),
@@ -101,19 +103,19 @@ def test_frames_come_in_the_order_of_time_and_equal_times_in_that_of_the_manifes
 
 
 @pytest.mark.parametrize("date", [None, "yesterday", "2023-01-03T23:59:60"])
-def test_without_a_date_the_order_of_the_manifest_counts(folder: Path, date: str | None) -> None:
+def test_without_dates_the_order_of_the_manifest_is_used(folder: Path, date: str | None) -> None:
     write_frame(folder / "003.fits", 3, 2, {"DATE-BEG": date})
     frames = read_transit(folder, LIMITS).frames
     assert [frame.time_s for frame in frames] == [0, 1, 2, 3, 4, 5]
     assert [frame.file for frame in frames] == [f"{i:03d}.fits" for i in range(6)]
 
 
-def test_date_obs_stands_in_for_date_beg(folder: Path) -> None:
+def test_date_obs_replaces_date_beg(folder: Path) -> None:
     write_transit(folder, cards={"DATE-BEG": None, "DATE-OBS": "2023-01-03T04:00:00"})
     assert [frame.time_s for frame in read_transit(folder, LIMITS).frames] == [0.0] * 6
 
 
-def test_the_noise_given_goes_before_the_manifest_s(folder: Path) -> None:
+def test_given_noise_replaces_that_of_the_manifest(folder: Path) -> None:
     assert read_transit(folder, LIMITS, noise=Noise(1.0, 0.5)).noise == Noise(1.0, 0.5)
     write_transit(folder, noise=None)
     assert read_transit(folder, LIMITS, noise=Noise(1.0, 0.5)).noise == Noise(1.0, 0.5)
@@ -121,7 +123,7 @@ def test_the_noise_given_goes_before_the_manifest_s(folder: Path) -> None:
     assert "photon_gain_dn" in message and "read_noise_dn" in message
 
 
-def test_the_instrument_is_the_headers_where_the_manifest_names_none(folder: Path) -> None:
+def test_without_an_instrument_in_the_manifest_the_headers_decide(folder: Path) -> None:
     write_transit(folder, instrument=None)
     assert read_transit(folder, LIMITS).instrument == "hri_euv"
     write_transit(folder, instrument=None, cards={"DETECTOR": "other"})
@@ -175,13 +177,13 @@ def dirty(at: tuple[int, int], value: float) -> Flat:
         (dirty((3, 3), -0.01), "known-psf-negative", "-0.01"),
     ],
 )
-def test_a_wrong_known_psf_is_told(folder: Path, kernel: Flat, code: str, told: str) -> None:
+def test_a_wrong_known_psf_is_refused(folder: Path, kernel: Flat, code: str, told: str) -> None:
     write_kernel(folder / "diffraction.fits", kernel)
     message = refusal(folder, code)
     assert "diffraction.fits" in message and "expected" in message and told in message
 
 
-def test_where_none_is_named_one_is_brought(folder: Path) -> None:
+def test_the_given_diffraction_is_used_if_no_known_psf_is_named(folder: Path) -> None:
     write_transit(folder, known_psf=None)
     assert "known_psf" in refusal(folder, "no-known-psf")
     assert read_transit(folder, LIMITS, diffraction=gaussian(20)).diffraction.shape == (20, 20)
@@ -197,11 +199,11 @@ def test_where_none_is_named_one_is_brought(folder: Path) -> None:
     refusal(folder, "known-psf-sum", diffraction=2 * gaussian(20))
 
 
-def test_a_named_one_goes_before_what_is_brought(folder: Path) -> None:
+def test_a_named_known_psf_replaces_the_given_diffraction(folder: Path) -> None:
     assert read_transit(folder, LIMITS, diffraction=gaussian(20)).diffraction.shape == (32, 32)
 
 
-def test_rounding_below_zero_is_taken_out() -> None:
+def test_rounding_below_zero_becomes_zero() -> None:
     kernel = checked_kernel(dirty((3, 3), -1e-9), "k")
     assert kernel.min() == 0 and kernel.sum() == pytest.approx(1, abs=1e-14)
 
@@ -216,14 +218,14 @@ def test_missing_files_are_named(folder: Path) -> None:
     assert "002.fits" in message and "diffraction.fits" in message and "001.fits" not in message
 
 
-def test_no_manifest_and_no_images(folder: Path) -> None:
+def test_a_missing_manifest_and_missing_images_are_named(folder: Path) -> None:
     write_transit(folder, images=0)
     assert "images" in refusal(folder, "bad-manifest")
     (folder / "transit.json").unlink()
     refusal(folder, "no-manifest")
 
 
-def test_a_frame_of_another_shape(folder: Path) -> None:
+def test_a_frame_of_another_shape_is_refused(folder: Path) -> None:
     header = fits.getheader(folder / "004.fits")
     fits.PrimaryHDU(np.ones((64, 64), "i4"), header).writeto(folder / "004.fits", overwrite=True)
     message = refusal(folder, "transit-shapes")
@@ -231,19 +233,19 @@ def test_a_frame_of_another_shape(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("x", "y"), [(-4.6, 20), (83.6, 20), (10, -4.6), (10, 67.6), (1e5, 20)])
-def test_an_occulter_outside_the_frame(folder: Path, x: float, y: float) -> None:
+def test_an_occulter_outside_the_frame_is_refused(folder: Path, x: float, y: float) -> None:
     change_image(folder, 2, x=x, y=y)
     message = refusal(folder, "occulter-outside")
     assert "images[2] (002.fits)" in message
 
 
 @pytest.mark.parametrize(("x", "y"), [(-4.4, 20), (83.4, 20), (10, -4.4), (10, 67.4)])
-def test_an_occulter_that_reaches_in(folder: Path, x: float, y: float) -> None:
+def test_an_occulter_partly_inside_the_frame_is_accepted(folder: Path, x: float, y: float) -> None:
     change_image(folder, 2, x=x, y=y)
     assert read_transit(folder, LIMITS).frames[2].place.x_px == x
 
 
-def test_an_occulter_too_large_for_the_frame(folder: Path) -> None:
+def test_an_occulter_too_large_for_the_frame_is_refused(folder: Path) -> None:
     change_image(folder, 1, r=16.5)
     assert "images[1] (001.fits)" in refusal(folder, "occulter-too-large")
     change_image(folder, 1, r=16.0)
@@ -260,12 +262,12 @@ def test_an_occulter_too_large_for_the_frame(folder: Path) -> None:
         ({"SATURATE": 1.0}, "all-saturated"),
     ],
 )
-def test_frames_that_cannot_be_used(folder: Path, cards: dict[str, object], code: str) -> None:
+def test_unusable_frames_are_refused(folder: Path, cards: dict[str, object], code: str) -> None:
     write_frame(folder / "005.fits", 5, 2, cards)
     assert "005.fits" in refusal(folder, code)
 
 
-def test_files_that_cannot_be_used(folder: Path) -> None:
+def test_unusable_files_are_refused(folder: Path) -> None:
     whole = (folder / "001.fits").read_bytes()
     (folder / "001.fits").write_bytes(whole[:6000])
     with pytest.raises(HeaderError, match=r"001\.fits"):
@@ -279,18 +281,18 @@ def test_files_that_cannot_be_used(folder: Path) -> None:
         read_transit(folder, LIMITS)
 
 
-def test_all_nan_is_told(folder: Path) -> None:
+def test_an_image_of_nan_is_refused(folder: Path) -> None:
     header = fits.getheader(folder / "003.fits")
     fits.PrimaryHDU(np.full(SHAPE, np.nan, "f4"), header).writeto(folder / "003.fits", overwrite=True)
     assert "003.fits" in refusal(folder, "all-nan")
 
 
-def test_practice(shared: Path) -> None:
+def test_the_practice_transit_is_read(shared: Path) -> None:
     transit, prepared = read_prepared(shared / "data/practice/p1", LIMITS_PRACTICE)
     assert len(transit.frames) == 30 and transit.shape == (512, 512)
     assert transit.diffraction.shape == (1024, 1024) and transit.diffraction.sum() == pytest.approx(1)
     assert transit.noise == Noise(6.0, 2.0) and transit.plate_scale_arcsec == pytest.approx(0.492)
-    assert [frame.fov for frame in transit.frames] == [1] * 10 + [2] * 10 + [3] * 10
+    assert [frame.pointing for frame in transit.frames] == [1] * 10 + [2] * 10 + [3] * 10
     assert all(
         later.time_s > frame.time_s for frame, later in zip(transit.frames, transit.frames[1:], strict=False)
     )

@@ -47,15 +47,15 @@ PLACES = [Place(20.0, 20.0, RADIUS_PX), Place(20.3, 18.77, RADIUS_PX), Place(19.
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_what_is_covered_is_the_discs_area(place: Place) -> None:
+def test_the_covered_area_is_that_of_the_disc(place: Place) -> None:
     share = coverage((41, 40), place)
     assert share.sum() == pytest.approx(np.pi * place.radius_px**2, rel=1e-3)
     np.testing.assert_allclose(share, covered_share(place, (0, 0), (41, 40), 1), atol=0.02)
     assert share.min() == 0 and share.max() == pytest.approx(1, abs=1e-12)
 
 
-def test_what_is_covered_changes_smoothly() -> None:
-    """Each step uncovers what it covers, and as much as every other step: the disc's width times the step."""
+def test_the_covered_area_changes_smoothly() -> None:
+    """Every step covers and uncovers the same area: the width of the disc times the step."""
     step, n = 0.05, 40
     for axis in ("x_px", "y_px"):
         start = Place(20.0, 20.0, RADIUS_PX)
@@ -68,7 +68,7 @@ def test_what_is_covered_changes_smoothly() -> None:
 
 @pytest.mark.parametrize("place", [*PLACES, Place(3.0, 38.2, RADIUS_PX), Place(-30.0, 10.0, RADIUS_PX)])
 @pytest.mark.parametrize("margin_px", [0.0, 1.3])
-def test_a_dark_pixel_has_all_its_corners_in_the_disc(place: Place, margin_px: float) -> None:
+def test_dark_pixels_have_all_corners_in_the_disc(place: Place, margin_px: float) -> None:
     expected = np.ones((41, 40), bool)
     for y in range(41):
         for x in range(40):
@@ -94,7 +94,7 @@ def test_distances_and_patches() -> None:
 def found_in(
     of: TrueSky, transit: Transit, indices: Sequence[int], *, ephemeris_sigma_px: float = 1.0
 ) -> list[FoundPlace]:
-    """The places of some frames, the scenes and the PSF given."""
+    """The places found in some frames, with the true scenes and PSF."""
     scenes = [of.true_scene(n).astype(np.float32) for n in range(len(transit.frames))]
     places = [frame.place for frame in transit.frames]
     return [
@@ -126,7 +126,7 @@ EVERY = range(IMAGES)
 
 
 def test_without_noise_places_are_exact() -> None:
-    """From an ephemeris that errs by 0.6 px; what is left is the light of the neighbours' own occulters."""
+    """The ephemeris has errors of 0.6 px. The remaining errors come from the occulters of the neighbours."""
     of = sky(brightness=BRIGHT)
     for sigma_px, tolerance_px in ((100.0, 0.02), (1.0, 0.02)):
         found = found_in(of, noise_free(of), EVERY, ephemeris_sigma_px=sigma_px)
@@ -138,7 +138,7 @@ def test_without_noise_places_are_exact() -> None:
     assert np.hypot(*reported.T).max() > 1
 
 
-def test_errors_on_the_disc_are_those_stated() -> None:
+def test_errors_on_the_disc_agree_with_the_stated_ones() -> None:
     of, on_disc = sky(), range(4, 8)
     pulls = []
     for seed in range(5):
@@ -159,7 +159,7 @@ def test_far_off_the_limb_faint_places_are_found_to_two_pixels() -> None:
         assert all(f.seen for f in found)
 
 
-def test_the_ephemeris_decides_where_the_image_says_nothing() -> None:
+def test_the_ephemeris_decides_if_the_image_has_no_information() -> None:
     of = sky(brightness=1.0)
     nothing = Noise(photon_gain_dn=6.0, read_noise_dn=1e6)
     transit = dataclasses.replace(noise_free(of), noise=nothing)
@@ -168,8 +168,8 @@ def test_the_ephemeris_decides_where_the_image_says_nothing() -> None:
         assert (f.sigma_x_px, f.sigma_y_px) == pytest.approx((1.0, 1.0), abs=0.02)
 
 
-def test_where_the_sun_changed_between_the_images_the_ephemeris_says_more() -> None:
-    """Of one image every structure is another: what its neighbours show is not behind its disc."""
+def test_the_ephemeris_has_more_weight_if_the_sun_changed() -> None:
+    """The structure of one image differs: its neighbours do not show the scene behind its disc."""
     of = sky(brightness=4.0)
     transit = noise_free(of)
     y, x = np.indices((SIZE_PX, SIZE_PX))
@@ -184,8 +184,8 @@ def test_where_the_sun_changed_between_the_images_the_ephemeris_says_more() -> N
         assert np.hypot(*apart([found.place], [exact])[0]) < 0.7
 
 
-def test_image_and_ephemeris_share_the_say_by_their_errors() -> None:
-    """Of the way from the ephemeris to the truth, 1 - sigma^2 is gone where the ephemeris' own error is 1."""
+def test_image_and_ephemeris_are_weighted_by_their_errors() -> None:
+    """The fit moves from the ephemeris towards the truth by a share 1 - sigma^2, if the error of the ephemeris is 1."""
     of, exact = sky(), sky().plan.place(5)
     reported = Place(exact.x_px + 1.0, exact.y_px - 1.0, RADIUS_PX)
     for read_noise_dn in (1e4, 3e4, 6e4):
@@ -203,7 +203,7 @@ def displaced(transit: Transit, index: int, place: Place) -> Transit:
     return dataclasses.replace(transit, frames=tuple(frames))
 
 
-def test_an_ephemeris_off_by_pixels_is_put_right_and_one_off_by_more_is_told() -> None:
+def test_an_ephemeris_wrong_by_pixels_is_corrected_and_a_larger_error_is_reported() -> None:
     of = sky(brightness=BRIGHT)
     exact = of.plan.place(5)
     near = Place(exact.x_px + 2.5, exact.y_px - 3.0, RADIUS_PX)
@@ -221,7 +221,7 @@ def test_a_disc_off_the_frame_is_refused_by_name(x_px: float, y_px: float) -> No
     assert caught.value.code == "occulter-outside"
 
 
-def test_an_image_without_an_occulter_is_told() -> None:
+def test_an_image_without_an_occulter_is_recognised() -> None:
     of = sky()
     pixels = [frame.pixels for frame in noise_free(of).frames]
     pixels[6] = of.seen_scenes[2].astype(np.float32)
@@ -233,7 +233,7 @@ def test_an_image_without_an_occulter_is_told() -> None:
 
 
 def overlap(one: Place, other: Place) -> bool:
-    """Whether the other's disc reaches into the square round the one."""
+    """Whether the second disc overlaps the square around the first."""
     reach = one.radius_px + PATCH_MARGIN_PX + other.radius_px
     return abs(one.x_px - other.x_px) <= reach and abs(one.y_px - other.y_px) <= reach
 
@@ -243,21 +243,21 @@ def places_of(transit: Transit) -> list[Place]:
 
 
 def test_neighbours_show_the_patch_and_are_the_nearest_in_time() -> None:
-    """Before a faint sky there are more of them, before a bright one four."""
+    """A bright sky needs four neighbours, a faint one more."""
     for brightness, most in ((0.02, 8), (500.0, LEAST_NEIGHBOURS)):
         transit = observed(sky(images=30, size_px=192, brightness=brightness)).transit
         assert most == max(len(neighbours) for neighbours in checked_neighbours(transit))
 
 
 def checked_neighbours(transit: Transit) -> list[list[int]]:
-    """The neighbours of all frames: free, of the same pointing, the nearest in time, and four where so many are."""
+    """Check the neighbours of all frames: no overlap, same pointing, nearest in time, four if available."""
     places, found = places_of(transit), []
     for n, frame in enumerate(transit.frames):
         chosen = neighbours_of(n, transit.frames, places, transit.noise)
         free = [
             k
             for k, other in enumerate(transit.frames)
-            if k != n and other.fov == frame.fov and not overlap(places[n], places[k])
+            if k != n and other.pointing == frame.pointing and not overlap(places[n], places[k])
         ]
         assert set(chosen) <= set(free)
         waits = [abs(transit.frames[k].time_s - frame.time_s) for k in chosen]
@@ -269,7 +269,7 @@ def checked_neighbours(transit: Transit) -> list[list[int]]:
     return found
 
 
-def test_places_as_known_decide_who_is_free() -> None:
+def test_the_given_places_decide_which_frames_are_neighbours() -> None:
     transit = observed(sky()).transit
     places = places_of(transit)
     before = neighbours_of(5, transit.frames, places, transit.noise)
@@ -278,18 +278,18 @@ def test_places_as_known_decide_who_is_free() -> None:
 
 
 def even_sky(shots: tuple[Shot, ...]) -> TrueSky:
-    """A Sun of one brightness, but for a texture of 5 %."""
+    """A Sun of uniform brightness with a texture of 5 %."""
     plan = dataclasses.replace(default_plan(3, SIZE_PX, oversampling=1), shots=shots)
     rng = np.random.default_rng(1)
-    scenes = {fov: 2000 * rng.normal(1, 0.05, (SIZE_PX, SIZE_PX)) for fov in plan.fovs}
+    scenes = {pointing: 2000 * rng.normal(1, 0.05, (SIZE_PX, SIZE_PX)) for pointing in plan.pointings}
     return true_sky(plan, SCATTER, DIFFRACTION, 1, scenes=scenes)
 
 
-def shot(fov: int, x_px: float, y_px: float) -> Shot:
-    return Shot(fov, x_px, y_px, 1.8, "high-only", 60.0 * fov)
+def shot(pointing: int, x_px: float, y_px: float) -> Shot:
+    return Shot(pointing, x_px, y_px, 1.8, "high-only", 60.0 * pointing)
 
 
-def test_without_neighbours_an_even_sun_gives_the_place_to_a_tenth_of_a_pixel() -> None:
+def test_without_neighbours_a_homogeneous_sun_gives_the_place_to_a_tenth_of_a_pixel() -> None:
     of = even_sky((shot(1, 60.3, 70.8), shot(2, 40.5, 30.1), shot(3, 90.0, 90.0)))
     for transit in (noise_free(of), observed(of).transit):
         found = found_in(of, transit, range(3))
@@ -298,12 +298,12 @@ def test_without_neighbours_an_even_sun_gives_the_place_to_a_tenth_of_a_pixel() 
         assert all(f.seen for f in found)
 
 
-def test_without_neighbours_an_uneven_sun_leaves_the_place_unsure() -> None:
-    """A ring's mean is no scene: what it leaves unexplained widens the errors, up to the ephemeris' own."""
+def test_without_neighbours_a_structured_sun_gives_a_large_error() -> None:
+    """The mean of a ring does not describe the scene; the misfit increases the errors, up to that of the ephemeris."""
     of = sky()
     shown = observed(of).transit
     alone = dataclasses.replace(
-        shown, frames=tuple(dataclasses.replace(f, fov=n) for n, f in enumerate(shown.frames, start=1))
+        shown, frames=tuple(dataclasses.replace(f, pointing=n) for n, f in enumerate(shown.frames, start=1))
     )
     on_disc = range(4, 8)
     with_neighbours = found_in(of, shown, on_disc)
@@ -316,7 +316,7 @@ def test_without_neighbours_an_uneven_sun_leaves_the_place_unsure() -> None:
 
 
 def test_a_disc_that_touches_the_edge_is_found() -> None:
-    """Also one that the field's edge cuts: the field without its first columns."""
+    """Also a disc that the edge of the field cuts: the first columns of the field are removed."""
     of = even_sky((shot(1, RADIUS_PX, 60.2), shot(1, 60.0, 60.0), shot(1, 100.4, SIZE_PX - 1 - RADIUS_PX)))
     found = found_in(of, noise_free(of), range(3), ephemeris_sigma_px=10.0)
     assert np.abs(errors(of, found, range(3))).max() < 0.03

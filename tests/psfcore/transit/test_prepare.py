@@ -1,4 +1,4 @@
-"""Gaps are filled with what another frame of the pointing shows, at this frame's brightness; all is marked."""
+"""Gaps are filled from another frame of the same pointing, scaled to the brightness of the frame, and marked."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def exposure(
     *,
     saturated: object = None,
     nonfinite: object = None,
-    fov: int = 1,
+    pointing: int = 1,
     time_s: float = 0.0,
     place: Place = AWAY,
 ) -> Exposure:
-    """An exposure of ``rate`` with gaps at the places given: index expressions, or masks."""
+    """An exposure of ``rate`` with gaps at the given index expressions or masks."""
     pixels, mask = rate.copy(), np.zeros(rate.shape, np.uint8)
     if saturated is not None:
         mask[saturated] |= int(MaskBit.SATURATED)
@@ -40,7 +40,12 @@ def exposure(
         mask[nonfinite] |= int(MaskBit.NONFINITE)
         pixels[nonfinite] = np.nan
     return exposure_of(
-        image(pixels, mask), file=f"{time_s:g}.fits", fov=fov, place=place, time_s=time_s, gain_mode=None
+        image(pixels, mask),
+        file=f"{time_s:g}.fits",
+        pointing=pointing,
+        place=place,
+        time_s=time_s,
+        gain_mode=None,
     )
 
 
@@ -53,7 +58,7 @@ def test_dn_become_dn_per_second() -> None:
         to_rate(image(rate, unit="erg"), "a")
 
 
-def test_what_has_no_gap_stays_as_it_is() -> None:
+def test_pixels_without_gaps_stay_unchanged() -> None:
     rate = true_rate(1)
     frames, prepared = prepare([exposure(rate, time_s=t) for t in (0, 1)])
     assert all(np.array_equal(frame.pixels, rate.astype(np.float32)) for frame in frames)
@@ -61,8 +66,8 @@ def test_what_has_no_gap_stays_as_it_is() -> None:
     assert prepared.to_json() == {"images": 2, "unfilled": 0, "frames": []}
 
 
-def test_the_gap_is_filled_at_the_frame_s_own_brightness() -> None:
-    """The donor is 1.3 times as bright and has noise: the scale takes that out, to the noise of a median."""
+def test_filled_pixels_are_scaled_to_the_brightness_of_the_frame() -> None:
+    """The other frame is 1.3 times as bright and noisy; the scale corrects this to the noise of a median."""
     rate = true_rate(1)
     rng = np.random.default_rng(2)
     donor = 1.3 * rate * rng.normal(1, 0.01, SHAPE)
@@ -77,7 +82,7 @@ def test_the_gap_is_filled_at_the_frame_s_own_brightness() -> None:
     assert (counts.saturated, counts.from_frames, counts.from_neighbours, counts.unfilled) == (48, 48, 0, 0)
 
 
-def test_the_nearest_in_time_of_the_same_pointing_is_taken() -> None:
+def test_gaps_are_filled_from_the_nearest_frame_of_the_same_pointing() -> None:
     rate, marked = true_rate(1), [true_rate(1) for _ in range(4)]
     for number, frame in enumerate(marked):
         frame[SPOT] = 2000.0 + number
@@ -86,7 +91,7 @@ def test_the_nearest_in_time_of_the_same_pointing_is_taken() -> None:
             exposure(marked[0], time_s=0),
             exposure(marked[1], time_s=90),
             exposure(rate, time_s=100, saturated=SPOT),
-            exposure(marked[2], time_s=105, fov=2),  # nearer, but of another pointing
+            exposure(marked[2], time_s=105, pointing=2),  # nearer, but of another pointing
             exposure(rate, time_s=107, saturated=SPOT),  # nearer, but saturated there too
             exposure(marked[3], time_s=111),
         ]
@@ -95,7 +100,7 @@ def test_the_nearest_in_time_of_the_same_pointing_is_taken() -> None:
     assert np.allclose(frames[4].pixels[SPOT], 2003)
 
 
-def test_what_the_nearest_lacks_the_next_gives() -> None:
+def test_gaps_of_the_nearest_frame_are_filled_from_the_next() -> None:
     rate = true_rate(1)
     half = (slice(40, 43), SPOT[1])
     frames, prepared = prepare(
@@ -109,7 +114,7 @@ def test_what_the_nearest_lacks_the_next_gives() -> None:
     assert prepared.frames[0].from_frames == 48 and prepared.frames[1].from_frames == 24
 
 
-def test_a_donor_s_occulter_is_no_sun() -> None:
+def test_pixels_behind_the_occulter_of_another_frame_are_not_used() -> None:
     rate = true_rate(1)
     over_the_spot = exposure(rate, time_s=10, place=Place(63.5, 42.5, 4.0))
     over_the_spot.pixels[SPOT] = 1.0
@@ -146,7 +151,7 @@ def test_a_wide_gap_is_filled_from_the_nearest_pixels() -> None:
 
 
 def test_nan_on_the_occulter_stays_dark() -> None:
-    """Another frame shows the Sun there."""
+    """Another frame shows the Sun at this place."""
     rate = true_rate(1)
     dark = rate.copy()
     y, x = np.indices(SHAPE)
@@ -165,11 +170,11 @@ def test_a_value_beyond_float32_is_a_gap() -> None:
     assert np.allclose(frames[0].pixels, rate) and prepared.frames[0].nonfinite == 1
 
 
-def test_mostly_saturated_and_nothing_to_fill_it_from() -> None:
+def test_a_mostly_saturated_image_that_cannot_be_filled_is_refused() -> None:
     rate = true_rate(1)
     most = (slice(None), slice(0, 41))
     with pytest.raises(DataError, match=r"0\.fits.* 51 %") as caught:
-        prepare([exposure(rate, saturated=most), exposure(rate, time_s=60, fov=2)])
+        prepare([exposure(rate, saturated=most), exposure(rate, time_s=60, pointing=2)])
     assert caught.value.code == "all-saturated"
     frames, _ = prepare([exposure(rate, saturated=most), exposure(rate, time_s=60)])
     y, x = np.indices(SHAPE)

@@ -1,4 +1,4 @@
-"""Real occultations: a PSF with scatter takes light out of the dark disc and leaves the ring as it is."""
+"""Real occultations: deconvolution with scatter removes light from the dark disc and does not change the ring."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from studies.venus_gap import explained, read
 from tests.venus import table
 
 
-def test_scatter_leaves_the_disc_of_venus(shared: Path) -> None:
+def test_deconvolution_removes_scatter_from_the_disc_of_venus(shared: Path) -> None:
     rows = {(name, what): (core, ring) for name, what, core, ring in table(shared)}
     for name in ("XRT", "AIA 1600"):
         seen_core, seen_ring = rows[name, "as observed"]
@@ -22,7 +22,7 @@ def test_scatter_leaves_the_disc_of_venus(shared: Path) -> None:
     assert rows["XRT", "scatter of 10 %"][0] < peer_core < rows["XRT", "as observed"][0]
 
 
-def test_the_gap_of_a_psf_without_long_range_scatter_is_a_level_and_what_goes_with_the_ring(
+def test_without_long_range_scatter_the_gap_is_a_constant_plus_a_share_of_the_ring(
     shared: Path,
 ) -> None:
     core, terms = read(shared)

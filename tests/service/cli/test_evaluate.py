@@ -14,15 +14,15 @@ from astropy.io import fits
 from click.testing import CliRunner, Result
 
 from psfcore.fits.psfs import write_psf as write_whole_psf
+from psfcore.simulate.headers import HRI_EUV
 from psfcore.simulate.scatter_truth import total_kernel
-from psfcore.simulate.transit import INSTRUMENT, PLATE_SCALE_ARCSEC
 from psfcore.simulate.transit_files import write
 from service.cli.evaluate import COMMANDS, _built_diffraction
 from tests.conftest import write_psf
 from tests.psfcore.conftest import make_psf
 from tests.psfcore.small_transits import DIFFRACTION, IMAGES, SCATTER, SIZE_PX, observed, sky
 
-SCALE = PLATE_SCALE_ARCSEC
+SCALE = HRI_EUV.plate_scale_arcsec
 
 
 def run(*arguments: str | Path) -> Result:
@@ -179,7 +179,7 @@ def test_what_is_no_transit_is_refused(true_psf: Path, transit: Path, tmp_path: 
 
 def test_a_fit_needs_to_know_the_diffraction(transit: Path, tmp_path: Path) -> None:
     unknown = changed(transit, tmp_path / "unknown", known_psf=None, instrument="my-telescope")
-    refused(run(unknown), "known_psf", INSTRUMENT, "got my-telescope")
+    refused(run(unknown), "known_psf", HRI_EUV.name, "got my-telescope")
     refused(run(unknown, "--psf", write_total(tmp_path / "p.fits"), "--dark-offsets"), "known_psf")
 
 
@@ -191,8 +191,8 @@ def test_the_diffraction_of_an_instrument_is_built(monkeypatch: pytest.MonkeyPat
         return make_psf(DIFFRACTION)
 
     monkeypatch.setattr("psfcore.build.build_psf", build)
-    np.testing.assert_array_equal(_built_diffraction(INSTRUMENT, (SIZE_PX, SIZE_PX)), DIFFRACTION)
-    assert asked == [(INSTRUMENT, "DIFFRACTION")]
+    np.testing.assert_array_equal(_built_diffraction(HRI_EUV.name, (SIZE_PX, SIZE_PX)), DIFFRACTION)
+    assert asked == [(HRI_EUV.name, "DIFFRACTION")]
 
 
 def test_too_few_images_are_refused(transit: Path, tmp_path: Path) -> None:

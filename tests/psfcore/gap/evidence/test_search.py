@@ -132,13 +132,13 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
 def brightening(share: float) -> Transit:
     """A patch of the first pointing brightens by a share over its images; behind the occulter it does not show."""
     transit = clean()
-    first = [frame for frame in transit.frames if frame.fov == 1]
+    first = [frame for frame in transit.frames if frame.pointing == 1]
     start, end = first[0].time_s, first[-1].time_s
     y, x = np.indices(transit.shape)
     patch = np.exp(-((y - 90) ** 2 + (x - 40) ** 2) / (2 * 15**2))
     frames = []
     for frame in transit.frames:
-        at = (frame.time_s - start) / (end - start) - 0.5 if frame.fov == 1 else 0.0
+        at = (frame.time_s - start) / (end - start) - 0.5 if frame.pointing == 1 else 0.0
         seen = 1 + share * at * patch * (1 - coverage(transit.shape, frame.place))
         frames.append(replace(frame, pixels=(frame.pixels * seen).astype(np.float32)))
     return replace(transit, frames=tuple(frames))

@@ -84,7 +84,7 @@ def test_held_out_discs_of_clean_transits_are_predicted() -> None:
         print("\n".join(["", f"seed {seed}", *lines(found)]))
         for fov in off:
             planes = made.noise_free
-            here = [f.residual_against_pct(planes[f.index]) for f in found.frames if f.fov == fov]
+            here = [f.residual_against_pct(planes[f.index]) for f in found.frames if f.pointing == fov]
             print(f"pointing {fov}, discs without noise: mean {np.mean(here):+.2f} %, rms {rms(here):.2f} %")
             assert abs(np.mean(here)) < 1.5 and rms(here) < 2
             off[fov] += here

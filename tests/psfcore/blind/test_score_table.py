@@ -1,4 +1,4 @@
-"""The blind set's table: hand-made truths and reports, figures reckoned by hand."""
+"""The blind set's table: hand-made truths and reports, figures computed by hand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import pytest
 from matplotlib.image import imread
 
 from psfcore.blind.plot import score_png
-from psfcore.blind.scoring import Judged, score, shown_chi2, table, true_closure, wilson
+from psfcore.blind.score_table import score, table, wilson
+from psfcore.blind.scoring import Judged, shown_chi2, true_closure
 
 
 def truth(kind: str, *names: str, left: float = 0.0, **more: Any) -> dict[str, Any]:
@@ -80,7 +81,7 @@ def judged() -> list[Judged]:
     return [Judged(n, true, said, 10.0 + n) for n, (true, said) in enumerate(CASES)]
 
 
-def test_wilson_is_the_textbook_s() -> None:
+def test_wilson_agrees_with_the_textbook() -> None:
     assert wilson(0, 0) == (0.0, 1.0)
     low, high = wilson(8, 10)
     assert (low, high) == pytest.approx((0.4902, 0.9433), abs=1e-4)
@@ -91,19 +92,19 @@ def test_wilson_is_the_textbook_s() -> None:
 # Figure: cases, value, whether its goal is met.
 EXPECTED = {
     "false alarms on clean data": (4, 2 / 4, False),
-    "of these, inconclusive": (4, 1 / 4, None),
+    "inconclusive on clean data": (4, 1 / 4, None),
     "answer contains the truth, >= 2 % left": (4, 3 / 4, False),
-    "the same, >= 1 % left, inconclusive half": (5, 3.5 / 5, False),
+    "the same, >= 1 % left, inconclusive = 1/2": (5, 3.5 / 5, False),
     # Two means of chi2 3^2 + 3^2 = 18 are below 30: none of these cases counts.
-    "of the first, where the discs show it": (0, None, None),
+    "the same, >= 2 % left, shown by the discs": (0, None, None),
     "first place is the truth": (3, 2 / 3, False),
     "one wrong effect named with confidence": (13, 3 / 13, False),
     "mean size of the answer": (4, (1 + 1 + 2 + 2) / 4, True),
     "unknown effects called unknown or inconclusive": (2, 1 / 2, False),
-    "closure as a share of the true effect's": (3, 1.0, True),  # of 1, 0.6 / 0.8, 1
-    "90 % interval of closure holds the truth": (3, 2 / 3, False),
-    "strongest axis right": (3, 2 / 3, False),
-    "time of the slowest, s": (13, 22.0, True),
+    "closure over that of the true effect": (3, 1.0, True),  # of 1, 0.6 / 0.8, 1
+    "90 % interval contains the true closure": (3, 2 / 3, False),
+    "strongest axis is right": (3, 2 / 3, False),
+    "time of the slowest case, s": (13, 22.0, True),
 }
 
 
@@ -113,10 +114,10 @@ def test_what_the_discs_show_is_what_exceeds_their_noise() -> None:
     assert shown_chi2({}) is None
     case = Judged(0, truth("single", "ghost", left=3.0, **shown), report("attributed", "ghost"), 1.0)
     row = score([case]).rows[4]
-    assert (row.figure, row.cases, row.value) == ("of the first, where the discs show it", 1, 1.0)
+    assert (row.figure, row.cases, row.value) == ("the same, >= 2 % left, shown by the discs", 1, 1.0)
 
 
-def test_of_a_pair_only_what_shows_has_to_be_named() -> None:
+def test_of_a_pair_only_the_effects_that_show_must_be_named() -> None:
     pair = truth("pair", "ghost", "scene_evolution", left=4.0)
     said = report("attributed", "ghost")
     pair["effects"][0]["left_alone_pct"], pair["effects"][1]["left_alone_pct"] = 4.0, 0.1
@@ -126,7 +127,7 @@ def test_of_a_pair_only_what_shows_has_to_be_named() -> None:
     assert score([Judged(0, pair, said, 1.0)]).rows[2].value == 0.0
 
 
-def test_a_pair_shows_where_each_of_it_would_alone() -> None:
+def test_a_pair_is_shown_if_each_required_effect_alone_is() -> None:
     shown = MEASURED | {"refitted": {"residual_pct": {"0": 3.0, "1": 4.0}, "noise_pct": {"0": 0.5, "1": 0.5}}}
     pair = truth("pair", "ghost", "scene_evolution", left=4.0, **shown)
     strong, weak = pair["effects"]
@@ -135,11 +136,11 @@ def test_a_pair_shows_where_each_of_it_would_alone() -> None:
     assert score([case]).rows[4].cases == 0
     weak["left_alone_chi2"] = 31.0
     assert score([case]).rows[4].cases == 1
-    weak |= {"left_alone_chi2": 29.0, "left_alone_pct": 0.5}  # need not be named
+    weak |= {"left_alone_chi2": 29.0, "left_alone_pct": 0.5}  # too weak: it need not be named
     assert score([case]).rows[4].cases == 1
 
 
-def test_every_figure_is_as_by_hand(judged: list[Judged]) -> None:
+def test_every_figure_equals_the_one_computed_by_hand(judged: list[Judged]) -> None:
     rows = {row.figure: row for row in score(judged).rows}
     assert set(rows) == set(EXPECTED)
     for figure, (cases, value, met) in EXPECTED.items():
@@ -149,7 +150,7 @@ def test_every_figure_is_as_by_hand(judged: list[Judged]) -> None:
     assert interval == pytest.approx(wilson(3, 13))
 
 
-def test_the_true_closure_is_what_the_sampling_does_not_leave() -> None:
+def test_the_true_closure_excludes_what_the_sampling_leaves() -> None:
     assert true_closure(MEASURED) == pytest.approx(1 - 1 / 25)
     assert true_closure(truth("clean")) is None
 
@@ -167,10 +168,10 @@ def test_confusion_and_power_count_every_case_once(judged: list[Judged]) -> None
     assert (top["left_after_refit_pct"], top["n"], top["contains_truth"]) == ([8.0, None], 1, 1)
 
 
-def test_the_table_says_failures_and_the_bound_of_no_alarm(judged: list[Judged]) -> None:
+def test_the_table_lists_failures_and_bounds_the_rate_of_false_alarms(judged: list[Judged]) -> None:
     clean = [case for case in judged if case.kind == "clean" and case.verdict == "none"] * 5
     text = table(score(clean, {7: "exit status 1: no light"}))
-    assert "no alarm in 10 clean cases bounds the rate at 0.300" in text
+    assert "no false alarm in 10 clean cases: the rate is below 0.300" in text
     assert "0007: exit status 1: no light" in text
     assert score([]).rows[0].value is None
 

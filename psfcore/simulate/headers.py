@@ -1,0 +1,98 @@
+"""The header keywords of the instrument that a simulation imitates, as its real images have them.
+
+HRI_EUV: level 2 files of EUI. AIA: level 1 files of its 171 A channel, which have no DETECTOR and no gain modes. Any
+other instrument: the keywords by which its TOML file recognises it, its wavelength and its plate scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+
+from psfcore.fits.images import CardValue
+from psfcore.instruments.model import Instrument
+from psfcore.simulate.plan import Shot
+
+_START = datetime(2023, 1, 3, 3, 42)
+_OWN_TEXTS = {
+    "hri_euv": {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV"},
+    "aia_171": {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVEUNIT": "angstrom"},
+}
+_COMMENTS = {
+    "ORIGIN": "not an observation",
+    "TELESCOP": "telescope imitated",
+    "INSTRUME": "instrument imitated",
+    "DETECTOR": "detector imitated",
+    "WAVEUNIT": "unit of WAVELNTH",
+    "WAVELNTH": "[Angstrom] wavelength",
+    "CDELT1": "[arcsec] pixel scale along axis 1",
+    "CDELT2": "[arcsec] pixel scale along axis 2",
+    "DATE-BEG": "[UTC] start of exposure, made up",
+    "DATE-OBS": "[UTC] start of exposure, made up",
+    "XPOSURE": "[s] exposure time",
+    "EXPTIME": "[s] exposure time",
+    "GAINCOMB": "gain mode imitated",
+    "BUNIT": "unit of the pixels",
+    "SATURATE": "[DN] level at which pixels clip",
+    "FOV": "pointing",
+    "MARGIN": "[pixel] beyond the field on each side",
+}
+
+
+@dataclass(frozen=True)
+class Imitated:
+    """An instrument in simulated headers.
+
+    name: as in transit.json. texts: keywords that identify it. wavelength_angstrom: a whole number, as WAVELNTH.
+    date_key, exposure_key: keywords of start and exposure time. has_gain_modes: whether GAINCOMB is written.
+    """
+
+    name: str
+    texts: dict[str, str]
+    wavelength_angstrom: int
+    plate_scale_arcsec: float
+    date_key: str = "DATE-BEG"
+    exposure_key: str = "XPOSURE"
+    has_gain_modes: bool = True
+
+    def values(self) -> dict[str, CardValue]:
+        """The keywords of every file."""
+        return {
+            "ORIGIN": "SIMULATED by heliopsf",
+            **self.texts,
+            "WAVELNTH": self.wavelength_angstrom,
+            "CDELT1": self.plate_scale_arcsec,
+            "CDELT2": self.plate_scale_arcsec,
+        }
+
+    def shot_values(self, shot: Shot, unit: str) -> dict[str, CardValue]:
+        """The keywords of an image in `unit`."""
+        begin = (_START + timedelta(seconds=shot.time_s)).isoformat(timespec="milliseconds")
+        values = self.values() | {self.date_key: begin, self.exposure_key: shot.exposure_s}
+        if self.has_gain_modes:
+            values["GAINCOMB"] = shot.gain_mode
+        return values | {"BUNIT": unit}
+
+
+HRI_EUV = Imitated("hri_euv", _OWN_TEXTS["hri_euv"], 174, 0.492)
+
+
+def imitated(instrument: Instrument) -> Imitated:
+    """The keywords of an instrument."""
+    if instrument.name == HRI_EUV.name:
+        return HRI_EUV
+    is_aia = instrument.name.startswith("aia_")
+    return Imitated(
+        name=instrument.name,
+        texts=_OWN_TEXTS.get(instrument.name, instrument.match),
+        wavelength_angstrom=round(instrument.wavelength_angstrom),
+        plate_scale_arcsec=instrument.detector.plate_scale_arcsec,
+        date_key="DATE-OBS" if is_aia else "DATE-BEG",
+        exposure_key="EXPTIME" if is_aia else "XPOSURE",
+        has_gain_modes=not is_aia,
+    )
+
+
+def commented(values: dict[str, CardValue]) -> dict[str, tuple[CardValue, str]]:
+    """Keywords with their comments."""
+    return {key: (value, _COMMENTS.get(key, "instrument imitated")) for key, value in values.items()}

@@ -1,0 +1,362 @@
+"""The members of a .zip, .tar or .tar.gz, read one after the other by ``zipfile`` and ``tarfile``.
+
+An archive may lie in every field. The gate checks each member before its bytes are read, and unpacked bytes are
+counted as they are read. The two libraries limit neither memory nor time by themselves; where they need a bound,
+they get a file object that enforces it (``_BoundedFile``, ``_TarInput``).
+
+Standard library only, so that the web process can list an upload.
+"""
+
+from __future__ import annotations
+
+import errno
+import gzip
+import io
+import re
+import stat
+import struct
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, BinaryIO, Literal, Protocol, Self, cast
+
+from psfcore.errors import DataError
+from psfcore.transit.admission import ArchiveLimits, Gate, not_plain, shown
+
+Kind = Literal["zip", "tar", "tar.gz"]
+START_BYTES = 262  # bytes at the start of a file that suffice to tell its kind
+_CHUNK = 1 << 20
+_TAR_MAGIC = b"ustar"
+_TAR_MAGIC_AT = 257
+_MAX_HEADER_BYTES = 1 << 16  # of all headers of one member: pax records, GNU long names
+_MAX_GLOBAL_RECORDS = 64
+_PAX_TYPES = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
+_PAX_RECORD = re.compile(rb"([1-9]\d{0,5}) [^=\n]+=")
+_MANY_DIGITS = re.compile(rb"\d{65}")
+_ZIP_ENTRY = b"PK\1\2"
+_DIRECTORY_BYTES_PER_MEMBER = 512  # in a zip's central directory; a generous mean
+_ZIP_ENCRYPTED = 0x1 | 0x40 | 0x2000
+_ZIP_METHODS = {zipfile.ZIP_STORED: "stored", zipfile.ZIP_DEFLATED: "deflated"}
+# The exceptions that a damaged archive raises, depending on where the damage is.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    tarfile.TarError,
+    zlib.error,
+    struct.error,
+    EOFError,
+    OSError,
+    ValueError,
+    LookupError,
+    ArithmeticError,
+    NotImplementedError,
+    RuntimeError,
+)
+
+
+def could_be_archive(start: bytes) -> bool:
+    """False as soon as the first bytes of a file (any number of them) rule out every kind."""
+    if _starts_like(start, b"PK\x03\x04") or _starts_like(start, b"PK\x05\x06"):
+        return True
+    if _starts_like(start, b"\x1f\x8b"):
+        return True
+    return _starts_like(start[_TAR_MAGIC_AT:], _TAR_MAGIC)
+
+
+def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
+    """The kind of a file by its first START_BYTES, or None. ``opened`` checks what a gzip file contains."""
+    if start.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        return "zip"
+    if start.startswith(b"\x1f\x8b"):
+        return "gzip"
+    return "tar" if start[_TAR_MAGIC_AT:].startswith(_TAR_MAGIC) else None
+
+
+def _starts_like(start: bytes, known: bytes) -> bool:
+    """True if one of the two is the beginning of the other."""
+    return start.startswith(known) or known.startswith(start)
+
+
+class Member:
+    """A file in an archive. gate: counts the unpacked bytes, unless the archive's input counts them."""
+
+    def __init__(self, name: str, size_bytes: int, stream: IO[bytes], gate: Gate | None = None) -> None:
+        self.name, self.size_bytes = name, size_bytes
+        self._stream, self._gate, self._read = stream, gate, 0
+
+    def read(self, count: int) -> bytes:
+        """The next bytes, b"" at the end. Raises DataError "archive-broken", "archive-too-large"."""
+        got = self._stream.read(count)  # zipfile checks the CRC at the end
+        self._read += len(got)
+        if self._gate is not None:
+            self._gate.count_unpacked(len(got))
+        if self._read > self.size_bytes or (len(got) < count and self._read != self.size_bytes):
+            message = f"expected {self.size_bytes} bytes in {shown(self.name)}, as declared; got {self._read}"
+            raise DataError("archive-broken", message)
+        return got
+
+
+class OpenArchive(Protocol):
+    """An archive that is open for reading, once, from its start to its end."""
+
+    kind: Kind
+
+    def members(self) -> Iterator[Member]:
+        """The accepted members; each must be read before the next is asked for."""
+        ...
+
+
+@contextmanager
+def opened(path: Path, limits: ArchiveLimits) -> Iterator[OpenArchive]:
+    """Open an archive. Errors that damage causes, here or in the with block, become "archive-broken".
+
+    Raises DataError "not-an-archive", "archive-climbs", "archive-not-plain", "archive-too-large", "archive-broken".
+    Passes on OSError of the disk.
+    """
+    with path.open("rb") as file:
+        kind = archive_kind(file.read(START_BYTES))
+        size = file.seek(0, io.SEEK_END)
+        file.seek(0)
+        gate = Gate(limits, size)
+        try:
+            if kind == "zip":
+                with zipfile.ZipFile(cast(IO[bytes], _BoundedFile(file, gate))) as archive:
+                    yield _Zip(archive, gate)
+            elif kind == "tar":
+                yield _Tar("tar", _TarInput(file, gate, size), gate)
+            elif kind == "gzip":
+                with gzip.GzipFile(fileobj=file, mode="rb") as stream:
+                    if archive_kind(stream.read(START_BYTES)) != "tar":
+                        message = "expected a .zip, .tar or .tar.gz; got a gzip file that contains no tar"
+                        raise DataError("not-an-archive", message)
+                    stream.seek(0)
+                    yield _Tar("tar.gz", _TarInput(cast(BinaryIO, stream), gate), gate)
+            else:
+                raise DataError("not-an-archive", "expected a .zip, .tar or .tar.gz; got another format")
+        except DataError:
+            raise
+        except _DAMAGE as error:
+            if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+                raise  # an error of the disk, not of the archive
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise DataError("archive-broken", f"expected an intact archive; got: {reason:.120}") from None
+
+
+def _truncated() -> DataError:
+    return DataError("archive-broken", "expected a complete archive; got one that ends too early")
+
+
+# --- zip --------------------------------------------------------------------------------------------------
+
+
+class _BoundedFile:
+    """The file that ``zipfile`` reads; a single read is never larger than the largest central directory allowed.
+
+    zipfile reads the central directory at once and makes an object for each entry. The entries are counted
+    here, by their signature, before zipfile makes those objects.
+    """
+
+    def __init__(self, file: BinaryIO, gate: Gate) -> None:
+        self._file = file
+        self._gate = gate
+        self._most = max(_CHUNK, gate.limits.max_files * _DIRECTORY_BYTES_PER_MEMBER)
+
+    def read(self, count: int = -1) -> bytes:
+        got = self._file.read(self._most + 1 if count < 0 else min(count, self._most + 1))
+        if len(got) > self._most:
+            message = f"expected a table of contents of at most {self._most} bytes; got more"
+            raise DataError("archive-too-large", message)
+        if got.startswith(_ZIP_ENTRY) and got.count(_ZIP_ENTRY) > self._gate.limits.max_files:
+            message = f"expected at most {self._gate.limits.max_files} members; got more"
+            raise DataError("archive-too-large", message)
+        return got
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def seekable(self) -> bool:
+        return True
+
+
+class _Zip:
+    kind: Kind = "zip"
+
+    def __init__(self, archive: zipfile.ZipFile, gate: Gate) -> None:
+        self._archive, self._gate = archive, gate
+
+    def members(self) -> Iterator[Member]:
+        """All entries are checked before the first is read."""
+        entries = self._archive.infolist()
+        self._gate.count_members(len(entries))
+        admitted = [(info, name) for info in entries if (name := self._admit(info)) is not None]
+        for info, name in admitted:
+            with self._archive.open(info) as stream:
+                yield Member(name, info.file_size, stream, self._gate)
+
+    def _admit(self, info: zipfile.ZipInfo) -> str | None:
+        kind = stat.S_IFMT(info.external_attr >> 16) if info.create_system != 0 else 0
+        if info.orig_filename.endswith("/") and kind in (0, stat.S_IFDIR):
+            self._gate.check_folder(info.orig_filename)
+            return None
+        name = self._gate.admit(info.orig_filename, info.file_size)
+        if name is None:
+            return None
+        if kind not in (0, stat.S_IFREG):
+            raise not_plain(info.orig_filename, "expected only plain files, no links or devices")
+        if info.flag_bits & _ZIP_ENCRYPTED:
+            raise not_plain(info.orig_filename, "expected files that are not encrypted")
+        if info.compress_type not in _ZIP_METHODS:
+            wanted = " or ".join(_ZIP_METHODS.values())
+            raise not_plain(
+                info.orig_filename, f"expected {wanted} files, not compression method {info.compress_type}"
+            )
+        # Deflate adds at most five bytes per block. A larger compressed size means that the declared size is wrong.
+        if info.compress_size > 2 * info.file_size + 1024:
+            got = f"{info.compress_size} compressed bytes for a declared size of {info.file_size} bytes"
+            message = f"{shown(info.orig_filename)}: expected sizes that agree; got {got}"
+            raise DataError("archive-broken", message)
+        return name
+
+
+# --- tar --------------------------------------------------------------------------------------------------
+
+
+class _TarInput:
+    """The file that ``tarfile`` reads: forward only, every byte counted, headers bounded.
+
+    tarfile believes the sizes in headers: it reads a pax header or a GNU long name of any size at once, follows any
+    number of them by recursion, and collects the maps of sparse files without a limit. Here the headers of one member
+    may take _MAX_HEADER_BYTES in all, which bounds each of these. A step back would inflate a .tar.gz again from its
+    start; tarfile needs none as long as members are read in order.
+
+    size: of a file in which data can be skipped by seeking; None: skipped data is read, and counted too.
+    """
+
+    def __init__(self, file: BinaryIO, gate: Gate, size: int | None = None) -> None:
+        self._file, self._gate, self._size = file, gate, size
+        self._at = 0
+        self._header_bytes_left: int | None = _MAX_HEADER_BYTES  # None: reading a member's data
+        self.pax_text_is_next = False
+
+    def expect_headers(self) -> None:
+        """From here to ``expect_data`` only headers are read."""
+        self._header_bytes_left = _MAX_HEADER_BYTES
+
+    def expect_data(self) -> None:
+        """From here the data of a member are read."""
+        self._header_bytes_left = None
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int) -> int:
+        if offset < self._at:
+            raise ValueError("a member that starts before the end of the one before")
+        if self._size is not None:
+            if offset > self._size:
+                raise _truncated()
+            self._at = self._file.seek(offset)
+        while self._at < offset:
+            if not self._counted(min(offset - self._at, _CHUNK)):
+                raise _truncated()
+        return self._at
+
+    def read(self, count: int) -> bytes:
+        if self._header_bytes_left is not None:
+            if not 0 <= count <= self._header_bytes_left:
+                message = f"expected at most {_MAX_HEADER_BYTES} bytes of headers for one member; got more"
+                raise DataError("archive-broken", message)
+            self._header_bytes_left -= count
+        got = self._counted(count)
+        if self.pax_text_is_next:
+            self.pax_text_is_next = False
+            _check_pax_records(got)
+        return got
+
+    def _counted(self, count: int) -> bytes:
+        got = self._file.read(count)
+        self._at += len(got)
+        self._gate.count_unpacked(len(got))
+        return got
+
+
+def _check_pax_records(text: bytes) -> None:
+    """Raise DataError "archive-broken" unless a pax header consists of records "length key=value\\n".
+
+    On other text tarfile's regular expressions take quadratic time and memory (long runs of digits: CVE-2024-6232).
+    """
+    at = 0
+    while at < len(text) and text[at] != 0:
+        record = _PAX_RECORD.match(text, at)
+        end = at + int(record[1]) if record else at
+        if record is None or end <= record.end() or text[end - 1 : end] != b"\n":
+            raise DataError("archive-broken", "expected pax records 'length key=value'; got other text")
+        at = end
+    if _MANY_DIGITS.search(text):
+        raise DataError("archive-broken", "expected pax records with at most 64 digits in a row; got more")
+
+
+def _checked_headers(source: _TarInput, gate: Gate) -> type[tarfile.TarInfo]:
+    """A TarInfo whose ``frombuf``, which tarfile calls for every header block, checks the block first."""
+
+    class Header(tarfile.TarInfo):
+        @classmethod
+        def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
+            if len(buf) < tarfile.BLOCKSIZE:
+                raise _truncated()  # tarfile would take this, and a damaged header, as the end of the archive
+            if not any(buf):
+                return super().frombuf(buf, encoding, errors)  # raises what ends the archive
+            gate.count_members()
+            try:
+                header = super().frombuf(buf, encoding, errors)
+            except tarfile.HeaderError as error:
+                raise DataError("archive-broken", f"expected a tar header; got a {error}") from None
+            if header.type == tarfile.GNUTYPE_SPARSE:
+                raise not_plain(header.name, "expected only plain files, no sparse ones")
+            source.pax_text_is_next = header.type in _PAX_TYPES
+            return header
+
+    return Header
+
+
+class _Tar:
+    def __init__(self, kind: Kind, source: _TarInput, gate: Gate) -> None:
+        self.kind, self._source, self._gate = kind, source, gate
+
+    def members(self) -> Iterator[Member]:
+        with tarfile.TarFile(  # reads the first header
+            fileobj=cast(IO[bytes], self._source),
+            tarinfo=_checked_headers(self._source, self._gate),
+            encoding="utf-8",
+            errors="surrogateescape",
+        ) as archive:
+            while True:
+                self._source.expect_headers()
+                info = archive.next()
+                self._source.expect_data()
+                if info is None:
+                    return
+                if len(archive.pax_headers) > _MAX_GLOBAL_RECORDS:  # each member gets a copy of them
+                    message = f"expected at most {_MAX_GLOBAL_RECORDS} global pax records; got more"
+                    raise DataError("archive-broken", message)
+                name = self._admit(info)
+                info.pax_headers = {}  # tarfile keeps each TarInfo
+                stream = None if name is None else archive.extractfile(info)
+                if name is not None and stream is not None:
+                    with stream:
+                        yield Member(name, info.size, stream)
+
+    def _admit(self, info: tarfile.TarInfo) -> str | None:
+        if any(key.startswith("GNU.sparse") for key in info.pax_headers):
+            raise not_plain(info.name, "expected only plain files, no sparse ones")
+        if info.isdir():
+            self._gate.check_folder(info.name)
+            return None
+        if not info.isreg() or info.size < 0:
+            raise not_plain(info.name, "expected only plain files, no links or devices")
+        return self._gate.admit(info.name, info.size)
