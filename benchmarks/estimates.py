@@ -44,19 +44,19 @@ QUICK: list[dict[str, Any]] = [
     {"kind": "psf-build", "instrument": "aia_171", "size": 2048},
     {"kind": "psf-build", "instrument": "hri_euv", "size": 4096},
     {"kind": "psf-tables", "psf": 2048},
-    *({"kind": kind, "px": 128, "images": 12} for kind in ("psf-fit", "evaluate", "gap-diagnose")),
+    *({"kind": kind, "px": 128, "images": 12} for kind in ("psf-fit", "report", "gap-diagnose")),
     {"kind": "cross-validate", "px": 256, "images": 18, "runs": 10},
     {"kind": "psf-fit", "px": 256, "images": 18},
 ]
 FULL: list[dict[str, Any]] = [
     {"kind": "deconvolve", "px": 4096, "psf": 2048, "method": {"name": "richardson-lucy", "steps": 10}},
     {"kind": "deconvolve", "px": 1024, "psf": "hri", "error_draws": 4, "noise": True},
-    *({"kind": kind, "px": 512, "images": 30} for kind in ("psf-fit", "evaluate", "gap-diagnose")),
+    *({"kind": kind, "px": 512, "images": 30} for kind in ("psf-fit", "report", "gap-diagnose")),
     {"kind": "cross-validate", "px": 512, "images": 30, "runs": 10},
     {"kind": "cross-validate", "px": 128, "images": 12, "runs": 2, "scheme": "exact"},
     {"kind": "psf-fit", "px": 256, "images": 18, "as_published": True},
 ]
-STUDIES = ("psf-fit", "evaluate", "gap-diagnose", "cross-validate")
+STUDIES = ("psf-fit", "report", "gap-diagnose", "cross-validate")
 
 
 def main() -> None:

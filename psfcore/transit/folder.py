@@ -224,7 +224,7 @@ def _noise(manifest: TransitManifest) -> Noise:
             f'expected "noise": {{"photon_gain_dn": ..., "read_noise_dn": ...}} in {MANIFEST_NAME}, or both '
             "figures with the request (DN a detected photon, DN rms of the readout); got none",
         )
-    return Noise(manifest.noise.photon_gain_dn, manifest.noise.read_noise_dn)
+    return manifest.noise.noise()
 
 
 def _known_psf(

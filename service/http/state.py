@@ -9,8 +9,7 @@ from fastapi import Depends, Request
 
 from psfcore.fits.header import FitsLimits
 from service.http.access import Access
-from service.http.rates import Rates
-from service.http.streams import Streams
+from service.http.rates import Rates, Streams
 from workers.broker.reconciler import Reconciler
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store

@@ -12,10 +12,10 @@ from datetime import UTC, datetime
 from typing import Any
 from xml.etree import ElementTree
 
-from service.api.jobs import RESULTS
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.catalogue.uws_jobs import JobLine
-from workers.contract.contract import Fault, JobError, Phase
+from workers.contract.kinds import KINDS, Result
+from workers.contract.phases import Fault, JobError, Phase
 
 MEDIA_TYPE = "application/xml"
 UWS = "http://www.ivoa.net/xml/UWS/v1.0"
@@ -80,8 +80,8 @@ def result_addresses(row: JobRow) -> dict[str, tuple[str, str]]:
     """By the result's name its address in this service and its media type; empty until the job is completed."""
     if row.phase != Phase.COMPLETED or row.result_id is None:
         return {}
-    made = RESULTS[row.kind]
-    media_type = "application/json" if made == "/v1/reports" else "application/fits"
+    made = KINDS[row.kind].result
+    media_type = "application/json" if made == Result.REPORT else "application/fits"
     return {
         "result": (f"{made}/{row.result_id}/file", media_type),
         "description": (f"{made}/{row.result_id}", "application/json"),

@@ -24,7 +24,7 @@ from service.uws import documents
 from service.uws import plain_errors as routing
 from service.uws.parameters import Form, bad, check, integer, kind_of, moment, phase, query_of, resolved
 from workers.catalogue.tables import JobRow, TermsRow
-from workers.contract.contract import JobError, Phase
+from workers.contract.phases import JobError, Phase
 
 MAX_RUN_ID = 256
 MOST = 2**31 - 1

@@ -20,8 +20,10 @@ from sqlalchemy.orm import InstrumentedAttribute, aliased
 
 from workers.catalogue.database import Database
 from workers.catalogue.tables import JobRow, TermsRow
-from workers.contract.contract import LIVE, Fault, JobError, Phase, canonical_hash
-from workers.contract.queues import Queue, queue_of
+from workers.contract.identities import canonical_hash
+from workers.contract.kinds import queue_of
+from workers.contract.phases import LIVE, Fault, JobError, Phase
+from workers.contract.queues import Queue
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-from workers.contract.contract import Identity, Method, NoiseFigures, RichardsonLucy
+from psfcore.noise_figures import NoiseFigures
+from workers.contract.methods import Method, RichardsonLucy
+from workers.contract.requests import Identity
 
 MOST_UPLOADED = 100_000
 MOST_SETS = 100

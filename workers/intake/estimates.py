@@ -22,7 +22,8 @@ from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
-from workers.contract.contract import PsfBuild, instrument_text
+from workers.contract.identities import instrument_text
+from workers.contract.requests import PsfBuild
 from workers.settings import Settings
 
 MIB = 2**20
@@ -73,7 +74,7 @@ class _Study:
 STUDIES = {
     "psf-fit": _Study(8.3, 2200.0, 485.0, 15.0),
     "cross-validate": _Study(2.9, 1600.0, 100.0, 20.0),
-    "evaluate": _Study(20.0, 10_500.0, 505.0, 27.0),
+    "report": _Study(20.0, 10_500.0, 505.0, 27.0),
     "gap-diagnose": _Study(6.0, 7100.0, 115.0, 37.0),
 }
 RUN_S, RUN_NS = (

@@ -20,7 +20,8 @@ from tests.conftest import SMALL_INSTRUMENT
 from tests.service.conftest import upload
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.contract import Phase, canonical_hash
+from workers.contract.identities import canonical_hash
+from workers.contract.phases import Phase
 from workers.settings import Settings
 
 JOBS = "/uws/jobs"
@@ -185,7 +186,7 @@ def test_a_job_may_be_set_up_bit_by_bit_and_is_judged_when_it_runs(api: TestClie
 
 def test_true_and_false_are_read_where_only_one_is_allowed(api: TestClient) -> None:
     created(api, KIND="cross-validate", transit_id="0" * 64, as_published="false", runs="3")
-    created(api, KIND="evaluate", transit_id="0" * 64, dark_offsets="false", psf_id="null")
+    created(api, KIND="report", transit_id="0" * 64, dark_offsets="false", psf_id="null")
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +258,7 @@ BAD_REQUESTS = [
     ("POST", "/executionduration", {}, 400, "expected EXECUTIONDURATION"),
     ("POST", "/destruction", {"DESTRUCTION": "soon"}, 400, "expected DESTRUCTION, a time as"),
     ("POST", "/destruction", {"DESTRUCTION": "1999-01-01T00:00:00Z"}, 400, "a time that is to come"),
-    ("POST", "/parameters", {"KIND": "evaluate"}, 400, "expected KIND=psf-build"),
+    ("POST", "/parameters", {"KIND": "report"}, 400, "expected KIND=psf-build"),
     ("POST", "/parameters", {"size": "big"}, 400, "size: "),
     ("GET", "/results/result", {}, 404, "has no result"),
     ("GET", "/results/%00", {}, 404, "has no result"),

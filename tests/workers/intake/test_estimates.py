@@ -16,9 +16,9 @@ from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
-from workers.contract.contract import Method, PsfBuild, RichardsonLucy
+from workers.contract.methods import Method, RichardsonLucy
+from workers.contract.requests import PsfBuild
 from workers.intake.estimates import MARGIN_SHARE, STEP_NS, _build, checked, estimate
-from workers.run import registry as tasks
 from workers.settings import Settings
 from workers.tasks.context import Context
 
@@ -145,7 +145,7 @@ def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:
         )
     for kind, more in {
         "psf-fit": {"as_published": False},
-        "evaluate": {},
+        "report": {},
         "gap-diagnose": {},
         "cross-validate": {"scheme": "shared", "runs": 10},
     }.items():
@@ -191,7 +191,7 @@ def test_a_job_that_executes_too_long_ends_with_its_next_step(
             context.report("working", step, 100)
         return "0" * 64
 
-    monkeypatch.setitem(tasks.TASKS, "deconvolve", slow)
+    monkeypatch.setattr("workers.tasks.deconvolve.deconvolve", slow)
     service = LocalService(settings.model_copy(update={"max_job_s": 0.3}))
     with pytest.raises(ServiceError) as ended:
         service.deconvolve(image_file, psf_id=service.upload_psf(psf_file)["id"])

@@ -23,9 +23,8 @@ from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.census import FileTally
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow, PsfRow
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 from workers.files.store import Store
-from workers.run import registry as tasks
 from workers.run.runner import Runner
 from workers.run.stopping import Stopping
 from workers.settings import Settings
@@ -45,7 +44,7 @@ class Bench:
 
     def run(self, task: Task) -> JobRow:
         """The job's row after a run of it."""
-        self._monkeypatch.setitem(tasks.TASKS, "psf-build", task)
+        self._monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
         job, _ = self.catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
         self.catalogue.jobs.mark_submitted(job.id)
         store = Store(self._settings.data_dir)
@@ -198,7 +197,7 @@ def test_a_database_gets_back_the_indexes_that_it_lacks(catalogue: Catalogue) ->
 
 WORKER = """
 import time
-from workers import tasks
+import workers.tasks.psf_build
 
 def listens(context, _):
     while True:
@@ -209,7 +208,7 @@ def deaf(context, _):
     context.report("at work", 2, 2)
     time.sleep(60)
 
-tasks.TASKS["psf-build"] = {task}
+workers.tasks.psf_build.psf_build = {task}
 from workers.run.worker import main
 main()
 """

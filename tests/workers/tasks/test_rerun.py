@@ -19,7 +19,7 @@ from tests.workers.psf_examples import OWNER, identity, product, psf
 from workers import lineage
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
-from workers.contract.contract import instrument_text
+from workers.contract.identities import instrument_text
 from workers.lineage import Ancestor, made_by
 from workers.tasks import deconvolve as deconvolve_task
 

@@ -19,8 +19,7 @@ from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
-from workers.contract.contract import Phase
-from workers.run import registry as tasks
+from workers.contract.phases import Phase
 from workers.run import runner
 from workers.settings import Settings
 from workers.tasks import deconvolve as deconvolve_task
@@ -164,7 +163,7 @@ def test_a_passing_failure_is_tried_again_and_then_given_up(
     def away(*_: object) -> str:
         raise ConnectionError("storage away")
 
-    monkeypatch.setitem(tasks.TASKS, "psf-build", away)
+    monkeypatch.setattr("workers.tasks.psf_build.psf_build", away)
     job = local.submit("psf-build", instrument="hri_euv", size=64)
     catalogue = Catalogue(settings.catalogue_url)
     phases = []
@@ -183,7 +182,7 @@ def test_our_own_failure_is_internal_and_is_logged(
     def broken(*_: object) -> str:
         raise ZeroDivisionError("ours")
 
-    monkeypatch.setitem(tasks.TASKS, "psf-build", broken)
+    monkeypatch.setattr("workers.tasks.psf_build.psf_build", broken)
     with pytest.raises(ServiceError) as caught:
         local.build_psf("hri_euv", size=64)
     assert caught.value.code == "internal-error"
