@@ -51,7 +51,9 @@ STATUS_OF = {
     "successor-named": 409,
     "version-taken": 409,
     "wrong-transition": 409,
+    "archive-too-large": 413,
     "too-much-memory": 413,
+    "not-an-archive": 415,
 }
 # On every answer, unless the route sets its own: no guessed media types, no frames, no referrer, no loaded content.
 SECURITY_HEADERS = {

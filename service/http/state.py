@@ -1,4 +1,4 @@
-"""What the endpoints share: settings, catalogue, store and reconciler, made once for each application."""
+"""What all endpoints share: settings, catalogue, store and reconciler. Each application makes them once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from workers.settings import Settings
 
 @dataclass(frozen=True)
 class State:
-    """Handles that live as long as the application."""
+    """Objects that live as long as the application."""
 
     settings: Settings
     catalogue: Catalogue
@@ -30,7 +30,7 @@ class State:
 
     @property
     def limits(self) -> FitsLimits:
-        """Limits of the files that are taken."""
+        """Limits of accepted FITS files."""
         return FitsLimits(max_pixels=self.settings.max_pixels)
 
 

@@ -78,7 +78,7 @@ def bad(message: str, status: int = 400) -> Problem:
 def kind_of(form: dict[str, str]) -> str:
     """Take KIND out of a form. Raises ``Problem`` if no client can request jobs of that kind."""
     kind = form.pop("kind", None)
-    if kind not in REQUESTS:
+    if kind is None or kind not in REQUESTS:
         hint = did_you_mean(kind or "", REQUESTS)
         raise bad(f"expected KIND, one of {', '.join(REQUESTS)}; got {_shown(kind)}{hint}")
     return kind

@@ -303,6 +303,18 @@ class Jobs:
             "lease": None,
         }
 
+    def run_times(self, kind: str, limit: int) -> list[tuple[dict[str, Any], float]]:
+        """Estimate and duration in seconds of the newest completed jobs of a kind."""
+        query = (
+            select(JobRow.estimate, JobRow.ended_at - JobRow.started_at)
+            .where(JobRow.kind == kind, JobRow.phase == Phase.COMPLETED)
+            .where(JobRow.estimate.is_not(None), JobRow.started_at.is_not(None))
+            .order_by(JobRow.created_at.desc())
+            .limit(limit)
+        )
+        with self._database.reading() as session:
+            return [(estimate or {}, float(seconds)) for estimate, seconds in session.execute(query)]
+
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
         """One UPDATE; True where it changed a row."""
         return bool(self._database.change(update(JobRow).where(and_(*conditions)).values(**values)))

@@ -216,13 +216,13 @@ KINDS: Mapping[str, Kind] = {row.name: row for row in _ROWS}
 
 def _request_model(row: Kind) -> type[Request]:
     name = "".join(part.title() for part in row.name.split("-")) + "Request"
+    fields: dict[str, Any] = {"kind": (Literal[row.name], ...), "parameters": (row.parameters, ...)}
     return create_model(
         name,
         __base__=Request,
         __module__=__name__,
         __doc__=f"A request for a job of kind `{row.name}`.",
-        kind=(Literal[row.name], ...),
-        parameters=(row.parameters, ...),
+        **fields,
     )
 
 

@@ -178,7 +178,7 @@ def test_a_job_may_be_set_up_bit_by_bit_and_is_judged_when_it_runs(api: TestClie
     assert missing.headers["content-type"].startswith("text/plain")
     post(api, f"{job}/parameters", image_id="0" * 64)
     unknown = post(api, f"{job}/phase", PHASE="RUN")
-    assert unknown.status_code == 400 and "no image was uploaded" in unknown.text
+    assert unknown.status_code == 400 and "the id of an uploaded image" in unknown.text
     assert api.get(f"{job}/phase").text == "PENDING"
     neither = created(api, KIND="psf-build")
     assert "expected one of instrument" in post(api, f"{neither}/phase", PHASE="RUN").text
@@ -203,7 +203,7 @@ def unchanged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 BAD_CREATIONS = [
     ("no KIND", {}, "expected KIND, one of deconvolve"),
     ("unknown KIND", {"KIND": "<rm -rf>"}, "got '<rm -rf>'"),
-    ("unknown parameter", BUILD | {"colour": "red"}, "colour: no parameter of psf-build"),
+    ("unknown parameter", BUILD | {"colour": "red"}, "colour: there is no such field"),
     ("not a number", BUILD | {"size": "big"}, "got 'big'"),
     ("odd size", BUILD | {"size": "127"}, "size: Input should be a multiple of 2; got 127"),
     ("not JSON", {"KIND": "deconvolve", "method": "{linear"}, "method: "),
@@ -226,7 +226,7 @@ BAD_CREATIONS = [
     ("ABORT at once", BUILD | {"PHASE": "ABORT"}, "expected PHASE=RUN"),
     ("duration", BUILD | {"EXECUTIONDURATION": "-1"}, "EXECUTIONDURATION"),
     ("destruction", BUILD | {"DESTRUCTION": "2001-01-01"}, "a time that is to come"),
-    ("no image there", {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64}, "no image was uploaded"),
+    ("no image there", {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64}, "the id of an uploaded image"),
     ("incomplete and RUN", {"KIND": "deconvolve", "PHASE": "RUN"}, "image_id: expected a value"),
 ]
 
@@ -256,7 +256,7 @@ BAD_REQUESTS = [
     ("POST", "/executionduration", {"EXECUTIONDURATION": "long"}, 400, "got 'long'"),
     ("POST", "/executionduration", {"EXECUTIONDURATION": "-5"}, 400, "EXECUTIONDURATION"),
     ("POST", "/executionduration", {}, 400, "expected EXECUTIONDURATION"),
-    ("POST", "/destruction", {"DESTRUCTION": "soon"}, 400, "expected DESTRUCTION, a time as"),
+    ("POST", "/destruction", {"DESTRUCTION": "soon"}, 400, "expected DESTRUCTION, a time such as"),
     ("POST", "/destruction", {"DESTRUCTION": "1999-01-01T00:00:00Z"}, 400, "a time that is to come"),
     ("POST", "/parameters", {"KIND": "report"}, 400, "expected KIND=psf-build"),
     ("POST", "/parameters", {"size": "big"}, 400, "size: "),
