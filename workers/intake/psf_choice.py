@@ -45,8 +45,8 @@ class Found:
         given = self._given()
         before = dict(list(given.items())[: list(given).index(self.emptied_by)]) if self.emptied_by else given
         asked = f"{self.emptied_by} {given[self.emptied_by]}" if self.emptied_by else "any property"
-        among = f"of those with {_joined(before)}" if before else "of all PSFs"
-        return f"expected one PSF with {self._said()}; {among} none has {asked}"
+        among = f"no PSF with {_joined(before)}" if before else "no PSF"
+        return f"expected one PSF with {self._said()}; {among} has {asked}"
 
     def _said(self) -> str:
         return _joined(self._given()) or "no filter"

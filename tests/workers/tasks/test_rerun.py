@@ -261,7 +261,7 @@ def test_the_job_that_made_a_psf(catalogue: Catalogue, values: dict[str, Any], k
 
 def test_parameters_that_are_taken_no_more_say_so(catalogue: Catalogue) -> None:
     row, _ = catalogue.add(product("x", "p", details={"parameters": {"image_id": "no id"}}))
-    with pytest.raises(DataError, match="does not take: image_id") as caught:
+    with pytest.raises(DataError, match="made with others: image_id") as caught:
         made_by(catalogue, row)
     assert caught.value.code == "parameters-outdated"
 
