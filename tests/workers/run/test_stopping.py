@@ -141,10 +141,10 @@ def test_the_lines_of_a_job_carry_its_id_and_owner(bench: Bench, caplog: pytest.
             said.append({"message": record.getMessage(), **logs.about()})
 
     keep = Keep()
-    logging.getLogger("workers.run.runner").addHandler(keep)
+    logging.getLogger("workers.run").addHandler(keep)
     caplog.set_level(logging.INFO)
     row = bench.run(steps_for(60.0, at_work=lambda: bench.stopping.ask(0.0)))
-    logging.getLogger("workers.run.runner").removeHandler(keep)
+    logging.getLogger("workers.run").removeHandler(keep)
     by_heart = [one for one in said if "handed back" in one["message"]]
     assert by_heart and len(said) >= 3
     assert all((one["job"], one["owner"]) == (row.id, "local") for one in said)
@@ -258,8 +258,8 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     row = catalogue.jobs.get(job.id)
     assert row is not None and (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
     told_of = log.read_text()
-    assert ("left to another worker" in told_of) == (task == "listens"), told_of
-    assert "ending now" in told_of or task == "listens", f"{took_s:.1f} s; {told_of}"
+    assert ("another worker has the job" in told_of) == (task == "listens"), told_of
+    assert "exiting now" in told_of or task == "listens", f"{took_s:.1f} s; {told_of}"
     assert catalogue.census.workers(60.0) == [], "it took its leave"
     catalogue.close()
     lines = [json.loads(line) for line in log.read_text().splitlines()]

@@ -271,5 +271,5 @@ def test_another_owner_s_job_is_not_read(catalogue: Catalogue) -> None:
     lease = catalogue.jobs.claim(job.id, "w")
     row, _ = catalogue.add(product("x", "p", details={"job_id": job.id}))
     assert lease is not None and catalogue.jobs.complete(lease, row.id)
-    with pytest.raises(DataError, match="not written down"):
+    with pytest.raises(DataError, match="not recorded"):
         made_by(catalogue, row)

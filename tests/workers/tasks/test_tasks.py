@@ -20,7 +20,7 @@ from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
 from workers.contract.phases import Phase
-from workers.run import runner
+from workers.run import attempt
 from workers.settings import Settings
 from workers.tasks import deconvolve as deconvolve_task
 
@@ -137,7 +137,7 @@ def test_a_built_psf_carries_where_it_came_from(local: LocalService, tmp_path: P
 def test_a_cancelled_job_stops_at_its_next_step(
     local: LocalService, settings: Settings, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runner, "REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr(attempt, "REPORT_EVERY_S", 0.0)
     write_image(tmp_path / "i.fits")
     image_id, psf_id = local.upload_image(tmp_path / "i.fits")["id"], local.upload_psf(psf_file)["id"]
     job = local.submit("deconvolve", image_id=image_id, psf_id=psf_id)
