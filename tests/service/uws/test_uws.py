@@ -181,7 +181,7 @@ def test_a_job_may_be_set_up_bit_by_bit_and_is_judged_when_it_runs(api: TestClie
     assert unknown.status_code == 400 and "the id of an uploaded image" in unknown.text
     assert api.get(f"{job}/phase").text == "PENDING"
     neither = created(api, KIND="psf-build")
-    assert "expected one of instrument" in post(api, f"{neither}/phase", PHASE="RUN").text
+    assert "expected exactly one of instrument" in post(api, f"{neither}/phase", PHASE="RUN").text
 
 
 def test_true_and_false_are_read_where_only_one_is_allowed(api: TestClient) -> None:
@@ -225,8 +225,12 @@ BAD_CREATIONS = [
     ("PHASE", BUILD | {"PHASE": "NONSENSE"}, "expected PHASE=RUN or none, got 'NONSENSE'"),
     ("ABORT at once", BUILD | {"PHASE": "ABORT"}, "expected PHASE=RUN"),
     ("duration", BUILD | {"EXECUTIONDURATION": "-1"}, "EXECUTIONDURATION"),
-    ("destruction", BUILD | {"DESTRUCTION": "2001-01-01"}, "a time that is to come"),
-    ("no image there", {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64}, "the id of an uploaded image"),
+    ("destruction", BUILD | {"DESTRUCTION": "2001-01-01"}, "a time in the future"),
+    (
+        "no image there",
+        {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64},
+        "the id of an uploaded image",
+    ),
     ("incomplete and RUN", {"KIND": "deconvolve", "PHASE": "RUN"}, "image_id: expected a value"),
 ]
 
@@ -257,12 +261,12 @@ BAD_REQUESTS = [
     ("POST", "/executionduration", {"EXECUTIONDURATION": "-5"}, 400, "EXECUTIONDURATION"),
     ("POST", "/executionduration", {}, 400, "expected EXECUTIONDURATION"),
     ("POST", "/destruction", {"DESTRUCTION": "soon"}, 400, "expected DESTRUCTION, a time such as"),
-    ("POST", "/destruction", {"DESTRUCTION": "1999-01-01T00:00:00Z"}, 400, "a time that is to come"),
+    ("POST", "/destruction", {"DESTRUCTION": "1999-01-01T00:00:00Z"}, 400, "a time in the future"),
     ("POST", "/parameters", {"KIND": "report"}, 400, "expected KIND=psf-build"),
     ("POST", "/parameters", {"size": "big"}, 400, "size: "),
     ("GET", "/results/result", {}, 404, "has no result"),
     ("GET", "/results/%00", {}, 404, "has no result"),
-    ("GET", "/error", {}, 404, "has no error"),
+    ("GET", "/error", {}, 404, "and has none"),
 ]
 
 
