@@ -247,6 +247,13 @@ def test_bad_creations(unchanged: TestClient, fields: dict[str, str], told: str)
     assert all(line.attrib["id"] in KNOWN for jobs in left for line in jobs), "nothing is left behind"
 
 
+def test_an_unknown_name_gets_the_known_one(api: TestClient) -> None:
+    former = api.post("/uws/jobs", data={"KIND": "evaluate"})
+    assert former.status_code == 400 and "did you mean 'report'?" in former.text
+    misspelt = api.post("/uws/jobs", data={"KIND": "deconvolve", "effects_picture": "true"})
+    assert misspelt.status_code == 400 and "did you mean 'changes_picture'?" in misspelt.text
+
+
 BAD_REQUESTS = [
     ("GET", "?WAIT=abc", {}, 400, "expected WAIT, a whole number of -1 or more; got 'abc'"),
     ("GET", "?WAIT=-2", {}, 400, "WAIT"),

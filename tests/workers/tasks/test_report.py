@@ -1,4 +1,4 @@
-"""The job evaluate: from an archive of a transit to a report as JSON, page and picture; and a PSF that is given."""
+"""The job kind report: from an archive of a transit to a report as JSON, page and picture; and a PSF that is given."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from workers.contract.identities import report_identity
 from workers.contract.requests import Report
 from workers.contract.resolved import ResolvedReport
 from workers.settings import Settings
+from workers.tasks import report as report_task
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +68,21 @@ def test_the_report_says_what_was_found_and_what_it_was_made_of(made: dict[str, 
     assert {"numpy", "scipy", "numba", "astropy"} <= set(report["provenance"]["libraries"])
     found = report["fit"]["parameters"]["total"]
     assert abs(found["value"] - TRUTH.total) < 4 * found["sigma"]
+
+
+def test_a_comparison_of_shapes_starts_from_the_fit_and_its_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[object, int]] = []
+
+    def compare(solution: object, *, seed: int, progress: object) -> Any:
+        asked.append((solution, seed))
+        return SimpleNamespace(to_json=lambda: {"shapes": "compared"})
+
+    monkeypatch.setattr(report_task, "compare_shapes_by_errors", compare)
+    request = ResolvedReport(transit_id="0" * 64, shapes=True, seed=7)
+    context: Any = SimpleNamespace(report=lambda stage, step, steps: None)
+    made: Any = SimpleNamespace(fit=SimpleNamespace(solution="the fit"))
+    assert report_task._shapes(context, request, made) == {"shapes": "compared"}
+    assert asked == [("the fit", 7)]
 
 
 def test_its_page_stands_alone_and_shows_every_image(made: dict[str, Any]) -> None:
