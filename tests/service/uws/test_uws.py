@@ -266,7 +266,7 @@ BAD_REQUESTS = [
     ("POST", "/phase", {}, 400, "expected PHASE=RUN"),
     ("POST", "/executionduration", {"EXECUTIONDURATION": "long"}, 400, "got 'long'"),
     ("POST", "/executionduration", {"EXECUTIONDURATION": "-5"}, 400, "EXECUTIONDURATION"),
-    ("POST", "/executionduration", {}, 400, "expected EXECUTIONDURATION"),
+    ("POST", "/executionduration", {}, 400, "expected the field EXECUTIONDURATION"),
     ("POST", "/destruction", {"DESTRUCTION": "soon"}, 400, "expected DESTRUCTION, a time such as"),
     ("POST", "/destruction", {"DESTRUCTION": "1999-01-01T00:00:00Z"}, 400, "a time in the future"),
     ("POST", "/parameters", {"KIND": "report"}, 400, "expected KIND=psf-build"),
