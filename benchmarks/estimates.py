@@ -1,9 +1,11 @@
-"""What jobs need, beside what workers/estimates.py says of them before they are taken.
+"""Measures what jobs need, and compares it with the estimates of workers/intake/estimates.py.
 
-    python -m benchmarks.estimates [--full]
+    python -m benchmarks.estimates [--full] [--write]
 
-Each case is a process of its own with one thread, whose processor time and peak of memory are taken. --full: also
-studies of a transit of 512 px, an image of 4096 px and one with an ERROR plane: some twenty minutes more.
+Each case runs in its own process with one thread; its processor time and peak memory are measured. --full: also
+studies of a transit of 512 px, an image of 4096 px and one with an ERROR plane (about twenty minutes more). --write:
+multiply the times of each kind in estimates.json by the median of measured over estimated time, and each method of
+deconvolution by its own. Memory is only printed.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ import os
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -25,7 +29,7 @@ METHODS = (
     "basic-iterative",
     "linear",
 )
-# psf: edge of a PSF with little light far out, or "hri" for HRI_EUV's, which has most.
+# psf: edge length of a PSF with little scattered light, or "hri" for the PSF of HRI_EUV, which has most.
 QUICK: list[dict[str, Any]] = [
     *(
         {"kind": "deconvolve", "px": 1024, "psf": "hri", "method": {"name": name, "steps": 20}}
@@ -44,37 +48,63 @@ QUICK: list[dict[str, Any]] = [
     {"kind": "psf-build", "instrument": "aia_171", "size": 2048},
     {"kind": "psf-build", "instrument": "hri_euv", "size": 4096},
     {"kind": "psf-tables", "psf": 2048},
-    *({"kind": kind, "px": 128, "images": 12} for kind in ("psf-fit", "evaluate", "gap-diagnose")),
+    *({"kind": kind, "px": 128, "images": 12} for kind in ("psf-fit", "report", "gap-diagnose")),
     {"kind": "cross-validate", "px": 256, "images": 18, "runs": 10},
     {"kind": "psf-fit", "px": 256, "images": 18},
 ]
 FULL: list[dict[str, Any]] = [
     {"kind": "deconvolve", "px": 4096, "psf": 2048, "method": {"name": "richardson-lucy", "steps": 10}},
     {"kind": "deconvolve", "px": 1024, "psf": "hri", "error_draws": 4, "noise": True},
-    *({"kind": kind, "px": 512, "images": 30} for kind in ("psf-fit", "evaluate", "gap-diagnose")),
+    *({"kind": kind, "px": 512, "images": 30} for kind in ("psf-fit", "report", "gap-diagnose")),
     {"kind": "cross-validate", "px": 512, "images": 30, "runs": 10},
     {"kind": "cross-validate", "px": 128, "images": 12, "runs": 2, "scheme": "exact"},
     {"kind": "psf-fit", "px": 256, "images": 18, "as_published": True},
 ]
-STUDIES = ("psf-fit", "evaluate", "gap-diagnose", "cross-validate")
+MEASURED = "measured.jsonl"
+STUDIES = ("psf-fit", "report", "gap-diagnose", "cross-validate")
 
 
 def main() -> None:
     """Run the cases and print a line for each."""
-    if len(sys.argv) > 2:
+    if len(sys.argv) > 2 and not sys.argv[1].startswith("--"):
         measure(json.loads(sys.argv[1]), Path(sys.argv[2]))
         return
     one_thread = os.environ | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    print(f"{'measured':>20}{'said':>20}")
+    print(f"{'measured':>20}{'estimated':>20}")
     with TemporaryDirectory(prefix="heliopsf-estimates-") as folder:
         for case in QUICK + (FULL if "--full" in sys.argv else []):
             subprocess.run(
                 [sys.executable, "-m", "benchmarks.estimates", json.dumps(case), folder], env=one_thread
             )
+        measured = Path(folder) / MEASURED
+        if "--write" in sys.argv and measured.exists():
+            write([json.loads(line) for line in measured.read_text().splitlines()])
+
+
+def write(measured: list[dict[str, Any]]) -> None:
+    """Correct the times in estimates.json by these measurements."""
+    from workers.intake.cost_model import COSTS_FILE, Costs
+
+    content = json.loads(COSTS_FILE.read_text("utf-8"))
+    ratios: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for one in measured:
+        ratios[one["kind"], one["method"]].append(one["took_s"] / one["estimated_s"])
+    for (kind, method), found in ratios.items():
+        times = content["kinds"][kind]
+        if method:
+            times["step_ns"][method] = round(times["step_ns"][method] * median(found), 3)
+            continue
+        for name, value in times.items():
+            if name.endswith(("_s", "_ns")):
+                times[name] = round(value * median(found), 3)
+        for scheme, pair in times.get("run", {}).items():
+            times["run"][scheme] = [round(value * median(found), 3) for value in pair]
+    Costs.model_validate(content)
+    Path(str(COSTS_FILE)).write_text(json.dumps(content, indent=2) + "\n", "utf-8")
 
 
 def measure(case: dict[str, Any], folder: Path) -> None:
-    """One case in this process; what files it needs are made in the folder once."""
+    """One case in this process. The files it needs are made in the folder by the first case that needs them."""
     from service.local import LocalService
     from workers.catalogue.tables import DEFAULT_OWNER
     from workers.intake import estimates
@@ -89,14 +119,22 @@ def measure(case: dict[str, Any], folder: Path) -> None:
         service.wait(job)
         took_s, peak = time.process_time() - started, peak_mib()
         service.close()
+    record = {
+        "kind": kind,
+        "method": case.get("method", {}).get("name", ""),
+        "took_s": took_s,
+        "estimated_s": said.start_s,
+    }
+    with (folder / MEASURED).open("a") as lines:
+        lines.write(json.dumps(record) + "\n")
     name = " ".join(str(value.get("name") if isinstance(value, dict) else value) for value in case.values())
     print(
-        f"{took_s:8.1f} s {peak:6.0f} MiB {said.seconds:8.1f} s {said.memory_mib:6d} MiB   {name}", flush=True
+        f"{took_s:8.1f} s {peak:6.0f} MiB {said.start_s:8.1f} s {said.memory_mib:6d} MiB   {name}", flush=True
     )
 
 
 def asked(case: dict[str, Any], folder: Path, service: Any) -> dict[str, Any]:
-    """A job's parameters; what it needs is uploaded."""
+    """The parameters of a job, after the upload of its inputs."""
     from tests.conftest import write_image
 
     if case["kind"] == "psf-build":
@@ -117,7 +155,7 @@ def asked(case: dict[str, Any], folder: Path, service: Any) -> dict[str, Any]:
 
 
 def psf_file(which: int | str, folder: Path) -> Path:
-    """A PSF's file, made where it is not there."""
+    """The file of a PSF; made if it does not exist."""
     from tests.conftest import write_psf
 
     path = folder / f"psf-{which}.fits"
@@ -133,7 +171,7 @@ def psf_file(which: int | str, folder: Path) -> Path:
 
 
 def transit(case: dict[str, Any], folder: Path) -> Path:
-    """A simulated transit's folder, made where it is not there."""
+    """The folder of a simulated transit; made if it does not exist."""
     path = folder / f"transit-{case['px']}"
     if not path.exists():
         sizes = ["--size", str(case["px"]), "--images", str(case["images"])]
@@ -147,7 +185,7 @@ CLI = [sys.executable, "-m", "service.cli"]
 
 
 def peak_mib() -> float:
-    """The most memory that this process has had."""
+    """The peak memory of this process, MiB."""
     line = next(
         line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")
     )

@@ -15,9 +15,8 @@ from service.api.psfs import status as psf_status
 from service.api.psfs import versions as psfs
 from service.http import description, guard, observation, problems
 from service.http.access import Access
-from service.http.rates import Rates
+from service.http.rates import Rates, Streams
 from service.http.state import State
-from service.http.streams import Streams
 from service.operation import docs, health, metrics
 from service.uws import routes as uws
 from workers.broker import app as queue

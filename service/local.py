@@ -25,9 +25,12 @@ from service.api.transits import TransitDetails
 from service.client.http import Operations, Progress, ServiceError, as_archive
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
-from workers.contract.contract import JobRequest, Phase
+from workers.contract.kinds import JobRequest
+from workers.contract.phases import Phase
+from workers.contract.suggestions import explained
 from workers.files.store import Store
-from workers.intake.requests import image_row, resolve, transit_row, uploaded_psf_row
+from workers.intake.requests import resolve
+from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 from workers.run.runner import Runner
 from workers.settings import Settings
 
@@ -95,9 +98,10 @@ class LocalService(Operations):
         """Write a job down; ``wait`` runs it."""
         body = {"kind": kind, "parameters": parameters}
         try:
-            request: JobRequest = TypeAdapter(JobRequest).validate_python(body)
+            request = TypeAdapter[JobRequest](JobRequest).validate_python(body)
         except ValidationError as error:
-            faults = (f"{'/'.join(map(str, e['loc'][1:]))}: {e['msg']}" for e in error.errors())
+            told = explained(error.errors(), JobRequest)
+            faults = (f"{'/'.join(map(str, e['loc'][1:])) or 'kind'}: {said}" for e, said in told)
             raise ServiceError("; ".join(faults)) from error
         resolved = resolve(
             request, self._catalogue, DEFAULT_OWNER, added_effects=self._settings.added_effects

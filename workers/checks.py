@@ -1,6 +1,6 @@
-"""Is each thing there that the service stands on? Each check raises ``Unusable`` with a short plain sentence.
+"""Checks what the service depends on. Each check raises ``Unusable`` with a short sentence.
 
-The sentences name no address and no credentials, so that they may be shown to anybody.
+The sentences contain no address and no credentials, so they can be shown to anybody.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from workers.settings import Settings
 
 
 class Unusable(Exception):
-    """Something that the service needs is not there."""
+    """Something that the service needs does not work."""
 
 
 def database(catalogue: Catalogue) -> None:
-    """The database answers."""
+    """Check that the database answers."""
     try:
         catalogue.ping()
     except SQLAlchemyError as error:
@@ -32,7 +32,7 @@ def database(catalogue: Catalogue) -> None:
 
 
 def storage(folder: Path) -> None:
-    """The folder of files can be written to."""
+    """Check that the data folder is writable."""
     try:
         with TemporaryFile(dir=folder) as probe:
             probe.write(b"heliopsf")
@@ -42,7 +42,7 @@ def storage(folder: Path) -> None:
 
 
 def object_store(store: Store) -> None:
-    """Files can be kept elsewhere, where that is where they are kept."""
+    """Check that the object store is writable."""
     try:
         store.check()
     except OSError as error:
@@ -50,13 +50,13 @@ def object_store(store: Store) -> None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Room that is left where the files are."""
+    """Free space of the data folder, bytes."""
     return shutil.disk_usage(folder).free
 
 
 def broker(settings: Settings) -> None:
-    """The broker answers."""
-    if "://" not in settings.broker_url:  # Celery would take it for a broker in its own memory
+    """Check that the broker answers."""
+    if "://" not in settings.broker_url:  # Celery would use a broker in its own memory
         raise Unusable("the broker's URL cannot be used (expected scheme://...)")
     try:
         queue.check(settings)
@@ -67,22 +67,22 @@ def broker(settings: Settings) -> None:
         KeyError,
         ImportError,
         AttributeError,
-    ) as error:  # what is no URL, or of no transport we have
+    ) as error:  # not a URL, or one of a transport that is not installed
         raise Unusable(f"the broker's URL cannot be used ({_kind(error)})") from error
 
 
 def embedded_worker(catalogue: Catalogue, settings: Settings) -> None:
-    """A worker said that it is there."""
+    """Check that a worker has announced itself."""
     try:
         workers = catalogue.census.workers(settings.lease_s)
     except SQLAlchemyError as error:
-        raise Unusable(f"the database does not say ({_kind(error)})") from error
+        raise Unusable(f"the database does not answer ({_kind(error)})") from error
     if not workers:
-        raise Unusable(f"no worker has been heard of for {settings.lease_s:g} s")
+        raise Unusable(f"no worker has announced itself for {settings.lease_s:g} s")
 
 
 def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, Callable[[], None]]:
-    """What must be there before requests are taken, by name."""
+    """The checks that must pass before requests are accepted, by name."""
     checks: dict[str, Callable[[], None]] = {
         "database": lambda: database(catalogue),
         "storage": lambda: storage(settings.data_dir),
@@ -109,7 +109,7 @@ _REASONS = {
 
 
 def database_said(error: SQLAlchemyError) -> str:
-    """What a database's error comes to. Its own words may repeat the URL, so they are not passed on."""
+    """A summary of a database error. The original text may contain the URL, so it is not shown."""
     words = str(getattr(error, "orig", None) or error).lower()
     known = [reason for pattern, reason in _REASONS.items() if re.search(pattern, words)]
     return (
@@ -118,5 +118,5 @@ def database_said(error: SQLAlchemyError) -> str:
 
 
 def _kind(error: BaseException) -> str:
-    """The error's name; that of its cause where it has one, which says more."""
+    """The name of the error's class; that of its cause, if it has one, because it is more specific."""
     return type(getattr(error, "orig", None) or error.__cause__ or error).__name__

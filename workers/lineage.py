@@ -1,6 +1,6 @@
-"""Where a product or a PSF came from: inputs, parameters, versions and jobs, back to what was uploaded.
+"""Lineage of a product or a PSF: inputs, parameters, versions and jobs, back to the uploads.
 
-What is told is what was written down when each thing was made. Things that are gone are named all the same.
+It repeats what was recorded when each thing was made. Deleted things are still named.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from pydantic import BaseModel, Field, ValidationError
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow, TransitRow
-from workers.contract.contract import ResolvedDeconvolve, ResolvedGapDiagnose, ResolvedPsfFit, ResolvedRerun
+from workers.contract.kinds import kind_of_origin
+from workers.contract.resolved import ResolvedRerun
+from workers.contract.suggestions import FORMER_NAMES
 
 MOST_DEEP = 16
 MOST_THINGS = 200
@@ -21,7 +23,7 @@ Type = Literal["product", "psf", "image", "transit", "report", "instrument-file"
 
 
 class Made(BaseModel):
-    """How a thing was made; null is what was not written down when it was."""
+    """How a thing was made; null: not recorded at that time."""
 
     created_at: float
     name: str | None = None
@@ -29,9 +31,7 @@ class Made(BaseModel):
     status: str | None = None
     origin: str | None = None
     file_sha256: str
-    job_id: str | None = Field(
-        None, description="the job that made it; jobs may be destroyed, what they made stays"
-    )
+    job_id: str | None = Field(None, description="the job that made it; the job may have been deleted since")
     algorithm_version: int | None = None
     software_version: str | None = None
     libraries: dict[str, str] | None = None
@@ -39,41 +39,45 @@ class Made(BaseModel):
 
 
 class Ancestor(BaseModel):
-    """A thing and what it was made from."""
+    """A thing and its parents: what it was made from."""
 
     type: Type
-    id: str = Field(description="of an upload and of an instrument file the SHA-256 of its bytes")
+    id: str = Field(description="id; for an upload or an instrument file the SHA-256 of its bytes")
     there: bool = Field(
-        description="whether the catalogue still holds it; an instrument file is in its PSF's file"
+        description="whether the catalogue still holds it; false for an instrument file, whose text is in the PSF file"
     )
-    made: Made | None = Field(None, description="null for what was uploaded as it is, or is gone")
+    made: Made | None = Field(None, description="null for an upload and for a deleted thing")
     parents: list[Ancestor] = []
     cut: bool = Field(
-        False, description="true where it has parents that are told elsewhere, or not at all: too many"
+        False,
+        description="true if its parents are left out here: they are listed elsewhere in this answer, or there are too many",
     )
 
 
 def lineage(catalogue: Catalogue, row: ProductRow | PsfRow) -> Ancestor:
-    """A thing with all that it came from, MOST_DEEP generations and MOST_THINGS things at most."""
-    return _Telling(catalogue, row.owner).of_row(row, 0)
+    """A thing and its ancestors: at most MOST_DEEP generations and MOST_THINGS things."""
+    return _Walk(catalogue, row.owner).of_row(row, 0)
 
 
 def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
-    """The job that made a thing, as one could ask for it again.
+    """The job that made a thing, so that it can run again.
 
-    Raises ``DataError`` "not-made-here" for an upload, "parameters-unknown" where nobody wrote them down, and
-    "parameters-outdated" where this version does not take them.
+    Raises ``DataError`` "not-made-here" for an upload, "parameters-unknown" if the parameters were not recorded, and
+    "parameters-outdated" if this version of the software does not accept them.
     """
     parameters = _parameters(row)
     if parameters is None and row.details.get("job_id"):
         job = catalogue.jobs.get(row.details["job_id"])
         parameters = job.parameters if job is not None and _made(job, row) else None
     if isinstance(row, PsfRow) and row.origin == "uploaded":
-        raise DataError("not-made-here", f"PSF {row.id} was uploaded: there is nothing to run again")
+        raise DataError(
+            "not-made-here",
+            f"expected a PSF that this service made; PSF {row.id} was uploaded, so no job can run again",
+        )
     if parameters is None:
         raise DataError(
             "parameters-unknown",
-            f"expected the parameters that {row.id} was made with; they were not written down, and its job is gone",
+            f"expected the parameters that {row.id} was made with; they were not recorded and its job was deleted",
         )
     try:
         return _job_of(row, parameters)
@@ -81,23 +85,33 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
         first = error.errors()[0]
         raise DataError(
             "parameters-outdated",
-            f"{row.id} was made with parameters that this version does not take: "
+            f"expected parameters that this version accepts; {row.id} was made with others: "
             f"{'/'.join(map(str, first['loc']))}: {first['msg']}",
         ) from error
 
 
 def _job_of(row: ProductRow | PsfRow, parameters: dict[str, Any]) -> ResolvedRerun:
-    """The job with these parameters; what was written down is what somebody had said, a job has the rest too."""
+    """The job with these parameters. The catalogue may keep only those that were given; defaults are filled in here."""
+    of: Literal["product", "psf"] = "product" if isinstance(row, ProductRow) else "psf"
+    origin = _origin(row)
+    kind = kind_of_origin(origin)
+    assert kind.resolved is not None
+    # Parameters that were renamed since the thing was made.
+    whole = {FORMER_NAMES.get(name, name): value for name, value in parameters.items()}
+    if (
+        origin != "built"
+    ):  # the instrument file's text, which a build requires, is in the file of the built PSF
+        whole = kind.resolved.model_validate(whole).model_dump(mode="json")
+    return ResolvedRerun(of=of, id=row.id, kind=kind.name, parameters=whole)
+
+
+def _origin(row: ProductRow | PsfRow) -> str:
+    """As ``workers.contract.kinds`` names it."""
     if isinstance(row, ProductRow):
-        whole = ResolvedDeconvolve.model_validate(parameters).model_dump(mode="json")
-        return ResolvedRerun(of="product", id=row.id, kind="deconvolve", parameters=whole)
+        return "deconvolved"
     if row.origin == "built":
-        return ResolvedRerun(of="psf", id=row.id, kind="psf-build", parameters=parameters)
-    if "parents" in row.details:
-        whole = ResolvedGapDiagnose.model_validate(parameters).model_dump(mode="json")
-        return ResolvedRerun(of="psf", id=row.id, kind="gap-diagnose", parameters=whole)
-    whole = ResolvedPsfFit.model_validate(parameters).model_dump(mode="json")
-    return ResolvedRerun(of="psf", id=row.id, kind="psf-fit", parameters=whole)
+        return "built"
+    return "corrected" if "parents" in row.details else "fitted"
 
 
 def _made(job: JobRow, row: ProductRow | PsfRow) -> bool:
@@ -115,17 +129,17 @@ def _provenance(row: PsfRow) -> dict[str, Any]:
     return found
 
 
-class _Telling:
-    """One telling of a lineage: things that were told are named again, but not told again."""
+class _Walk:
+    """One walk through a lineage. A thing met twice is named again, but its parents are not repeated."""
 
     def __init__(self, catalogue: Catalogue, owner: str) -> None:
         self._catalogue, self._owner = catalogue, owner
-        self._told: set[str] = set()
+        self._visited: set[str] = set()
 
     def of_row(self, row: ProductRow | PsfRow, depth: int) -> Ancestor:
         parents = _parents(row)
-        enough = row.id in self._told or depth >= MOST_DEEP or len(self._told) >= MOST_THINGS
-        self._told.add(row.id)
+        enough = row.id in self._visited or depth >= MOST_DEEP or len(self._visited) >= MOST_THINGS
+        self._visited.add(row.id)
         return Ancestor(
             type="product" if isinstance(row, ProductRow) else "psf",
             id=row.id,
@@ -154,7 +168,7 @@ class _Telling:
 
 
 def _parents(row: ProductRow | PsfRow) -> list[tuple[Type, str]]:
-    """What a thing was made from, by type and id."""
+    """Type and id of each thing that a thing was made from."""
     if isinstance(row, ProductRow):
         return [("image", row.image_id), ("psf", row.psf_id)]
     provenance = _provenance(row)

@@ -1,7 +1,7 @@
-"""Logs of the service and its workers: one line a record on standard error, as JSON or for a reader.
+"""Logs of the service and its workers on standard error: one line a record, as JSON or as text.
 
-What a line is about (the request, the job, its owner) is bound once, where it is known, and is on every line
-that is written while it is bound. Headers, tokens and contents of files are never logged.
+The request, the job and its owner are bound once; every line that is written while they are bound contains them.
+Headers, keys and contents of files are never logged.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from workers.settings import Settings
 
 _ABOUT: ContextVar[dict[str, str]] = ContextVar("what log lines are about", default={})  # noqa: B039 - never changed in place
-# What goes on a line as it came from outside: nothing that could end the line or stand for another.
+# A client chooses its request id, so it may contain nothing that ends a line or looks like another entry.
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 def bind(**about: str) -> None:
-    """Lines of this context are about these from now on: ``request``, ``job``, ``owner``."""
+    """Add ``request``, ``job`` or ``owner`` to all further lines of this context."""
     _ABOUT.set({**_ABOUT.get(), **about})
 
 
 @contextmanager
 def bound(**about: str) -> Iterator[None]:
-    """Lines written in the block are about these."""
+    """Add these to all lines that are written in the block."""
     token = _ABOUT.set({**_ABOUT.get(), **about})
     try:
         yield
@@ -41,17 +41,17 @@ def bound(**about: str) -> Iterator[None]:
 
 
 def about() -> dict[str, str]:
-    """What lines are about here and now."""
+    """What is bound at present."""
     return dict(_ABOUT.get())
 
 
 def request_id(sent: str | None) -> str:
-    """The id that a client sent, where it is a plain short word; a new one otherwise."""
+    """The id that a client sent, if it is a short plain word; otherwise a new one."""
     return sent if sent is not None and _REQUEST_ID.fullmatch(sent) else uuid.uuid4().hex
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line; ``extra={"fields": {...}}`` of a call are keys of it."""
+    """One JSON object a line, with the keys of ``extra={"fields": {...}}``."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as a line."""
@@ -70,10 +70,10 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """For a reader at a terminal: time, level, message, and what it is about."""
+    """Text for a terminal: time, level, message and what is bound."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as a line, with the traceback below where there is one."""
+        """The record as a line, followed by its traceback, if any."""
         time = datetime.fromtimestamp(record.created, UTC).strftime("%H:%M:%S")
         parts = {**_ABOUT.get(), **getattr(record, "fields", {})}
         facts = "".join(f" {name}={value}" for name, value in parts.items())
@@ -82,18 +82,18 @@ class TextFormatter(logging.Formatter):
 
 
 def _one_line(text: str) -> str:
-    """The text without what would end its line or steer a terminal; some of it came from outside."""
+    """The text with control characters escaped, because clients choose parts of it."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def configure(settings: Settings) -> None:
-    """Write the process's logs to standard error; calling it again changes nothing."""
+    """Write the logs of the process to standard error. Repeated calls change nothing."""
     stream = sys.__stderr__ or sys.stderr
     form = settings.log_format or ("text" if stream.isatty() else "json")
     handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-    # Their news are of single requests, connections and plug-ins; ours says the same with the request's id.
+    # These log every request, connection and plug-in; our own lines have the same with the request id.
     for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime.plugins"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     logging.captureWarnings(True)

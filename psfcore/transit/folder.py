@@ -226,7 +226,7 @@ def _noise(manifest: TransitManifest) -> Noise:
             f'expected "noise": {{"photon_gain_dn": ..., "read_noise_dn": ...}} in {MANIFEST_NAME}, or both '
             "figures in the request (DN per detected photon, rms read noise in DN); got neither",
         )
-    return Noise(manifest.noise.photon_gain_dn, manifest.noise.read_noise_dn)
+    return manifest.noise.noise()
 
 
 def _known_psf(

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from psfcore.errors import DataError
+from psfcore.noise_figures import NoiseFigures
 
 MANIFEST_NAME = "transit.json"
 MAX_IMAGES = 2000
@@ -63,11 +64,10 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class NoiseEntry(_Frozen):
-    """DN a detected photon, and DN rms of the readout; not both zero."""
+class _Noise(NoiseFigures):
+    """As in a request, but unknown keys of transit.json are ignored."""
 
-    photon_gain_dn: Annotated[Number, Field(ge=0)]
-    read_noise_dn: Annotated[Number, Field(ge=0)]
+    model_config = ConfigDict(extra="ignore")
 
 
 class ImageEntry(_Frozen):
@@ -86,7 +86,7 @@ class TransitManifest(_Frozen):
     schema_: Literal["transit/1"] = Field(alias="schema")
     instrument: Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_printable)] | None = None
     known_psf: FileName | None = None
-    noise: NoiseEntry | None = None
+    noise: _Noise | None = None
     images: Annotated[tuple[ImageEntry, ...], Field(min_length=1, max_length=MAX_IMAGES)]
 
     @property

@@ -11,15 +11,14 @@ from pydantic import BaseModel, Field
 from psfcore.errors import DataError
 from service.http.callers import Bulk, Caller, Reading
 from service.http.paging import Cursor, Limit, Page, following, page, place, position
-from service.http.problems import RESPONSES, Problem
-from service.http.psf_problems import problem
+from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room
 from service.http.state import Shared
 from workers.bulk import turns as bulk_turns
 from workers.bulk.intake import begin
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.contract.bulk import AT_WORK, BulkPhase, BulkRequest, ItemState
-from workers.contract.contract import JobError
+from workers.contract.phases import JobError
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)

@@ -30,7 +30,7 @@ from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from workers.contract.bulk import BULK_ENDED, BulkPhase
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 
 log = logging.getLogger(__name__)
 LOOK_EVERY_S = 0.5

@@ -15,8 +15,8 @@ from service.http.problems import RESPONSES, Problem
 from service.http.quotas import Allowed
 from service.http.state import Shared
 from workers.catalogue.tables import ImageRow
-from workers.contract.contract import Identity
-from workers.intake.requests import image_row
+from workers.contract.requests import Identity
+from workers.intake.uploads import image_row
 
 router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)
 

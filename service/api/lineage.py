@@ -9,11 +9,11 @@ from fastapi import APIRouter, Response
 from psfcore.errors import DataError
 from service.api.jobs import JobView, submit_job
 from service.http.callers import Reading, Submitting
-from service.http.problems import RESPONSES
-from service.http.psf_problems import problem
+from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
 from workers.catalogue.tables import ProductRow, PsfRow
-from workers.contract.contract import Identity, Rerun, RerunRequest
+from workers.contract.kinds import KINDS
+from workers.contract.requests import Identity, Rerun
 from workers.lineage import Ancestor, lineage
 
 router = APIRouter(tags=["lineage"], responses=RESPONSES)
@@ -52,7 +52,7 @@ def rerun_product(product_id: Identity, response: Response, caller: Submitting, 
 def _rerun(
     of: Literal["product", "psf"], identity: str, response: Response, caller: Submitting, state: Shared
 ) -> JobView:
-    asked = RerunRequest(kind="rerun", parameters=Rerun(of=of, id=identity))
+    asked = KINDS["rerun"].request(kind="rerun", parameters=Rerun(of=of, id=identity))
     return submit_job(asked, response, caller, state)
 
 

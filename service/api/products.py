@@ -13,7 +13,7 @@ from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem
 from service.http.state import Shared
 from workers.catalogue.tables import ProductRow
-from workers.contract.contract import Identity
+from workers.contract.requests import Identity
 
 router = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)
 
@@ -107,7 +107,9 @@ def get_product_effects(product_id: Identity, request: Request, caller: Reading,
     digest = _find(state, caller, product_id).details.get("effects_picture_sha256")
     if digest is None:
         raise Problem(
-            404, "no-effects-picture", "expected a job with effects_picture true; this product's had it false"
+            404,
+            "no-effects-picture",
+            "expected a product made with changes_picture true; this one was made with false",
         )
     return files.send(request, state.store, digest, "image/png", None)
 

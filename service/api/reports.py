@@ -13,7 +13,7 @@ from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem
 from service.http.state import Shared
 from workers.catalogue.tables import ReportRow
-from workers.contract.contract import Identity
+from workers.contract.requests import Identity
 
 PAGE_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'"

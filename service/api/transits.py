@@ -6,6 +6,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
 
+from psfcore.noise_figures import NoiseFigures
 from service.http import uploads
 from service.http.callers import Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
@@ -13,8 +14,8 @@ from service.http.problems import RESPONSES, Problem
 from service.http.quotas import Allowed
 from service.http.state import Shared
 from workers.catalogue.tables import TransitRow
-from workers.contract.contract import Identity, NoiseFigures
-from workers.intake.requests import transit_row
+from workers.contract.requests import Identity
+from workers.intake.uploads import transit_row
 
 router = APIRouter(prefix="/v1/transits", tags=["transits"], responses=RESPONSES)
 

@@ -43,8 +43,8 @@ from service.cli.psf import versions as cli_psf_versions
 from service.client.http import percent
 from workers import checks
 from workers.catalogue.schema import SchemaError
-from workers.contract.contract import Component, ShapeName
 from workers.contract.queues import Queue, queues_named
+from workers.contract.requests import Component, ShapeName
 from workers.settings import software_version
 
 

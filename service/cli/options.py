@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from service.client.http import ServiceError
-from workers.contract.contract import Method
+from workers.contract.methods import Method
 from workers.settings import Settings
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)

@@ -94,7 +94,7 @@ class Operations(ABC):
             "method": {"name": method, **_given(method_parameters)},
             "saturation_dn": saturation_dn,
             "error_draws": error_draws,
-            "effects_picture": effects is not None,
+            "changes_picture": effects is not None,
         }
         image_id = self.upload_image(image)["id"]
         job = self.submit("deconvolve", image_id=image_id, **wanted, **_noise(noise))
@@ -188,7 +188,7 @@ class Operations(ABC):
         ``report``, ``page``, ``preview``: where to write it as JSON, as HTML, as a picture. ``noise``: as for
         ``deconvolve``. ``parameters``: ``psf_id`` of a PSF to judge instead of fitting one, ``seed``, ``dark_offsets``.
         """
-        found = self._on_transit("evaluate", transit, progress, noise, parameters)
+        found = self._on_transit("report", transit, progress, noise, parameters)
         self._fetch(found, report, preview)
         if page is not None:
             self.download(found["html"], page)

@@ -1,8 +1,8 @@
-"""Who asks, and may they? Each route names the scope that it needs, and works for the owner that it gets from here.
+"""Identifies the caller of a request and checks its scopes. Each route names the scope it needs.
 
-With keys, a request has one in ``Authorization``: as a bearer token, or as the password of HTTP Basic (any user
-name), which browsers and clients of the Virtual Observatory know. Open, for a service that only its own machine
-reaches, nobody is asked and all is one owner's.
+A request sends its key in ``Authorization``: as a bearer token, or as the password of HTTP Basic (with any user
+name), which browsers and clients of the Virtual Observatory support. An open service needs no key, and everything
+belongs to one owner.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from service.http.state import Shared, State
 from workers.catalogue.keys import OWNER, KeyRefused, Scope
 from workers.catalogue.tables import DEFAULT_OWNER
 
-ACT_FOR = "X-Owner"  # whose an administrator's request is to be
+ACT_FOR = "X-Owner"  # names the owner that an administrator acts for
 CHALLENGE = {"WWW-Authenticate": 'Bearer realm="heliopsf", Basic realm="heliopsf", charset="UTF-8"'}
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks: the owner of all that is made and seen, and what the key allows."""
+    """The sender of a request: its owner sees and owns everything the request touches; its key has these scopes."""
 
     owner: str
     scopes: frozenset[Scope]
-    name: str  # what rates are counted by, and what logs say: the key's id, or an address
+    name: str  # for rate limits and logs: the id of the key, or the address
 
 
 class _Scheme(SecurityBase):
-    """A way to send a key, for the description of the interface."""
+    """A way to send a key, for the OpenAPI description."""
 
     def __init__(self, name: str, model: HTTPBase) -> None:
         self.scheme_name, self.model = name, model
 
     async def __call__(self) -> None:
-        """Nothing: the key is looked at in one place, whichever way it came."""
+        """Do nothing: ``_caller`` checks the key, however it was sent."""
 
 
 _AS_BEARER = _Scheme("bearer", HTTPBearer(description="a key, hpsf_ID_SECRET"))
@@ -57,7 +57,7 @@ def _caller(
     _bearer: Annotated[None, Depends(_AS_BEARER)],
     _basic: Annotated[None, Depends(_AS_PASSWORD)],
 ) -> Caller:
-    """Who asks, where the key allows what the route needs and its allowance is not used up; else ``Problem``."""
+    """The caller. Raises ``Problem`` if the key lacks a scope that the route needs, or the caller reached its rate limit."""
     caller = _let_in(request, state)
     request.state.caller = caller
     for scope in map(Scope, needed.scopes):
@@ -80,7 +80,7 @@ def _let_in(request: Request, state: State) -> Caller:
     try:
         row = state.catalogue.keys.check(_sent_key(request))
     except KeyRefused as refused:
-        state.rates.take(Bucket.READS, address)  # who tries keys is not let try without end
+        state.rates.take(Bucket.READS, address)  # limits attempts to guess keys
         raise Problem(401, refused.code, refused.message, headers=CHALLENGE) from refused
     caller = Caller(row.owner, frozenset(map(Scope, row.scopes)), row.id)
     owner = request.headers.get(ACT_FOR)
@@ -92,7 +92,7 @@ def _let_in(request: Request, state: State) -> Caller:
 
 
 def _sent_key(request: Request) -> str:
-    """The key in a request; ``KeyRefused`` where there is none."""
+    """The key in a request. Raises ``KeyRefused`` if there is none."""
     way, _, sent = request.headers.get("Authorization", "").partition(" ")
     sent = sent.strip()
     if way.lower() == "bearer" and sent:

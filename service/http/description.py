@@ -1,4 +1,4 @@
-"""The description of the interface, where what the framework says of it is not what the service does."""
+"""Corrects the OpenAPI description where the framework describes the answers wrongly."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ PROBLEM = f"#/components/schemas/{problems.ProblemDocument.__name__}"
 
 
 def install(app: FastAPI) -> None:
-    """Describe errors as the problem documents that they are, on every route."""
-    framework_s = app.openapi
+    """Describe errors as problem documents on every route."""
+    generate = app.openapi
 
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
-            _correct(framework_s())
+            _correct(generate())
         assert app.openapi_schema is not None
         return app.openapi_schema
 

@@ -1,4 +1,4 @@
-"""Downloads: a stored file with its hash as ETag."""
+"""Sends stored files, with their SHA-256 as ETag."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from fastapi.responses import FileResponse, Response
 from workers.files.store import Store
 
 FITS_TYPE = "application/fits"
-KEPT = "private, max-age=31536000, immutable"  # what an address answers with never changes
+KEPT = "private, max-age=31536000, immutable"  # the content at an address never changes
 
 
 def send(request: Request, store: Store, digest: str, media_type: str, filename: str | None) -> Response:
-    """The file, or 304 where the client has it already."""
+    """The file, or 304 if the client has it already."""
     headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT}
     if known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
@@ -20,6 +20,6 @@ def send(request: Request, store: Store, digest: str, media_type: str, filename:
 
 
 def known(request: Request, etag: str) -> bool:
-    """Whether the client says that it has what this ETag names."""
+    """Whether the client already has the content of this ETag (If-None-Match)."""
     tags = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
     return "*" in tags or etag in tags

@@ -1,6 +1,4 @@
-"""What holds for every request and every answer, before and after any route: by whom it was sent, how long it is,
-what a browser may do with it.
-"""
+"""Checks every request before its route (host, origin, length), and sets the security headers of every answer."""
 
 from __future__ import annotations
 
@@ -50,8 +48,9 @@ class _Guard:
         await self._app(scope, receive, kept)
 
     def _check_host(self, headers: Headers) -> None:
-        """A name that is not the service's own is how a page elsewhere reaches an open service: it makes its own
-        name stand for a loopback address, and the browser takes both for one site (DNS rebinding).
+        """Refuse unknown host names. Otherwise a foreign page could reach an open service by DNS rebinding.
+
+        Such a page lets its own name resolve to a loopback address; the browser then treats both as one site.
         """
         hosts = self._access.hosts
         if hosts is None:
@@ -61,13 +60,13 @@ class _Guard:
             raise problems.Problem(
                 421,
                 "host-not-served",
-                f"expected a name of this service in the address; got {sent[:80]!r} "
-                "(HELIOPSF_ALLOWED_HOSTS adds names)",
+                f"expected a host name of this service; got {sent[:80]!r}: use another address, or add the name to "
+                "HELIOPSF_ALLOWED_HOSTS",
             )
 
 
 def _check_origin(method: str, headers: Headers) -> None:
-    """A page of another site may send forms here without asking, and a browser adds what it knows of HTTP Basic."""
+    """Refuse changes requested by a page of another site: the browser would add its stored HTTP Basic password."""
     if method in SAFE_METHODS:
         return
     site, origin = headers.get("sec-fetch-site"), headers.get("origin")
@@ -79,12 +78,12 @@ def _check_origin(method: str, headers: Headers) -> None:
         raise problems.Problem(
             403,
             "cross-site",
-            "expected a request by a program, or by a page of this service; got one by another site's",
+            "expected a request from a program or from a page of this service; got one from a page of another site",
         )
 
 
 def _host_name(sent: str) -> str:
-    """The host in a Host header, in small letters, without its port and the brackets of IPv6."""
+    """The host in a Host header: lower case, without its port and the brackets of IPv6."""
     try:
         return urlsplit(f"//{sent}").hostname or ""
     except ValueError:
@@ -92,9 +91,11 @@ def _host_name(sent: str) -> str:
 
 
 def _bounded(headers: Headers, receive: Receive, most: int) -> Receive:
-    """The body as far as a request that is no file may be long."""
+    """The body of a request that is not an upload, up to its largest size."""
     declared = headers.get("content-length", "")
-    too_large = f"expected a request of at most {most} bytes; got more"
+    too_large = (
+        f"expected a request of at most {most} bytes; got more (the operator can raise HELIOPSF_MAX_BODY_MIB)"
+    )
     if declared.isdecimal() and int(declared) > most:
         raise problems.Problem(413, "too-large", too_large)
     got = 0
@@ -104,14 +105,16 @@ def _bounded(headers: Headers, receive: Receive, most: int) -> Receive:
         message = await receive()
         got += len(message.get("body", b""))
         if got > most:
-            raise HTTPException(413, too_large)  # the one exception that reading a body lets through
+            raise HTTPException(
+                413, too_large
+            )  # the only exception that FastAPI passes on while it reads a body
         return message
 
     return bounded
 
 
 def _keep(headers: MutableHeaders, scope: Scope) -> None:
-    """What browsers are told of every answer; a route's own word goes before."""
+    """Add the headers that every answer has; headers that the route has set are kept."""
     for name, value in problems.SECURITY_HEADERS.items():
         headers.setdefault(name, value)
     if "etag" in headers:

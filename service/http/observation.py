@@ -1,4 +1,4 @@
-"""What is known of each request: its id, a line in the log, and its place in the metrics."""
+"""Observes every request: gives it an id, logs it, and counts it in the metrics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from workers import logs
 
 log = logging.getLogger(__name__)
 REQUEST_ID = "X-Request-ID"
-# Anything else that a client may send as a method is one label, and so is every path that is nowhere.
+# All other methods share one label, and so do all paths without a route. This bounds the number of labels.
 METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 NOWHERE = "none"
 ROUTINE = {"/healthz", "/readyz", "/metrics"}
@@ -22,7 +22,7 @@ BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0
 
 
 class RequestMetrics:
-    """Requests of this process by route, method and status; the database knows nothing of these."""
+    """Requests of this process by route, method and status. They are not in the database."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -34,20 +34,20 @@ class RequestMetrics:
         )
         self._seconds = Histogram(
             "heliopsf_http_request_seconds",
-            "Time from a request's header to the end of its answer",
+            "Time from the header of a request to the end of its answer",
             ["route", "method"],
             buckets=BUCKETS_S,
             registry=self.registry,
         )
         self._received = Counter(
             "heliopsf_http_received_bytes",
-            "Bytes of request bodies taken in by this process",
+            "Bytes of request bodies received by this process",
             ["route"],
             registry=self.registry,
         )
 
     def count(self, route: str, method: str, status: int, seconds: float, received: int) -> None:
-        """Note a request that was answered."""
+        """Count an answered request."""
         method = method if method in METHODS else "other"
         self._answered.labels(route, method, str(status)).inc()
         self._seconds.labels(route, method).observe(seconds)
@@ -56,7 +56,7 @@ class RequestMetrics:
 
 
 def install(app: FastAPI) -> RequestMetrics:
-    """Watch every request of the application."""
+    """Observe every request of the application."""
     metrics = RequestMetrics()
     app.add_middleware(_Observed, metrics=metrics)
     return metrics
@@ -71,10 +71,10 @@ class _Observed:
             await self._app(scope, receive, send)
             return
         request_id = logs.request_id(Headers(scope=scope).get(REQUEST_ID))
-        # Each request has a context of its own. It stays bound, so that what the server logs of a failure has it too.
+        # Each request has its own context. The id stays bound, so that the server's log of a failure has it too.
         logs.bind(request=request_id)
         started = time.perf_counter()
-        status, received = 500, 0  # what is answered where nothing was before an exception
+        status, received = 500, 0  # 500 is the answer to an exception before any other answer
 
         async def counted() -> Message:
             nonlocal received
@@ -114,6 +114,6 @@ class _Observed:
 
 
 def _caller(scope: Scope) -> dict[str, str]:
-    """Who asked, as far as it is known: the owner, and the key's id or the address. Never the key."""
+    """The caller, if known: the owner, and the id of the key or the address. Never the key itself."""
     caller = scope.get("state", {}).get("caller")
     return {} if caller is None else {"owner": caller.owner, "caller": caller.name}

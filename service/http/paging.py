@@ -1,4 +1,4 @@
-"""Lists a page at a time, newest first, by a cursor that is a place in the order and no offset."""
+"""Lists in pages, newest first. A cursor names a place in the order, not an offset, so new rows shift no page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Item = TypeVar("Item", bound=BaseModel)
 
 
 class Page(BaseModel, Generic[Item]):
-    """Part of a list."""
+    """One page of a list."""
 
     items: list[Item]
     next: str | None = Field(description="address of the next page; null on the last")
@@ -29,18 +29,18 @@ class _Ordered(Protocol):
 
 
 Row = TypeVar("Row", bound=_Ordered)
-Limit = Annotated[int, Query(ge=1, le=200, description="rows a page")]
-Cursor = Annotated[str | None, Query(description="from the `next` of the page before")]
+Limit = Annotated[int, Query(ge=1, le=200, description="rows per page")]
+Cursor = Annotated[str | None, Query(description="the cursor in `next` of the previous page")]
 
 
 def position(cursor: str | None) -> tuple[float, str] | None:
-    """The (created_at, id) in a cursor; ``Problem`` 422 where it is none of ours."""
+    """The (created_at, id) in a cursor. Raises ``Problem`` 422 if this service did not issue it."""
     parts = place(cursor, 2)
     return None if parts is None else (number(parts[0]), parts[1])
 
 
 def place(cursor: str | None, count: int) -> list[str] | None:
-    """The parts of the place in a cursor, the last of them an id; ``Problem`` 422 where it is none of ours."""
+    """The parts of a cursor; the last is an id. Raises ``Problem`` 422 if this service did not issue it."""
     if cursor is None:
         return None
     try:
@@ -53,7 +53,7 @@ def place(cursor: str | None, count: int) -> list[str] | None:
 
 
 def number(part: str) -> float:
-    """A time in a cursor; ``Problem`` 422 where it is none."""
+    """A time in a cursor. Raises ``Problem`` 422 if it is not a finite number."""
     try:
         at = float(part)
     except ValueError as error:
@@ -64,18 +64,22 @@ def number(part: str) -> float:
 
 
 def following(request: Request, *parts: str) -> str:
-    """The address of the page that begins behind a place."""
+    """The address of the page that starts after a place."""
     cursor = base64.urlsafe_b64encode(" ".join(parts).encode()).decode()
     query = request.url.include_query_params(cursor=cursor)
     return f"{query.path}?{query.query}"
 
 
 def _no_cursor() -> Problem:
-    return Problem(422, "bad-cursor", "expected the cursor of an earlier page's `next`")
+    return Problem(
+        422,
+        "bad-cursor",
+        "expected a cursor from `next` of an earlier page; got another text: start again without a cursor",
+    )
 
 
 def page(request: Request, rows: Sequence[Row], limit: int, view: Callable[[Row], Item]) -> Page[Item]:
-    """The page for ``limit + 1`` rows that were asked for: one more than is shown tells of a next page."""
+    """The page of ``limit`` rows. Callers query ``limit + 1`` rows: the last one shows that there is a next page."""
     after = rows[limit - 1] if len(rows) > limit else None
     next_page = None if after is None else following(request, repr(after.created_at), after.id)
     return Page(items=[view(row) for row in rows[:limit]], next=next_page)

@@ -1,26 +1,61 @@
-"""Errors as RFC 9457 problem documents."""
+"""Errors as RFC 9457 problem documents, and the HTTP status of each error code."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Any
+from typing import Any, cast
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic_core import ErrorDetails
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
+from psfcore.errors import DataError
 from workers import logs
+from workers.contract.suggestions import explained
 from workers.files.store import StoreAway
 
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
-# On every answer, unless a route has its own: nothing is guessed, framed, told to others, or loaded by a page.
+# HTTP status of a DataError, by its code; 422 for every other code.
+STATUS_OF = {
+    "no-psf-fits": 404,
+    "no-such-context": 404,
+    "no-such-image": 404,
+    "no-such-product": 404,
+    "no-such-psf": 404,
+    "no-such-transit": 404,
+    "changed-meanwhile": 409,
+    "cutout-not-plain": 409,
+    "line-known": 409,
+    "name-taken": 409,
+    "no-date": 409,
+    "no-instrument": 409,
+    "no-line": 409,
+    "no-psf-for-instrument": 409,
+    "no-such-successor": 409,
+    "not-made-here": 409,
+    "not-to-supersede": 409,
+    "nothing-to-pin": 409,
+    "parameters-outdated": 409,
+    "parameters-unknown": 409,
+    "plate-scale-mismatch": 409,
+    "ranges-overlap": 409,
+    "several-psfs-fit": 409,
+    "successor-named": 409,
+    "version-taken": 409,
+    "wrong-transition": 409,
+    "archive-too-large": 413,
+    "too-much-memory": 413,
+    "not-an-archive": 415,
+}
+# On every answer, unless the route sets its own: no guessed media types, no frames, no referrer, no loaded content.
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -31,20 +66,18 @@ SECURITY_HEADERS = {
 
 
 class ProblemDocument(BaseModel):
-    """An error, as the service answers it."""
+    """The document that answers an error."""
 
     model_config = ConfigDict(extra="allow")
 
-    type: str = Field(
-        "about:blank", description="kind of problem, a stable short name behind `urn:heliopsf:`"
-    )
+    type: str = Field("about:blank", description="`urn:heliopsf:` and the error code, a stable short name")
     title: str
     status: int
-    detail: str = Field(description="what was expected and what came")
+    detail: str = Field(description="what was expected, what came, and what to do next")
 
 
 class Problem(Exception):
-    """Raised by any endpoint; answered as a problem document."""
+    """An error with its HTTP status. Any endpoint may raise it; the answer is a problem document."""
 
     def __init__(
         self, status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
@@ -52,6 +85,11 @@ class Problem(Exception):
         super().__init__(detail)
         self.status, self.code, self.detail, self.more = status, code, detail, more
         self.headers = dict(headers or {})
+
+
+def problem(error: DataError, **more: Any) -> Problem:
+    """The problem for an error of the request or its data; ``more`` goes into the document."""
+    return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **more)
 
 
 def answer(
@@ -69,20 +107,27 @@ def answer(
 
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {"model": ProblemDocument, "description": "The request cannot be done; `detail` says why."},
+    "4XX": {"model": ProblemDocument, "description": "The request was refused; `detail` says why."},
 }
 
 
 def install(app: FastAPI) -> None:
-    """Answer every error of the application with a problem document."""
+    """Make the application answer every error with a problem document."""
 
     @app.exception_handler(Problem)
-    def _problem(_request: Request, problem: Problem) -> JSONResponse:
-        return answer(problem.status, problem.code, problem.detail, headers=problem.headers, **problem.more)
+    def _problem(_request: Request, found: Problem) -> JSONResponse:
+        return answer(found.status, found.code, found.detail, headers=found.headers, **found.more)
 
     @app.exception_handler(RequestValidationError)
-    def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
-        errors = [{"at": "/".join(map(str, e["loc"])), "message": e["msg"]} for e in error.errors()]
+    def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        body = getattr(request.scope.get("route"), "body_field", None)
+        model = None if body is None else body.field_info.annotation
+        errors = []
+        for found in error.errors():
+            # What the client sent in the body has "body" before its location in the model.
+            inside = cast(ErrorDetails, found | {"loc": found["loc"][1:]})
+            [(_, message)] = explained([inside], model if found["loc"][:1] == ("body",) else None)
+            errors.append({"at": "/".join(map(str, found["loc"])), "message": message})
         detail = "; ".join(f"{e['at']}: {e['message']}" for e in errors)
         return answer(422, "invalid-request", detail, errors=errors)
 
@@ -90,21 +135,24 @@ def install(app: FastAPI) -> None:
     def _http(request: Request, error: HTTPException) -> JSONResponse:
         detail = str(error.detail)
         if error.status_code == 404:
-            detail = f"nothing is at {request.url.path}"
+            detail = f"expected an address of this service; nothing is at {request.url.path}: /docs lists all addresses"
         elif error.status_code == 405:
-            detail = f"{request.url.path} does not take {request.method}"
-        problem = answer(error.status_code, f"http-{error.status_code}", detail)
-        problem.headers.update(error.headers or {})
-        return problem
+            detail = (
+                f"expected a method that {request.url.path} accepts; got {request.method}: /docs lists them"
+            )
+        return answer(error.status_code, f"http-{error.status_code}", detail, headers=error.headers)
 
     @app.exception_handler(OperationalError)
     @app.exception_handler(InterfaceError)
     @app.exception_handler(PoolTimeoutError)
     def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:
         log.error("database: %s", error)
-        problem = answer(503, "database-away", "the database does not answer; try again in a moment")
-        problem.headers["Retry-After"] = "5"
-        return problem
+        return answer(
+            503,
+            "database-away",
+            "the database of the service does not answer; try again in a moment",
+            headers={"Retry-After": "5"},
+        )
 
     @app.exception_handler(StoreAway)
     def _store(_request: Request, error: StoreAway) -> JSONResponse:
@@ -112,13 +160,18 @@ def install(app: FastAPI) -> None:
         return answer(
             503,
             "storage-away",
-            "the storage of files does not answer; try again in a moment",
+            "the file storage of the service does not answer; try again in a moment",
             headers={"Retry-After": "5"},
         )
 
     @app.exception_handler(Exception)
     def _ours(_request: Request, _error: Exception) -> JSONResponse:
-        # Starlette logs the traceback and passes the error on to the server after this answer.
-        # This answer goes past all that sets headers.
+        # After this answer Starlette logs the traceback and passes the error on to the server. No middleware sets the
+        # headers of this answer, so they are set here.
         headers = {**SECURITY_HEADERS, "X-Request-ID": logs.about().get("request", "")}
-        return answer(500, "internal-error", "the service failed; the error is in its log", headers=headers)
+        return answer(
+            500,
+            "internal-error",
+            "the service failed and logged the error; send the X-Request-ID of this answer to the operator",
+            headers=headers,
+        )

@@ -1,4 +1,4 @@
-"""How much an owner may have kept: refused before it is sent, or before it is worked on."""
+"""Checks the storage quota of an owner before an upload is received and before a job is accepted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Allowed:
         self._asked = 0
 
     def __call__(self, count: int) -> None:
-        """So many bytes more; ``Problem`` 429 or 413."""
+        """Count more bytes. Raises ``Problem`` 429 over the rate limit, 413 over the quota."""
         self._asked += count
         usage = _usage(self._state, self._caller.owner)
         if not usage.allows(self._asked):
@@ -25,7 +25,7 @@ class Allowed:
         self._state.rates.take_bytes(self._caller.name, count)
 
     def add(self, row: Row) -> tuple[Row, bool]:
-        """``Catalogue.add`` of the upload's row; ``Problem`` 413 where others took the room meanwhile."""
+        """``Catalogue.add`` of the upload's row. Raises ``Problem`` 413 if other uploads filled the quota meanwhile."""
         try:
             return self._state.catalogue.add(row, self._state.settings.quota_mib)
         except OverQuota as over:
@@ -33,7 +33,7 @@ class Allowed:
 
 
 def check_room(state: State, owner: str) -> None:
-    """Before work whose results are kept: ``Problem`` 507 where the owner may keep nothing more."""
+    """Raise ``Problem`` 507 if the owner's quota is full, so that no result could be kept."""
     usage = _usage(state, owner)
     if usage.full:
         raise _exceeded(507, usage, NOT_KEPT)

@@ -1,14 +1,16 @@
-"""How much one caller may ask for in a minute: reads, submissions, bytes sent in.
+"""Limits for each caller: reads, submissions and uploaded bytes a minute, and streams open at a time.
 
-Counted where all servers see it (in Redis) if the broker is one, in this process else. Each caller has an allowance
-of its own, so that one script gone wild does not keep the others waiting.
+If the broker is Redis, all servers count there together; otherwise each process counts for itself. Each caller has
+its own allowance, so that a runaway script does not delay the others.
 """
 
 from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
+from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -25,7 +27,7 @@ WINDOW_S = 60
 MIB = 2**20
 _REDIS = ("redis://", "rediss://")
 _PATIENCE_S = 1.0
-_AWAY_S = 10.0  # so long nobody asks a Redis that did not answer
+_AWAY_S = 10.0  # until a Redis that did not answer is asked again
 
 
 class Bucket(StrEnum):
@@ -38,7 +40,7 @@ class Bucket(StrEnum):
 
 @dataclass(frozen=True)
 class Allowance:
-    """What a caller may ask for in a minute, and what is left of it now."""
+    """How much a caller may use in a minute, and how much of it is left."""
 
     bucket: Bucket
     limit: int
@@ -47,7 +49,7 @@ class Allowance:
 
     @property
     def headers(self) -> dict[str, str]:
-        """As answers tell it, in the words of the IETF's draft on rate limit headers."""
+        """The headers of an answer, as in the IETF draft on rate limit headers."""
         return {
             "RateLimit-Policy": f'"{self.bucket}";q={self.limit};w={WINDOW_S}',
             "RateLimit": f'"{self.bucket}";r={self.left};t={self.reset_s}',
@@ -55,7 +57,7 @@ class Allowance:
 
 
 class Rates:
-    """Allowances of all callers, by the settings; a limit of 0 is none."""
+    """Allowances of all callers, from the settings; 0: unlimited."""
 
     def __init__(self, settings: Settings) -> None:
         per_minute = {
@@ -73,9 +75,9 @@ class Rates:
         self._away_until = 0.0
 
     def take(self, bucket: Bucket, who: str, cost: int = 1) -> Allowance | None:
-        """Count against a caller's allowance; ``Problem`` 429 where it is used up. None: there is no limit.
+        """Subtract a cost from a caller's allowance; None if there is no limit. Raises ``Problem`` 429 if it is used up.
 
-        What costs more than a minute's whole allowance needs all of it, so that it can be had at all.
+        A request that costs more than the allowance of a minute takes all of it, so that it is possible at all.
         """
         item = self._items.get(bucket)
         if item is None or time.monotonic() < self._away_until:
@@ -85,10 +87,10 @@ class Rates:
             granted = limiter.hit(item, bucket, who, cost=min(cost, item.amount))
             reset_at, left = limiter.get_window_stats(item, bucket, who)
         except StorageError as error:
-            # Let in, not shut out: limits keep the service quick, they do not keep anybody from anything (keys
-            # do that), and the loss of what counts should not be the loss of the service.
+            # Accept the request: limits only keep the service fast (keys protect it), so the service must work
+            # without them.
             self._away_until = time.monotonic() + _AWAY_S
-            log.warning("rates are not counted for %g s, Redis does not answer: %s", _AWAY_S, error)
+            log.warning("no rate limits for %g s because Redis does not answer: %s", _AWAY_S, error)
             return None
         allowance = Allowance(bucket, item.amount, left, max(1, math.ceil(reset_at - time.time())))
         if not granted:
@@ -96,7 +98,7 @@ class Rates:
         return allowance
 
     def take_bytes(self, who: str, count: int) -> Allowance | None:
-        """As ``take``, for bytes sent in."""
+        """As ``take``, for uploaded bytes."""
         return self.take(Bucket.UPLOADS, who, math.ceil(count / MIB))
 
     def _limit_by(self) -> SlidingWindowCounterRateLimiter:
@@ -110,12 +112,39 @@ class Rates:
         return self._limiter
 
 
+class Streams:
+    """Counts the streams that each caller has open in this process, and limits them."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._open: Counter[str] = Counter()
+        self._lock = threading.Lock()
+
+    def open(self, who: str) -> None:
+        """Count one more stream. Raises ``Problem`` 429 if the caller has the maximum open."""
+        with self._lock:
+            if self._open[who] >= self._most:
+                raise Problem(
+                    429,
+                    "too-many-streams",
+                    f"expected at most {self._most} open streams of events per caller; close one first",
+                )
+            self._open[who] += 1
+
+    def close(self, who: str) -> None:
+        """Count one stream less."""
+        with self._lock:
+            self._open[who] -= 1
+            if not self._open[who]:
+                del self._open[who]
+
+
 def _too_many(allowance: Allowance) -> Problem:
-    unit = {Bucket.READS: "requests", Bucket.SUBMISSIONS: "submissions", Bucket.UPLOADS: "MiB sent in"}
+    unit = {Bucket.READS: "requests", Bucket.SUBMISSIONS: "submissions", Bucket.UPLOADS: "MiB of uploads"}
     return Problem(
         429,
         "too-many-requests",
-        f"expected at most {allowance.limit} {unit[allowance.bucket]} a minute; got more: try again in "
+        f"expected at most {allowance.limit} {unit[allowance.bucket]} a minute; got more; try again in "
         f"{allowance.reset_s} s",
         headers={"Retry-After": str(allowance.reset_s), **allowance.headers},
     )

@@ -1,4 +1,4 @@
-"""What the endpoints share: settings, catalogue, store and reconciler, made once for each application."""
+"""What all endpoints share: settings, catalogue, store and reconciler. Each application makes them once."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from fastapi import Depends, Request
 
 from psfcore.fits.header import FitsLimits
 from service.http.access import Access
-from service.http.rates import Rates
-from service.http.streams import Streams
+from service.http.rates import Rates, Streams
 from workers.broker.reconciler import Reconciler
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
@@ -19,7 +18,7 @@ from workers.settings import Settings
 
 @dataclass(frozen=True)
 class State:
-    """Handles that live as long as the application."""
+    """Objects that live as long as the application."""
 
     settings: Settings
     catalogue: Catalogue
@@ -31,7 +30,7 @@ class State:
 
     @property
     def limits(self) -> FitsLimits:
-        """Limits of the files that are taken."""
+        """Limits of accepted FITS files."""
         return FitsLimits(max_pixels=self.settings.max_pixels)
 
 

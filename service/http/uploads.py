@@ -1,4 +1,4 @@
-"""One upload, streamed to the store: hashed, counted and recognised as it comes, never held in memory."""
+"""Receives an upload: streams it to the store, and hashes, counts and checks it on the way. It is never held in memory."""
 
 from __future__ import annotations
 
@@ -26,35 +26,34 @@ from psfcore.transit.archive import (
     could_be_archive,
     list_archive,
 )
-from service.http.problems import Problem
+from service.http.problems import Problem, problem
 from workers.files.store import Store
 
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
-FORM_BYTES = 2**16  # what a form may add to the file
-LARGE = frozenset({"/v1/images", "/v1/psfs", "/v1/transits"})  # where files come in, with limits of their own
-UNDECLARED_BYTES = 2**20  # taken at a time from the allowance where a request does not say how long it is
+FORM_BYTES = 2**16  # the most that a form may add to the file
+LARGE = frozenset({"/v1/images", "/v1/psfs", "/v1/transits"})  # upload addresses; they have their own limits
+UNDECLARED_BYTES = 2**20  # counted at a time if the request does not declare its length
 Take = Callable[[int], object]
-_ARCHIVE_STATUS = {"archive-too-large": 413, "not-an-archive": 415}
 
 
 def _body(what: str, media_type: str) -> dict[str, Any]:
-    """How an upload stands in the description of the interface."""
+    """The OpenAPI description of an upload."""
     return {
         "parameters": [
             {
                 "name": "filename",
                 "in": "query",
                 "required": False,
-                "description": "a label for people, where the file is the body itself",
+                "description": "file name shown to people, if the body is the file itself",
                 "schema": {"type": "string"},
             }
         ],
         "requestBody": {
             "required": True,
-            "description": f"The {what}, as the body itself or as the part `file` of a form.",
+            "description": f"The {what}: the body itself, or the part `file` of a form.",
             "content": {
                 media_type: {"schema": {"type": "string", "format": "binary"}},
                 "multipart/form-data": {
@@ -70,7 +69,7 @@ def _body(what: str, media_type: str) -> dict[str, Any]:
 
 
 OPENAPI_BODY = _body("FITS file", "application/fits")
-OPENAPI_TRANSIT_BODY = _body("transit's .zip, .tar or .tar.gz", "application/octet-stream")
+OPENAPI_TRANSIT_BODY = _body("archive of the transit (.zip, .tar or .tar.gz)", "application/octet-stream")
 
 Found = TypeVar("Found")
 FoundOut = TypeVar("FoundOut", covariant=True)
@@ -78,7 +77,7 @@ FoundOut = TypeVar("FoundOut", covariant=True)
 
 @dataclass(frozen=True)
 class Upload(Generic[Found]):
-    """A file that came whole, and what a look into it found; not yet kept."""
+    """A completely received file and a summary of its content. It is not yet in the store."""
 
     path: Path
     sha256: str
@@ -88,16 +87,16 @@ class Upload(Generic[Found]):
 
 
 class _Format(Protocol[FoundOut]):
-    """What kind of file is taken."""
+    """A kind of file that can be uploaded."""
 
     what: str
     start_bytes: int
 
     def recognise(self, start: bytes, *, whole: bool) -> None:
-        """Raise ``Problem`` where the first bytes, all there are if ``whole``, rule it out."""
+        """Raise ``Problem`` if these first bytes cannot start such a file. whole: there are no further bytes."""
 
     def inspect(self, path: Path) -> FoundOut:
-        """Look into the file; ``Problem`` where it cannot be used."""
+        """Read the summary of the file. Raises ``Problem`` if the file cannot be used."""
 
 
 @asynccontextmanager
@@ -106,8 +105,8 @@ async def receive(
 ) -> AsyncIterator[Upload[HeaderSummary]]:
     """Stream the request's FITS file to a temporary path and inspect its header.
 
-    take: counts bytes against the caller's allowance. Raises ``Problem`` 413 over the size limit, 415 for what is no FITS, 400 for a broken form or an upload
-    that ended early, and 422 for a header that shows a file that cannot be used.
+    take: counts bytes against the caller's allowance. Raises ``Problem`` 413 over the size limit, 415 if it is not
+    FITS, 400 for a broken form or an incomplete upload, and 422 for a header of a file that cannot be used.
     """
     async with _receive(request, store, _Fits(limits), max_bytes, take) as upload:
         yield upload
@@ -119,8 +118,8 @@ async def receive_transit(
 ) -> AsyncIterator[Upload[ArchiveContents]]:
     """Stream a transit's archive to a temporary path and check its table of contents and its transit.json.
 
-    Raises ``Problem`` as ``receive`` does: 413 also where more would come out than the limits allow, 415 for what
-    is no archive, and 422 for one that cannot be used.
+    Raises ``Problem`` as ``receive`` does: also 413 if the unpacked files would exceed the limits, 415 if it is not
+    an archive, and 422 if the transit cannot be used.
     """
     async with _receive(request, store, _Archive(limits), max_bytes, take) as upload:
         yield upload
@@ -132,7 +131,7 @@ async def _receive(
 ) -> AsyncIterator[Upload[Found]]:
     declared = _refuse_by_length(request, max_bytes)
     taken = declared
-    if declared:  # refused before it is sent, where it is known how much that will be
+    if declared:  # with a declared length the upload can be refused before it is sent
         await run_in_threadpool(take, declared)
     with store.temporary() as path:
         body = _Body(request, max_bytes)
@@ -151,7 +150,7 @@ async def _receive(
                 digest.update(chunk)
                 file.write(chunk)
         if size == 0:
-            raise Problem(400, "empty-upload", f"expected {expected.what}, got 0 bytes")
+            raise Problem(400, "empty-upload", f"expected {expected.what}, got 0 bytes: check the file")
         expected.recognise(start, whole=True)
         found = await run_in_threadpool(expected.inspect, path)
         yield Upload(path, digest.hexdigest(), size, body.filename, found)
@@ -165,7 +164,7 @@ class _Fits:
         self._limits = limits
 
     def recognise(self, start: bytes, *, whole: bool) -> None:
-        """Refuse at the first bytes what cannot become FITS, before the rest is taken."""
+        """Refuse a file that is not FITS at its first bytes, before the rest is received."""
         if not any(start.startswith(known[: len(start)]) for known in FITS_STARTS):
             raise Problem(
                 415, "not-fits", f"expected a FITS file (it starts with 'SIMPLE  ='), got {start[:9]!r}"
@@ -175,7 +174,7 @@ class _Fits:
         try:
             return read_summary(path, self._limits)
         except HeaderError as error:
-            raise Problem(422, error.code, error.message) from error
+            raise problem(error) from error
 
 
 class _Archive:
@@ -186,7 +185,7 @@ class _Archive:
         self._limits = limits
 
     def recognise(self, start: bytes, *, whole: bool) -> None:
-        """Refuse at the first bytes what cannot become an archive, before the rest is taken."""
+        """Refuse a file that is not an archive at its first bytes, before the rest is received."""
         if not (could_be_archive(start) and (not whole or archive_kind(start))):
             raise Problem(415, "not-an-archive", f"expected {self.what}, got bytes {start[:9]!r}")
 
@@ -194,11 +193,11 @@ class _Archive:
         try:
             return list_archive(path, self._limits)
         except DataError as error:
-            raise Problem(_ARCHIVE_STATUS.get(error.code, 422), error.code, error.message) from error
+            raise problem(error) from error
 
 
 def _refuse_by_length(request: Request, max_bytes: int) -> int:
-    """The length that the request declares; 0 where it declares none."""
+    """The length that the request declares; 0 if it declares none."""
     text = request.headers.get("content-length", "")
     declared = int(text) if text.isdecimal() else 0
     if declared > max_bytes + FORM_BYTES:
@@ -207,7 +206,11 @@ def _refuse_by_length(request: Request, max_bytes: int) -> int:
 
 
 def _too_large(max_bytes: int) -> Problem:
-    return Problem(413, "too-large", f"expected a file of at most {max_bytes} bytes, got more")
+    return Problem(
+        413,
+        "too-large",
+        f"expected a file of at most {max_bytes} bytes; got more: ask the operator for a higher limit",
+    )
 
 
 class _Body:
@@ -233,7 +236,9 @@ class _Body:
                         yield chunk
         except ClientDisconnect as error:
             raise Problem(
-                400, "upload-ended-early", "the connection closed before the file was whole"
+                400,
+                "upload-ended-early",
+                "expected the complete file; the connection closed before: upload it again",
             ) from error
 
     async def _form(self, options: dict[bytes, bytes]) -> AsyncIterator[bytes]:
@@ -252,7 +257,7 @@ class _Body:
             sent = 0
             async for chunk in self._request.stream():
                 sent += len(chunk)
-                if sent > self._max_bytes + FORM_BYTES:  # parts that are not the file count too
+                if sent > self._max_bytes + FORM_BYTES:  # the other parts of the form count too
                     raise _too_large(self._max_bytes)
                 parser.write(chunk)
                 while self._ready:
@@ -262,7 +267,11 @@ class _Body:
         if not self._seen_file:
             raise Problem(400, "bad-form", "expected a form with a part named 'file', got none")
         if not self._whole:
-            raise Problem(400, "upload-ended-early", "the form ended before its last boundary")
+            raise Problem(
+                400,
+                "upload-ended-early",
+                "expected the complete form; it ended before its last boundary: upload it again",
+            )
 
     def _part_begin(self) -> None:
         self._in_file = False
@@ -290,7 +299,7 @@ class _Body:
 
 
 def _label(filename: str | None) -> str | None:
-    """A client's file name as a label for people: its last part, printable, short. It is never a path."""
+    """A short printable label from a client's file name. It is never used as a path."""
     if not filename:
         return None
     last = re.split(r"[/\\]", filename)[-1]

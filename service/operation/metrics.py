@@ -16,12 +16,12 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoM
 from prometheus_client.registry import Collector
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.api.jobs import RESULTS
 from service.http.callers import Administering
 from service.http.state import Shared, State
 from workers import checks
 from workers.catalogue.census import JobTally
-from workers.contract.contract import Phase
+from workers.contract.kinds import KINDS
+from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 from workers.settings import software_version
 
@@ -69,7 +69,7 @@ class _Catalogued(Collector):
 
     def _jobs(self) -> Iterator[Metric]:
         tallies = {(tally.kind, tally.phase): tally for tally in self._state.catalogue.census.tally()}
-        kinds = sorted({*RESULTS, *(kind for kind, _ in tallies)})
+        kinds = sorted({*KINDS, *(kind for kind, _ in tallies)})
         jobs = GaugeMetricFamily("heliopsf_jobs", "Jobs", labels=["kind", "phase"])
         attempts = GaugeMetricFamily("heliopsf_job_attempts", "Starts of jobs", labels=["kind"])
         retries = GaugeMetricFamily("heliopsf_job_retries", "Starts of jobs after the first", labels=["kind"])

@@ -1,0 +1,1 @@
+"""The IVOA UWS 1.1 interface."""

@@ -1,6 +1,6 @@
-"""UWS 1.1 documents: job list, job, parameters and results, as XML by the IVOA's schema.
+"""UWS 1.1 documents (job list, job, parameters, results) as XML of the IVOA schema.
 
-Citation: REC-UWS-1.1 (24 October 2016), appendix B, whose order of elements is kept. Times are UTC and end in Z.
+Citation: REC-UWS-1.1 (24 October 2016), appendix B, which also fixes the order of elements. Times are UTC and end in Z.
 """
 
 from __future__ import annotations
@@ -12,17 +12,19 @@ from datetime import UTC, datetime
 from typing import Any
 from xml.etree import ElementTree
 
-from service.api.jobs import RESULTS
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.catalogue.uws_jobs import JobLine
-from workers.contract.contract import Fault, JobError, Phase
+from workers.contract.kinds import KINDS, Result
+from workers.contract.phases import Fault, JobError, Phase
 
 MEDIA_TYPE = "application/xml"
 UWS = "http://www.ivoa.net/xml/UWS/v1.0"
 XLINK = "http://www.w3.org/1999/xlink"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 VERSION = "1.1"
-NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # what XML 1.0 cannot hold
+NO_XML = re.compile(
+    "[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
+)  # characters that XML 1.0 cannot contain
 
 for _prefix, _namespace in (("uws", UWS), ("xlink", XLINK), ("xsi", XSI)):
     ElementTree.register_namespace(_prefix, _namespace)
@@ -77,11 +79,11 @@ def results(row: JobRow, base_url: str) -> bytes:
 
 
 def result_addresses(row: JobRow) -> dict[str, tuple[str, str]]:
-    """By the result's name its address in this service and its media type; empty until the job is completed."""
+    """The address and media type of each result, by its name; empty until the job is COMPLETED."""
     if row.phase != Phase.COMPLETED or row.result_id is None:
         return {}
-    made = RESULTS[row.kind]
-    media_type = "application/json" if made == "/v1/reports" else "application/fits"
+    made = KINDS[row.kind].result
+    media_type = "application/json" if made == Result.REPORT else "application/fits"
     return {
         "result": (f"{made}/{row.result_id}/file", media_type),
         "description": (f"{made}/{row.result_id}", "application/json"),
@@ -102,7 +104,7 @@ def _parameters(row: JobRow) -> ElementTree.Element:
 
 
 def _parameter_text(value: Any) -> str:
-    """A parameter as a form would send it: text as it is, all else as JSON."""
+    """A parameter as a form sends it: a text unchanged, anything else as JSON."""
     return value if isinstance(value, str) else json.dumps(value)
 
 

@@ -1,4 +1,4 @@
-"""What UWS clients send: forms, and job parameters as text, read against the contract."""
+"""Reads what UWS clients send: forms, and job parameters as text, and checks them against the contract."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import AsyncGenerator, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
 from fastapi import Depends, Request
@@ -20,26 +20,24 @@ from service.http.problems import Problem
 from service.http.quotas import check_room
 from service.http.state import State
 from service.uws.documents import NO_XML
-from workers.contract.contract import JobRequest, Phase
+from workers.contract.kinds import KINDS, REQUESTS
+from workers.contract.phases import Phase
+from workers.contract.suggestions import did_you_mean, explained
 from workers.intake import estimates
 from workers.intake.requests import resolve
 
 MAX_FORM_BYTES = 2**20
 MAX_FIELDS = 64
 SHOWN = 120
-# Phases that the standard has and jobs here never reach; clients may ask for them all the same.
+# The last four are phases of the standard that jobs of this service never have; clients may still ask for them.
 PHASES = frozenset({*Phase, "HELD", "SUSPENDED", "UNKNOWN", "ARCHIVED"})
 INTEGER = re.compile(r"-?[0-9]{1,15}", re.ASCII)
-REQUESTS: dict[str, type[BaseModel]] = {
-    get_args(request.model_fields["kind"].annotation)[0]: request
-    for request in get_args(get_args(JobRequest)[0])
-}
 
 
 async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a form and of the address, by their names in small letters; ``Problem`` where it cannot be read.
+    """The fields of a form and of the address, by their names in lower case. Raises ``Problem`` if it is no form.
 
-    A field without a value is one that was not sent.
+    A field without a value counts as not sent.
     """
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "multipart/form-data":
@@ -61,7 +59,7 @@ Form = Annotated[dict[str, str], Depends(read_form)]
 
 
 def query_of(request: Request, *several: str) -> dict[str, list[str]]:
-    """The fields of the address by their names in small letters; those not in ``several`` may come once."""
+    """The fields of the address, by their names in lower case. Only those in ``several`` may be repeated."""
     found: dict[str, list[str]] = {}
     for name, value in request.query_params.multi_items():
         if value:
@@ -73,15 +71,16 @@ def query_of(request: Request, *several: str) -> dict[str, list[str]]:
 
 
 def bad(message: str, status: int = 400) -> Problem:
-    """A refusal of what the client sent."""
+    """The answer to a bad parameter."""
     return Problem(status, "bad-parameter", message)
 
 
 def kind_of(form: dict[str, str]) -> str:
-    """Takes KIND out of a form."""
+    """Take KIND out of a form. Raises ``Problem`` if no client can request jobs of that kind."""
     kind = form.pop("kind", None)
-    if kind not in REQUESTS:
-        raise bad(f"expected KIND, one of {', '.join(REQUESTS)}; got {_shown(kind)}")
+    if kind is None or kind not in REQUESTS:
+        hint = did_you_mean(kind or "", REQUESTS)
+        raise bad(f"expected KIND, one of {', '.join(REQUESTS)}; got {_shown(kind)}{hint}")
     return kind
 
 
@@ -93,12 +92,12 @@ def integer(name: str, text: str, least: int) -> int:
 
 
 def moment(name: str, text: str) -> float:
-    """Seconds since 1970 of a time in ISO 8601; without a zone it is UTC."""
+    """Seconds since 1970 of a time in ISO 8601; a time without a zone is UTC."""
     try:
         when = datetime.fromisoformat(text)
         return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
     except (ValueError, OverflowError) as error:
-        raise bad(f"expected {name}, a time as 2026-01-31T12:00:00Z; got {_shown(text)}") from error
+        raise bad(f"expected {name}, a time such as 2026-01-31T12:00:00Z; got {_shown(text)}") from error
 
 
 def phase(text: str) -> str:
@@ -109,7 +108,7 @@ def phase(text: str) -> str:
 
 
 def check(kind: str, given: dict[str, str]) -> None:
-    """``Problem`` where a parameter of a job that is still set up is wrong in itself; others may be missing yet."""
+    """Raise ``Problem`` for a wrong parameter of a PENDING job; parameters may still be missing."""
     _values, errors = _understood(kind, given)
     wrong = [e for e in errors if e["loc"] and not (e["type"] == "missing" and len(e["loc"]) == 1)]
     if wrong:
@@ -119,9 +118,9 @@ def check(kind: str, given: dict[str, str]) -> None:
 def resolved(
     state: State, owner: str, kind: str, given: dict[str, str]
 ) -> tuple[dict[str, Any], str, dict[str, Any]]:
-    """A job's parameters with nothing left open, the identity of what it makes, and what it is expected to need.
+    """Resolved parameters of a job, the identity of its result, and its estimate.
 
-    ``Problem`` 400 where they are wrong, or ask for more than a job may need; 507 where there is no room.
+    Raises ``Problem`` 400 if they are wrong or the job would need too much, and 507 if the owner's quota is full.
     """
     check_room(state, owner)
     values, errors = _understood(kind, given)
@@ -136,9 +135,9 @@ def resolved(
 
 
 def _understood(kind: str, given: dict[str, str]) -> tuple[dict[str, Any], list[ErrorDetails]]:
-    """Values as the contract takes them, and what is wrong with them.
+    """The values that the contract accepts, and the errors of the others.
 
-    A text stays a text where the contract takes it, as numbers, names and true or false; else it is read as JSON.
+    A text that the contract accepts (a name, a number, true or false) stays a text; any other is read as JSON.
     """
     for name, text in given.items():
         if NO_XML.search(text):
@@ -151,29 +150,29 @@ def _understood(kind: str, given: dict[str, str]) -> tuple[dict[str, Any], list[
 
 
 def _errors(kind: str, values: dict[str, Any]) -> list[ErrorDetails]:
-    model = REQUESTS[kind].model_fields["parameters"].annotation
-    assert isinstance(model, type) and issubclass(model, BaseModel)
     try:
-        model.model_validate(values)
+        _model(kind).model_validate(values)
     except ValidationError as error:
-        return error.errors(include_url=False, include_context=False)
+        return error.errors(include_url=False)
     return []
 
 
 def _wrong(kind: str, errors: Iterable[ErrorDetails]) -> Problem:
-    model = REQUESTS[kind].model_fields["parameters"].annotation
-    assert isinstance(model, type) and issubclass(model, BaseModel)
-    told = []
-    for error in errors:
+    lines = []
+    for error, message in explained(errors, _model(kind)):
         name = "/".join(map(str, error["loc"])) or kind
-        if error["type"] == "extra_forbidden":
-            message = f"no parameter of {kind}; expected {', '.join(model.model_fields)}"
-        elif error["type"] == "missing":
+        if error["type"] == "missing":
             message = "expected a value, got none"
-        else:
-            message = f"{error['msg']}; got {_shown(error['input'])}"
-        told.append(f"{name}: {message}")
-    return bad("\n".join(told))
+        elif error["type"] not in ("extra_forbidden", "union_tag_invalid"):
+            message = f"{message}; got {_shown(error['input'])}"
+        lines.append(f"{name}: {message}")
+    return bad("\n".join(lines))
+
+
+def _model(kind: str) -> type[BaseModel]:
+    model = KINDS[kind].parameters
+    assert model is not None
+    return model
 
 
 def _shown(value: object) -> str:
@@ -194,7 +193,7 @@ def _single(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
 
 
 async def _bounded(request: Request) -> AsyncGenerator[bytes, None]:
-    """The body, as far as a form may be long."""
+    """The body, up to the largest size of a form."""
     got = 0
     async for chunk in request.stream():
         got += len(chunk)

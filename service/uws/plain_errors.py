@@ -1,4 +1,4 @@
-"""How UWS addresses answer and describe themselves: refusals as plain text, fields whose names are read in any case."""
+"""Errors of UWS addresses as plain text, and the OpenAPI description of their fields."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.uws.documents import MEDIA_TYPE
 
 
 class PlainErrors(APIRoute):
-    """Refusals as plain text, as clients of the Virtual Observatory show them."""
+    """Errors as plain text, which clients of the Virtual Observatory show to their users."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handle = super().get_route_handler()
@@ -29,7 +29,7 @@ class PlainErrors(APIRoute):
 
 
 def query(**described: str) -> dict[str, Any]:
-    """Parameters of an address for the description of the interface; their names are read in any case."""
+    """OpenAPI description of query parameters. Upper and lower case of their names are equal."""
     return {
         "parameters": [
             {
@@ -45,7 +45,7 @@ def query(**described: str) -> dict[str, Any]:
 
 
 def form(**described: str) -> dict[str, Any]:
-    """A form's fields for the description of the interface."""
+    """OpenAPI description of the fields of a form."""
     fields = {name: {"type": "string", "description": text} for name, text in described.items()}
     schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
     return {"requestBody": {"content": {"application/x-www-form-urlencoded": {"schema": schema}}}}

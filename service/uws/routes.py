@@ -1,9 +1,9 @@
 """IVOA UWS 1.1 over the same jobs: ``/uws/jobs``, for clients of the Virtual Observatory.
 
-Citation: REC-UWS-1.1 (24 October 2016), section 2.2. A job is PENDING until it is told to run, has an end to its
-execution and to its keeping, and stands for itself: equal requests share what they make, but not their jobs. Of
-equal jobs one is at work at a time: the others are QUEUED until it ends, and then COMPLETED with what it made, or tried
-where it made nothing. What a job made stays in the catalogue when the job is destroyed. Errors are plain text.
+Citation: REC-UWS-1.1 (24 October 2016), section 2.2. A job is PENDING until the client starts it, and has a limit
+on its execution and a time at which it is destroyed. Identical requests share their result, but each has its own
+job. Identical jobs run once: the others wait QUEUED, and then share the result, or run if there is none. Destroying
+a job does not delete its result. Errors are plain text.
 """
 
 from __future__ import annotations
@@ -24,19 +24,24 @@ from service.uws import documents
 from service.uws import plain_errors as routing
 from service.uws.parameters import Form, bad, check, integer, kind_of, moment, phase, query_of, resolved
 from workers.catalogue.tables import JobRow, TermsRow
-from workers.contract.contract import JobError, Phase
+from workers.contract.phases import JobError, Phase
 
 MAX_RUN_ID = 256
 MOST = 2**31 - 1
 MOST_LISTED = 10_000  # jobs in one document, which is built in memory
-FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a job that is waited for is looked at less and less often
+FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a waiting request checks its job less and less often
 
 
 router = APIRouter(
     prefix="/uws/jobs",
     tags=["uws"],
     route_class=routing.PlainErrors,
-    responses={"4XX": {"content": {"text/plain": {}}, "description": "What was expected and what came."}},
+    responses={
+        "4XX": {
+            "content": {"text/plain": {}},
+            "description": "What was expected, what came, and what to do next.",
+        }
+    },
 )
 
 
@@ -45,13 +50,13 @@ router = APIRouter(
     summary="UWS: the job list",
     **routing.XML,
     openapi_extra=routing.query(
-        PHASE="jobs in this phase; several are one of them",
-        AFTER="jobs created after this time, ISO 8601 in UTC",
-        LAST=f"so many jobs, the newest; at most {MOST_LISTED}, which are as many as come without it",
+        PHASE="list jobs in this phase; may be repeated",
+        AFTER="list jobs created after this time (ISO 8601, UTC)",
+        LAST=f"list this number of newest jobs; at most {MOST_LISTED}, which is also the default",
     ),
 )
 def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
-    """Jobs, newest first, as far as they are asked for, and no more than LAST may be; /v1/jobs has pages."""
+    """Your jobs, newest first. /v1/jobs lists all of them in pages."""
     query = query_of(request, "phase")
     after, last = query.get("after"), query.get("last")
     # Times are shown to the millisecond, so "after" is the millisecond after.
@@ -67,18 +72,18 @@ def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
 
 @router.post(
     "",
-    summary="UWS: set up a job",
+    summary="UWS: create a job",
     **routing.TO_JOB,
     openapi_extra=routing.form(
-        KIND="of job, as deconvolve",
-        PHASE="RUN starts it at once",
-        RUNID="a name of yours for it",
-        EXECUTIONDURATION="seconds that it may execute",
-        DESTRUCTION="time at which it is destroyed",
+        KIND="kind of job, for example deconvolve",
+        PHASE="RUN: start the job at once",
+        RUNID="your own name for the job",
+        EXECUTIONDURATION="seconds that the job may execute",
+        DESTRUCTION="time at which the job is destroyed",
     ),
 )
 def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
-    """A new job, PENDING or told to run. Other fields are its parameters; those that are objects are JSON."""
+    """Create a job. All other fields are parameters of the job; write objects as JSON."""
     run_id, start = form.pop("runid", None), form.pop("phase", None)
     duration, destruction = form.pop("executionduration", None), form.pop("destruction", None)
     kind = kind_of(form)
@@ -106,12 +111,12 @@ def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shar
     summary="UWS: a job",
     **routing.XML,
     openapi_extra=routing.query(
-        WAIT="seconds to wait for the job's phase to change; -1: as long as the service keeps a client waiting",
-        PHASE="with WAIT: do not wait where the job is not in this phase",
+        WAIT="seconds to wait for a change of the phase; -1: as long as the service allows",
+        PHASE="with WAIT: wait only if the job is in this phase",
     ),
 )
 async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Shared) -> Response:
-    """The job as it is, or as soon as its phase is another. Who waits holds no thread."""
+    """The job: at once, or with WAIT as soon as its phase changes."""
     query = query_of(request)
     most = state.settings.uws_max_wait_s
     wait_s = integer("WAIT", query["wait"][0], -1) if "wait" in query else 0
@@ -132,7 +137,7 @@ async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Sha
 
 @router.delete("/{job_id}", summary="UWS: abort and destroy a job", **routing.TO_JOB)
 def delete_uws_job(job_id: str, request: Request, caller: Submitting, state: Shared) -> Response:
-    """The job is gone, whatever its phase; a worker that has it stops. What it made stays in the catalogue."""
+    """Delete the job in any phase; a worker that runs it stops. Its result stays in the catalogue."""
     _find(state, caller, job_id)
     state.catalogue.uws.destroy(job_id)
     return RedirectResponse(_jobs_url(request), 303)
@@ -151,7 +156,7 @@ def post_uws_job(job_id: str, caller: Submitting, form: Form, request: Request, 
 
 @router.get("/{job_id}/phase", summary="UWS: a job's phase", **routing.TEXT)
 def get_uws_phase(job_id: str, caller: Reading, state: Shared) -> Response:
-    """The phase, one word."""
+    """The phase as one word."""
     return _text(_find(state, caller, job_id).phase)
 
 
@@ -162,7 +167,7 @@ def get_uws_phase(job_id: str, caller: Reading, state: Shared) -> Response:
     openapi_extra=routing.form(PHASE="RUN or ABORT"),
 )
 def post_uws_phase(job_id: str, caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
-    """RUN queues a PENDING job; ABORT stops one that has not ended. Where that is so already nothing happens."""
+    """RUN queues a PENDING job; ABORT stops a job that has not ended. A repeated request changes nothing."""
     row = _find(state, caller, job_id)
     match form.get("phase"):
         case "RUN":
@@ -176,7 +181,7 @@ def post_uws_phase(job_id: str, caller: Submitting, form: Form, request: Request
 
 @router.get("/{job_id}/executionduration", summary="UWS: how long a job may execute", **routing.TEXT)
 def get_uws_duration(job_id: str, caller: Reading, state: Shared) -> Response:
-    """Seconds; 0 is as long as it takes."""
+    """Seconds; 0: unlimited."""
     return _text(str(_terms(state, caller, job_id)[1].execution_duration_s))
 
 
@@ -184,12 +189,12 @@ def get_uws_duration(job_id: str, caller: Reading, state: Shared) -> Response:
     "/{job_id}/executionduration",
     summary="UWS: limit how long a job may execute",
     **routing.TO_JOB,
-    openapi_extra=routing.form(EXECUTIONDURATION="seconds; 0: as long as it takes"),
+    openapi_extra=routing.form(EXECUTIONDURATION="seconds; 0: unlimited"),
 )
 def post_uws_duration(
     job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
 ) -> Response:
-    """The limit is set, or to what is allowed where more was asked for."""
+    """Set the limit. The service reduces it to the largest one that the operator allows."""
     _find(state, caller, job_id)
     asked = _duration(state, _given(form, "EXECUTIONDURATION"))
     state.catalogue.uws.set_terms(job_id, execution_duration_s=asked)
@@ -198,35 +203,35 @@ def post_uws_duration(
 
 @router.get("/{job_id}/destruction", summary="UWS: when a job is destroyed", **routing.TEXT)
 def get_uws_destruction(job_id: str, caller: Reading, state: Shared) -> Response:
-    """A time, or nothing where the job is kept for good."""
+    """A time; empty if the job is kept for ever."""
     at = _terms(state, caller, job_id)[1].destruction_at
     return _text("" if at is None else documents.time_text(at))
 
 
 @router.post(
     "/{job_id}/destruction",
-    summary="UWS: say when a job is destroyed",
+    summary="UWS: set when a job is destroyed",
     **routing.TO_JOB,
-    openapi_extra=routing.form(DESTRUCTION="ISO 8601 in UTC"),
+    openapi_extra=routing.form(DESTRUCTION="a time (ISO 8601, UTC)"),
 )
 def post_uws_destruction(
     job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
 ) -> Response:
-    """The time is set, or to the last one that is allowed where a later one was asked for."""
+    """Set the time. The service replaces it by the latest one that the operator allows."""
     _find(state, caller, job_id)
     at = _destruction(state, _given(form, "DESTRUCTION"))
     state.catalogue.uws.set_terms(job_id, destruction_at=at)
     return _see(request, job_id)
 
 
-@router.get("/{job_id}/quote", summary="UWS: when a job is likely to be done", **routing.TEXT)
+@router.get("/{job_id}/quote", summary="UWS: when a job is expected to end", **routing.TEXT)
 def get_uws_quote(job_id: str, caller: Reading, state: Shared) -> Response:
-    """A time, or nothing where it is not known."""
+    """A time; empty if unknown."""
     at = _quote(_find(state, caller, job_id))
     return _text("" if at is None else documents.time_text(at))
 
 
-@router.get("/{job_id}/owner", summary="UWS: whose job it is", **routing.TEXT)
+@router.get("/{job_id}/owner", summary="UWS: the owner of a job", **routing.TEXT)
 def get_uws_owner(job_id: str, caller: Reading, state: Shared) -> Response:
     """The owner's name."""
     return _text(_find(state, caller, job_id).owner)
@@ -234,7 +239,7 @@ def get_uws_owner(job_id: str, caller: Reading, state: Shared) -> Response:
 
 @router.get("/{job_id}/parameters", summary="UWS: a job's parameters", **routing.XML)
 def get_uws_parameters(job_id: str, caller: Reading, state: Shared) -> Response:
-    """As given while the job is PENDING; with every default filled in once it was told to run."""
+    """As sent while the job is PENDING; with every default filled in after it was started."""
     return _xml(documents.parameters(_find(state, caller, job_id)))
 
 
@@ -247,10 +252,12 @@ def get_uws_parameters(job_id: str, caller: Reading, state: Shared) -> Response:
 def post_uws_parameters(
     job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
 ) -> Response:
-    """Set parameters of a job that is PENDING; others stay as they are."""
+    """Set parameters of a PENDING job. Parameters that are not sent do not change."""
     row = _find(state, caller, job_id)
     if kind_of({"kind": row.kind} | form) != row.kind:
-        raise bad(f"expected KIND={row.kind}, which a job keeps; got {form['kind']}")
+        raise bad(
+            f"expected KIND={row.kind}; got {form['kind']}: the kind of a job cannot change, so create another job"
+        )
     form.pop("kind", None)
 
     def change(given: dict[str, Any]) -> dict[str, Any]:
@@ -258,47 +265,53 @@ def post_uws_parameters(
         return given | form
 
     if not state.catalogue.uws.amend(job_id, change):
-        raise _not_now(_find(state, caller, job_id), "parameters are set while it is PENDING")
+        raise _not_now(_find(state, caller, job_id), "parameters can be set only while a job is PENDING")
     return _see(request, job_id)
 
 
 @router.get("/{job_id}/results", summary="UWS: a job's results", **routing.XML)
 def get_uws_results(job_id: str, request: Request, caller: Reading, state: Shared) -> Response:
-    """Addresses of what the job made: none before it is completed."""
+    """Addresses of the results; empty until the job is COMPLETED."""
     return _xml(documents.results(_find(state, caller, job_id), _base_url(request)))
 
 
 @router.get("/{job_id}/results/{name}", summary="UWS: one of a job's results", **routing.TO_JOB)
 def get_uws_result(job_id: str, name: str, request: Request, caller: Reading, state: Shared) -> Response:
-    """To the file that the job made (``result``) or to what is known of it (``description``)."""
+    """Redirect to the file that the job made (``result``) or to its description (``description``)."""
     row = _find(state, caller, job_id)
     found = documents.result_addresses(row).get(name)
     if found is None:
-        raise Problem(404, "no-such-result", f"job {job_id} is {row.phase} and has no result {name[:40]!a}")
+        raise Problem(
+            404,
+            "no-such-result",
+            f"expected a result of job {job_id}; it is {row.phase} and has no result {name[:40]!a}",
+        )
     return RedirectResponse(_base_url(request) + found[0], 303)
 
 
 @router.get("/{job_id}/error", summary="UWS: why a job failed", **routing.TEXT)
 def get_uws_error(job_id: str, caller: Reading, state: Shared) -> Response:
-    """What went wrong, and whose fault it is."""
+    """The error and its fault: user, transient or internal."""
     row = _find(state, caller, job_id)
     if row.error is None:
-        raise Problem(404, "no-error", f"job {job_id} is {row.phase} and has no error")
+        raise Problem(
+            404, "no-error", f"expected a job with an error; job {job_id} is {row.phase} and has none"
+        )
     error = JobError.model_validate(row.error)
     return _text(f"{error.message}\n({error.code}, fault: {error.fault})\n")
 
 
 def _start(state: State, caller: Caller, row: JobRow) -> None:
-    """PENDING -> QUEUED. ``Problem`` 400 where the parameters are not what the job needs, 403 where it has ended."""
+    """PENDING -> QUEUED. Raises ``Problem`` 400 for wrong parameters, 403 if the job has ended."""
     while row.phase == Phase.PENDING:
         if state.catalogue.uws.start(
             row.id, row.parameters, *resolved(state, row.owner, row.kind, row.parameters)
         ):
             state.reconciler.wake()
             return
-        row = _find(state, caller, row.id)  # changed meanwhile
+        row = _find(state, caller, row.id)  # another request changed the job meanwhile
     if Phase(row.phase).ended:
-        raise _not_now(row, "PHASE=RUN starts one that is PENDING")
+        raise _not_now(row, "PHASE=RUN can start only a PENDING job: create a new one")
 
 
 def _not_now(row: JobRow, rule: str) -> Problem:
@@ -315,13 +328,13 @@ def _destruction(state: State, text: str | None) -> float:
     last = now + state.settings.uws_max_keep_s
     asked = last if text is None else moment("DESTRUCTION", text)
     if asked <= now:
-        raise bad(f"expected DESTRUCTION, a time that is to come; got {text}")
+        raise bad(f"expected DESTRUCTION, a time in the future; got {text}")
     return min(asked, last)
 
 
 def _given(form: dict[str, str], name: str) -> str:
     if name.lower() not in form:
-        raise bad(f"expected {name}, got no such field")
+        raise bad(f"expected the field {name}; got none")
     return form[name.lower()]
 
 
@@ -331,11 +344,11 @@ def _quote(row: JobRow) -> float | None:
 
 
 def _find(state: State, caller: Caller, job_id: str) -> JobRow:
-    """The job's row, where it is this owner's; ``Problem`` 404 where it is not."""
+    """The row of a job. Raises ``Problem`` 404 if the caller has no such job."""
     known = len(job_id) == 32 and set(job_id) <= set("0123456789abcdef")
     row = state.catalogue.jobs.get(job_id) if known else None
     if row is None or row.owner != caller.owner:
-        raise Problem(404, "no-such-job", f"there is no job with id {job_id[:64]!a}")
+        raise Problem(404, "no-such-job", f"expected the id of one of your jobs; got {job_id[:64]!a}")
     return row
 
 

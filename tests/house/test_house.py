@@ -58,6 +58,7 @@ LIGHT = (
     "psfcore.fits.cutout",
     "psfcore.tables.lookup",
     "psfcore.errors",
+    "psfcore.noise_figures",
     "psfcore.transit.archive",
     "psfcore.transit.manifest",
 )
@@ -98,6 +99,7 @@ def test_the_web_process_carries_no_numerics_and_no_task() -> None:
         "httpx",
     }
     assert loaded & heavy == set()
+    assert {name for name in loaded if name.startswith("workers.tasks.")} == set()
 
 
 def test_servers_and_workers_fetch_nothing_and_take_no_objects_from_outside() -> None:

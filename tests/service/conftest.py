@@ -12,7 +12,7 @@ from service.app import create_app
 from tests.tables import copied_tables
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

@@ -13,7 +13,7 @@ from tests.conftest import write_image
 from tests.whole.stack import MODES, Missing, Stack, wait_for
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import JobRow
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 from workers.settings import Settings
 

@@ -46,7 +46,7 @@ def test_the_real_hri_image(stack: Stack, shared: Path, tmp_path: Path) -> None:
 def test_images_of_other_telescopes_need_a_psf_of_theirs(
     stack: Stack, shared: Path, tmp_path: Path, psf_file: Path, name: str
 ) -> None:
-    with pytest.raises(ServiceError, match="upload its PSF") as refused:
+    with pytest.raises(ServiceError, match="upload a PSF") as refused:
         stack.client.deconvolve(shared / name)
     assert refused.value.status == 409
     psf_id = stack.client.upload_psf(psf_file)["id"]

@@ -103,7 +103,11 @@ def test_without_a_good_key_pyvo_gets_nothing(stack: Stack) -> None:
     for session, status, said in (
         (requests.Session(), 401, "expected a key"),
         (session_with("hpsf_" + 16 * "0" + "_" + 43 * "A"), 401, "key"),
-        (session_with(key_of(stack, "other", Scope.READ, Scope.SUBMIT)), 404, "there is no job"),
+        (
+            session_with(key_of(stack, "other", Scope.READ, Scope.SUBMIT)),
+            404,
+            "expected the id of one of your jobs",
+        ),
     ):
         with pytest.raises(DALServiceError, match=said) as refused:
             AsyncTAPJob(job.url, session=session, delete=False)

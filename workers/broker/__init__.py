@@ -1,0 +1,1 @@
+"""The queue of job ids between the web process and the workers."""

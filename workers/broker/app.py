@@ -1,8 +1,8 @@
-"""The broker: a Celery application, and how a job's id is given to it.
+"""The broker: a Celery application, and the submission of job ids to it.
 
-The broker is disposable. What it loses is submitted again from the job table, and what it delivers twice does
-nothing the second time, so nothing here has to be durable. Jobs are submitted by the task's name: the web
-process imports no task.
+The broker may lose messages or deliver them twice: lost jobs are submitted again from the job table, and a second
+delivery does nothing. So nothing here has to be durable. Jobs are submitted by the name of the Celery task, because
+the web process must not import tasks.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ log = logging.getLogger(__name__)
 
 
 def make_app(settings: Settings) -> Celery:
-    """A Celery application for these settings; with the embedded broker, its folders are made too."""
+    """A Celery application for these settings. For the embedded broker its folders are made."""
     app = Celery("heliopsf", broker=settings.broker_url, set_as_current=False)
     app.conf.update(
         task_serializer="json",
         accept_content=["json"],
         task_ignore_result=True,
-        # Acknowledged early: the job table is the truth, and a worker that holds unacknowledged messages
-        # does not survive the loss of its broker (kombu 5.7).
+        # Acknowledge early: the job table decides what has to run, and a worker with unacknowledged messages does
+        # not survive the loss of its broker (kombu 5.7).
         task_acks_late=False,
         worker_prefetch_multiplier=1,
         task_queues=[BrokerQueue(broker_name(queue), routing_key=broker_name(queue)) for queue in Queue],
@@ -48,28 +48,28 @@ def make_app(settings: Settings) -> Celery:
 
 
 def submit(app: Celery, job_id: str, queue: Queue = Queue.INTERACTIVE) -> bool:
-    """Give the job's id to the broker; False where the broker is away (the reconciler tries again)."""
+    """Send the id of a job to the broker. False if the broker does not answer; the reconciler then tries again."""
     try:
         app.send_task(RUN_JOB, args=[job_id], queue=broker_name(queue), retry=False)
     except AWAY as error:
-        log.warning("broker away, job %s stays queued: %s", job_id, error)
+        log.warning("the broker does not answer, job %s stays queued: %s", job_id, error)
         return False
     return True
 
 
 def call_for_help(app: Celery, job_id: str, workers: int) -> None:
-    """Ask idle workers to share a job's parts. Where the messages are lost, its own worker does them all."""
+    """Ask idle workers to share the work of a job. If the messages are lost, its own worker does all of it."""
     try:
         for _ in range(workers):
             app.send_task(ASSIST, args=[job_id], queue=broker_name(Queue.CROSSVAL), retry=False)
     except AWAY as error:
-        log.warning("broker away, job %s goes on alone: %s", job_id, error)
+        log.warning("the broker does not answer, job %s continues without help: %s", job_id, error)
 
 
 def check(settings: Settings) -> None:
-    """Raise where the broker, which is not the embedded one, does not answer within seconds.
+    """Raise an error if the broker, which must not be the embedded one, does not answer within seconds.
 
-    What is raised is one of ``AWAY``, or what its transport makes of a URL that is none.
+    It is one of ``AWAY``, or for a bad URL what its transport raises.
     """
     options = {"socket_connect_timeout": 2, "socket_timeout": 2}
     with Connection(settings.broker_url, transport_options=options, connect_timeout=2) as connection:

@@ -1,8 +1,8 @@
-"""How a worker takes messages: from the most urgent queue that has one, and none before a process is free for it.
+"""Makes a worker take messages from the queue of highest priority, and only when one of its processes is idle.
 
-Celery and kombu do neither by themselves. They take from queues in turn, so that a thousand messages of one queue stand
-before the second of another; and with early acknowledgement a message more than can be started, behind which
-whatever is more urgent then waits for two jobs instead of one.
+By default Celery and kombu do neither. They serve the queues in turn, whatever their priority. And with early
+acknowledgement they fetch one message more than they can start; a more urgent job would then wait for two jobs
+instead of one.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from workers.contract.queues import by_urgency
 
 
 class MostUrgentFirst(priority_cycle):
-    """For Redis: the order in which one BRPOP names the queues."""
+    """For Redis: the order of the queues in one BRPOP."""
 
     def consume(self, n: int) -> list[str]:
-        """The queues to ask."""
+        """The queues to read, highest priority first."""
         return by_urgency(self.items[:n])
 
 
 class _InOrder(FairCycle):
-    """For the folder: each time from the first queue that has a message."""
+    """For the folder: reads the first queue that has a message."""
 
     def get(self, callback: Callable[..., Any], **options: Any) -> Any:
-        """One message to the callback; what ``predicate`` says where there is none."""
+        """Pass one message to the callback. Raises ``predicate`` if there is none."""
         for queue in by_urgency(self.resources):
             try:
                 return self.fun(queue, callback, **options)
@@ -48,10 +48,10 @@ class _InOrder(FairCycle):
 
 
 class _FolderChannel(filesystem.Channel):
-    """Writes whole files or none: kombu's own would stop for ever at one that is empty, or was read too early."""
+    """Writes files atomically. Kombu's own channel would hang at a file that is empty or was read too early."""
 
     def get_table(self, exchange: str) -> list[Any]:
-        """The queues bound to an exchange; none of a file that was cut when the power went."""
+        """The queues bound to an exchange; empty if the file is damaged, for example by a power failure."""
         try:
             return list(super().get_table(exchange))
         except ValueError:
@@ -75,7 +75,7 @@ class _FolderChannel(filesystem.Channel):
 
 
 def _write_whole(file: Path, content: Any) -> None:
-    """Write a file that nobody sees before all of it is there. Raises ``ChannelError``."""
+    """Write a file atomically. Raises ``ChannelError``."""
     try:
         write_whole(file, dumps(content))
     except OSError as error:
@@ -83,19 +83,19 @@ def _write_whole(file: Path, content: Any) -> None:
 
 
 class FolderTransport(filesystem.Transport):
-    """The broker of the embedded mode: kombu's folder of messages, its queues in our order."""
+    """The broker of the embedded mode: kombu's folder of messages, with our priorities of queues."""
 
     Channel = _FolderChannel
 
     def drain_events(self, connection: Any, timeout: float | None = None, **_: Any) -> None:
-        """One message, or ``TimeoutError``; at once where the worker was told to stop.
+        """Deliver one message. Raises ``TimeoutError`` if none arrives in time, or at once if the worker must stop.
 
-        Kombu's own would sleep on for seconds, twice: Celery looks at what it was told between two calls alone.
+        Kombu's own version would sleep for seconds, twice: Celery checks whether to stop only between two calls.
         """
         until = None if timeout is None else time.monotonic() + timeout
         channels: Any = self.cycle
         while True:
-            # What it is to stop with is an exit code, so that 0 is a yes.
+            # should_stop is an exit code: 0 also means that the worker must stop.
             if state.should_stop is not None and state.should_stop is not False:
                 raise TimeoutError
             try:
@@ -108,15 +108,15 @@ class FolderTransport(filesystem.Transport):
 
 
 class TakeWhatCanStart(bootsteps.StartStopStep):
-    """Lets a worker take no message while all its processes are at work.
+    """Keeps a worker from taking messages while all its processes are busy.
 
-    As Celery's ``worker_disable_prefetch`` does it, which knows Redis alone.
+    Celery's ``worker_disable_prefetch`` does the same, but only for Redis.
     """
 
     requires = ("celery.worker.consumer.tasks:Tasks",)
 
     def start(self, consumer: Any) -> None:
-        """Ask the pool before the limit of messages."""
+        """Make the channel check the pool before its own limit of messages."""
         qos = consumer.task_consumer.channel.qos
         within_limit = qos.can_consume
         qos.can_consume = lambda: (

@@ -1,4 +1,4 @@
-"""Keeps the broker in step with the job table: what it lost, and what a dead worker held, goes in again."""
+"""Keeps the broker consistent with the job table: lost messages and jobs of lost workers are submitted again."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
-# So few that what is more urgent, and comes while many are submitted, does not wait for all of them.
+# Few enough that an urgent job, which arrives during a pass, does not wait for many others.
 AT_ONCE = 50
 
 
 def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
-    """One pass; returns how many jobs were submitted, ``AT_ONCE`` at most. Any number of processes may do this at once."""
+    """One pass. Returns the number of submitted jobs, at most ``AT_ONCE``. Several processes may do this at the same time."""
     for job_id in catalogue.jobs.give_up_silent(settings.lease_s, settings.max_attempts):
-        log.warning("job %s: its worker fell silent; queued again", job_id)
+        log.warning("job %s: no heartbeat from its worker; queued again", job_id)
     for job_id in catalogue.uws.end_by_terms():
-        log.info("job %s: its time had come; destroyed", job_id)
+        log.info("job %s: destroyed at the time its client set", job_id)
     bulk_turns.keep_turns(catalogue, settings)
     submitted: list[str] = []
     for job in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE):
@@ -36,7 +36,7 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
 
 
 class Reconciler:
-    """A thread that reconciles every ``settings.reconcile_s`` seconds, and at once when it is woken."""
+    """A thread that reconciles every ``settings.reconcile_s`` seconds, and at once after ``wake``."""
 
     def __init__(self, catalogue: Catalogue, app: Celery, settings: Settings) -> None:
         self._catalogue, self._app, self._settings = catalogue, app, settings
@@ -55,7 +55,7 @@ class Reconciler:
         self._thread.join()
 
     def wake(self) -> None:
-        """There is something to submit now."""
+        """Start a pass now: there is a job to submit."""
         self._wake.set()
 
     @property
@@ -71,6 +71,6 @@ class Reconciler:
                 submitted = reconcile(self._catalogue, self._app, self._settings)
             except SQLAlchemyError as error:
                 # The database may be restarting; the next pass finds out.
-                log.warning("reconciler: database away: %s", error)
+                log.warning("reconciler: the database does not answer: %s", error)
             if submitted < AT_ONCE:
                 self._wake.wait(self._settings.reconcile_s)

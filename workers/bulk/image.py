@@ -20,7 +20,9 @@ from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Taken
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkWork
-from workers.contract.contract import Deconvolve, ResolvedDeconvolve, product_identity
+from workers.contract.identities import product_identity
+from workers.contract.requests import Deconvolve
+from workers.contract.resolved import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files.store import sha256_of, sync
 from workers.intake import estimates

@@ -13,7 +13,7 @@ from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import PsfRow
 from workers.contract.bulk import BulkPhase, BulkRequest
-from workers.contract.contract import canonical_hash
+from workers.contract.identities import canonical_hash
 from workers.files import archive as archive_files
 from workers.settings import Settings
 

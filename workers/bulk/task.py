@@ -20,7 +20,7 @@ from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed, Taken
 from workers.catalogue.jobs import Lease
 from workers.catalogue.stage_times import STARTING
 from workers.contract.bulk import BulkPhase, BulkWork, Condition
-from workers.contract.contract import Fault, JobError
+from workers.contract.phases import Fault, JobError
 from workers.files import archive as archive_files
 from workers.tasks.context import Context, TurnOver
 

@@ -14,7 +14,8 @@ from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import JobRow
 from workers.contract.bulk import BulkPhase
-from workers.contract.contract import Fault, JobError, Phase, canonical_hash
+from workers.contract.identities import canonical_hash
+from workers.contract.phases import Fault, JobError, Phase
 from workers.contract.queues import Queue
 from workers.settings import Settings
 

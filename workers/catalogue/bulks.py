@@ -24,7 +24,7 @@ from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import JobRow
 from workers.contract.bulk import AT_WORK, OPEN, STOPPED, BulkPhase, ItemState
-from workers.contract.contract import Fault, JobError, Phase
+from workers.contract.phases import Fault, JobError, Phase
 
 # Errors of files whose rows do not hold their paths: to try these again would find no file, or another one.
 NOT_UTF_8, TOO_LONG = "path-not-utf-8", "path-too-long"

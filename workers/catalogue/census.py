@@ -11,7 +11,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from workers.catalogue.database import Database
 from workers.catalogue.jobs import no_equal_at_work
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow, TransitRow, WorkerRow
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 
 

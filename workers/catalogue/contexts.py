@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from psfcore.errors import DataError
 from workers.catalogue.database import Database
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
-from workers.contract.contract import canonical_hash
+from workers.contract.identities import canonical_hash
 from workers.versions.status import PsfStatus
 from workers.versions.validity import Validity, iso
 

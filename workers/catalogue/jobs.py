@@ -20,8 +20,10 @@ from sqlalchemy.orm import InstrumentedAttribute, aliased
 
 from workers.catalogue.database import Database
 from workers.catalogue.tables import JobRow, TermsRow
-from workers.contract.contract import LIVE, Fault, JobError, Phase, canonical_hash
-from workers.contract.queues import Queue, queue_of
+from workers.contract.identities import canonical_hash
+from workers.contract.kinds import queue_of
+from workers.contract.phases import LIVE, Fault, JobError, Phase
+from workers.contract.queues import Queue
 
 log = logging.getLogger(__name__)
 
@@ -300,6 +302,18 @@ class Jobs:
             "ended_at": case((cancelled, self._database.now)),
             "lease": None,
         }
+
+    def run_times(self, kind: str, limit: int) -> list[tuple[dict[str, Any], float]]:
+        """Estimate and duration in seconds of the newest completed jobs of a kind."""
+        query = (
+            select(JobRow.estimate, JobRow.ended_at - JobRow.started_at)
+            .where(JobRow.kind == kind, JobRow.phase == Phase.COMPLETED)
+            .where(JobRow.estimate.is_not(None), JobRow.started_at.is_not(None))
+            .order_by(JobRow.created_at.desc())
+            .limit(limit)
+        )
+        with self._database.reading() as session:
+            return [(estimate or {}, float(seconds)) for estimate, seconds in session.execute(query)]
 
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
         """One UPDATE; True where it changed a row."""

@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, Double, Index, String, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-from workers.contract.contract import LIVE
+from workers.contract.phases import LIVE
 from workers.contract.queues import Queue
 
 DEFAULT_OWNER = "local"

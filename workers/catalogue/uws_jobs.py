@@ -15,8 +15,9 @@ from sqlalchemy.exc import IntegrityError
 from workers.catalogue.database import Database
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.tables import JobRow, TermsRow
-from workers.contract.contract import Phase, canonical_hash
-from workers.contract.queues import queue_of
+from workers.contract.identities import canonical_hash
+from workers.contract.kinds import queue_of
+from workers.contract.phases import Phase
 
 
 @dataclass(frozen=True)

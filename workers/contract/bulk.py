@@ -1,9 +1,9 @@
-"""Bulk: many images deconvolved alike, as it is asked for and as it goes on.
+"""Bulk runs: many images deconvolved in the same way. Requests and phases.
 
-LISTING --> RUNNING --> COMPLETED        retry: COMPLETED --> RUNNING, with the images that failed
+LISTING --> RUNNING --> COMPLETED        retry: COMPLETED --> RUNNING, for the failed images
    |  ^      |  ^
-   v  |      v  |                        cancel: any but COMPLETED and CANCELLED --> CANCELLED
-  PAUSED or ERROR                        pause, resume: there and back
+   v  |      v  |                        cancel: any phase except COMPLETED and CANCELLED --> CANCELLED
+  PAUSED or ERROR                        pause and resume
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-from workers.contract.contract import Identity, Method, NoiseFigures, RichardsonLucy
+from psfcore.noise_figures import NoiseFigures
+from workers.contract.methods import Method, RichardsonLucy
+from workers.contract.requests import Identity
 
 MOST_UPLOADED = 100_000
 MOST_SETS = 100
@@ -22,24 +24,24 @@ TEXT = r"^[^\x00-\x1f\x7f]+$"
 
 
 class BulkPhase(StrEnum):
-    """Phases of a bulk."""
+    """Phases of a bulk run."""
 
-    LISTING = "LISTING"  # its files are being looked for
+    LISTING = "LISTING"  # its files are being listed
     RUNNING = "RUNNING"
     PAUSED = "PAUSED"
-    COMPLETED = "COMPLETED"  # every image is done, or failed
+    COMPLETED = "COMPLETED"  # every image is done or has failed
     CANCELLED = "CANCELLED"
-    ERROR = "ERROR"  # it could not go on, for a reason that no single image has
+    ERROR = "ERROR"  # stopped by an error that is not an error of a single image
 
 
 AT_WORK = frozenset({BulkPhase.LISTING, BulkPhase.RUNNING})
 STOPPED = frozenset({BulkPhase.PAUSED, BulkPhase.ERROR})
-OPEN = AT_WORK | STOPPED  # an equal request shares these
+OPEN = AT_WORK | STOPPED  # an identical request gets the run that is in one of these phases
 BULK_ENDED = frozenset({BulkPhase.COMPLETED, BulkPhase.CANCELLED})
 
 
 class ItemState(StrEnum):
-    """How far one image of a bulk is."""
+    """State of one image of a bulk run."""
 
     WAITING = "waiting"
     TAKEN = "taken"
@@ -65,30 +67,30 @@ Where = Annotated[dict[Keyword, Condition], Field(max_length=MOST_CONDITIONS)]
 
 
 class FileSet(_Strict):
-    """Files below a folder that the operator allows."""
+    """A set of files, below a folder that the operator allows."""
 
     glob: str = Field(
         min_length=2,
         max_length=1000,
         pattern=TEXT,
-        description="an absolute path; * ? [ab] stand for parts of a name, ** for any folders between",
+        description="an absolute path; * ? [ab] match parts of a name, ** matches any number of folders",
     )
     where: Where = Field(
         default_factory=dict,
-        description='what the header must say: {"INSTRUME": "EUI", "WAVELNTH": [171, 174], "XPOSURE": {">=": 1}}',
+        description='conditions on the header, for example {"INSTRUME": "EUI", "WAVELNTH": [171, 174], "XPOSURE": {">=": 1}}',
     )
 
 
 class Output(_Strict):
-    """Where products are written as files too."""
+    """A folder that products are also written to."""
 
     folder: str = Field(
         min_length=2,
         max_length=1000,
         pattern=TEXT,
-        description="absolute, below a folder that the operator allows; made where it is not there",
+        description="absolute path below a folder that the operator allows; made if it does not exist",
     )
-    only: bool = Field(False, description="there alone: the service keeps no product")
+    only: bool = Field(False, description="true: write products only to the folder; the service keeps none")
 
 
 class Treatment(_Strict):
@@ -96,16 +98,21 @@ class Treatment(_Strict):
 
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
-        None, description="of the images' gain mode; none: the instrument's, if known"
+        None, description="noise figures of the images' gain mode; null: the instrument's, if known"
     )
     saturation_dn: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="DN of one exposure; none: the instrument's, if known"
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="saturation level in DN of one exposure; null: the instrument's, if known",
     )
-    error_draws: int = Field(0, ge=0, le=64, description="noise draws for an ERROR plane (4 or more)")
+    error_draws: int = Field(
+        0, ge=0, le=64, description="number of noise realisations for an ERROR plane (4 or more)"
+    )
 
 
 class BulkWork(_Strict):
-    """What is asked of a bulk, but for the uploads, which are images of it from the start."""
+    """A request for a bulk run without its uploaded images, which are listed from the start."""
 
     name: str = Field("", max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$", description="a label for people")
     files: list[FileSet] = Field(default_factory=list, max_length=MOST_SETS)
@@ -114,22 +121,22 @@ class BulkWork(_Strict):
         None,
         min_length=1,
         max_length=64,
-        description="or the set to find each image's PSF in: its id or name",
+        description="the context to choose each image's PSF from: its id or name",
     )
     parameters: Treatment = Field(default_factory=lambda: Treatment())
     output: Output | None = None
 
     @property
     def keeps_products(self) -> bool:
-        """Whether the service keeps what it makes, in its store."""
+        """Whether the service keeps the products in its store."""
         return self.output is None or not self.output.only
 
 
 class BulkRequest(BulkWork):
-    """Many images to be deconvolved with one PSF, or each with the PSF that a context pins for it."""
+    """Deconvolve many images with one PSF, or each with the PSF that a context pins for it."""
 
     images: list[Identity] = Field(
-        default_factory=list, max_length=MOST_UPLOADED, description="ids that uploads of images answered"
+        default_factory=list, max_length=MOST_UPLOADED, description="ids returned by the uploads of images"
     )
 
     @model_validator(mode="after")
@@ -138,6 +145,6 @@ class BulkRequest(BulkWork):
             raise ValueError("expected images or files; got neither")
         if (self.psf_id is None) == (self.context is None):
             raise ValueError(
-                "expected one of psf_id and context: what a bulk is made with is fixed when it begins"
+                "expected exactly one of psf_id and context, because the PSFs of a bulk run are fixed when it starts"
             )
         return self

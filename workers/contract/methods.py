@@ -1,6 +1,6 @@
-"""Methods of deconvolution as a request names them: a part of ``workers.contract.contract``, which shows them too.
+"""Methods of deconvolution and their parameters, as a request names them.
 
-A new method is a class here, a file in ``psfcore/deconvolve`` and a test.
+To add a method, write a class here, a file in ``psfcore/deconvolve/methods`` and a test.
 """
 
 from __future__ import annotations
@@ -11,32 +11,33 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Parameters(BaseModel):
-    """Parameters of a job, or of a part of one: what is not known is refused, and nothing is changed."""
+    """Parameters of a job or of a part of it. Unknown names are refused; values cannot be changed afterwards."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class _Method(Parameters):
-    """What every method of deconvolution takes. A method's own parameters stand beside."""
+    """Parameters that every method of deconvolution has. Each method adds its own."""
 
     algorithm_version: ClassVar[int]
     stop: Literal["fixed", "discrepancy"] = Field(
         "fixed",
-        description="after all steps, or once the residual is down at the noise (needs noise figures)",
+        description="`fixed`: stop after `steps` iterations; `discrepancy`: stop earlier, when the residual has fallen to "
+        "the noise (needs noise figures)",
     )
     edges: Literal["zero", "symmetric", "extended"] | None = Field(
-        None, description="what is taken to lie beyond the field; none: what the method does best with"
+        None, description="the assumed scene beyond the field of view; null: the method's default"
     )
     margin_px: int | None = Field(
         None,
         ge=0,
         le=4096,
-        description="how far the scene is followed beyond the field; none: as the PSF asks",
+        description="width of the estimated margin around the field of view; null: derived from the PSF",
     )
 
 
 class RichardsonLucy(_Method):
-    """Richardson-Lucy; with 20 steps and zero edges it is what the paper recommends."""
+    """Richardson-Lucy. The paper recommends 20 steps and edges `zero`."""
 
     algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy"] = "richardson-lucy"
@@ -44,16 +45,16 @@ class RichardsonLucy(_Method):
 
 
 class RichardsonLucyAccelerated(_Method):
-    """Richardson-Lucy with the extrapolation of Biggs and Andrews: fewer steps to the same point."""
+    """Richardson-Lucy with the extrapolation of Biggs and Andrews, which reaches the same result in fewer steps."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-accelerated"]
     steps: int = Field(10, ge=1, le=200)
-    order: Literal[1, 2] = Field(1, description="of the extrapolation")
+    order: Literal[1, 2] = Field(1, description="order of the extrapolation")
 
 
 class RichardsonLucyExtended(_Method):
-    """Richardson-Lucy that finds what lies beyond the edges too (Bertero and Boccacci)."""
+    """Richardson-Lucy that also estimates the scene beyond the edges (Bertero and Boccacci)."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-extended"]
@@ -61,16 +62,18 @@ class RichardsonLucyExtended(_Method):
 
 
 class RichardsonLucyTotalVariation(_Method):
-    """Richardson-Lucy with a price on variation: less noise, for pictures more than for photometry."""
+    """Richardson-Lucy with total-variation regularisation: less noise; meant for pictures rather than photometry."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-total-variation"]
     steps: int = Field(20, ge=1, le=200)
-    smoothing: float = Field(0.01, ge=0, le=0.02, description="the price, in counts; 0 is Richardson-Lucy")
+    smoothing: float = Field(
+        0.01, ge=0, le=0.02, description="weight of the regularisation, in counts; 0 gives Richardson-Lucy"
+    )
 
 
 class BasicIterative(_Method):
-    """Basic iterative deconvolution: the paper's advice for a bright source near an edge."""
+    """Basic iterative deconvolution, which the paper recommends for a bright source near an edge."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["basic-iterative"]
@@ -78,7 +81,7 @@ class BasicIterative(_Method):
 
 
 class Linear(_Method):
-    """The linear reconstruction: no positivity, no bias on faint pixels, settled after about five steps."""
+    """Linear reconstruction: no positivity constraint, no bias of faint pixels, converged after about five steps."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["linear"]
@@ -94,10 +97,3 @@ Method = Annotated[
     | Linear,
     Field(discriminator="name"),
 ]
-
-
-class NoiseFigures(Parameters):
-    """Variance of a pixel in DN^2 = photon_gain_dn * signal in DN + read_noise_dn^2."""
-
-    photon_gain_dn: float = Field(ge=0, allow_inf_nan=False, description="DN a detected photon")
-    read_noise_dn: float = Field(ge=0, allow_inf_nan=False, description="DN rms of the readout")

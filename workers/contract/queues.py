@@ -1,4 +1,4 @@
-"""The queues that jobs wait in, and the order that workers take from them in: what a person waits for goes first."""
+"""The queues that jobs wait in, in the order in which workers take jobs from them."""
 
 from __future__ import annotations
 
@@ -7,20 +7,15 @@ from enum import StrEnum
 
 
 class Queue(StrEnum):
-    """Where a job waits, the most urgent first."""
+    """Queues of jobs, highest priority first."""
 
     INTERACTIVE = "interactive"
     CROSSVAL = "crossval"
     BULK = "bulk"
 
 
-def queue_of(kind: str) -> Queue:
-    """Where a job of this kind waits, unless it is said otherwise: a cross-validation takes long, and goes after the quick."""
-    return {"cross-validate": Queue.CROSSVAL, "bulk": Queue.BULK}.get(kind, Queue.INTERACTIVE)
-
-
 def queues_named(names: str) -> tuple[Queue, ...]:
-    """The queues in a text such as ``interactive,bulk``, most urgent first; ``ValueError`` says which there are."""
+    """The queues in a text such as ``interactive,bulk``, highest priority first; ValueError if it names another."""
     wanted = {name.strip() for name in names.split(",") if name.strip()}
     if not wanted or wanted - set(Queue):
         raise ValueError(f"expected queues of {', '.join(Queue)}, separated by commas; got {names!r}")
@@ -28,11 +23,11 @@ def queues_named(names: str) -> tuple[Queue, ...]:
 
 
 def by_urgency(names: Iterable[str]) -> list[str]:
-    """Names of the broker's queues in our order; those that are not ours, as of control, come first."""
+    """Names of the broker's queues, highest priority first; Celery's own control queues come before all."""
     order = {broker_name(queue): place for place, queue in enumerate(Queue)}
     return sorted(names, key=lambda name: order.get(name, -1))
 
 
 def broker_name(queue: Queue | str) -> str:
-    """What the queue is called in the broker, which others may use too."""
+    """The queue's name in the broker. The prefix separates it from the queues of other programs."""
     return f"heliopsf.{queue}"

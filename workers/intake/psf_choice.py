@@ -1,4 +1,4 @@
-"""The one PSF that fits: by filters, or for an image by what its header says; or why there is no one."""
+"""Chooses the one PSF that fits filters or the header of an image, or says why there is not exactly one."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ MOST_NAMED = 20
 
 @dataclass(frozen=True)
 class Found:
-    """What was looked for, where, and what was found of it: one PSF where all is well."""
+    """The result of a search for one PSF."""
 
     wanted: PsfFilter
-    context: PsfContextRow | None  # none: among all PSFs
+    context: PsfContextRow | None  # None: all PSFs were searched
     psfs: Sequence[PsfRow]  # MOST_NAMED + 1 at most
-    emptied_by: str | None  # where there are none, the filter that left none
+    emptied_by: str | None  # the first filter that excluded all PSFs, if none was found
 
     def one(self) -> PsfRow:
-        """The PSF. Raises ``DataError`` "no-psf-fits" or "several-psfs-fit", which say why."""
+        """The PSF. Raises ``DataError`` "no-psf-fits" or "several-psfs-fit"."""
         if len(self.psfs) == 1:
             return self.psfs[0]
         if self.psfs:
@@ -37,22 +37,22 @@ class Found:
             more = ", and more" if len(self.psfs) > MOST_NAMED else ""
             raise DataError(
                 "several-psfs-fit",
-                f"expected one PSF with {self._said()}; got {'; '.join(named)}{more}: narrow it by another filter",
+                f"expected one PSF with {self._said()}; got {'; '.join(named)}{more}: add another filter",
             )
         raise DataError("no-psf-fits", self._why_none())
 
     def _why_none(self) -> str:
         given = self._given()
         before = dict(list(given.items())[: list(given).index(self.emptied_by)]) if self.emptied_by else given
-        asked = f"{self.emptied_by} {given[self.emptied_by]}" if self.emptied_by else "any filter at all"
-        among = f"of those with {_joined(before)}" if before else "of all PSFs"
-        return f"expected one PSF with {self._said()}; {among} none has {asked}"
+        asked = f"{self.emptied_by} {given[self.emptied_by]}" if self.emptied_by else "any property"
+        among = f"no PSF with {_joined(before)}" if before else "no PSF"
+        return f"expected one PSF with {self._said()}; {among} has {asked}"
 
     def _said(self) -> str:
         return _joined(self._given()) or "no filter"
 
     def _given(self) -> dict[str, str]:
-        """The filters as people wrote them, in the order in which they are met."""
+        """The filters as people write them, in the order in which they are applied."""
         wanted = self.wanted
         at = wanted.valid_at
         said = {
@@ -69,7 +69,7 @@ class Found:
 
 
 def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | None) -> Found:
-    """The PSFs that fit in a context (an id, a name, "now"; none: the owner's default); without one, certified ones.
+    """The PSFs that fit in a context (an id, a name or "now"; None: the owner's default). Without a context: certified PSFs.
 
     Raises ``DataError`` "no-such-context".
     """
@@ -85,7 +85,7 @@ def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | Non
 def look_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str = TOTAL
 ) -> Found:
-    """The PSFs of an image's instrument, channel and time. header: the summary that its upload was kept with.
+    """The PSFs of an image's instrument, channel and time. header: the summary stored with its upload.
 
     Raises ``DataError`` "no-instrument", "no-date" or "no-such-context".
     """
@@ -93,7 +93,7 @@ def look_for_image(
     if instrument is None:
         raise DataError(
             "no-instrument",
-            "expected DETECTOR or INSTRUME in the image's header, to find its PSF by; got neither",
+            "expected DETECTOR or INSTRUME in the image's header; got neither: name the PSF yourself",
         )
     at = _observed_at(header)
     found = look(catalogue, PsfFilter(instrument, channel, kind, valid_at=at), owner, context)
@@ -101,7 +101,7 @@ def look_for_image(
         raise DataError(
             "no-date",
             f"expected DATE-BEG or DATE-OBS as 2024-03-01T12:00:00 in the image's header, since PSFs of "
-            f"{line_of(instrument, channel, kind)} are valid for some times alone; got {header['date_obs']!r}",
+            f"{line_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}",
         )
     return found
 
@@ -109,9 +109,9 @@ def look_for_image(
 def picked_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None
 ) -> Found | None:
-    """What an image is deconvolved with where nobody names a PSF; None where its line has none that was certified.
+    """The PSF for an image if the request names none; None if the series of the image has no certified PSF.
 
-    Raises ``DataError`` as ``look_for_image`` does, and "no-psf-fits" where the line has PSFs, but none in the context.
+    Raises ``DataError`` as ``look_for_image`` does, and "no-psf-fits" if the series has PSFs, but none in the context.
     """
     instrument, channel = _seen_through(header)
     line = line_of(instrument, channel, TOTAL)
@@ -123,7 +123,7 @@ def picked_for_image(
         raise DataError(
             "no-psf-fits",
             f"expected context {pinned.name} to pin a PSF of {line or 'an instrument'}; it pins none: name a PSF, or "
-            f"context {NOW!r} for what is certified now",
+            f"use context {NOW!r} for the PSFs that are certified now",
         )
     return look_for_image(catalogue, header, owner, context) if certified else None
 
@@ -136,7 +136,7 @@ def _seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
 def _observed_at(header: Mapping[str, Any]) -> float | None:
     try:
         return seconds(header["date_obs"] or "")
-    except DataError:  # a card may hold anything; who needs the time says what it lacks
+    except DataError:  # a keyword may contain anything; the caller reports a missing time
         return None
 
 

@@ -1,267 +1,183 @@
-"""From what a user asks to what is written down: rows of uploads, and requests with nothing left open."""
+"""From the request for a job to resolved parameters: every default filled in, every id checked, the PSF chosen."""
 
 from __future__ import annotations
 
-import dataclasses
-import time
 import uuid
-from pathlib import PurePath
+from dataclasses import dataclass
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import HeaderSummary
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import parse_instrument
-from psfcore.transit.archive import ArchiveContents
+from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
-from workers.contract.contract import (
-    CrossValidate,
-    CrossValidateRequest,
-    Deconvolve,
-    DeconvolveRequest,
-    Evaluate,
-    EvaluateRequest,
-    GapDiagnose,
-    GapDiagnoseRequest,
-    JobRequest,
-    PsfBuild,
-    PsfBuildRequest,
-    PsfFit,
-    PsfFitRequest,
-    PsfTablesRequest,
-    Rerun,
-    RerunRequest,
-    ResolvedCrossValidate,
-    ResolvedDeconvolve,
-    ResolvedEvaluate,
-    ResolvedGapDiagnose,
-    ResolvedPsfFit,
-    canonical_hash,
-    evaluate_identity,
-    gap_identity,
-    instrument_text,
-    product_identity,
-    psf_fit_identity,
-    psf_identity,
-    psf_tables_identity,
-)
+from workers.contract.identities import canonical_hash, instrument_text, psf_identity
+from workers.contract.kinds import KINDS, JobRequest, Kind, load
+from workers.contract.methods import Parameters
+from workers.contract.requests import Deconvolve, PsfBuild
+from workers.contract.resolved import ResolvedDeconvolve
 from workers.intake.psf_choice import picked_for_image
 from workers.lineage import made_by
-from workers.versions.series import UPLOADED, channel_of, instrument_of, line_of
-from workers.versions.status import PsfStatus
 
 
-def image_row(
-    owner: str, sha256: str, size_bytes: int, filename: str | None, summary: HeaderSummary
-) -> ImageRow:
-    """The row of an uploaded image."""
-    return ImageRow(
-        owner=owner,
-        id=sha256,
-        created_at=time.time(),
-        bytes=size_bytes,
-        filename=filename,
-        summary=dataclasses.asdict(summary),
-    )
+@dataclass(frozen=True)
+class Asked:
+    """The parameters of a request, and what resolving them needs."""
 
+    kind: Kind
+    parameters: Any
+    catalogue: Catalogue
+    owner: str
+    added_effects: tuple[str, ...]
 
-def transit_row(
-    owner: str, sha256: str, size_bytes: int, filename: str | None, contents: ArchiveContents
-) -> TransitRow:
-    """The row of an uploaded transit; its summary is what the table of contents and transit.json say."""
-    manifest = contents.manifest
-    return TransitRow(
-        owner=owner,
-        id=sha256,
-        created_at=time.time(),
-        bytes=size_bytes,
-        filename=filename,
-        summary={
-            "archive": contents.kind,
-            "instrument": manifest.instrument,
-            "images": len(manifest.images),
-            "pointings": [{"fov": fov, "images": images} for fov, images in manifest.pointings.items()],
-            "noise": None if manifest.noise is None else manifest.noise.model_dump(mode="json"),
-            "known_psf": manifest.known_psf,
-            "files": [{"name": name, "bytes": contents.files[name]} for name in manifest.files],
-            "unpacked_bytes": sum(contents.files.values()),
-        },
-    )
-
-
-def uploaded_psf_row(
-    owner: str,
-    sha256: str,
-    size_bytes: int,
-    filename: str | None,
-    summary: HeaderSummary,
-    *,
-    name: str | None = None,
-    version: str | None = None,
-    instrument: str | None = None,
-    channel: str | None = None,
-    kind: str | None = None,
-) -> PsfRow:
-    """The row of an uploaded PSF, a draft; its name, version and line come from the request, the header or the file."""
-    header = dataclasses.asdict(summary)
-    instrument = instrument or instrument_of(header)
-    channel = channel or channel_of(instrument, summary.wavelnth)
-    kind = kind or UPLOADED
-    return PsfRow(
-        owner=owner,
-        id=sha256,
-        created_at=time.time(),
-        name=name or summary.psf_name or PurePath(filename or "uploaded").stem,
-        version=version or summary.psf_version or f"0.0.0+{sha256[:8]}",
-        instrument=instrument,
-        channel=channel,
-        kind=kind,
-        line=line_of(instrument, channel, kind),
-        status=PsfStatus.DRAFT,
-        origin="uploaded",
-        file_sha256=sha256,
-        bytes=size_bytes,
-        preview_sha256=None,
-        details={
-            "shape": list(summary.shape),
-            "plate_scale_arcsec": summary.cdelt1,
-            "wavelength_angstrom": summary.wavelnth,
-            "filename": filename,
-        },
-    )
+    def resolved(self, **more: Any) -> Parameters:
+        """The resolved model with the parameters and these further fields."""
+        assert self.kind.resolved is not None
+        return self.kind.resolved.model_validate(self.parameters.model_dump(mode="json") | more)
 
 
 def resolve(
     request: JobRequest, catalogue: Catalogue, owner: str, *, added_effects: tuple[str, ...] = ()
 ) -> tuple[dict[str, Any], str]:
-    """Parameters with nothing left open, and the identity of what the job makes.
+    """Resolved parameters, and the identity of what the job makes.
 
-    added_effects: modules of effects that the operator adds to a diagnosis. Raises ``DataError`` with code ``no-such-image``, ``no-such-psf``, ``no-psf-for-instrument``,
-    ``unknown-instrument`` or ``bad-instrument-file``, and as ``workers.intake.psf_choice`` does.
+    added_effects: modules with effects that the operator adds to the library of a gap diagnosis. Raises
+    ``DataError`` "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument",
+    "no-noise-figures", "no-known-psf", "unknown-instrument" or "bad-instrument-file", and the errors of
+    ``workers.intake.psf_choice`` and ``workers.lineage.made_by``.
     """
-    match request:
-        case PsfBuildRequest(parameters=build):
-            parse_instrument(instrument_text(build), build.instrument or "instrument_file")
-            if build.mask_id is not None and catalogue.get(ImageRow, build.mask_id, owner) is None:
-                raise DataError("no-such-image", f"no image was uploaded with id {build.mask_id}")
-            return build.model_dump(mode="json"), psf_identity(build)
-        case PsfFitRequest(parameters=fit) | CrossValidateRequest(parameters=fit):
-            row = _transit(catalogue, fit.transit_id, owner)
-            kind = ResolvedCrossValidate if isinstance(fit, CrossValidate) else ResolvedPsfFit
-            resolved_fit = kind(
-                diffraction_recipe=_diffraction_of(row.summary, fit), **fit.model_dump(mode="json")
-            )
-            return resolved_fit.model_dump(mode="json"), psf_fit_identity(resolved_fit)
-        case EvaluateRequest(parameters=judged):
-            resolved_report = _evaluation(catalogue, judged, owner)
-            return resolved_report.model_dump(mode="json"), evaluate_identity(resolved_report)
-        case GapDiagnoseRequest(parameters=diagnosis):
-            resolved_gap = _diagnosis(catalogue, diagnosis, owner, added_effects)
-            return resolved_gap.model_dump(mode="json"), gap_identity(resolved_gap)
-        case PsfTablesRequest(parameters=asked):
-            _check_psf(catalogue, asked.psf_id, owner)
-            return asked.model_dump(mode="json"), psf_tables_identity(asked)
-        case RerunRequest(parameters=again):
-            made = made_by(catalogue, _thing(catalogue, again, owner))
-            # Of its own: a rerun that found an earlier one's result would be none.
-            return made.model_dump(mode="json"), canonical_hash({"kind": "rerun", "asked": uuid.uuid4().hex})
-        case DeconvolveRequest(parameters=wanted):
-            image = catalogue.get(ImageRow, wanted.image_id, owner)
-            if image is None:
-                raise DataError("no-such-image", f"no image was uploaded with id {wanted.image_id}")
-            resolved = resolved_deconvolution(wanted, image.summary, catalogue, owner)
-            return resolved.model_dump(mode="json"), product_identity(resolved)
+    kind = KINDS[request.kind]
+    resolver = load(kind.resolver)
+    resolved: Parameters = resolver(Asked(kind, request.parameters, catalogue, owner, added_effects))
+    if kind.identity is None:
+        # A random identity: every job of this kind makes something new.
+        identity = canonical_hash({"kind": kind.name, "asked": uuid.uuid4().hex})
+    else:
+        identity = kind.identity(resolved)
+    return resolved.model_dump(mode="json"), identity
+
+
+def resolve_by_ids(asked: Asked) -> Parameters:
+    """Check the ids in the parameters, and add the recipe of the diffraction PSF if the kind needs one."""
+    parameters = asked.parameters
+    for name, check in (("image_id", _image), ("psf_id", _psf), ("transit_id", _transit)):
+        identity = getattr(parameters, name, None)
+        if identity is not None:
+            check(asked.catalogue, identity, asked.owner)
+    assert asked.kind.resolved is not None
+    if "diffraction_recipe" not in asked.kind.resolved.model_fields:
+        return asked.resolved()
+    summary = _transit(asked.catalogue, parameters.transit_id, asked.owner).summary
+    return asked.resolved(diffraction_recipe=_diffraction_of(summary, parameters.noise))
+
+
+def resolve_psf_build(asked: Asked) -> Parameters:
+    """Check the instrument file and the mask of a PSF build."""
+    build: PsfBuild = asked.parameters
+    parse_instrument(instrument_text(build), build.instrument or "instrument_file")
+    if build.mask_id is not None:
+        _image(asked.catalogue, build.mask_id, asked.owner)
+    return build
+
+
+def resolve_report(asked: Asked) -> Parameters:
+    """A report on a given PSF needs no fit, so no diffraction PSF and no dark offsets."""
+    if asked.parameters.psf_id is None:
+        return resolve_by_ids(asked)
+    summary = _transit(asked.catalogue, asked.parameters.transit_id, asked.owner).summary
+    _psf(asked.catalogue, asked.parameters.psf_id, asked.owner)
+    _check_noise(summary, asked.parameters.noise)
+    # Requests that differ only in an ignored parameter share one report.
+    return asked.resolved(dark_offsets=False)
+
+
+def resolve_gap_diagnose(asked: Asked) -> Parameters:
+    """A diagnosis also records the effects that the operator adds, and the SHA-256 of their source texts."""
+    added = asked.added_effects
+    fields = {"added_effects": added, "added_effects_sha256": tuple(map(sha256_of_source, added))}
+    resolved = resolve_by_ids(asked)
+    return resolved.model_validate(resolved.model_dump(mode="json") | fields)
+
+
+def resolve_rerun(asked: Asked) -> Parameters:
+    """The job that made a product or a PSF."""
+    again = asked.parameters
+    row: ProductRow | PsfRow | None
+    if again.of == "psf":
+        row = asked.catalogue.get(PsfRow, again.id, asked.owner)
+    else:
+        row = asked.catalogue.get(ProductRow, again.id, asked.owner)
+    if row is None:
+        raise DataError(
+            f"no-such-{again.of}", f"expected the id of a {again.of} in the catalogue; got {again.id}"
+        )
+    return made_by(asked.catalogue, row)
+
+
+def resolve_deconvolve(asked: Asked) -> Parameters:
+    """A deconvolution with its PSF."""
+    image = _image(asked.catalogue, asked.parameters.image_id, asked.owner)
+    return resolved_deconvolution(asked.parameters, image.summary, asked.catalogue, asked.owner)
 
 
 def resolved_deconvolution(
     wanted: Deconvolve, header: dict[str, Any], catalogue: Catalogue, owner: str
 ) -> ResolvedDeconvolve:
-    """A deconvolution of an image with this header, its PSF found. Raises ``DataError`` as ``resolve`` does."""
+    """A deconvolution, with its PSF, of an image with this header. Raises ``DataError`` as ``resolve`` does."""
     return ResolvedDeconvolve(
         **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
     )
 
 
+def _image(catalogue: Catalogue, image_id: str, owner: str) -> ImageRow:
+    row = catalogue.get(ImageRow, image_id, owner)
+    if row is None:
+        raise DataError("no-such-image", f"expected the id of an uploaded image; got {image_id}")
+    return row
+
+
 def _transit(catalogue: Catalogue, transit_id: str, owner: str) -> TransitRow:
     row = catalogue.get(TransitRow, transit_id, owner)
     if row is None:
-        raise DataError("no-such-transit", f"no transit was uploaded with id {transit_id}")
+        raise DataError("no-such-transit", f"expected the id of an uploaded transit; got {transit_id}")
     return row
 
 
-def _thing(catalogue: Catalogue, again: Rerun, owner: str) -> ProductRow | PsfRow:
-    """What is to be made again."""
-    row: ProductRow | PsfRow | None
-    if again.of == "psf":
-        row = catalogue.get(PsfRow, again.id, owner)
-    else:
-        row = catalogue.get(ProductRow, again.id, owner)
+def _psf(catalogue: Catalogue, psf_id: str, owner: str) -> PsfRow:
+    row = catalogue.get(PsfRow, psf_id, owner)
     if row is None:
-        raise DataError(f"no-such-{again.of}", f"the catalogue holds no {again.of} with id {again.id}")
+        raise DataError("no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}")
     return row
 
 
-def _check_psf(catalogue: Catalogue, psf_id: str, owner: str) -> None:
-    if catalogue.get(PsfRow, psf_id, owner) is None:
-        raise DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
-
-
-def _evaluation(catalogue: Catalogue, asked: Evaluate, owner: str) -> ResolvedEvaluate:
-    """A report with nothing left open; where a PSF is given there is nothing to fit, and no diffraction is asked for."""
-    summary = _transit(catalogue, asked.transit_id, owner).summary
-    if asked.psf_id is None:
-        recipe, given = _diffraction_of(summary, asked), asked.model_dump(mode="json")
-    else:
-        _check_psf(catalogue, asked.psf_id, owner)
-        _check_noise(summary, asked)
-        # Equal requests share a report, and what is not done makes none of its own.
-        recipe, given = None, asked.model_dump(mode="json") | {"dark_offsets": False}
-    return ResolvedEvaluate(diffraction_recipe=recipe, **given)
-
-
-def _diagnosis(
-    catalogue: Catalogue, asked: GapDiagnose, owner: str, added_effects: tuple[str, ...]
-) -> ResolvedGapDiagnose:
-    """A diagnosis with nothing left open."""
-    summary = _transit(catalogue, asked.transit_id, owner).summary
-    if asked.psf_id is not None:
-        _check_psf(catalogue, asked.psf_id, owner)
-    return ResolvedGapDiagnose(
-        diffraction_recipe=_diffraction_of(summary, asked),
-        added_effects=added_effects,
-        added_effects_sha256=tuple(sha256_of_source(source) for source in added_effects),
-        **asked.model_dump(mode="json"),
-    )
-
-
-def _check_noise(summary: dict[str, Any], asked: PsfFit | Evaluate | GapDiagnose) -> None:
-    if asked.noise is None and summary["noise"] is None:
+def _check_noise(summary: dict[str, Any], noise: NoiseFigures | None) -> None:
+    if noise is None and summary["noise"] is None:
         raise DataError(
             "no-noise-figures",
-            "expected noise figures in transit.json or in the request (photon_gain_dn, read_noise_dn); got neither",
+            "expected noise figures (photon_gain_dn, read_noise_dn) in transit.json or in the request; got neither",
         )
 
 
-def _diffraction_of(summary: dict[str, Any], fit: PsfFit | Evaluate | GapDiagnose) -> PsfBuild | None:
-    """How the known part of a transit's PSF is made; None where the transit brings it."""
-    _check_noise(summary, fit)
+def _diffraction_of(summary: dict[str, Any], noise: NoiseFigures | None) -> PsfBuild | None:
+    """The recipe of the diffraction PSF of a transit; None if the transit brings that PSF."""
+    _check_noise(summary, noise)
     if summary["known_psf"] is not None:
         return None
     if summary["instrument"] not in instrument_names():
         raise DataError(
             "no-known-psf",
-            f"expected known_psf in transit.json, or an instrument of {', '.join(instrument_names())}; "
+            f"expected known_psf in transit.json, or one of the instruments {', '.join(instrument_names())}; "
             f"got neither ({summary['instrument']!r})",
         )
     return PsfBuild(instrument=summary["instrument"], component="diffraction")
 
 
 def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, owner: str) -> dict[str, Any]:
-    """The PSF of a deconvolution: the one named, the certified one for the image, or its instrument's as it is built."""
+    """The PSF named in the request; else the certified one that fits the image; else the instrument's, as built."""
     if wanted.psf_id is not None:
-        _check_psf(catalogue, wanted.psf_id, owner)
+        _psf(catalogue, wanted.psf_id, owner)
         return {"psf_id": wanted.psf_id}
     found = picked_for_image(catalogue, header, owner, wanted.context)
     if found is not None:
@@ -275,12 +191,12 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
 
 
 def _default_psf(header: dict[str, Any]) -> PsfBuild:
-    """The PSF of the instrument that made the image: the shipped instrument file at full size."""
+    """The recipe of the PSF of the instrument that made the image: the shipped instrument file at full size."""
     if header["instrument"] is None:
-        made_by = " ".join(str(header[k]) for k in ("telescop", "instrume", "detector") if header[k])
+        named = " ".join(str(header[k]) for k in ("telescop", "instrume", "detector") if header[k])
         raise DataError(
             "no-psf-for-instrument",
-            f"expected an image of an instrument whose PSF is known here, got one by "
-            f"'{made_by or 'an unnamed instrument'}'; upload its PSF and name it as psf_id",
+            f"expected an image of an instrument with a shipped instrument file; got one by "
+            f"'{named or 'an unnamed instrument'}': upload a PSF and name it as psf_id",
         )
     return PsfBuild(instrument=header["instrument"])

@@ -1,9 +1,9 @@
 """The worker process: ``celery -A workers.run.worker`` or ``heliopsf worker``.
 
-Nothing numerical is loaded before the fork: each child loads it for itself, with its share of the threads.
+The parent loads no numerics: each child loads them after the fork, with its share of the threads.
 
-Told to stop (SIGTERM, or once Control-C), it takes no more jobs. The one at work may go on for ``stop_s``; then it
-is handed back, queued as if it had not been started. After ``gone_s`` the worker is gone, whatever its job does.
+On SIGTERM, or one Control-C, the worker takes no more jobs. The running job may continue for ``stop_s`` seconds;
+then it is handed back and queued as if it had not started. After ``gone_s`` seconds the worker exits in any case.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ app = queue.make_app(settings)
 app.select_queues([broker_name(name) for name in settings.queues])
 app.steps["consumer"].add(TakeWhatCanStart)
 LOOK_EVERY_S = 0.5
-WAIT_S = 2.0  # for a database that does not answer, before it is asked again
-stopping = Stopping()  # made before the fork: the children see what is asked of their parent
+WAIT_S = 2.0  # until a database that does not answer is tried again
+stopping = Stopping()  # made before the fork, so that the children see when their parent is told to stop
 
 
 @app.task(name=queue.RUN_JOB)
@@ -47,13 +47,13 @@ def run_job(job_id: str) -> None:
 
 @app.task(name=queue.ASSIST)
 def assist(job_id: str) -> None:
-    """Share the parts of a job that another worker runs."""
+    """Share the work of a job that another worker runs."""
     _runner().assist(job_id)
 
 
 @setup_logging.connect
 def _logs(**_: object) -> None:
-    """Celery leaves logging to us where this is connected."""
+    """Celery leaves logging alone if a function is connected to this signal."""
     logs.configure(settings)
 
 
@@ -66,11 +66,13 @@ def _watch(**_: object) -> None:
 
     try:
         check_tables()
-    # Celery goes on after an Exception here, but not after an exit.
+    # After an Exception here Celery would continue; SystemExit ends it.
     except SchemaError as error:
         raise SystemExit(f"Error: {error}") from error
     except SQLAlchemyError as error:
-        raise SystemExit(f"Error: the database: {checks.database_said(error)}") from error
+        raise SystemExit(
+            f"Error: expected a working database; it answered: {checks.database_said(error)}"
+        ) from error
     threading.Thread(target=_end_at_the_latest, name="end at the latest", daemon=True).start()
 
 
@@ -80,16 +82,16 @@ def _stop(**_: object) -> None:
 
 
 def check_tables() -> None:
-    """Wait for a database that does not answer, and look whether its tables are this version's.
+    """Wait until the database answers, and check the revision of its tables.
 
-    Raises ``workers.catalogue.schema.SchemaError`` where they are not.
+    Raises ``workers.catalogue.schema.SchemaError`` if this version of the software needs another revision.
     """
     from sqlalchemy.exc import OperationalError
 
     from workers import checks
     from workers.catalogue.catalogue import Catalogue
 
-    catalogue = Catalogue(settings.catalogue_url)  # closed again: no connection may be there at the fork
+    catalogue = Catalogue(settings.catalogue_url)  # closed below: no connection may be open at the fork
     try:
         while True:
             try:
@@ -106,20 +108,20 @@ def _end_at_the_latest() -> None:
     while not stopping.asked:
         time.sleep(LOOK_EVERY_S)
     time.sleep(settings.gone_s)
-    log.warning("not ended in order %g s after the signal: ending now", settings.gone_s)
-    # The kernel ends the children with their parent (Celery asks for that where it can be had).
+    log.warning("still running %g s after the signal to stop: exiting now", settings.gone_s)
+    # The kernel ends the children with their parent, where Celery could ask for that.
     os._exit(0)
 
 
 @worker_process_init.connect
 def _prepare_child(**_: object) -> None:
-    """Load the kernels when the child starts, so that the first job does not wait for it."""
+    """Load all tasks when the child starts, so that the first job does not wait for their libraries."""
     _runner()
     threading.Thread(target=_be_present, name="presence", daemon=True).start()
 
 
 def _be_present() -> None:
-    """Say again and again that this child is there, at work or not; once it is to stop, that it is not."""
+    """Announce this child in the list of workers at regular intervals; remove it when the worker stops."""
     from sqlalchemy.exc import SQLAlchemyError
 
     from workers.run.runner import worker_name
@@ -133,7 +135,7 @@ def _be_present() -> None:
             else:
                 _catalogue().census.announce(worker_name(), started_at, software_version())
         except SQLAlchemyError as error:
-            log.warning("presence not written: %s", str(error).splitlines()[0])
+            log.warning("could not announce this worker: %s", str(error).splitlines()[0])
         if leaving:
             return
         again = time.monotonic() + settings.presence_s
@@ -143,12 +145,14 @@ def _be_present() -> None:
 
 @lru_cache(maxsize=1)
 def _runner() -> Runner:
-    # Before numba is imported: the omp layer kills forked children.
+    # Set before numba is imported: its omp layer kills forked children.
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
     from workers.files.opened import open_store
+    from workers.run.registry import load_tasks
     from workers.run.runner import Runner
 
+    load_tasks()
     return Runner(
         settings,
         _catalogue(),
@@ -167,11 +171,11 @@ def _catalogue() -> Catalogue:
 
 
 def main(parent: int | None = None) -> None:
-    """Run a worker in this process until it is told to stop, or until the process ``parent`` is gone.
+    """Run a worker in this process until it is told to stop, or until the process ``parent`` ends.
 
-    SystemExit with a line and status 1 where the database is not at this version's revision.
+    Raises SystemExit with a message and status 1 if the database is not at the revision of this version.
     """
-    logs.configure(settings)  # before Celery has anything to say
+    logs.configure(settings)  # before Celery logs anything
     if parent is not None:
         threading.Thread(target=_stop_with, args=(parent,), daemon=True).start()
     pool = ["--pool", "prefork", "--concurrency", str(settings.worker_processes)]
@@ -180,7 +184,7 @@ def main(parent: int | None = None) -> None:
         app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])
     except SystemExit as ended:
         if ended.code == 0 and stopping.asked:
-            # All is ended in order. The interpreter's own end would wait for the idle threads of the pool.
+            # Everything has ended in order. Leaving through the interpreter would wait for idle threads of the pool.
             logging.shutdown()
             os._exit(0)
         raise

@@ -9,7 +9,7 @@ from psfcore.fits.header import FitsLimits
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.stage_times import StageTimes
-from workers.contract.contract import JobError
+from workers.contract.phases import JobError
 from workers.files.store import Store
 from workers.settings import Settings
 

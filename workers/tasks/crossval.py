@@ -27,7 +27,8 @@ from psfcore.scatter.validation.cross_validation_plot import cross_validation_pn
 from psfcore.transit.transit import Transit
 from workers.catalogue.parts import Part
 from workers.catalogue.tables import ReportRow
-from workers.contract.contract import ResolvedCrossValidate, psf_fit_identity
+from workers.contract.identities import psf_fit_identity
+from workers.contract.resolved import ResolvedCrossValidate
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
 from workers.tasks.psf_fit import load_transit

@@ -34,7 +34,8 @@ from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
 from psfcore.scatter.samples import possible_psfs
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
-from workers.contract.contract import ResolvedDeconvolve, product_identity
+from workers.contract.identities import product_identity
+from workers.contract.resolved import ResolvedDeconvolve
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
 from workers.tasks.prepared_psfs import PreparedPsfs
@@ -111,7 +112,7 @@ class _Work:
     def noise(self) -> Noise | None:
         """The noise figures asked for, or those of the instrument that made the image."""
         if self.request.noise is not None:
-            return Noise(**self.request.noise.model_dump())
+            return self.request.noise.noise()
         recipe = self.request.psf_recipe
         instrument = self.request.picked_for if recipe is None else recipe.instrument
         return None if instrument is None else noise_for(load_instrument(instrument), self.image.header)
@@ -247,7 +248,7 @@ def keep(made: Made, path: Path) -> ProductRow:
     work, context = made.work, made.work.context
     size_bytes = path.stat().st_size
     file_sha256 = context.store.keep(path)
-    picture = _effects_picture(work, made.result, made.found) if work.request.effects_picture else None
+    picture = _effects_picture(work, made.result, made.found) if work.request.changes_picture else None
     assert made.preview_sha256 is not None
     row = ProductRow(
         owner=context.owner,

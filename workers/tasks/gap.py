@@ -18,12 +18,8 @@ from psfcore.gap.report.report import gap_report
 from psfcore.psf import Psf
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from workers.catalogue.tables import ReportRow
-from workers.contract.contract import (
-    ResolvedGapDiagnose,
-    corrected_psf_identity,
-    diffraction_identity,
-    gap_identity,
-)
+from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
+from workers.contract.resolved import ResolvedGapDiagnose
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
 from workers.tasks.psf_build import given_psf, psf_row

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from workers.catalogue.tables import ReportRow
-from workers.contract.contract import ResolvedOnTransit
+from workers.contract.resolved import ResolvedOnTransit
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
 

@@ -21,7 +21,9 @@ from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.psf import Psf, cumulative_curve
 from psfcore.tables.make import tables_of
 from workers.catalogue.tables import PsfRow
-from workers.contract.contract import PsfBuild, ResolvedDeconvolve, instrument_text, psf_identity
+from workers.contract.identities import instrument_text, psf_identity
+from workers.contract.requests import PsfBuild
+from workers.contract.resolved import ResolvedDeconvolve
 from workers.files.store import Store
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context

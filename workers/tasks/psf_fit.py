@@ -7,7 +7,6 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf, write_psf
-from psfcore.noise import Noise
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.scatter.fit_plot import fit_png
 from psfcore.scatter.report import fit_json
@@ -16,12 +15,8 @@ from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 from workers.catalogue.tables import PsfRow, TransitRow
-from workers.contract.contract import (
-    ResolvedOnTransit,
-    ResolvedPsfFit,
-    diffraction_identity,
-    psf_fit_identity,
-)
+from workers.contract.identities import diffraction_identity, psf_fit_identity
+from workers.contract.resolved import ResolvedOnTransit, ResolvedPsfFit
 from workers.tasks.context import Context
 from workers.tasks.keep_report import provenance_of, write_json
 from workers.tasks.psf_build import built_psf, psf_row
@@ -70,7 +65,7 @@ def load_transit(
             diffraction=lambda _instrument, _shape: (
                 _built_diffraction(context, request) if diffraction is None else diffraction
             ),
-            noise=None if request.noise is None else Noise(**request.noise.model_dump()),
+            noise=None if request.noise is None else request.noise.noise(),
             saturation_dn=request.saturation_dn,
         )
 

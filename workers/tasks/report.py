@@ -1,4 +1,4 @@
-"""The task ``evaluate``: an uploaded transit in, a report on it and its PSF out, as JSON, page and picture."""
+"""The task ``report``: an uploaded transit in, a report on it and its PSF out, as JSON, page and picture."""
 
 from __future__ import annotations
 
@@ -8,29 +8,31 @@ from typing import Any
 import numpy as np
 
 from psfcore.evaluation.plot import evaluation_png
+from psfcore.evaluation.shapes import compare_shapes_by_errors
 from psfcore.report.page import page_of
 from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.transit.transit import Kernel
 from workers.catalogue.tables import ReportRow
-from workers.contract.contract import ResolvedEvaluate, evaluate_identity
+from workers.contract.identities import report_identity
+from workers.contract.resolved import ResolvedReport
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
 from workers.tasks.psf_build import given_psf
 from workers.tasks.psf_fit import load_transit
 
-KIND = "evaluate"
+KIND = "report"
 POINT_PX = 17
 
 
-def evaluate(context: Context, parameters: Mapping[str, Any]) -> str:
+def report(context: Context, parameters: Mapping[str, Any]) -> str:
     """Make a report on a transit; returns its id."""
-    request = ResolvedEvaluate.model_validate(parameters)
-    identity = evaluate_identity(request)
+    request = ResolvedReport.model_validate(parameters)
+    identity = report_identity(request)
     if context.catalogue.get(ReportRow, identity, context.owner) is not None:
         return identity
     psf = given_psf(context, request.psf_id)
     transit, prepared = load_transit(context, request, diffraction=None if psf is None else _point())
-    report = make_report(
+    made = make_report(
         transit,
         prepared,
         psf=psf,
@@ -39,7 +41,8 @@ def evaluate(context: Context, parameters: Mapping[str, Any]) -> str:
         threads=context.settings.threads,
         progress=context.report,
     )
-    _save(context, request, identity, report)
+    shapes = _shapes(context, request, made) if request.shapes else None
+    _save(context, request, identity, made, shapes)
     return identity
 
 
@@ -50,10 +53,24 @@ def _point() -> Kernel:
     return point
 
 
-def _save(context: Context, request: ResolvedEvaluate, identity: str, report: PsfReport) -> None:
+def _shapes(context: Context, request: ResolvedReport, report: PsfReport) -> dict[str, Any]:
+    """The comparison of the scatter shapes by their held-out residuals."""
+    assert report.fit is not None  # a request for shapes names no PSF, so the transit was fitted
+    return compare_shapes_by_errors(report.fit.solution, seed=request.seed, progress=context.report).to_json()
+
+
+def _save(
+    context: Context,
+    request: ResolvedReport,
+    identity: str,
+    report: PsfReport,
+    shapes: dict[str, Any] | None,
+) -> None:
     """JSON, page and picture into the store, the row into the catalogue."""
     provenance = {"report_id": identity, **provenance_of(context, request)}
     said = report_json(report, provenance)
+    if shapes is not None:
+        said["shapes"] = shapes
     with (
         context.store.temporary() as text,
         context.store.temporary() as page,

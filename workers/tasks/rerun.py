@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,23 +19,16 @@ from psfcore.fits.images import read_plane, read_planes
 from psfcore.fits.psfs import read_psf
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
-from workers.contract.contract import ResolvedRerun, rerun_identity
+from workers.contract.identities import rerun_identity
+from workers.contract.kinds import KINDS
+from workers.contract.resolved import ResolvedRerun
 from workers.lineage import Made, lineage
 from workers.tasks.context import Context
-from workers.tasks.deconvolve import deconvolve
-from workers.tasks.gap import gap_diagnose
 from workers.tasks.keep_report import keep_report, write_json
-from workers.tasks.psf_build import named_psf, psf_build
-from workers.tasks.psf_fit import psf_fit
+from workers.tasks.psf_build import named_psf
 
 KIND = "rerun"
 SCHEMA = 1
-TASKS: dict[str, Callable[[Context, Mapping[str, Any]], str]] = {
-    "deconvolve": deconvolve,
-    "psf-build": psf_build,
-    "psf-fit": psf_fit,
-    "gap-diagnose": gap_diagnose,
-}
 Thing = ProductRow | PsfRow
 
 
@@ -87,7 +80,7 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
     parameters = dict(request.parameters)
     if request.kind == "psf-build":
         parameters |= {"instrument": None, "instrument_file": _instrument_text(context, first)}
-    TASKS[request.kind](dataclasses.replace(context, catalogue=apart), parameters)
+    KINDS[request.kind].load_task()(dataclasses.replace(context, catalogue=apart), parameters)
     # Last comes what was asked for; before it what it needed and nobody has any more.
     made = [row for row in apart.made if isinstance(row, type(first))]
     if not made:

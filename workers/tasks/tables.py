@@ -7,7 +7,7 @@ from typing import Any
 
 from psfcore.drawing.plots import psf_png
 from psfcore.fits.psfs import read_psf
-from workers.contract.contract import PsfTables
+from workers.contract.requests import PsfTables
 from workers.tasks.context import Context
 from workers.tasks.psf_build import keep_tables, named_psf
 

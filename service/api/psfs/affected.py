@@ -11,12 +11,11 @@ from psfcore.errors import DataError
 from service.http import paging
 from service.http.callers import Reading
 from service.http.paging import Cursor, Limit, Page
-from service.http.problems import RESPONSES
-from service.http.psf_problems import problem
+from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
 from workers.catalogue.affected import Affected, Place
 from workers.catalogue.tables import PsfRow
-from workers.contract.contract import Identity
+from workers.contract.requests import Identity
 
 router = APIRouter(tags=["PSFs"], responses=RESPONSES)
 

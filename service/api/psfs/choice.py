@@ -12,11 +12,10 @@ from psfcore.errors import DataError
 from service.api.psfs.filters import Filters, InContext
 from service.api.psfs.versions import PsfView
 from service.http.callers import Reading
-from service.http.problems import RESPONSES, Problem
-from service.http.psf_problems import problem
+from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
 from workers.catalogue.tables import ImageRow
-from workers.contract.contract import Identity
+from workers.contract.requests import Identity
 from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image
 from workers.versions.series import TOTAL, WORD
 from workers.versions.validity import iso

@@ -11,12 +11,11 @@ from psfcore.errors import DataError
 from service.api.psfs.filters import TEXT
 from service.http.callers import Certifying, Reading
 from service.http.paging import Cursor, Limit, Page, page, position
-from service.http.problems import RESPONSES
-from service.http.psf_problems import problem
+from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
 from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow
-from workers.contract.contract import ContextName, Identity
+from workers.contract.requests import ContextName, Identity
 from workers.versions.validity import TIME, Validity, iso
 
 router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES)

@@ -20,14 +20,13 @@ from psfcore.fits.cutout import cutout
 from psfcore.tables import lookup as psf_lookup
 from service.http import downloads as files
 from service.http.callers import Caller, Reading
-from service.http.problems import RESPONSES, Problem
+from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
 from workers.catalogue.tables import PsfRow
-from workers.contract.contract import Identity
+from workers.contract.requests import Identity
 
 # Enters every ETag: raised by hand when an answer changes that the same tables give.
 ANSWERS_VERSION = 1
-STATUS_OF = {"cutout-not-plain": 409, "plate-scale-mismatch": 409}
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
 Radius = Annotated[float, Query(description="px, from the PSF's centre")]
@@ -162,7 +161,7 @@ def get_cutout(
     try:
         content = cutout(state.store.path(row.file_sha256), size, state.limits)
     except DataError as error:
-        raise _problem(error) from error
+        raise problem(error) from error
     headers["Content-Disposition"] = f'attachment; filename="psf-{psf_id[:12]}-{size}px.fits"'
     return Response(content, media_type=files.FITS_TYPE, headers=headers)
 
@@ -180,7 +179,7 @@ def _answer(
     try:
         return JSONResponse(ask(*tables), headers=headers)
     except DataError as error:
-        raise _problem(error) from error
+        raise problem(error) from error
 
 
 def _headers(what: str) -> dict[str, str]:
@@ -209,10 +208,6 @@ def _no_tables(row: PsfRow) -> Problem:
         f"expected a PSF with tables; {row.name} {row.version} ({row.origin}) has none yet: the job "
         f'{{"kind": "psf-tables", "parameters": {{"psf_id": "{row.id}"}}}} sent to /v1/jobs makes them',
     )
-
-
-def _problem(error: DataError) -> Problem:
-    return Problem(STATUS_OF.get(error.code, 422), error.code, error.message)
 
 
 def _numbers(text: str) -> list[float]:

@@ -7,8 +7,7 @@ from typing import Annotated
 from fastapi import Depends, Query
 
 from psfcore.errors import DataError
-from service.http.problems import Problem
-from service.http.psf_problems import problem
+from service.http.problems import Problem, problem
 from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.versions.status import PsfStatus

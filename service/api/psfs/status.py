@@ -11,12 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from psfcore.errors import DataError
 from service.api.psfs.filters import TEXT
 from service.http.callers import Caller, Certifying, Reading
-from service.http.problems import RESPONSES
-from service.http.psf_problems import problem
+from service.http.problems import RESPONSES, problem
 from service.http.state import Shared, State
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfChangeRow, PsfRow
-from workers.contract.contract import Identity
+from workers.contract.requests import Identity
 from workers.versions.series import WORD
 from workers.versions.status import MAY_BECOME, PsfStatus, next_version
 from workers.versions.validity import TIME, Validity, iso

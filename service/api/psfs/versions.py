@@ -15,15 +15,14 @@ from service.http import downloads as files
 from service.http import uploads
 from service.http.callers import Caller, Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
-from service.http.problems import RESPONSES, Problem
-from service.http.psf_problems import problem
+from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import Allowed
 from service.http.state import Shared
 from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfRow
-from workers.contract.contract import Identity
-from workers.intake.requests import uploaded_psf_row
+from workers.contract.requests import Identity
+from workers.intake.uploads import uploaded_psf_row
 from workers.versions.series import WORD
 from workers.versions.status import PsfStatus
 from workers.versions.validity import iso

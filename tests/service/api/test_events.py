@@ -170,7 +170,7 @@ def test_a_job_that_is_destroyed_ends_its_stream(live: Live) -> None:
     live.catalogue.uws.destroy(job_id)
     following.join(10)
     assert following.said("event:") == ["progress", "gone"]
-    with pytest.raises(ServiceError, match="there is no job"):
+    with pytest.raises(ServiceError, match="expected the id of one of your jobs"):
         list(live.client.follow(f"/v1/jobs/{job_id}"))
 
 

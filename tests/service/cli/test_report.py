@@ -40,13 +40,13 @@ def test_a_transit_becomes_a_page(
     pack(folder, tmp_path / "transit.tar")
     transit_id = upload(api, tmp_path / "transit.tar", "/v1/transits")
     parameters = {"transit_id": transit_id, "psf_id": upload(api, psf, "/v1/psfs")}
-    asked = api.post("/v1/jobs", json={"kind": "evaluate", "parameters": parameters})
+    asked = api.post("/v1/jobs", json={"kind": "report", "parameters": parameters})
     assert asked.status_code == 202, asked.text
     run_jobs()
     job = api.get(asked.headers["location"]).json()
     assert job["phase"] == "COMPLETED", job["error"]
     report = api.get(job["result"]).json()
-    assert report["kind"] == "evaluate" and report["transit_id"] == transit_id
+    assert report["kind"] == "report" and report["transit_id"] == transit_id
     page = api.get(report["html"])
     assert page.headers["content-type"] == "text/html; charset=utf-8"
     policy = page.headers["content-security-policy"]
@@ -56,13 +56,13 @@ def test_a_transit_becomes_a_page(
     assert again.status_code == 304 and again.headers["content-security-policy"] == policy
     assert api.get(report["file"]).json()["schema"] == "psf-report/1"
     assert api.get(report["preview"]).content.startswith(b"\x89PNG")
-    equal = api.post("/v1/jobs", json={"kind": "evaluate", "parameters": parameters})
+    equal = api.post("/v1/jobs", json={"kind": "report", "parameters": parameters})
     assert equal.status_code == 200 and equal.json()["id"] == job["id"]
 
 
 def test_requests_that_cannot_be(api: TestClient, folder: Path, tmp_path: Path) -> None:
     def ask(**parameters: object) -> tuple[int, str]:
-        answer = api.post("/v1/jobs", json={"kind": "evaluate", "parameters": parameters})
+        answer = api.post("/v1/jobs", json={"kind": "report", "parameters": parameters})
         return answer.status_code, answer.json()["type"].removeprefix("urn:heliopsf:")
 
     assert ask(transit_id="0" * 64) == (404, "no-such-transit")

@@ -19,7 +19,7 @@ from tests.fits_bombs import lying_tiles
 from tests.service.conftest import upload
 from tests.service.http.attacks import BOMBS, MIB, TABLE, Attack
 from tests.service.keyed import Keyed, keyed
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

@@ -182,7 +182,7 @@ def test_lists_show_one_s_own_alone(service: Keyed, anns: dict[str, str]) -> Non
 
 
 @pytest.mark.parametrize(
-    "kind", ["deconvolve", "deconvolve psf", "psf-tables", "psf-build", "evaluate", "psf-fit", "gap-diagnose"]
+    "kind", ["deconvolve", "deconvolve psf", "psf-tables", "psf-build", "report", "psf-fit", "gap-diagnose"]
 )
 def test_a_job_uses_one_s_own_things_alone(
     service: Keyed, anns: dict[str, str], kind: str, tmp_path: Path
@@ -195,7 +195,7 @@ def test_a_job_uses_one_s_own_things_alone(
         "deconvolve psf": {"image_id": own, "psf_id": anns["psf_id"]},
         "psf-tables": {"psf_id": anns["psf_id"]},
         "psf-build": {"instrument_file": SMALL_INSTRUMENT, "mask_id": anns["image_id"]},
-        "evaluate": {"transit_id": anns["transit_id"]},
+        "report": {"transit_id": anns["transit_id"]},
         "psf-fit": {"transit_id": anns["transit_id"]},
         "gap-diagnose": {"transit_id": anns["transit_id"]},
     }[kind]

@@ -138,6 +138,24 @@ def test_bad_jobs(api: TestClient, body: object, status: int) -> None:
     assert api.get("/v1/jobs").json()["items"] == []
 
 
+@pytest.mark.parametrize(
+    ("body", "suggested"),
+    [
+        ({"kind": "evaluate", "parameters": {"transit_id": "0" * 64}}, "report"),
+        (
+            {"kind": "deconvolve", "parameters": {"image_id": "0" * 64, "effects_picture": True}},
+            "changes_picture",
+        ),
+        ({"kind": "psf-build", "parameters": {"instrumnt": "hri_euv"}}, "instrument"),
+    ],
+)
+def test_an_unknown_name_gets_the_known_one(api: TestClient, body: object, suggested: str) -> None:
+    refused = api.post("/v1/jobs", json=body)
+    assert refused.status_code == 422
+    assert f"did you mean '{suggested}'?" in refused.json()["detail"]
+    assert any("did you mean" in error["message"] for error in refused.json()["errors"])
+
+
 def test_an_image_of_an_unknown_instrument_asks_for_a_psf(api: TestClient, image_file: Path) -> None:
     body = {"kind": "deconvolve", "parameters": {"image_id": upload(api, image_file)}}
     answer = api.post("/v1/jobs", json=body)

@@ -20,7 +20,8 @@ from tests.conftest import SMALL_INSTRUMENT
 from tests.service.conftest import upload
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.contract import Phase, canonical_hash
+from workers.contract.identities import canonical_hash
+from workers.contract.phases import Phase
 from workers.settings import Settings
 
 JOBS = "/uws/jobs"
@@ -177,15 +178,15 @@ def test_a_job_may_be_set_up_bit_by_bit_and_is_judged_when_it_runs(api: TestClie
     assert missing.headers["content-type"].startswith("text/plain")
     post(api, f"{job}/parameters", image_id="0" * 64)
     unknown = post(api, f"{job}/phase", PHASE="RUN")
-    assert unknown.status_code == 400 and "no image was uploaded" in unknown.text
+    assert unknown.status_code == 400 and "the id of an uploaded image" in unknown.text
     assert api.get(f"{job}/phase").text == "PENDING"
     neither = created(api, KIND="psf-build")
-    assert "expected one of instrument" in post(api, f"{neither}/phase", PHASE="RUN").text
+    assert "expected exactly one of instrument" in post(api, f"{neither}/phase", PHASE="RUN").text
 
 
 def test_true_and_false_are_read_where_only_one_is_allowed(api: TestClient) -> None:
     created(api, KIND="cross-validate", transit_id="0" * 64, as_published="false", runs="3")
-    created(api, KIND="evaluate", transit_id="0" * 64, dark_offsets="false", psf_id="null")
+    created(api, KIND="report", transit_id="0" * 64, dark_offsets="false", psf_id="null")
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +203,7 @@ def unchanged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 BAD_CREATIONS = [
     ("no KIND", {}, "expected KIND, one of deconvolve"),
     ("unknown KIND", {"KIND": "<rm -rf>"}, "got '<rm -rf>'"),
-    ("unknown parameter", BUILD | {"colour": "red"}, "colour: no parameter of psf-build"),
+    ("unknown parameter", BUILD | {"colour": "red"}, "colour: there is no such field"),
     ("not a number", BUILD | {"size": "big"}, "got 'big'"),
     ("odd size", BUILD | {"size": "127"}, "size: Input should be a multiple of 2; got 127"),
     ("not JSON", {"KIND": "deconvolve", "method": "{linear"}, "method: "),
@@ -224,8 +225,12 @@ BAD_CREATIONS = [
     ("PHASE", BUILD | {"PHASE": "NONSENSE"}, "expected PHASE=RUN or none, got 'NONSENSE'"),
     ("ABORT at once", BUILD | {"PHASE": "ABORT"}, "expected PHASE=RUN"),
     ("duration", BUILD | {"EXECUTIONDURATION": "-1"}, "EXECUTIONDURATION"),
-    ("destruction", BUILD | {"DESTRUCTION": "2001-01-01"}, "a time that is to come"),
-    ("no image there", {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64}, "no image was uploaded"),
+    ("destruction", BUILD | {"DESTRUCTION": "2001-01-01"}, "a time in the future"),
+    (
+        "no image there",
+        {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64},
+        "the id of an uploaded image",
+    ),
     ("incomplete and RUN", {"KIND": "deconvolve", "PHASE": "RUN"}, "image_id: expected a value"),
 ]
 
@@ -242,6 +247,13 @@ def test_bad_creations(unchanged: TestClient, fields: dict[str, str], told: str)
     assert all(line.attrib["id"] in KNOWN for jobs in left for line in jobs), "nothing is left behind"
 
 
+def test_an_unknown_name_gets_the_known_one(api: TestClient) -> None:
+    former = api.post("/uws/jobs", data={"KIND": "evaluate"})
+    assert former.status_code == 400 and "did you mean 'report'?" in former.text
+    misspelt = api.post("/uws/jobs", data={"KIND": "deconvolve", "effects_picture": "true"})
+    assert misspelt.status_code == 400 and "did you mean 'changes_picture'?" in misspelt.text
+
+
 BAD_REQUESTS = [
     ("GET", "?WAIT=abc", {}, 400, "expected WAIT, a whole number of -1 or more; got 'abc'"),
     ("GET", "?WAIT=-2", {}, 400, "WAIT"),
@@ -254,14 +266,14 @@ BAD_REQUESTS = [
     ("POST", "/phase", {}, 400, "expected PHASE=RUN"),
     ("POST", "/executionduration", {"EXECUTIONDURATION": "long"}, 400, "got 'long'"),
     ("POST", "/executionduration", {"EXECUTIONDURATION": "-5"}, 400, "EXECUTIONDURATION"),
-    ("POST", "/executionduration", {}, 400, "expected EXECUTIONDURATION"),
-    ("POST", "/destruction", {"DESTRUCTION": "soon"}, 400, "expected DESTRUCTION, a time as"),
-    ("POST", "/destruction", {"DESTRUCTION": "1999-01-01T00:00:00Z"}, 400, "a time that is to come"),
-    ("POST", "/parameters", {"KIND": "evaluate"}, 400, "expected KIND=psf-build"),
+    ("POST", "/executionduration", {}, 400, "expected the field EXECUTIONDURATION"),
+    ("POST", "/destruction", {"DESTRUCTION": "soon"}, 400, "expected DESTRUCTION, a time such as"),
+    ("POST", "/destruction", {"DESTRUCTION": "1999-01-01T00:00:00Z"}, 400, "a time in the future"),
+    ("POST", "/parameters", {"KIND": "report"}, 400, "expected KIND=psf-build"),
     ("POST", "/parameters", {"size": "big"}, 400, "size: "),
     ("GET", "/results/result", {}, 404, "has no result"),
     ("GET", "/results/%00", {}, 404, "has no result"),
-    ("GET", "/error", {}, 404, "has no error"),
+    ("GET", "/error", {}, 404, "and has none"),
 ]
 
 

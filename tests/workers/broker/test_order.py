@@ -18,7 +18,8 @@ from workers.broker.order import FolderTransport, MostUrgentFirst
 from workers.broker.reconciler import AT_ONCE, reconcile
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import JobRow
-from workers.contract.queues import Queue, broker_name, by_urgency, queue_of, queues_named
+from workers.contract.kinds import queue_of
+from workers.contract.queues import Queue, broker_name, by_urgency, queues_named
 from workers.settings import Settings
 
 

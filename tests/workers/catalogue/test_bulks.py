@@ -23,7 +23,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import ImageRow, JobRow
 from workers.contract.bulk import BulkPhase, BulkWork, ItemState
-from workers.contract.contract import Fault, JobError
+from workers.contract.phases import Fault, JobError
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.context import Context

@@ -11,7 +11,7 @@ import pytest
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow
-from workers.contract.contract import Fault, JobError, Phase
+from workers.contract.phases import Fault, JobError, Phase
 
 BROKEN = JobError(fault=Fault.INTERNAL, code="broken", message="broken")
 

@@ -10,7 +10,7 @@ import pytest
 
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 
 
 def drafted(catalogue: Catalogue, **terms: Any) -> JobRow:

@@ -15,10 +15,19 @@ from service.client.http import ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
-from workers.contract.contract import Method, PsfBuild, RichardsonLucy
-from workers.intake.estimates import MARGIN_SHARE, STEP_NS, _build, checked, estimate
-from workers.run import registry as tasks
+from workers.catalogue.tables import ImageRow, JobRow, PsfRow, TransitRow
+from workers.contract.methods import Method, RichardsonLucy
+from workers.contract.phases import Phase
+from workers.contract.requests import PsfBuild
+from workers.intake.cost_model import COSTS
+from workers.intake.estimates import (
+    BOUNDS,
+    FEWEST_JOBS,
+    _build,
+    _factors,
+    checked,
+    estimate,
+)
 from workers.settings import Settings
 from workers.tasks.context import Context
 
@@ -56,13 +65,15 @@ def needs(
     catalogue: Catalogue, kind: str, parameters: dict[str, Any], threads: int = 1
 ) -> tuple[float, float]:
     found = estimate(kind, parameters, catalogue, OWNER, threads)
-    assert found.as_json() == {"memory_mib": found.memory_mib, "seconds": found.seconds}
+    assert found.as_json()["memory_mib"] == found.memory_mib
+    assert found.as_json()["seconds"] == found.seconds
     return found.seconds, found.memory_mib
 
 
 def test_every_method_has_its_figures() -> None:
     names = {kind.model_fields["name"].annotation.__args__[0] for kind in Method.__args__[0].__args__}  # type: ignore[attr-defined]
-    assert set(STEP_NS) == names and names > set(MARGIN_SHARE)
+    cost = COSTS.kinds.deconvolve
+    assert set(cost.step_ns) == set(cost.margin_share) == names
 
 
 def test_more_to_do_needs_more(catalogue: Catalogue) -> None:
@@ -127,7 +138,7 @@ def test_an_instrument_file_of_extremes_can_be_estimated(extremes: tuple[str, ..
     for key, value in zip(keys, extremes, strict=True):
         text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
     mount = "\n[mount]\nbasis = 'assumed'\nrays = [{count = 4, width_mm = 1e-9}]\n"
-    seconds, mib = _build(PsfBuild(instrument_file=text + mount))
+    seconds, mib = _build(PsfBuild(instrument_file=text + mount).model_dump(mode="json"))
     assert 0 < seconds < 600 and 0 < mib < 4096
 
 
@@ -145,7 +156,7 @@ def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:
         )
     for kind, more in {
         "psf-fit": {"as_published": False},
-        "evaluate": {},
+        "report": {},
         "gap-diagnose": {},
         "cross-validate": {"scheme": "shared", "runs": 10},
     }.items():
@@ -157,6 +168,43 @@ def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:
     given = {"transit_id": "2" * 64, "runs": 10, "diffraction_recipe": None}
     shared, exact = (needs(catalogue, "cross-validate", given | {"scheme": s}) for s in ("shared", "exact"))
     assert exact[0] > 5 * shared[0]
+
+
+def completed(catalogue: Catalogue, kind: str, name: str, start_s: float, took_s: float) -> None:
+    """Add a completed job with this estimate and this duration."""
+    row = JobRow(
+        id=f"{name:0>32}", owner=OWNER, kind=kind, parameters={}, request_key=name, work_key=name,
+        phase=Phase.COMPLETED, created_at=0.0, started_at=100.0, ended_at=100.0 + took_s,
+        estimate={"memory_mib": 1, "seconds": start_s, "start_s": start_s},
+    )  # fmt: skip
+    with catalogue._database.writing.begin() as session:
+        session.add(row)
+
+
+@pytest.mark.parametrize(
+    ("took_s", "expected"),
+    [(3.0, 3.0), (0.5, 0.5), (100.0, BOUNDS[1]), (0.06, BOUNDS[0]), (0.001, 1.0)],
+    ids=["slower", "faster", "much slower", "much faster", "result was there already"],
+)
+def test_the_estimate_follows_the_times_of_completed_jobs(
+    catalogue: Catalogue, took_s: float, expected: float
+) -> None:
+    asked = deconvolution(catalogue)
+    start_s, memory = needs(catalogue, "deconvolve", asked)
+    for n in range(FEWEST_JOBS - 1):
+        completed(catalogue, "deconvolve", str(n), 1.0, took_s)
+    _factors.clear()
+    assert needs(catalogue, "deconvolve", asked) == (start_s, memory), "too few jobs to learn from"
+    completed(catalogue, "deconvolve", "99", 1.0, took_s)
+    _factors.clear()
+    seconds, same = needs(catalogue, "deconvolve", asked)
+    assert seconds == pytest.approx(start_s * expected, abs=0.2) and same == memory
+    assert estimate("deconvolve", asked, catalogue, OWNER, 1).start_s == pytest.approx(start_s, abs=0.1)
+
+
+def test_a_kind_without_figures_of_its_own_has_an_estimate(catalogue: Catalogue) -> None:
+    seconds, memory = needs(catalogue, "brand-new", {"image_id": image(catalogue, 1024)})
+    assert seconds > 0 and memory > 0
 
 
 def test_what_is_over_a_limit_is_refused_and_told_how_to_get_under_it(catalogue: Catalogue) -> None:
@@ -191,7 +239,7 @@ def test_a_job_that_executes_too_long_ends_with_its_next_step(
             context.report("working", step, 100)
         return "0" * 64
 
-    monkeypatch.setitem(tasks.TASKS, "deconvolve", slow)
+    monkeypatch.setattr("workers.tasks.deconvolve.deconvolve", slow)
     service = LocalService(settings.model_copy(update={"max_job_s": 0.3}))
     with pytest.raises(ServiceError) as ended:
         service.deconvolve(image_file, psf_id=service.upload_psf(psf_file)["id"])

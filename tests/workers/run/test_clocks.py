@@ -12,7 +12,7 @@ from sqlalchemy import select
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 
 OFF_S = [600.0, -600.0]
 LEASE_S = 30.0

@@ -18,9 +18,8 @@ from workers.broker.reconciler import reconcile
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PsfRow
-from workers.contract.contract import Fault, JobError, Phase
+from workers.contract.phases import Fault, JobError, Phase
 from workers.files.store import Store
-from workers.run import registry as tasks
 from workers.run.runner import Runner
 from workers.settings import Settings
 from workers.tasks.context import Context
@@ -110,7 +109,7 @@ def test_two_at_once_compute_once(
             context.catalogue.add(made)
         return str(parameters["key"])
 
-    monkeypatch.setitem(tasks.TASKS, "psf-build", build)
+    monkeypatch.setattr("workers.tasks.psf_build.psf_build", build)
     submitted: list[str] = []
     monkeypatch.setattr(queue, "submit", lambda app, job_id, queue_name: submitted.append(job_id) or True)
     runner = Runner(settings, catalogue, Store(settings.data_dir))

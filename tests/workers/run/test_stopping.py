@@ -23,9 +23,8 @@ from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.census import FileTally
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow, PsfRow
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 from workers.files.store import Store
-from workers.run import registry as tasks
 from workers.run.runner import Runner
 from workers.run.stopping import Stopping
 from workers.settings import Settings
@@ -45,7 +44,7 @@ class Bench:
 
     def run(self, task: Task) -> JobRow:
         """The job's row after a run of it."""
-        self._monkeypatch.setitem(tasks.TASKS, "psf-build", task)
+        self._monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
         job, _ = self.catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
         self.catalogue.jobs.mark_submitted(job.id)
         store = Store(self._settings.data_dir)
@@ -142,10 +141,10 @@ def test_the_lines_of_a_job_carry_its_id_and_owner(bench: Bench, caplog: pytest.
             said.append({"message": record.getMessage(), **logs.about()})
 
     keep = Keep()
-    logging.getLogger("workers.run.runner").addHandler(keep)
+    logging.getLogger("workers.run").addHandler(keep)
     caplog.set_level(logging.INFO)
     row = bench.run(steps_for(60.0, at_work=lambda: bench.stopping.ask(0.0)))
-    logging.getLogger("workers.run.runner").removeHandler(keep)
+    logging.getLogger("workers.run").removeHandler(keep)
     by_heart = [one for one in said if "handed back" in one["message"]]
     assert by_heart and len(said) >= 3
     assert all((one["job"], one["owner"]) == (row.id, "local") for one in said)
@@ -198,7 +197,7 @@ def test_a_database_gets_back_the_indexes_that_it_lacks(catalogue: Catalogue) ->
 
 WORKER = """
 import time
-from workers import tasks
+import workers.tasks.psf_build
 
 def listens(context, _):
     while True:
@@ -209,7 +208,7 @@ def deaf(context, _):
     context.report("at work", 2, 2)
     time.sleep(60)
 
-tasks.TASKS["psf-build"] = {task}
+workers.tasks.psf_build.psf_build = {task}
 from workers.run.worker import main
 main()
 """
@@ -259,8 +258,8 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     row = catalogue.jobs.get(job.id)
     assert row is not None and (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
     told_of = log.read_text()
-    assert ("left to another worker" in told_of) == (task == "listens"), told_of
-    assert "ending now" in told_of or task == "listens", f"{took_s:.1f} s; {told_of}"
+    assert ("another worker has the job" in told_of) == (task == "listens"), told_of
+    assert "exiting now" in told_of or task == "listens", f"{took_s:.1f} s; {told_of}"
     assert catalogue.census.workers(60.0) == [], "it took its leave"
     catalogue.close()
     lines = [json.loads(line) for line in log.read_text().splitlines()]

@@ -14,7 +14,7 @@ from service.local import LocalService
 from tests.transit_files import write_simulated
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.parts import Part, Parts
-from workers.contract.contract import Phase
+from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings

@@ -18,7 +18,9 @@ from tests.gap_files import EDGE_GLOW, answer_at_once, write_gap
 from tests.html_page import check_stands_alone
 from tests.psfcore.gap import small_gaps
 from workers.catalogue.tables import DEFAULT_OWNER, PsfRow, ReportRow
-from workers.contract.contract import GapDiagnose, ResolvedGapDiagnose, corrected_psf_identity, gap_identity
+from workers.contract.identities import corrected_psf_identity, gap_identity
+from workers.contract.requests import GapDiagnose
+from workers.contract.resolved import ResolvedGapDiagnose
 from workers.settings import Settings
 from workers.tasks import gap as gap_task
 

@@ -1,4 +1,4 @@
-"""The job evaluate: from an archive of a transit to a report as JSON, page and picture; and a PSF that is given."""
+"""The job kind report: from an archive of a transit to a report as JSON, page and picture; and a PSF that is given."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,11 @@ from service.local import LocalService
 from tests.html_page import check_stands_alone, read_page
 from tests.transit_files import TRUTH, diffraction, write_simulated
 from workers.catalogue.tables import DEFAULT_OWNER, ReportRow
-from workers.contract.contract import Evaluate, ResolvedEvaluate, evaluate_identity
+from workers.contract.identities import report_identity
+from workers.contract.requests import Report
+from workers.contract.resolved import ResolvedReport
 from workers.settings import Settings
+from workers.tasks import report as report_task
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +60,7 @@ def made(service: LocalService, transit: Path, tmp_path_factory: pytest.TempPath
 
 def test_the_report_says_what_was_found_and_what_it_was_made_of(made: dict[str, Any], transit: Path) -> None:
     row, report = made["row"], made["json"]
-    assert row["kind"] == "evaluate" and row["html"] == f"/v1/reports/{row['id']}/page"
+    assert row["kind"] == "report" and row["html"] == f"/v1/reports/{row['id']}/page"
     assert row["details"]["sentence"] == report["sentence"] and row["details"]["held_out"] is True
     assert report["schema"] == "psf-report/1" and report["seed"] == 3
     assert set(report["inputs"]["sha256"]) >= {"000.fits", "008.fits", "diffraction.fits", "transit.json"}
@@ -64,6 +68,21 @@ def test_the_report_says_what_was_found_and_what_it_was_made_of(made: dict[str, 
     assert {"numpy", "scipy", "numba", "astropy"} <= set(report["provenance"]["libraries"])
     found = report["fit"]["parameters"]["total"]
     assert abs(found["value"] - TRUTH.total) < 4 * found["sigma"]
+
+
+def test_a_comparison_of_shapes_starts_from_the_fit_and_its_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[object, int]] = []
+
+    def compare(solution: object, *, seed: int, progress: object) -> Any:
+        asked.append((solution, seed))
+        return SimpleNamespace(to_json=lambda: {"shapes": "compared"})
+
+    monkeypatch.setattr(report_task, "compare_shapes_by_errors", compare)
+    request = ResolvedReport(transit_id="0" * 64, shapes=True, seed=7)
+    context: Any = SimpleNamespace(report=lambda stage, step, steps: None)
+    made: Any = SimpleNamespace(fit=SimpleNamespace(solution="the fit"))
+    assert report_task._shapes(context, request, made) == {"shapes": "compared"}
+    assert asked == [("the fit", 7)]
 
 
 def test_its_page_stands_alone_and_shows_every_image(made: dict[str, Any]) -> None:
@@ -133,7 +152,7 @@ def test_what_is_wrong_with_a_request(service: LocalService, transit: Path, tmp_
 
 
 def test_reports_of_other_parameters_are_other_reports() -> None:
-    first = ResolvedEvaluate(transit_id="a" * 64)
+    first = ResolvedReport(transit_id="a" * 64)
     others = (
         {"seed": 2},
         {"psf_id": "b" * 64},
@@ -142,11 +161,9 @@ def test_reports_of_other_parameters_are_other_reports() -> None:
         {"noise": {"photon_gain_dn": 1.0, "read_noise_dn": 2.0}},
         {"transit_id": "c" * 64},
     )
-    identities = {
-        evaluate_identity(ResolvedEvaluate(**({"transit_id": "a" * 64} | other))) for other in others
-    }
-    assert len(identities | {evaluate_identity(first)}) == len(others) + 1
-    assert Evaluate(transit_id="a" * 64).dark_offsets
+    identities = {report_identity(ResolvedReport(**({"transit_id": "a" * 64} | other))) for other in others}
+    assert len(identities | {report_identity(first)}) == len(others) + 1
+    assert Report(transit_id="a" * 64).dark_offsets
 
 
 def test_the_row_is_in_the_catalogue_once(service: LocalService, made: dict[str, Any]) -> None:

@@ -19,7 +19,7 @@ from tests.workers.psf_examples import OWNER, identity, product, psf
 from workers import lineage
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
-from workers.contract.contract import instrument_text
+from workers.contract.identities import instrument_text
 from workers.lineage import Ancestor, made_by
 from workers.tasks import deconvolve as deconvolve_task
 
@@ -261,7 +261,7 @@ def test_the_job_that_made_a_psf(catalogue: Catalogue, values: dict[str, Any], k
 
 def test_parameters_that_are_taken_no_more_say_so(catalogue: Catalogue) -> None:
     row, _ = catalogue.add(product("x", "p", details={"parameters": {"image_id": "no id"}}))
-    with pytest.raises(DataError, match="does not take: image_id") as caught:
+    with pytest.raises(DataError, match="made with others: image_id") as caught:
         made_by(catalogue, row)
     assert caught.value.code == "parameters-outdated"
 
@@ -271,5 +271,5 @@ def test_another_owner_s_job_is_not_read(catalogue: Catalogue) -> None:
     lease = catalogue.jobs.claim(job.id, "w")
     row, _ = catalogue.add(product("x", "p", details={"job_id": job.id}))
     assert lease is not None and catalogue.jobs.complete(lease, row.id)
-    with pytest.raises(DataError, match="not written down"):
+    with pytest.raises(DataError, match="not recorded"):
         made_by(catalogue, row)

@@ -19,9 +19,8 @@ from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
-from workers.contract.contract import Phase
-from workers.run import registry as tasks
-from workers.run import runner
+from workers.contract.phases import Phase
+from workers.run import attempt
 from workers.settings import Settings
 from workers.tasks import deconvolve as deconvolve_task
 
@@ -138,7 +137,7 @@ def test_a_built_psf_carries_where_it_came_from(local: LocalService, tmp_path: P
 def test_a_cancelled_job_stops_at_its_next_step(
     local: LocalService, settings: Settings, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runner, "REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr(attempt, "REPORT_EVERY_S", 0.0)
     write_image(tmp_path / "i.fits")
     image_id, psf_id = local.upload_image(tmp_path / "i.fits")["id"], local.upload_psf(psf_file)["id"]
     job = local.submit("deconvolve", image_id=image_id, psf_id=psf_id)
@@ -164,7 +163,7 @@ def test_a_passing_failure_is_tried_again_and_then_given_up(
     def away(*_: object) -> str:
         raise ConnectionError("storage away")
 
-    monkeypatch.setitem(tasks.TASKS, "psf-build", away)
+    monkeypatch.setattr("workers.tasks.psf_build.psf_build", away)
     job = local.submit("psf-build", instrument="hri_euv", size=64)
     catalogue = Catalogue(settings.catalogue_url)
     phases = []
@@ -183,7 +182,7 @@ def test_our_own_failure_is_internal_and_is_logged(
     def broken(*_: object) -> str:
         raise ZeroDivisionError("ours")
 
-    monkeypatch.setitem(tasks.TASKS, "psf-build", broken)
+    monkeypatch.setattr("workers.tasks.psf_build.psf_build", broken)
     with pytest.raises(ServiceError) as caught:
         local.build_psf("hri_euv", size=64)
     assert caught.value.code == "internal-error"

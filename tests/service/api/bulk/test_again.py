@@ -122,7 +122,7 @@ def test_a_bulk_that_finds_no_file_is_cancelled_while_it_looks(
     settings: Settings,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("workers.run.runner.REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
     monkeypatch.setattr("workers.bulk.task.TELL_EVERY_S", 0.0)
     psf_id = upload(api, psf_file, "/v1/psfs")
     request = {"files": [{"glob": f"{archive}/**/*.none"}], "psf_id": psf_id, "parameters": FEW}

@@ -385,7 +385,7 @@ def test_cancelled_it_stops_at_the_next_step_that_it_tells_of(
         psf_id=psf_id,
         parameters={"method": {"name": "richardson-lucy", "steps": 200}},
     )
-    monkeypatch.setattr("workers.run.runner.REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
     monkeypatch.setattr("workers.bulk.task.TELL_EVERY_S", 0.0)
     real = deconvolve_task._Work.progress
 

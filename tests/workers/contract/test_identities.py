@@ -1,0 +1,157 @@
+"""Identities: identical requests have the same one, and whatever changes a result changes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from psfcore.errors import DataError
+from workers.contract.identities import (
+    canonical_hash,
+    corrected_psf_identity,
+    gap_identity,
+    product_identity,
+    psf_fit_identity,
+    psf_identity,
+    psf_tables_identity,
+    report_identity,
+)
+from workers.contract.methods import RichardsonLucy
+from workers.contract.requests import PsfBuild, PsfTables
+from workers.contract.resolved import (
+    ResolvedCrossValidate,
+    ResolvedDeconvolve,
+    ResolvedGapDiagnose,
+    ResolvedPsfFit,
+    ResolvedReport,
+)
+
+A, B, T = "a" * 64, "b" * 64, "c" * 64
+
+
+def test_the_hash_does_not_depend_on_the_order_of_keys() -> None:
+    assert canonical_hash({"a": 1, "b": 2}) == canonical_hash({"b": 2, "a": 1})
+
+
+def identity(**changes: object) -> str:
+    base = {"image_id": A, "psf_id": B, "method": {"name": "richardson-lucy"}}
+    return product_identity(ResolvedDeconvolve.model_validate(base | changes))
+
+
+def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = identity()
+    assert base == identity(method={"name": "richardson-lucy", "steps": 20})
+    recipe = {"instrument": "hri_euv"}
+    assert base == identity(psf_recipe=recipe), "how a PSF would be made is in its id"
+    others = {
+        identity(image_id=B),
+        identity(psf_id=A),
+        identity(method={"name": "richardson-lucy", "steps": 19}),
+        identity(method={"name": "richardson-lucy", "edges": "zero"}),
+        identity(method={"name": "linear"}),
+        identity(noise={"photon_gain_dn": 6.0, "read_noise_dn": 2.0}),
+        identity(saturation_dn=4000.0),
+        identity(error_draws=8),
+    }
+    monkeypatch.setattr(RichardsonLucy, "algorithm_version", RichardsonLucy.algorithm_version + 1)
+    others.add(identity())
+    assert len(others) == 9 and base not in others
+
+
+def test_a_built_psf_is_identified_by_its_parameters() -> None:
+    small, large = PsfBuild(instrument="hri_euv", size=256), PsfBuild(instrument="hri_euv")
+    assert psf_identity(small) != psf_identity(large)
+    with pytest.raises(DataError, match="hri_euv"):
+        psf_identity(PsfBuild(instrument="no_such"))
+
+
+NOISE = {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
+INSTRUMENT = "x = 1\n"
+RECIPE = {"instrument_file": INSTRUMENT, "component": "diffraction"}
+
+
+def _product(**changes: Any) -> str:
+    return identity(**changes)
+
+
+def _fit(**parameters: Any) -> str:
+    return psf_fit_identity(ResolvedPsfFit.model_validate({"transit_id": T} | parameters))
+
+
+def _gap(**parameters: Any) -> str:
+    return gap_identity(ResolvedGapDiagnose.model_validate({"transit_id": T} | parameters))
+
+
+# Computed by commit c86f564, whose catalogues must stay valid: the id of a result that exists must not change.
+FROZEN: list[tuple[Callable[[], str], str]] = [
+    (lambda: _product(), "348efc1ea88a3456cd0dc7c610e9db2090c16dfabf1b583370b50fbad856ca3c"),
+    (
+        lambda: _product(changes_picture=True),
+        "93371c79c428bc05f50d5ec50bde773bf095ac375fc0c245b41b477026015a07",
+    ),
+    (
+        lambda: _product(
+            picked_for="hri_euv",
+            context_id="ctx",
+            noise=NOISE,
+            saturation_dn=4000.0,
+            error_draws=8,
+            method={"name": "linear", "steps": 7, "edges": "zero"},
+        ),
+        "b8f009bf76f3b169f01d253a81e7a0d3febdfe605941d951cf53a18d7dd9f4e0",
+    ),
+    (
+        lambda: psf_identity(PsfBuild(instrument_file=INSTRUMENT)),
+        "77833efb52eb6c2cd50385ad03591c1e5886f96b8b7460a5169122773fa2e715",
+    ),
+    (
+        lambda: psf_identity(
+            PsfBuild(instrument_file=INSTRUMENT, size=256, component="diffraction", mask_id=A)
+        ),
+        "fdbe2fad028d94d3d1453e504b22b0aea7696b8cc0041a61578a6eb0907a2bfe",
+    ),
+    (
+        lambda: _fit(diffraction_recipe=RECIPE),
+        "1ef68522eb129759cea8c5f6bb55e129910d3d6c52796c762458bc382c0c2e38",
+    ),
+    (
+        lambda: _fit(noise=NOISE, seed=3, shape="knee", as_published=True, saturation_dn=1.5),
+        "c9fa98e30cbb058c8a780aa601d4ae7aa3c004fb8e44a3b3210659f73b1cecd0",
+    ),
+    (
+        lambda: psf_fit_identity(
+            ResolvedCrossValidate.model_validate(
+                {"transit_id": T, "noise": NOISE, "diffraction_recipe": RECIPE}
+            )
+        ),
+        "3e43fc58cebff856c7d2d15e187d1b0b1569004ec53962f077255c53156cef5e",
+    ),
+    (
+        lambda: psf_tables_identity(PsfTables(psf_id=B)),
+        "9d664534c5deabe05e6ed2f333d0076ae5ae3d0d1fe4d40e3277c472bd47414e",
+    ),
+    (
+        lambda: _gap(psf_id=B, diffraction_recipe=RECIPE),
+        "9bcb71b80c3faa0c69d76a60a835e0383a5df584880da7cc52b884c9d4a64370",
+    ),
+    (
+        lambda: _gap(added_effects=("m",), added_effects_sha256=(A,)),
+        "8666e536336afc155fe9ee19ad194ea4558d50bff8f09244e2282c2a058f78f4",
+    ),
+    (
+        lambda: corrected_psf_identity(A),
+        "3f5c6acb05b9d85505cbb17f4188b25a5a7919c50632992e0e0e5db484f0cd2b",
+    ),
+]
+
+
+@pytest.mark.parametrize(("compute", "frozen"), FROZEN, ids=[frozen[:8] for _, frozen in FROZEN])
+def test_identities_of_existing_results_do_not_change(compute: Callable[[], str], frozen: str) -> None:
+    assert compute() == frozen
+
+
+def test_a_report_with_a_comparison_of_shapes_is_another_report() -> None:
+    plain, shapes = ResolvedReport(transit_id=T), ResolvedReport(transit_id=T, shapes=True)
+    assert report_identity(plain) != report_identity(shapes)

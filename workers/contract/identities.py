@@ -1,0 +1,116 @@
+"""Identities: what a job makes has the SHA-256 of everything that determines it as its id."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from psfcore.instruments.files import instrument_path
+from workers.contract.requests import PsfBuild, PsfTables
+from workers.contract.resolved import (
+    ResolvedCrossValidate,
+    ResolvedDeconvolve,
+    ResolvedGapDiagnose,
+    ResolvedOnTransit,
+    ResolvedPsfFit,
+    ResolvedReport,
+    ResolvedRerun,
+)
+
+
+def canonical_hash(content: dict[str, Any]) -> str:
+    """SHA-256 of a JSON object in canonical form (sorted keys, no spaces)."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def instrument_text(build: PsfBuild) -> str:
+    """The text of a build's instrument file: the user's own, or the shipped one.
+
+    Raises DataError "unknown-instrument" if no instrument of that name is shipped.
+    """
+    if build.instrument_file is not None:
+        return build.instrument_file
+    assert build.instrument is not None
+    return instrument_path(build.instrument).read_text("utf-8")
+
+
+def psf_identity(build: PsfBuild) -> str:
+    """Identity of a built PSF: bytes of the instrument file, parameters, version of the algorithm.
+
+    Raises DataError "unknown-instrument" if no instrument of that name is shipped.
+    """
+    return canonical_hash(
+        {
+            "kind": "psf-build",
+            "instrument_file": hashlib.sha256(instrument_text(build).encode()).hexdigest(),
+            "parameters": build.model_dump(mode="json", include={"mask_id", "size", "component"}),
+            "algorithm_version": build.algorithm_version,
+        }
+    )
+
+
+def psf_tables_identity(request: PsfTables) -> str:
+    """Identity of the tables of a PSF: the PSF and the version of the algorithm."""
+    return canonical_hash(
+        {"kind": "psf-tables", "psf_id": request.psf_id, "algorithm_version": request.algorithm_version}
+    )
+
+
+def product_identity(request: ResolvedDeconvolve) -> str:
+    """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, version of the algorithm."""
+    # The id of the PSF determines it. The recipe only says how to build it, and the context where it was found.
+    excluded = {"psf_recipe", "context_id"} | ({"picked_for"} if request.picked_for is None else set())
+    hashed = request.model_dump(mode="json", exclude=excluded)
+    # This parameter was called effects_picture when the first products were made. Hashing it under that name keeps
+    # the ids of existing products valid.
+    hashed["effects_picture"] = hashed.pop("changes_picture")
+    return canonical_hash(
+        {"kind": "deconvolve", "request": hashed, "algorithm_version": request.method.algorithm_version}
+    )
+
+
+def psf_fit_identity(request: ResolvedPsfFit | ResolvedCrossValidate) -> str:
+    """Identity of a fit or a cross-validation: bytes of the transit, parameters, diffraction PSF, version of the algorithm."""
+    return _transit_identity("psf-fit" if isinstance(request, ResolvedPsfFit) else "cross-validate", request)
+
+
+def report_identity(request: ResolvedReport) -> str:
+    """Identity of a report: bytes of the transit, parameters, PSF or diffraction PSF, version of the algorithm."""
+    return _transit_identity("report", request)
+
+
+def gap_identity(request: ResolvedGapDiagnose) -> str:
+    """Identity of a diagnosis: bytes of the transit, parameters, PSF, diffraction PSF, version of the algorithm."""
+    # Diagnoses without added effects keep the ids that they had before the texts of added effects were hashed.
+    excluded = () if request.added_effects_sha256 else ("added_effects_sha256",)
+    return _transit_identity("gap-diagnose", request, excluded)
+
+
+def diffraction_identity(request: ResolvedOnTransit) -> str | None:
+    """Identity of the diffraction PSF to build for a request; None if the transit or the given PSF brings it."""
+    return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
+
+
+def _transit_identity(kind: str, request: ResolvedOnTransit, excluded: tuple[str, ...] = ()) -> str:
+    """excluded: fields of the request that do not change the result."""
+    return canonical_hash(
+        {
+            "kind": kind,
+            # The identity of the diffraction PSF determines it; the recipe only says how to build it.
+            "request": request.model_dump(mode="json", exclude={"diffraction_recipe", *excluded}),
+            "diffraction": diffraction_identity(request),
+            "algorithm_version": request.algorithm_version,
+        }
+    )
+
+
+def rerun_identity(request: ResolvedRerun, job_id: str) -> str:
+    """Identity of the report of a rerun. It contains the job's id: every rerun runs anew."""
+    return canonical_hash({"kind": "rerun", "of": request.of, "id": request.id, "job": job_id})
+
+
+def corrected_psf_identity(diagnosis: str) -> str:
+    """Identity of the PSF that a diagnosis adds, with the effect that explains the gap in its model."""
+    return canonical_hash({"kind": "gap-corrected-psf", "diagnosis": diagnosis})

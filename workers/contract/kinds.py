@@ -1,0 +1,252 @@
+"""The table of job kinds, one row a kind. Everything else that depends on the kind is read from it.
+
+To add a kind: its parameters in ``workers.contract.requests``, a row here, a task in ``workers/tasks``, and a test.
+The web process imports this module, so a task is named here and imported by the worker alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from importlib import import_module
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+
+from pydantic import Field, create_model
+
+from workers.contract.identities import (
+    gap_identity,
+    product_identity,
+    psf_fit_identity,
+    psf_identity,
+    psf_tables_identity,
+    report_identity,
+)
+from workers.contract.methods import Parameters
+from workers.contract.queues import Queue
+from workers.contract.requests import (
+    CrossValidate,
+    Deconvolve,
+    GapDiagnose,
+    PsfBuild,
+    PsfFit,
+    PsfTables,
+    Report,
+    Rerun,
+)
+from workers.contract.resolved import (
+    ResolvedCrossValidate,
+    ResolvedDeconvolve,
+    ResolvedGapDiagnose,
+    ResolvedPsfFit,
+    ResolvedReport,
+    ResolvedRerun,
+)
+
+Task = Callable[[Any, Mapping[str, Any]], str]
+Assistant = Callable[[Any, Mapping[str, Any]], None]
+
+
+class Result(StrEnum):
+    """What a job makes; the value is its place in the interface."""
+
+    PRODUCT = "/v1/products"
+    PSF = "/v1/psfs"
+    REPORT = "/v1/reports"
+    BULK = "/v1/bulk"
+
+
+class Request(Parameters):
+    """A request for a job. Each kind has a model of its own, made from its row of the table."""
+
+    queue: Literal["bulk"] | None = Field(
+        None, description="`bulk`: lowest priority; null: the default queue of the kind"
+    )
+    kind: str
+    parameters: Any
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of job.
+
+    | field | meaning |
+    |---|---|
+    | task, assistant | dotted names; an assistant is what other workers run for a job that calls for help |
+    | result | what the job makes |
+    | parameters, resolved | models: as the client sends them, and as the worker gets them; none: clients cannot request this kind |
+    | identity | of what the job makes, from its resolved parameters; none: every job makes something new |
+    | resolver | dotted name of the function that turns parameters into resolved ones, if checking the ids and adding the recipe of the diffraction PSF is not enough |
+    | queue | where jobs of this kind wait by default |
+    | origin | how the PSFs and products of this kind came about; a rerun finds the kind to run by it |
+    | needs_room | whether the owner's quota must have room before the job starts |
+    | counted_whole | whether the steps count the whole job, so that the time left follows from them |
+    | time_advice, memory_advice | what to change in a request that needs more than the operator's limits |
+    """
+
+    name: str
+    task: str
+    result: Result
+    parameters: type[Parameters] | None = None
+    resolved: type[Parameters] | None = None
+    identity: Callable[[Any], str] | None = None
+    resolver: str = "workers.intake.requests:resolve_by_ids"
+    assistant: str | None = None
+    origin: str | None = None
+    queue: Queue = Queue.INTERACTIVE
+    needs_room: bool = True
+    counted_whole: bool = False
+    time_advice: str = "use fewer or smaller images"
+    memory_advice: str = "use fewer or smaller images"
+
+    @property
+    def request(self) -> type[Request]:
+        """The model of a request for this kind."""
+        return REQUESTS[self.name]
+
+    def load_task(self) -> Task:
+        """Import the task. Only workers may do this: it loads numerics."""
+        task: Task = load(self.task)
+        return task
+
+    def load_assistant(self) -> Assistant | None:
+        """Import what other workers run for a job of this kind; None if they cannot help."""
+        return None if self.assistant is None else load(self.assistant)
+
+
+_ROWS = (
+    Kind(
+        "deconvolve",
+        task="workers.tasks.deconvolve:deconvolve",
+        result=Result.PRODUCT,
+        parameters=Deconvolve,
+        resolved=ResolvedDeconvolve,
+        identity=product_identity,
+        origin="deconvolved",
+        resolver="workers.intake.requests:resolve_deconvolve",
+        time_advice="use fewer steps or error_draws, or edges 'zero'",
+        memory_advice="crop the image, or use a smaller margin_px or edges 'zero'",
+    ),
+    Kind(
+        "psf-build",
+        task="workers.tasks.psf_build:psf_build",
+        result=Result.PSF,
+        parameters=PsfBuild,
+        resolved=PsfBuild,
+        identity=psf_identity,
+        origin="built",
+        resolver="workers.intake.requests:resolve_psf_build",
+        counted_whole=True,
+        time_advice="use a smaller size, or fewer spectral lines in the bandpass",
+        memory_advice="use a smaller size, or fewer spectral lines in the bandpass",
+    ),
+    Kind(
+        "psf-fit",
+        task="workers.tasks.psf_fit:psf_fit",
+        result=Result.PSF,
+        parameters=PsfFit,
+        resolved=ResolvedPsfFit,
+        identity=psf_fit_identity,
+        origin="fitted",
+        counted_whole=True,
+    ),
+    Kind(
+        "psf-tables",
+        task="workers.tasks.tables:psf_tables",
+        result=Result.PSF,
+        parameters=PsfTables,
+        resolved=PsfTables,
+        identity=psf_tables_identity,
+        needs_room=False,  # the quota does not count tables
+        time_advice="crop the PSF",
+        memory_advice="crop the PSF",
+    ),
+    Kind(
+        "cross-validate",
+        task="workers.tasks.crossval:cross_validate",
+        result=Result.REPORT,
+        parameters=CrossValidate,
+        resolved=ResolvedCrossValidate,
+        identity=psf_fit_identity,
+        assistant="workers.tasks.crossval:assist_cross_validation",
+        queue=Queue.CROSSVAL,  # takes long: quick jobs go first
+        counted_whole=True,
+        time_advice="use fewer runs, scheme 'shared', or fewer or smaller images",
+        memory_advice="use fewer runs, scheme 'shared', or fewer or smaller images",
+    ),
+    Kind(
+        "report",
+        task="workers.tasks.report:report",
+        result=Result.REPORT,
+        parameters=Report,
+        resolved=ResolvedReport,
+        identity=report_identity,
+        resolver="workers.intake.requests:resolve_report",
+        counted_whole=True,
+    ),
+    Kind(
+        "gap-diagnose",
+        task="workers.tasks.gap:gap_diagnose",
+        result=Result.REPORT,
+        parameters=GapDiagnose,
+        resolved=ResolvedGapDiagnose,
+        identity=gap_identity,
+        origin="corrected",
+        resolver="workers.intake.requests:resolve_gap_diagnose",
+    ),
+    Kind(
+        "rerun",
+        task="workers.tasks.rerun:rerun",
+        result=Result.REPORT,
+        parameters=Rerun,
+        resolved=ResolvedRerun,
+        resolver="workers.intake.requests:resolve_rerun",
+    ),
+    # Made by /v1/bulk, which has its own requests; the task checks the quota before each image.
+    Kind(
+        "bulk",
+        task="workers.bulk.task:bulk_turn",
+        result=Result.BULK,
+        queue=Queue.BULK,
+        needs_room=False,
+    ),
+)
+KINDS: Mapping[str, Kind] = {row.name: row for row in _ROWS}
+
+
+def _request_model(row: Kind) -> type[Request]:
+    name = "".join(part.title() for part in row.name.split("-")) + "Request"
+    fields: dict[str, Any] = {"kind": (Literal[row.name], ...), "parameters": (row.parameters, ...)}
+    return create_model(
+        name,
+        __base__=Request,
+        __module__=__name__,
+        __doc__=f"A request for a job of kind `{row.name}`.",
+        **fields,
+    )
+
+
+# The models of the kinds that clients can request.
+REQUESTS: Mapping[str, type[Request]] = {
+    row.name: _request_model(row) for row in _ROWS if row.parameters is not None
+}
+if TYPE_CHECKING:
+    JobRequest = Request
+else:
+    JobRequest = Annotated[Union[tuple(REQUESTS.values())], Field(discriminator="kind")]  # noqa: UP007
+
+
+def queue_of(kind: str) -> Queue:
+    """The default queue of a kind."""
+    return KINDS[kind].queue if kind in KINDS else Queue.INTERACTIVE
+
+
+def kind_of_origin(origin: str) -> Kind:
+    """The kind of job that makes things of this origin."""
+    return next(kind for kind in _ROWS if kind.origin == origin)
+
+
+def load(dotted: str) -> Any:
+    """What a name such as ``workers.tasks.rerun:rerun`` means; imports its module."""
+    module, _, name = dotted.partition(":")
+    return getattr(import_module(module), name)

@@ -1,0 +1,86 @@
+"""What to tell a client whose request names something unknown: which names exist, and the one probably meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from difflib import get_close_matches
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic_core import ErrorDetails
+
+# Names of earlier versions that are too different from today's to be guessed.
+FORMER_NAMES = {"evaluate": "report", "effects_picture": "changes_picture"}
+SHOWN = 60
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``; did you mean 'x'?``, or an empty text if no known name is close."""
+    names = list(known)
+    former = FORMER_NAMES.get(name)
+    close = [former] if former in names else get_close_matches(name, names, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def explained(errors: Iterable[ErrorDetails], model: Any) -> Iterator[tuple[ErrorDetails, str]]:
+    """Each validation error with its message; errors about unknown names say which names are known.
+
+    model: the type that was validated; the errors' locations start there.
+    """
+    for error in errors:
+        yield error, _message(error, model)
+
+
+def _message(error: ErrorDetails, model: Any) -> str:
+    if error["type"] == "extra_forbidden":
+        name, known = str(error["loc"][-1]), _fields(_at(model, error["loc"][:-1]))
+        return f"there is no such field; expected one of {', '.join(known)}{did_you_mean(name, known)}"
+    if error["type"] == "union_tag_invalid":
+        tag, key = str(error["ctx"]["tag"]), str(error["ctx"]["discriminator"]).strip("'")
+        tags = _tags(_at(model, error["loc"]), key)
+        said = ascii(tag)[:SHOWN]
+        return f"expected {key} to be one of {', '.join(tags)}; got {said}{did_you_mean(tag, tags)}"
+    if error["type"] == "union_tag_not_found":
+        key = str(error["ctx"]["discriminator"]).strip("'")
+        return f"expected {key}, one of {', '.join(_tags(_at(model, error['loc']), key))}; got none"
+    return error["msg"]
+
+
+def _members(kind: Any) -> list[type[BaseModel]]:
+    """The models that a type allows."""
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return [kind]
+    if get_origin(kind) in (Annotated, list):
+        return _members(get_args(kind)[0])
+    if get_origin(kind) in (Union, UnionType):
+        return [model for one in get_args(kind) for model in _members(one)]
+    return []
+
+
+def _at(kind: Any, location: Iterable[str | int]) -> Any:
+    """The type at a location. Besides fields, a location names the tag that chose a member of a union."""
+    for step in location:
+        if isinstance(step, int):  # a place in a list
+            continue
+        members = _members(kind)
+        field = next((m.model_fields[step] for m in members if step in m.model_fields), None)
+        if field is not None:
+            kind = field.annotation
+        else:
+            chosen = [m for m in members if any(step in _literals(m, name) for name in m.model_fields)]
+            kind = chosen[0] if chosen else kind
+    return kind
+
+
+def _literals(model: type[BaseModel], name: str) -> tuple[Any, ...]:
+    kind = model.model_fields[name].annotation if name in model.model_fields else None
+    return get_args(kind) if get_origin(kind) is Literal else ()
+
+
+def _fields(kind: Any) -> list[str]:
+    return list(dict.fromkeys(name for model in _members(kind) for name in model.model_fields))
+
+
+def _tags(kind: Any, key: str) -> list[str]:
+    return [str(tag) for model in _members(kind) for tag in _literals(model, key)]

@@ -1,0 +1,96 @@
+"""Catalogue rows of what users upload: images, transits and PSFs."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import PurePath
+
+from psfcore.fits.header import HeaderSummary
+from psfcore.transit.archive import ArchiveContents
+from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
+from workers.versions.series import UPLOADED, channel_of, instrument_of, line_of
+from workers.versions.status import PsfStatus
+
+
+def image_row(
+    owner: str, sha256: str, size_bytes: int, filename: str | None, summary: HeaderSummary
+) -> ImageRow:
+    """The row of an uploaded image."""
+    return ImageRow(
+        owner=owner,
+        id=sha256,
+        created_at=time.time(),
+        bytes=size_bytes,
+        filename=filename,
+        summary=dataclasses.asdict(summary),
+    )
+
+
+def transit_row(
+    owner: str, sha256: str, size_bytes: int, filename: str | None, contents: ArchiveContents
+) -> TransitRow:
+    """The row of an uploaded transit. Its summary comes from the archive's table of contents and transit.json."""
+    manifest = contents.manifest
+    return TransitRow(
+        owner=owner,
+        id=sha256,
+        created_at=time.time(),
+        bytes=size_bytes,
+        filename=filename,
+        summary={
+            "archive": contents.kind,
+            "instrument": manifest.instrument,
+            "images": len(manifest.images),
+            "pointings": [{"fov": fov, "images": images} for fov, images in manifest.pointings.items()],
+            "noise": None if manifest.noise is None else manifest.noise.model_dump(mode="json"),
+            "known_psf": manifest.known_psf,
+            "files": [{"name": name, "bytes": contents.files[name]} for name in manifest.files],
+            "unpacked_bytes": sum(contents.files.values()),
+        },
+    )
+
+
+def uploaded_psf_row(
+    owner: str,
+    sha256: str,
+    size_bytes: int,
+    filename: str | None,
+    summary: HeaderSummary,
+    *,
+    name: str | None = None,
+    version: str | None = None,
+    instrument: str | None = None,
+    channel: str | None = None,
+    kind: str | None = None,
+) -> PsfRow:
+    """The row of an uploaded PSF, with status draft.
+
+    What the request does not name (name, version, series) is taken from the header, then from the file's name.
+    """
+    header = dataclasses.asdict(summary)
+    instrument = instrument or instrument_of(header)
+    channel = channel or channel_of(instrument, summary.wavelnth)
+    kind = kind or UPLOADED
+    return PsfRow(
+        owner=owner,
+        id=sha256,
+        created_at=time.time(),
+        name=name or summary.psf_name or PurePath(filename or "uploaded").stem,
+        version=version or summary.psf_version or f"0.0.0+{sha256[:8]}",
+        instrument=instrument,
+        channel=channel,
+        kind=kind,
+        line=line_of(instrument, channel, kind),
+        status=PsfStatus.DRAFT,
+        origin="uploaded",
+        file_sha256=sha256,
+        bytes=size_bytes,
+        preview_sha256=None,
+        details={
+            "shape": list(summary.shape),
+            "plate_scale_arcsec": summary.cdelt1,
+            "wavelength_angstrom": summary.wavelnth,
+            "filename": filename,
+        },
+    )

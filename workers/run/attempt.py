@@ -1,0 +1,133 @@
+"""One attempt at a job: its heartbeat, its progress, and the reasons to stop it early."""
+
+from __future__ import annotations
+
+import contextvars
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.jobs import Lease
+from workers.catalogue.stage_times import StageTimes
+from workers.contract.phases import Phase
+from workers.run.stopping import Stopping
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int], None]
+REPORT_EVERY_S = 0.3
+
+
+class TookTooLong(Exception):
+    """The job ran longer than the operator allows."""
+
+    def __init__(self, limit_s: float) -> None:
+        super().__init__(
+            f"expected a job to run for at most {limit_s:g} s (HELIOPSF_MAX_JOB_S); this one was stopped after that "
+            f"time: send a smaller request, or ask the operator for a higher limit"
+        )
+
+
+class Cancelled(Exception):
+    """The job was cancelled, or this worker lost its lease: stop, and write nothing."""
+
+
+@dataclass
+class Attempt:
+    """A claimed job while it runs. ``limit_s`` is the longest time from ``started`` to a report of progress."""
+
+    catalogue: Catalogue
+    lease: Lease
+    heartbeat_s: float
+    stopping: Stopping
+    also_report: Progress | None
+    limit_s: float
+    started: float = field(default_factory=time.monotonic)
+    stopped: threading.Event = field(default_factory=threading.Event)
+    ended: threading.Event = field(default_factory=threading.Event)
+    last_report: float = 0.0
+    times: StageTimes = field(default_factory=StageTimes)
+
+    @contextmanager
+    def beating(self) -> Iterator[None]:
+        """Send heartbeats from another thread while the block runs."""
+        run = contextvars.copy_context().run
+        name = f"heartbeat {self.lease.job_id}"
+        heart = threading.Thread(target=run, args=(self._beat,), name=name, daemon=True)
+        heart.start()
+        try:
+            yield
+        finally:
+            self.ended.set()
+            heart.join()
+
+    def _beat(self) -> None:
+        """Send heartbeats until the attempt ends or is cancelled; hand the job back if the worker has to stop."""
+        while not self.ended.wait(self.heartbeat_s):
+            try:
+                if self.stopping.due and self.catalogue.jobs.hand_back(self.lease):
+                    log.warning("job %s: handed back because this worker is stopping", self.lease.job_id)
+                    self.stopped.set()
+                    return
+                alive = self.catalogue.jobs.heartbeat(self.lease)
+            except SQLAlchemyError as error:
+                # If this lasts, the lease expires and another worker gets the job. Nothing to do here.
+                log.warning("job %s: could not write the heartbeat: %s", self.lease.job_id, error)
+                continue
+            if not alive:
+                self.stopped.set()
+                return
+
+    def report(self, stage: str, step: int, steps: int) -> None:
+        """Tasks call this at each step. Raises ``Cancelled`` or ``TookTooLong`` if the work must stop."""
+        with self.times.step(stage, step):
+            self._report(stage, step, steps)
+
+    def _report(self, stage: str, step: int, steps: int) -> None:
+        now = time.monotonic()
+        if step == steps or now - self.last_report >= REPORT_EVERY_S:
+            self.last_report = now
+            try:
+                if not self.catalogue.jobs.progress(self.lease, stage, step, steps):
+                    self.stopped.set()
+            except SQLAlchemyError as error:
+                # The database may be back in a moment; finished work must not be lost until then.
+                log.warning("job %s: could not write the progress: %s", self.lease.job_id, error)
+        if self.stopped.is_set():
+            raise Cancelled(self.lease.job_id)
+        if now - self.started > self.limit_s:
+            raise TookTooLong(self.limit_s)
+        if self.also_report is not None:
+            self.also_report(stage, step, steps)
+
+
+@dataclass
+class Assistance:
+    """Help with a job that runs in another worker: it ends when that job ends."""
+
+    catalogue: Catalogue
+    job_id: str
+    stopping: Stopping
+    looked_at: float = field(default_factory=time.monotonic)
+    times: StageTimes = field(default_factory=StageTimes)
+
+    def report(self, stage: str, step: int, _steps: int) -> None:
+        """Assistants call this at each step. Raises ``Cancelled`` if the job has ended or this worker must stop."""
+        with self.times.step(stage, step):
+            self._look()
+
+    def _look(self) -> None:
+        if self.stopping.due:
+            raise Cancelled(self.job_id)
+        if time.monotonic() - self.looked_at < REPORT_EVERY_S:
+            return
+        self.looked_at = time.monotonic()
+        now = self.catalogue.jobs.get(self.job_id)
+        if now is None or now.phase != Phase.EXECUTING or now.cancel_requested:
+            raise Cancelled(self.job_id)
