@@ -18,7 +18,6 @@ from workers import logs
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import NOT_KEPT
-from workers.catalogue.stage_times import StageTimes
 from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.contract import Fault, JobError, Phase
 from workers.contract.queues import Queue
@@ -27,6 +26,7 @@ from workers.run import registry as tasks
 from workers.run.stopping import Stopping
 from workers.settings import Settings
 from workers.tasks.context import Context, TurnOver
+from workers.tasks.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class _Work:
     stopped: threading.Event = field(default_factory=threading.Event)
     ended: threading.Event = field(default_factory=threading.Event)
     last_report: float = 0.0
-    times: StageTimes = field(default_factory=StageTimes)
+    times: StageTimer = field(default_factory=StageTimer)
 
     def beat(self) -> None:
         """Heartbeat until the work ends; notes a cancellation, and hands the job back where the worker must go."""
@@ -167,7 +167,7 @@ class Runner:
             return
 
         looked_at = time.monotonic()
-        times = StageTimes()
+        times = StageTimer()
 
         def report(stage: str, step: int, _steps: int) -> None:
             with times.step(stage, step):
@@ -263,7 +263,7 @@ class Runner:
         )
         return any(row is not None for row in found)
 
-    def _keep_times(self, job: JobRow, times: StageTimes) -> None:
+    def _keep_times(self, job: JobRow, times: StageTimer) -> None:
         """Add an attempt's stages to the sums; its outcome is written by now, and stays whatever comes of this."""
         try:
             self._catalogue.stage_times.add(job.kind, times.end())

@@ -1,4 +1,4 @@
-"""The task ``evaluate``: an uploaded transit in, a report on it and its PSF out, as JSON, page and picture."""
+"""The task ``evaluate``: an uploaded transit in, a report on it and its PSF out, as JSON, HTML page and picture."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from workers.catalogue.tables import ReportRow
 from workers.contract.contract import ResolvedEvaluate, evaluate_identity
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
-from workers.tasks.psf_build import given_psf
-from workers.tasks.psf_fit import load_transit
+from workers.tasks.psfs import given_psf
+from workers.tasks.transits import load_transit
 
 KIND = "evaluate"
 POINT_PX = 17
 
 
 def evaluate(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Make a report on a transit; returns its id."""
+    """Make a report on a transit; returns the report's id."""
     request = ResolvedEvaluate.model_validate(parameters)
     identity = evaluate_identity(request)
     if context.catalogue.get(ReportRow, identity, context.owner) is not None:
@@ -44,14 +44,14 @@ def evaluate(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def _point() -> Kernel:
-    """A diffraction that does nothing: where a PSF is given it holds the diffraction, and nothing asks for more."""
+    """A diffraction PSF that changes nothing. A given PSF already contains the diffraction."""
     point = np.zeros((POINT_PX, POINT_PX))
     point[POINT_PX // 2, POINT_PX // 2] = 1.0
     return point
 
 
 def _save(context: Context, request: ResolvedEvaluate, identity: str, report: PsfReport) -> None:
-    """JSON, page and picture into the store, the row into the catalogue."""
+    """Write JSON, HTML page and picture into the store, and add the row to the catalogue."""
     provenance = {"report_id": identity, **provenance_of(context, request)}
     said = report_json(report, provenance)
     with (

@@ -1,0 +1,212 @@
+"""The task ``deconvolve``: an uploaded image and a PSF in, an image product out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+from astropy.io.fits import Header
+
+from psfcore.deconvolve.assess.changes import effects
+from psfcore.deconvolve.assess.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
+from psfcore.deconvolve.assess.quality import quality_plane
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.errors import DataError
+from psfcore.fits.fits_io import read_image, read_psf
+from psfcore.fits.gain import noise_for, saturation_for
+from psfcore.image import Image
+from psfcore.instruments.model import load_instrument
+from psfcore.noise import Noise
+from psfcore.psf import Psf
+from psfcore.psf_sampling import psf_for_image
+from psfcore.scatter.samples import possible_psfs
+from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
+from workers.contract.contract import ResolvedDeconvolve, product_identity
+from workers.tasks.context import Context
+from workers.tasks.prepared_psfs import PreparedPsfs
+from workers.tasks.product import Inputs, Made, details_of, keep, save_preview, write
+from workers.tasks.psf_build import requested_psf
+
+# Fields of a request's method that go into Conditions; all other fields are arguments of the method itself.
+_CONDITIONS = {"name", "edges", "margin_px"}
+
+
+def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Deconvolve an uploaded image and add the product to the catalogue; returns the product's id.
+
+    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "no-noise-figures", and whatever reading
+    the image and the method raise.
+    """
+    request = ResolvedDeconvolve.model_validate(parameters)
+    identity = product_identity(request)
+    if context.catalogue.get(ProductRow, identity, context.owner) is not None:
+        return identity
+    psf_row = requested_psf(context, request)
+    image = _load_upload(context, request)
+    made = make(context, request, psf_row, image)
+    with context.store.temporary() as path:
+        write(made, path)
+        context.report("saving", 1, 1)
+        keep(made, path)
+    return identity
+
+
+def _load_upload(context: Context, request: ResolvedDeconvolve) -> Image:
+    upload = context.catalogue.get(ImageRow, request.image_id, context.owner)
+    if upload is None:
+        raise DataError(
+            "no-such-image",
+            f"expected the id of an uploaded image; got {request.image_id}, which is not in the catalogue: upload the "
+            "image first",
+        )
+    return load(context, request, context.store.path(request.image_id), upload.summary)
+
+
+def load(context: Context, request: ResolvedDeconvolve, path: Path, summary: Mapping[str, Any]) -> Image:
+    """Read an image file; ``summary`` is the summary of its header, from which the saturation level follows."""
+    context.report("reading", 0, request.method.steps)
+    level = request.saturation_dn or _known_saturation_dn(summary)
+    return read_image(path, context.limits, saturation_dn=level)
+
+
+def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
+    """The saturation level of the instrument's gain mode in the header; None if either is unknown."""
+    if summary["instrument"] is None or summary["gain_mode"] is None:
+        return None
+    return saturation_for(load_instrument(summary["instrument"]), Header({"GAINCOMB": summary["gain_mode"]}))
+
+
+@lru_cache(maxsize=1)
+def _prepared(max_bytes: int) -> PreparedPsfs:
+    """The prepared PSFs of this process. Its jobs run one after the other and often use the same PSF."""
+    return PreparedPsfs(max_bytes)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """One deconvolution: its inputs, and how to run it, once for the image or many times for its errors."""
+
+    inputs: Inputs
+
+    @property
+    def context(self) -> Context:
+        return self.inputs.context
+
+    @property
+    def request(self) -> ResolvedDeconvolve:
+        return self.inputs.request
+
+    @cached_property
+    def psf(self) -> Psf:
+        """The PSF on the image's pixels."""
+        path = self.context.store.path(self.inputs.psf_row.file_sha256)
+        return self.prepared.on_pixels_of(self.inputs.image.header, path, self.context.limits)
+
+    @property
+    def prepared(self) -> PreparedPsfs:
+        """The PSFs that this process has prepared."""
+        return _prepared(self.context.settings.psf_cache_mib * 2**20)
+
+    @cached_property
+    def noise(self) -> Noise | None:
+        """The noise figures of the request; without them, those of the instrument that took the image."""
+        if self.request.noise is not None:
+            return Noise(**self.request.noise.model_dump())
+        recipe = self.request.psf_recipe
+        instrument = self.request.picked_for if recipe is None else recipe.instrument
+        return None if instrument is None else noise_for(load_instrument(instrument), self.inputs.image.header)
+
+    @cached_property
+    def possible_psfs(self) -> list[Psf]:
+        """PSFs that are possible within the PSF's errors, on the image's pixels; empty if its file holds no errors."""
+        psf = read_psf(self.context.store.path(self.inputs.psf_row.file_sha256), self.context.limits)
+        if psf.fitted is None:
+            return []
+        possible = possible_psfs(psf, threads=self.context.settings.threads)
+        return [psf_for_image(one, self.inputs.image.header) for one in possible]
+
+    def run(self, image: Image, stage: str | None = None, psf: Psf | None = None) -> Deconvolved:
+        """Run the method on an image of this shape. Progress is reported under ``stage``; None: no progress."""
+        method = self.request.method
+        conditions = Conditions(
+            edges=method.edges,
+            margin_px=method.margin_px,
+            noise=self.noise,
+            threads=self.context.settings.threads,
+            progress=None if stage is None else self.progress(stage),
+            engine_for=self.prepared.engine_for,
+        )
+        return method_named(method.name)(
+            image, psf or self.psf, conditions, **method.model_dump(exclude=_CONDITIONS)
+        )
+
+    def progress(self, stage: str) -> Callable[[int, int], None]:
+        """A progress function for code that counts its own steps."""
+        return lambda step, steps: self.context.report(stage, step, steps)
+
+    def errors(self, result: Deconvolved) -> ErrorPlanes | None:
+        """The error planes, or None if the request does not ask for them. Raises DataError "no-noise-figures"."""
+        if not self.request.error_draws:
+            return None
+        if self.noise is None:
+            raise DataError(
+                "no-noise-figures",
+                "expected noise (photon_gain_dn and read_noise_dn) to simulate noise realisations; got none, and the "
+                "instrument's figures are unknown: give them in the request, or set error_draws to 0",
+            )
+        self.context.times.begin("drawing errors")
+        planes = error_planes(
+            self.inputs.image,
+            self.psf,
+            lambda image: self.run(image).pixels,
+            self.noise,
+            estimate=result.pixels,
+            draws=self.request.error_draws,
+            edge_px=result.edge_band_px,
+            threads=self.context.settings.threads,
+            progress=self.progress("drawing errors"),
+        )
+        if not self.possible_psfs:
+            return planes
+        self.context.times.begin("errors of the PSF")
+        from_psf = psf_error_plane(
+            self.possible_psfs,
+            lambda psf: self.run(self.inputs.image, psf=psf).pixels,
+            chance=False,
+            progress=self.progress("errors of the PSF"),
+        )
+        return with_psf_error(planes, from_psf)
+
+
+def make(
+    context: Context, request: ResolvedDeconvolve, psf_row: PsfRow, image: Image, *, preview: bool = True
+) -> Made:
+    """Deconvolve an image and measure what changed in it. ``preview``: also draw the preview picture."""
+    inputs = Inputs(context, request, psf_row, image)
+    work = _Work(inputs)
+    context.times.begin("deconvolving")
+    result = work.run(image, "deconvolving")
+    errors = work.errors(result)
+    context.report("saving", 0, 1)
+    edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
+    draw = partial(save_preview, inputs, result)
+    with ThreadPoolExecutor(1) as beside:
+        # A worker with one thread draws in its own thread: a second thread would slow down the worker beside it.
+        picture = beside.submit(draw).result if preview and context.settings.threads > 1 else draw
+        found = effects(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
+        quality = quality_plane(
+            image,
+            result.pixels,
+            edge_px=edge_px,
+            suspected=found.artefacts.suspected,
+            error=None if errors is None else errors.error,
+        )
+        details = details_of(inputs, result, errors, found)
+        preview_sha256 = picture() if preview else None
+    return Made(inputs, result, errors, found, quality, details, preview_sha256)
