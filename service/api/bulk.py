@@ -63,7 +63,7 @@ class BulkView(BaseModel):
     @classmethod
     def of(cls, row: BulkRow, state: Shared) -> BulkView:
         """The view of a row."""
-        pace = state.catalogue.bulks.pace(row)
+        pace = state.catalogue.bulks.progress.pace(row)
         here = f"/v1/bulk/{row.id}"
         left = row.total - row.done - row.failed
         rate = None if row.phase in (BulkPhase.PAUSED, BulkPhase.ERROR) else pace.images_an_hour
@@ -83,7 +83,7 @@ class BulkView(BaseModel):
                 done=row.done,
                 reused=row.reused,
                 failed=row.failed,
-                to_look_at=state.catalogue.bulks.to_look_at(row.id, LOOK_FROM),
+                to_look_at=state.catalogue.bulks.progress.to_look_at(row.id, LOOK_FROM),
             ),
             images_an_hour=rate,
             time_left_s=left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
@@ -201,7 +201,7 @@ def list_failures(
     """What failed, in the bulk's order."""
     row = find(state, caller, bulk_id)
     after = _after(cursor)
-    items = state.catalogue.bulks.items(row.id, ItemState.FAILED, after=after, limit=limit + 1)
+    items = state.catalogue.bulks.progress.items(row.id, ItemState.FAILED, after=after, limit=limit + 1)
     next_page = following(request, str(items[limit - 1].position)) if len(items) > limit else None
     return Page(items=[Failed.of(item) for item in items[:limit]], next=next_page)
 

@@ -17,7 +17,7 @@ from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from workers.catalogue.bulk_tables import BulkItemRow
-from workers.catalogue.bulks import Bulks
+from workers.catalogue.bulk_progress import BulkProgress
 from workers.contract.bulk import ItemState
 
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)
@@ -108,21 +108,21 @@ def get_results(
 ) -> Response:
     """All images that are done so far, as they come out of the database: there may be very many."""
     row = find(state, caller, bulk_id)
-    rows = _in_order(state.catalogue.bulks, row.id, order, limit)
+    rows = _in_order(state.catalogue.bulks.progress, row.id, order, limit)
     headers = {"Content-Disposition": f'attachment; filename="bulk-{bulk_id[:12]}.{format}"'}
     lines, media_type = (_table(rows), CSV) if format == "csv" else (_json_lines(rows), NDJSON)
     return StreamingResponse(lines, media_type=media_type, headers=headers)
 
 
-def _in_order(bulks: Bulks, bulk_id: str, order: str, limit: int | None) -> Iterator[list[Result]]:
+def _in_order(progress: BulkProgress, bulk_id: str, order: str, limit: int | None) -> Iterator[list[Result]]:
     """Results, a batch at a time; each batch is a look into the database of its own."""
     left = limit
     after, behind = -1, None
     while left is None or left > 0:
         if order == "worst":
-            batch = bulks.worst(bulk_id, after=behind)
+            batch = progress.worst(bulk_id, after=behind)
         else:
-            batch = bulks.items(bulk_id, ItemState.DONE, after=after)
+            batch = progress.items(bulk_id, ItemState.DONE, after=after)
         if not batch:
             return
         after = batch[-1].position

@@ -87,15 +87,15 @@ class Contexts:
         return found
 
     def pins(self, context_id: str, owner: str) -> Sequence[PsfPinRow]:
-        """What a context pins, by line and time."""
+        """What a context pins, by series and time."""
         query = select(PsfPinRow).where(PsfPinRow.owner == owner, PsfPinRow.context_id == context_id)
         with self._database.reading() as session:
-            return session.scalars(query.order_by(PsfPinRow.line, PsfPinRow.valid_from)).all()
+            return session.scalars(query.order_by(PsfPinRow.series, PsfPinRow.valid_from)).all()
 
-    def any_pinned(self, context_id: str, line: str, owner: str) -> bool:
-        """Whether a context pins a PSF of the line."""
+    def any_pinned(self, context_id: str, series: str, owner: str) -> bool:
+        """Whether a context pins a PSF of the series."""
         query = select(PsfPinRow.psf_id).where(
-            PsfPinRow.owner == owner, PsfPinRow.context_id == context_id, PsfPinRow.line == line
+            PsfPinRow.owner == owner, PsfPinRow.context_id == context_id, PsfPinRow.series == series
         )
         with self._database.reading() as session:
             return session.scalars(query.limit(1)).first() is not None
@@ -132,7 +132,7 @@ class Contexts:
 
 def _certified(session: Session, owner: str) -> list[PsfPinRow]:
     query = select(PsfRow).where(PsfRow.owner == owner, PsfRow.status == PsfStatus.CERTIFIED)
-    rows = session.scalars(query.order_by(PsfRow.line, PsfRow.valid_from)).all()
+    rows = session.scalars(query.order_by(PsfRow.series, PsfRow.valid_from)).all()
     if not rows:
         raise DataError("nothing-to-pin", "expected certified PSFs to pin; there is none yet")
     return [_pin(row, None) for row in rows]
@@ -147,13 +147,13 @@ def _given(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]
         if row is None:
             raise DataError("no-such-psf", f"the catalogue holds no PSF with id {pin.psf_id}")
         rows.append(_pin(row, pin.validity))
-    rows.sort(key=lambda pinned: (pinned.line, pinned.valid_from))
+    rows.sort(key=lambda pinned: (pinned.series, pinned.valid_from))
     _check_apart(rows)
     return rows
 
 
 def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
-    if row.line is None:
+    if row.series is None:
         raise DataError("no-line", f"expected PSFs of a known instrument; PSF {row.id} names none")
     own = Validity(
         -math.inf if row.valid_from is None else row.valid_from,
@@ -162,7 +162,7 @@ def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
     pinned = validity or own
     return PsfPinRow(
         owner=row.owner,
-        line=row.line,
+        series=row.series,
         valid_from=pinned.start,
         valid_to=pinned.end,
         psf_id=row.id,
@@ -173,10 +173,10 @@ def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
 def _check_apart(rows: Sequence[PsfPinRow]) -> None:
     for one, other in pairwise(rows):
         first, second = Validity(one.valid_from, one.valid_to), Validity(other.valid_from, other.valid_to)
-        if one.line == other.line and first.overlaps(second):
+        if one.series == other.series and first.overlaps(second):
             raise DataError(
                 "ranges-overlap",
-                f"expected one PSF of {one.line} at any time; got PSF {one.psf_id} for {first} and PSF "
+                f"expected one PSF of {one.series} at any time; got PSF {one.psf_id} for {first} and PSF "
                 f"{other.psf_id} for {second}",
             )
 
@@ -187,7 +187,7 @@ def _context(name: str, owner: str, by: str, reason: str, rows: Iterable[PsfPinR
     identity = canonical_hash(
         {
             "name": name,
-            "pins": [[pin.line, iso(pin.valid_from), iso(pin.valid_to), pin.psf_id] for pin in pins],
+            "pins": [[pin.series, iso(pin.valid_from), iso(pin.valid_to), pin.psf_id] for pin in pins],
         }
     )
     for pin in pins:

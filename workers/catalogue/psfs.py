@@ -1,7 +1,7 @@
 """PSFs in the catalogue: found by what they are and what they are valid for, certified and deprecated.
 
-A change of status holds the lock on its line's row (PostgreSQL) or the database's one write lock (SQLite), from before
-it looks at the line's other PSFs until it is written: of two that cannot both be, the second sees the first.
+A change of status holds the lock on its series's row (PostgreSQL) or the database's one write lock (SQLite), from before
+it looks at the series's other PSFs until it is written: of two that cannot both be, the second sees the first.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.database import Database
-from workers.catalogue.tables import PsfChangeRow, PsfLineRow, PsfPinRow, PsfRow
-from workers.versions.series import UPLOADED, line_of
+from workers.catalogue.tables import PsfChangeRow, PsfSeriesRow, PsfPinRow, PsfRow
+from workers.versions.series import UPLOADED, series_of
 from workers.versions.status import PsfStatus, check_transition, check_version
 from workers.versions.validity import Validity
 
@@ -32,7 +32,7 @@ class StatusAsked:
     version: str | None = None
     validity: Validity | None = None
     successor_id: str | None = None
-    supersedes: tuple[str, ...] = ()  # certified PSFs of the line, deprecated in the same step
+    supersedes: tuple[str, ...] = ()  # certified PSFs of the series, deprecated in the same step
     # Of a draft of which nobody has said it yet.
     instrument: str | None = None
     channel: str | None = None
@@ -53,10 +53,10 @@ class PsfFilter:
     valid_at: float | None = None
 
     @property
-    def line(self) -> str | None:
-        """The line, where all that makes one is given."""
+    def series(self) -> str | None:
+        """The series, where all that makes one is given."""
         whole = self.instrument and self.channel and self.kind
-        return line_of(self.instrument, self.channel, self.kind or "") if whole else None
+        return series_of(self.instrument, self.channel, self.kind or "") if whole else None
 
 
 class Psfs:
@@ -101,9 +101,9 @@ class Psfs:
                     return name.removesuffix("_id")
         return None
 
-    def any_certified(self, line: str, owner: str) -> bool:
-        """Whether a PSF of the line is certified."""
-        certified = and_(PsfRow.owner == owner, PsfRow.line == line, PsfRow.status == PsfStatus.CERTIFIED)
+    def any_certified(self, series: str, owner: str) -> bool:
+        """Whether a PSF of the series is certified."""
+        certified = and_(PsfRow.owner == owner, PsfRow.series == series, PsfRow.status == PsfStatus.CERTIFIED)
         with self._database.reading() as session:
             return bool(session.scalar(select(exists().where(certified))))
 
@@ -115,10 +115,10 @@ class Psfs:
         with self._database.reading() as session:
             return session.scalars(query.order_by(PsfChangeRow.number)).all()
 
-    def released(self, line: str, owner: str) -> Sequence[str]:
-        """The versions that PSFs of a line were certified under."""
+    def released(self, series: str, owner: str) -> Sequence[str]:
+        """The versions that PSFs of a series were certified under."""
         with self._database.reading() as session:
-            return session.scalars(_released(line, owner)).all()
+            return session.scalars(_released(series, owner)).all()
 
     def change(self, psf_id: str, owner: str, asked: StatusAsked, by: str) -> PsfRow:
         """Certify a PSF, change the range of a certified one, deprecate it, or name a deprecated one's successor.
@@ -129,24 +129,24 @@ class Psfs:
         """
         with self._database.writing.begin() as session:
             row = _found(session, psf_id, owner)
-            line = _line(row, asked)
-            self._lock(session, line, owner)
+            series = _series(row, asked)
+            self._lock(session, series, owner)
             session.refresh(row, with_for_update=True)
-            if _line(row, asked) != line:
-                raise DataError("changed-meanwhile", f"PSF {psf_id} was just put in another line; ask again")
+            if _series(row, asked) != series:
+                raise DataError("changed-meanwhile", f"PSF {psf_id} was just put in another series; ask again")
             before = PsfStatus(row.status)
             check_transition(before, asked.status)
             if asked.status == PsfStatus.CERTIFIED:
-                _certify(session, row, line, asked, by)
+                _certify(session, row, series, asked, by)
             else:
                 _deprecate(session, row, asked, by)
             return row
 
-    def _lock(self, session: Session, line: str, owner: str) -> None:
-        """Hold the line until the transaction ends; SQLite's is held by now."""
+    def _lock(self, session: Session, series: str, owner: str) -> None:
+        """Hold the series until the transaction ends; SQLite's is held by now."""
         insert = sqlite.insert if self._database.sqlite else postgresql.insert
-        session.execute(insert(PsfLineRow).values(owner=owner, line=line).on_conflict_do_nothing())
-        session.get(PsfLineRow, (owner, line), with_for_update=True)
+        session.execute(insert(PsfSeriesRow).values(owner=owner, series=series).on_conflict_do_nothing())
+        session.get(PsfSeriesRow, (owner, series), with_for_update=True)
 
 
 _NEWEST_FIRST = (PsfRow.created_at.desc(), PsfRow.id.desc())
@@ -164,8 +164,8 @@ def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
     elif wanted.valid_at is not None:
         query = query.join(latest := _latest_from(wanted, owner).subquery(), PsfRow.id == latest.c.psf_id)
         query = query.where(PsfRow.valid_to > wanted.valid_at)
-    # A line's name stands for all that makes it: indexes begin with it.
-    whole = ("line",) if wanted.line is not None else ("instrument", "channel", "kind")
+    # A series's name stands for all that makes it: indexes begin with it.
+    whole = ("series",) if wanted.series is not None else ("instrument", "channel", "kind")
     for name in (*whole, "name", "version", "status"):
         value = getattr(wanted, name)
         if value is not None:
@@ -178,40 +178,40 @@ def _pinned(wanted: PsfFilter, owner: str) -> Select[Any]:
     query = select(PsfPinRow.psf_id).where(
         PsfPinRow.owner == owner, PsfPinRow.context_id == wanted.context_id
     )
-    if wanted.line is not None:
-        query = query.where(PsfPinRow.line == wanted.line)
+    if wanted.series is not None:
+        query = query.where(PsfPinRow.series == wanted.series)
     if wanted.valid_at is not None:
         query = query.where(PsfPinRow.valid_from <= wanted.valid_at, PsfPinRow.valid_to > wanted.valid_at)
     return query.distinct()  # one may be pinned for several ranges
 
 
 def _latest_from(wanted: PsfFilter, owner: str) -> Select[Any]:
-    """Of each line the id of the certified PSF whose range began last; ranges do not overlap: no other can hold the time."""
+    """Of each series the id of the certified PSF whose range began last; ranges do not overlap: no other can hold the time."""
     latest = (
         select(PsfRow.id)
         .where(
-            PsfRow.owner == PsfLineRow.owner,
-            PsfRow.line == PsfLineRow.line,
+            PsfRow.owner == PsfSeriesRow.owner,
+            PsfRow.series == PsfSeriesRow.series,
             PsfRow.status == PsfStatus.CERTIFIED,
             PsfRow.valid_from <= wanted.valid_at,
         )
         .order_by(PsfRow.valid_from.desc())
         .limit(1)
-        .correlate(PsfLineRow)
+        .correlate(PsfSeriesRow)
         .scalar_subquery()
     )
     query = select(latest.label("psf_id")).distinct()
-    query = query.select_from(PsfLineRow).where(PsfLineRow.owner == owner)
-    if wanted.line is not None:
-        query = query.where(PsfLineRow.line == wanted.line)
+    query = query.select_from(PsfSeriesRow).where(PsfSeriesRow.owner == owner)
+    if wanted.series is not None:
+        query = query.where(PsfSeriesRow.series == wanted.series)
     elif wanted.instrument is not None:
-        query = query.where(PsfLineRow.line.startswith(f"{wanted.instrument}/", autoescape=True))
+        query = query.where(PsfSeriesRow.series.startswith(f"{wanted.instrument}/", autoescape=True))
     return query
 
 
-def _released(line: str, owner: str) -> Select[Any]:
+def _released(series: str, owner: str) -> Select[Any]:
     released = PsfRow.status.in_((PsfStatus.CERTIFIED, PsfStatus.DEPRECATED))
-    return select(PsfRow.version).where(PsfRow.owner == owner, PsfRow.line == line, released)
+    return select(PsfRow.version).where(PsfRow.owner == owner, PsfRow.series == series, released)
 
 
 def _found(session: Session, psf_id: str, owner: str) -> PsfRow:
@@ -221,19 +221,19 @@ def _found(session: Session, psf_id: str, owner: str) -> PsfRow:
     return row
 
 
-def _line(row: PsfRow, asked: StatusAsked) -> str:
-    """The line of a PSF, with what is now said of it. Raises ``DataError`` "line-known" or "no-line"."""
-    instrument, channel, kind = _said_of_line(row, asked)
-    line = line_of(instrument, channel, kind)
-    if line is None:
+def _series(row: PsfRow, asked: StatusAsked) -> str:
+    """The series of a PSF, with what is now said of it. Raises ``DataError`` "line-known" or "no-line"."""
+    instrument, channel, kind = _said_of_series(row, asked)
+    series = series_of(instrument, channel, kind)
+    if series is None:
         raise DataError(
             "no-line",
             f"expected an instrument, which the file of PSF {row.id} does not name: say instrument, channel and kind",
         )
-    return line
+    return series
 
 
-def _said_of_line(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | None, str]:
+def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | None, str]:
     open_to = row.status == PsfStatus.DRAFT
     known = {
         "instrument": row.instrument,
@@ -251,11 +251,11 @@ def _said_of_line(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | No
     )
 
 
-def _certify(session: Session, row: PsfRow, line: str, asked: StatusAsked, by: str) -> None:
+def _certify(session: Session, row: PsfRow, series: str, asked: StatusAsked, by: str) -> None:
     _refuse(asked, "deprecation", successor_id=asked.successor_id)
     version = row.version
     if row.status == PsfStatus.DRAFT:
-        others = session.scalars(_released(line, row.owner)).all()
+        others = session.scalars(_released(series, row.owner)).all()
         version = check_version(asked.version, others)
     elif asked.version not in (None, row.version):
         raise DataError(
@@ -267,24 +267,24 @@ def _certify(session: Session, row: PsfRow, line: str, asked: StatusAsked, by: s
         if (
             superseded is None
             or superseded is row
-            or superseded.line != line
+            or superseded.series != series
             or superseded.status != PsfStatus.CERTIFIED
         ):
             raise DataError(
-                "not-to-supersede", f"supersedes: expected certified PSFs of {line}; got {superseded_id}"
+                "not-to-supersede", f"supersedes: expected certified PSFs of {series}; got {superseded_id}"
             )
         _write(session, superseded, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=row.id)
     session.flush()
-    other = _overlapping(session, row, line, validity)
+    other = _overlapping(session, row, series, validity)
     if other is not None:
         raise DataError(
             "ranges-overlap",
-            f"expected a range that no certified PSF of {line} has a part of; got {validity}, and PSF {other.id} "
+            f"expected a range that no certified PSF of {series} has a part of; got {validity}, and PSF {other.id} "
             f"({other.name} {other.version}) has {_validity(other)}: deprecate it, name it "
             "under supersedes, or certify it for another range first",
         )
-    row.instrument, row.channel, row.kind = _said_of_line(row, asked)
-    row.line = line
+    row.instrument, row.channel, row.kind = _said_of_series(row, asked)
+    row.series = series
     _write(
         session,
         row,
@@ -304,11 +304,11 @@ def _validity(row: PsfRow) -> Validity:
     return Validity(row.valid_from, row.valid_to)
 
 
-def _overlapping(session: Session, row: PsfRow, line: str, validity: Validity) -> PsfRow | None:
-    """The certified PSF of the line that shares a time with the range. Theirs do not overlap: the last to begin decides."""
+def _overlapping(session: Session, row: PsfRow, series: str, validity: Validity) -> PsfRow | None:
+    """The certified PSF of the series that shares a time with the range. Theirs do not overlap: the last to begin decides."""
     query = select(PsfRow).where(
         PsfRow.owner == row.owner,
-        PsfRow.line == line,
+        PsfRow.series == series,
         PsfRow.status == PsfStatus.CERTIFIED,
         PsfRow.id != row.id,
         PsfRow.valid_from < validity.end,
@@ -333,14 +333,14 @@ def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> No
         )
     if asked.successor_id is not None:
         successor = session.get(PsfRow, (row.owner, asked.successor_id))
-        if successor is None or successor.line != row.line or successor.status != PsfStatus.CERTIFIED:
+        if successor is None or successor.series != row.series or successor.status != PsfStatus.CERTIFIED:
             raise DataError(
                 "no-such-successor",
-                f"successor: expected a certified PSF of {row.line}; got {asked.successor_id}"
+                f"successor: expected a certified PSF of {row.series}; got {asked.successor_id}"
                 + (
                     ""
                     if successor is None
-                    else f", a {successor.status} one of {successor.line or 'no line'}"
+                    else f", a {successor.status} one of {successor.series or 'no series'}"
                 ),
             )
         if successor is row:
@@ -357,7 +357,7 @@ def _refuse(asked: StatusAsked, other: str, **given: object) -> None:
 
 
 def _write(session: Session, row: PsfRow, reason: str, by: str, **values: object) -> None:
-    """The change itself, and its line in the PSF's history."""
+    """The change itself, and its series in the PSF's history."""
     before, version_before = row.status, row.version
     for name, value in values.items():
         setattr(row, name, value)

@@ -65,7 +65,7 @@ class TransitRow(Uploaded, Base):
 class PsfRow(Base):
     """A PSF, uploaded, built or fitted. Its content is immutable: another content is another row.
 
-    ``version`` is what its file says, until the PSF is certified under a version of its line.
+    ``version`` is what its file says, until the PSF is certified under a version of its series.
     """
 
     __tablename__ = "psfs"
@@ -77,7 +77,7 @@ class PsfRow(Base):
     instrument: Mapped[str | None]
     channel: Mapped[str | None]  # the wavelength in whole angstrom, as 174
     kind: Mapped[str] = mapped_column(server_default="total")  # total, a component's name, uploaded
-    line: Mapped[str | None]  # of these three; none without an instrument
+    series: Mapped[str | None]  # of these three; none without an instrument
     status: Mapped[str]
     # Of a PSF that is or was certified: times of observation, open ends as infinities.
     valid_from: Mapped[float | None]
@@ -98,19 +98,19 @@ class PsfRow(Base):
                 "instrument",
                 "channel",
                 "kind",
-                "line",
-                "line status",
+                "series",
+                "series status",
                 "name",
                 "version",
                 "status",
             )
         ),
-        Index("psfs_by_validity", "owner", "line", "status", "valid_from"),
-        # Every version is given once in its line, and never again.
+        Index("psfs_by_validity", "owner", "series", "status", "valid_from"),
+        # Every version is given once in its series, and never again.
         Index(
             "one_psf_a_version",
             "owner",
-            "line",
+            "series",
             "version",
             unique=True,
             sqlite_where=_RELEASED,
@@ -120,12 +120,12 @@ class PsfRow(Base):
     )
 
 
-class PsfLineRow(Base):
-    """A line of PSFs that some PSF was certified in. Who changes what is certified in it holds this row's lock."""
+class PsfSeriesRow(Base):
+    """A series of PSFs that some PSF was certified in. Who changes what is certified in it holds this row's lock."""
 
-    __tablename__ = "psf_lines"
+    __tablename__ = "psf_series"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    line: Mapped[str] = mapped_column(String(128), primary_key=True)
+    series: Mapped[str] = mapped_column(String(128), primary_key=True)
 
 
 class PsfChangeRow(Base):
@@ -150,7 +150,7 @@ class PsfChangeRow(Base):
 
 
 class PsfContextRow(Base):
-    """A named set of PSFs, one a line and range of times. Immutable; its id is the hash of its name and its pins."""
+    """A named set of PSFs, one a series and range of times. Immutable; its id is the hash of its name and its pins."""
 
     __tablename__ = "psf_contexts"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -168,12 +168,12 @@ class PsfContextRow(Base):
 
 
 class PsfPinRow(Base):
-    """A PSF that a context pins for a line and a range of times of observation."""
+    """A PSF that a context pins for a series and a range of times of observation."""
 
     __tablename__ = "psf_pins"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     context_id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    line: Mapped[str] = mapped_column(String(128), primary_key=True)
+    series: Mapped[str] = mapped_column(String(128), primary_key=True)
     valid_from: Mapped[float] = mapped_column(primary_key=True)
     valid_to: Mapped[float]
     psf_id: Mapped[str] = mapped_column(String(64))

@@ -49,7 +49,7 @@ from workers.contract.contract import (
 )
 from workers.intake.psf_choice import picked_for_image
 from workers.lineage import made_by
-from workers.versions.series import UPLOADED, channel_of, instrument_of, line_of
+from workers.versions.series import UPLOADED, channel_of, instrument_of, series_of
 from workers.versions.status import PsfStatus
 
 
@@ -104,7 +104,7 @@ def uploaded_psf_row(
     channel: str | None = None,
     kind: str | None = None,
 ) -> PsfRow:
-    """The row of an uploaded PSF, a draft; its name, version and line come from the request, the header or the file."""
+    """The row of an uploaded PSF, a draft; its name, version and series come from the request, the header or the file."""
     header = dataclasses.asdict(summary)
     instrument = instrument or instrument_of(header)
     channel = channel or channel_of(instrument, summary.wavelnth)
@@ -118,7 +118,7 @@ def uploaded_psf_row(
         instrument=instrument,
         channel=channel,
         kind=kind,
-        line=line_of(instrument, channel, kind),
+        series=series_of(instrument, channel, kind),
         status=PsfStatus.DRAFT,
         origin="uploaded",
         file_sha256=sha256,

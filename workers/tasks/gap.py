@@ -1,7 +1,7 @@
 """The task ``gap-diagnose``: an uploaded transit in, a report on its gap out, and a corrected PSF if one is found.
 
-The gap is the part of the residual that the scatter fit does not explain. The corrected PSF is fitted with the effects
-that explain the gap in the model.
+The gap is the rms of the residuals over the images, with the expected noise removed in quadrature. The corrected PSF is
+that of a model which contains the effects that explain the gap.
 """
 
 from __future__ import annotations

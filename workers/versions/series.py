@@ -15,7 +15,7 @@ WORD = r"^[a-z0-9][a-z0-9_.-]{0,39}$"
 _NOT_OF_A_WORD = re.compile(r"[^a-z0-9_.]+")
 
 
-def line_of(instrument: str | None, channel: str | None, kind: str) -> str | None:
+def series_of(instrument: str | None, channel: str | None, kind: str) -> str | None:
     """What a PSF is one of: instrument, channel and kind; none where the instrument is not known."""
     return f"{instrument}/{channel or '-'}/{kind}" if instrument else None
 

@@ -5,8 +5,8 @@
                       +------+              +--------+
                   another range         a successor named
 
-A draft may be used by whoever names it. A certified PSF is what images of its line get where none is named: it has a
-version of its own, and a range of times of observation that no other certified PSF of its line shares. A deprecated one
+A draft may be used by whoever names it. A certified PSF is what images of its series get where none is named: it has a
+version of its own, and a range of times of observation that no other certified PSF of its series shares. A deprecated one
 stays for those who ask for it; its successor, once named, stays.
 """
 
@@ -52,7 +52,7 @@ def next_version(released: Iterable[str]) -> str:
 
 
 def check_version(version: str | None, released: Iterable[str]) -> str:
-    """The version, where it may be given to a PSF of a line whose others are ``released``.
+    """The version, where it may be given to a PSF of a series whose others are ``released``.
 
     Raises ``DataError`` "version-missing", "bad-version" or "version-taken", which say which could be given.
     """
@@ -66,7 +66,7 @@ def check_version(version: str | None, released: Iterable[str]) -> str:
         )
     if version in others:
         raise DataError(
-            "version-taken", f"expected a version that the line has not had, got {version}; {free}"
+            "version-taken", f"expected a version that the series has not had, got {version}; {free}"
         )
     return version
 

@@ -69,7 +69,7 @@ def _choice(search: Callable[[], Found]) -> Choice:
                 "name": psf.name,
                 "version": psf.version,
                 "status": psf.status,
-                "line": psf.line,
+                "series": psf.series,
                 "valid_from": None if psf.valid_from is None else iso(psf.valid_from),
                 "valid_to": None if psf.valid_to is None else iso(psf.valid_to),
             }

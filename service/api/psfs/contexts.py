@@ -51,9 +51,9 @@ class ContextAsked(BaseModel):
 
 
 class PinView(BaseModel):
-    """The PSF of a line for a range of times of observation."""
+    """The PSF of a series for a range of times of observation."""
 
-    line: str = Field(description="instrument/channel/kind")
+    series: str = Field(description="instrument/channel/kind")
     valid_from: str | None = Field(description="null: from ever")
     valid_to: str | None = Field(description="null: open")
     psf_id: str
@@ -63,7 +63,7 @@ class PinView(BaseModel):
     def of(cls, row: PsfPinRow) -> PinView:
         """The view of a row."""
         return cls(
-            line=row.line,
+            series=row.series,
             valid_from=iso(row.valid_from),
             valid_to=iso(row.valid_to),
             psf_id=row.psf_id,
@@ -97,7 +97,7 @@ class ContextView(BaseModel):
 class WholeContext(ContextView):
     """A context with all that it pins."""
 
-    pins: list[PinView] = Field(description="by line and time")
+    pins: list[PinView] = Field(description="by series and time")
 
 
 class DefaultAsked(BaseModel):

@@ -36,12 +36,12 @@ class StatusChange(BaseModel):
     status: PsfStatus
     reason: str = Field("", max_length=400, pattern=TEXT, description="why, for those who ask later")
     version: str | None = Field(
-        None, max_length=40, description="of a draft: three numbers, as 1.2.0, that its line has not had"
+        None, max_length=40, description="of a draft: three numbers, as 1.2.0, that its series has not had"
     )
     valid_from: Time | None = Field(None, description="the first time of observation; null: from ever")
     valid_to: Time | None = Field(None, description="the time before which it ends; null: open")
     supersedes: list[Identity] = Field(
-        [], max_length=100, description="certified PSFs of the line that are deprecated in the same step"
+        [], max_length=100, description="certified PSFs of the series that are deprecated in the same step"
     )
     successor: Identity | None = Field(
         None, description="of a deprecated PSF: the certified one to use instead"
@@ -88,12 +88,12 @@ class StatusView(BaseModel):
     id: str
     status: PsfStatus
     version: str
-    line: str | None = Field(description="instrument/channel/kind; null where the instrument is not known")
+    series: str | None = Field(description="instrument/channel/kind; null where the instrument is not known")
     valid_from: str | None = Field(description="null: from ever, or never certified")
     valid_to: str | None = Field(description="null: open, or never certified")
     successor: str | None
     may_become: list[PsfStatus]
-    next_version: str | None = Field(description="one that its line has not had; null where it has no line")
+    next_version: str | None = Field(description="one that its series has not had; null where it has no series")
     history: list[Change] = Field(description="the first change first; kept for ever")
 
 
@@ -110,7 +110,7 @@ def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusVi
 def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, state: Shared) -> StatusView:
     """Certify a draft, change a certified PSF's range, deprecate it, or name a deprecated one's successor.
 
-    Ranges of certified PSFs of a line may not overlap: 409 names the one in the way.
+    Ranges of certified PSFs of a series may not overlap: 409 names the one in the way.
     """
     try:
         row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)
@@ -141,11 +141,11 @@ def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
         id=row.id,
         status=PsfStatus(row.status),
         version=row.version,
-        line=row.line,
+        series=row.series,
         valid_from=None if row.valid_from is None else iso(row.valid_from),
         valid_to=None if row.valid_to is None else iso(row.valid_to),
         successor=row.successor_id,
         may_become=sorted(MAY_BECOME[PsfStatus(row.status)]),
-        next_version=None if row.line is None else next_version(psfs.released(row.line, caller.owner)),
+        next_version=None if row.series is None else next_version(psfs.released(row.series, caller.owner)),
         history=[Change.of(change) for change in psfs.changes(row.id, caller.owner)],
     )

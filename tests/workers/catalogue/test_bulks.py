@@ -81,7 +81,7 @@ def test_images_are_taken_in_order_and_the_last_one_ends_the_bulk(catalogue: Cat
     bulk_id, lease = made(catalogue, 3), turn(catalogue)
     taken = list(all_taken(catalogue, bulk_id, lease))
     assert [one.position for one in taken] == [0, 1, 2]
-    assert catalogue.bulks.pace(row(catalogue, bulk_id)).taken == 3
+    assert catalogue.bulks.progress.pace(row(catalogue, bulk_id)).taken == 3
     assert done(catalogue, taken[0]) and done(catalogue, taken[1], reused=True)
     assert row(catalogue, bulk_id).phase == BulkPhase.RUNNING
     assert catalogue.bulks.fail(taken[2], BAD)
@@ -135,7 +135,7 @@ def test_an_image_of_a_lost_worker_is_taken_by_another_and_its_result_counts(cat
     assert not done(catalogue, first, score=9.0), "the lost one comes back too late"
     assert catalogue.bulks.take(bulk_id, lost, 3) is None, "and gets nothing more"
     assert done(catalogue, second)
-    (item,) = catalogue.bulks.items(bulk_id, ItemState.DONE)
+    (item,) = catalogue.bulks.progress.items(bulk_id, ItemState.DONE)
     assert (item.attempts, item.score) == (2, 0.5)
 
 
@@ -147,7 +147,7 @@ def test_an_image_that_costs_workers_is_put_apart(catalogue: Catalogue) -> None:
         catalogue.jobs.give_up_silent(-1.0, 99)
     taken = catalogue.bulks.take(bulk_id, turn(catalogue), 3)
     assert taken is not None and taken.position == 1, "the others go on"
-    (item,) = catalogue.bulks.items(bulk_id, ItemState.FAILED)
+    (item,) = catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)
     assert item.error is not None and item.error["code"] == "worker-lost" and item.attempts == 3
     assert done(catalogue, taken)
     assert row(catalogue, bulk_id).phase == BulkPhase.COMPLETED
@@ -302,7 +302,7 @@ def test_files_whose_paths_cannot_be_kept_are_images_that_failed(
     (taken,) = all_taken(catalogue, bulk_id, lease)
     assert taken.source == str(root / "a.fits")
     failed = {
-        item.error["code"]: item for item in catalogue.bulks.items(bulk_id, ItemState.FAILED) if item.error
+        item.error["code"]: item for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED) if item.error
     }
     assert set(failed) == {"unreadable-file", "path-too-long", "path-not-utf-8"}
     assert row(catalogue, bulk_id).failed == 4
@@ -311,7 +311,7 @@ def test_files_whose_paths_cannot_be_kept_are_images_that_failed(
     message = failed["path-too-long"].error["message"]  # type: ignore[index]
     assert message.startswith(f"expected a path of at most 1024 characters; got {len(str(long))}")
     assert message.endswith("5/long.fits")
-    sources = [item.source for item in catalogue.bulks.items(bulk_id, ItemState.FAILED)]
+    sources = [item.source for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)]
     assert f"{root}/\\xff\\xfe/Sonne\\xf6.fits" in sources
     assert max(map(len, sources)) == bulk_task.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
     check_counts(catalogue, bulk_id)
@@ -334,20 +334,20 @@ def test_the_most_doubtful_come_first_over_pages(catalogue: Catalogue) -> None:
     for taken, score in zip(all_taken(catalogue, bulk_id, lease), scores, strict=False):
         done(catalogue, taken, score=score)
     found: list[BulkItemRow] = []
-    while page := catalogue.bulks.worst(
+    while page := catalogue.bulks.progress.worst(
         bulk_id, after=(found[-1].score or 0.0, found[-1].position) if found else None, limit=2
     ):
         found += page
     assert [item.score for item in found] == sorted(scores, reverse=True)
     assert len({item.position for item in found}) == 6
-    assert catalogue.bulks.to_look_at(bulk_id, 1.0) == 3
+    assert catalogue.bulks.progress.to_look_at(bulk_id, 1.0) == 3
 
 
 def test_uploads_that_are_not_there_are_named(catalogue: Catalogue) -> None:
     catalogue.add(ImageRow(owner="o", id="a" * 64, created_at=1.0, bytes=1, summary={}))
-    assert catalogue.bulks.first_not_uploaded(["a" * 64], "o") is None
-    assert catalogue.bulks.first_not_uploaded(["a" * 64, "b" * 64], "o") == "b" * 64
-    assert catalogue.bulks.first_not_uploaded(["a" * 64], "other") == "a" * 64
+    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64], "o") is None
+    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64, "b" * 64], "o") == "b" * 64
+    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64], "other") == "a" * 64
 
 
 def test_fifty_thousand_images(catalogue: Catalogue) -> None:
@@ -360,7 +360,7 @@ def test_fifty_thousand_images(catalogue: Catalogue) -> None:
             taken = catalogue.bulks.take(bulk_id, lease, 3)
             assert taken is not None and done(catalogue, taken)
             bulk = row(catalogue, bulk_id)
-            catalogue.bulks.pace(bulk), catalogue.bulks.to_look_at(bulk_id, 1.0)
+            catalogue.bulks.progress.pace(bulk), catalogue.bulks.progress.to_look_at(bulk_id, 1.0)
             times.append(time.perf_counter() - start)
         return sorted(times)[len(times) // 2]
 
@@ -394,18 +394,18 @@ def test_the_pace_is_that_of_the_last_images(catalogue: Catalogue, gone_s: float
             connection.execute(one.values(ended_at=now - 10 * (11 - position)))
         began = update(BulkRow).where(BulkRow.id == bulk_id)
         connection.execute(began.values(running_since=now - 120, ended_at=now if gone_s else None))
-    assert catalogue.bulks.pace(row(catalogue, bulk_id)).images_an_hour == pytest.approx(360.0, rel=0.05)
+    assert catalogue.bulks.progress.pace(row(catalogue, bulk_id)).images_an_hour == pytest.approx(360.0, rel=0.05)
 
 
 def test_images_of_open_bulks_are_counted_together(catalogue: Catalogue) -> None:
-    assert catalogue.bulks.open_images() == {"left": 0, "done": 0, "failed": 0}
+    assert catalogue.bulks.progress.open_images() == {"left": 0, "done": 0, "failed": 0}
     first, lease = made(catalogue, 3, key="a"), turn(catalogue)
     made(catalogue, 2, key="b")
     one, other, _ = all_taken(catalogue, first, lease)
     done(catalogue, one), catalogue.bulks.fail(other, BAD)
-    assert catalogue.bulks.open_images() == {"left": 3, "done": 1, "failed": 1}
+    assert catalogue.bulks.progress.open_images() == {"left": 3, "done": 1, "failed": 1}
     catalogue.bulks.cancel(first)
-    assert catalogue.bulks.open_images() == {"left": 2, "done": 0, "failed": 0}
+    assert catalogue.bulks.progress.open_images() == {"left": 2, "done": 0, "failed": 0}
 
 
 def test_whatever_is_asked_of_a_bulk_is_found_by_index(catalogue: Catalogue) -> None:
@@ -420,12 +420,12 @@ def test_whatever_is_asked_of_a_bulk_is_found_by_index(catalogue: Catalogue) -> 
         assert (
             third is not None and done(catalogue, first) and bulks.fail(second, BAD) and bulks.release(third)
         )
-        bulks.pace(bulk), bulks.to_look_at(bulk_id, 1.0), bulks.at_work(), bulks.open_images()
+        bulks.progress.pace(bulk), bulks.progress.to_look_at(bulk_id, 1.0), bulks.at_work(), bulks.progress.open_images()
         (
-            bulks.items(bulk_id, ItemState.DONE, after=3, limit=51),
-            bulks.worst(bulk_id, after=(1.0, 3), limit=51),
+            bulks.progress.items(bulk_id, ItemState.DONE, after=3, limit=51),
+            bulks.progress.worst(bulk_id, after=(1.0, 3), limit=51),
         )
-        bulks.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
+        bulks.progress.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
         catalogue.page(BulkRow, owner="o", limit=51, after=(1.0, "a"))
     asked = [one for one in sent if one[0].lstrip().startswith(("SELECT", "UPDATE"))]
     assert len(asked) >= 18
