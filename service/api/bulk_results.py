@@ -16,8 +16,8 @@ from service.api.bulk import BulkId, find
 from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.bulk_progress import BulkProgress
+from workers.catalogue.bulk_tables import BulkItemRow
 from workers.contract.bulk import ItemState
 
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)

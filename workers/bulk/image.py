@@ -83,8 +83,8 @@ def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Ta
 def _waited(context: Context, request: BulkWork, identity: str) -> bool:
     """Wait while another job makes this product; whether there was one.
 
-        A run whose products the service does not keep never waits: no job makes the same file.
-        """
+    A run whose products the service does not keep never waits: no job makes the same file.
+    """
     waited = False
     if not request.keeps_products:
         return False
@@ -104,7 +104,10 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
     if taken.uploaded:
         row = context.catalogue.get(ImageRow, taken.source, context.owner)
         if row is None:
-            raise DataError("no-such-image", f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue")
+            raise DataError(
+                "no-such-image",
+                f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue",
+            )
         yield _Source(None, row.id, row.summary, row.filename or "image")
         return
     allowed = archive_files.roots(context.settings.bulk_roots)
@@ -114,7 +117,9 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
             sha256 = archive_files.copy_hashed(path, copy, context.settings.max_upload_bytes)
         except OSError as error:
             reason = archive_files.reason_of(error)
-            raise DataError("unreadable-file", f"expected a readable file; the system says: {reason}") from error
+            raise DataError(
+                "unreadable-file", f"expected a readable file; the system says: {reason}"
+            ) from error
         summary = dataclasses.asdict(read_summary(copy, context.limits))
         yield _Source(copy, sha256, summary, path.name)
 

@@ -27,7 +27,9 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
     images = list(dict.fromkeys(request.images))
     missing = catalogue.bulks.progress.first_not_uploaded(images, owner)
     if missing is not None:
-        raise DataError("no-such-image", f"expected ids of uploaded images; got {missing}, which is not in the catalogue")
+        raise DataError(
+            "no-such-image", f"expected ids of uploaded images; got {missing}, which is not in the catalogue"
+        )
     _check_places(request, settings)
     asked = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
     now = time.time()
@@ -68,7 +70,9 @@ def _check_places(request: BulkRequest, settings: Settings) -> None:
         return
     folder = Path(request.output.folder)
     if not folder.is_absolute() or ".." in folder.parts:
-        raise DataError("bad-path", f"output: expected an absolute path without '..'; got {ascii(str(folder))[:200]}")
+        raise DataError(
+            "bad-path", f"output: expected an absolute path without '..'; got {ascii(str(folder))[:200]}"
+        )
     archive_files.check_under(folder, archive_files.roots(settings.bulk_output_roots), "an output folder")
 
 

@@ -107,7 +107,10 @@ def _listed_one(context: Context, found: archive_files.Found, where: dict[str, C
 def _path_error(path: Path, source: str) -> JobError | None:
     """The error if the catalogue cannot store this path, so that the file could not be found later; None if it can."""
     if source != str(path):
-        code, message = NOT_UTF_8, f"expected a path in UTF-8; got one that ends in {source[-100:]}: rename the file"
+        code, message = (
+            NOT_UTF_8,
+            f"expected a path in UTF-8; got one that ends in {source[-100:]}: rename the file",
+        )
     elif len(source) > MOST_LETTERS:
         code = TOO_LONG
         message = f"expected a path of at most {MOST_LETTERS} characters; got {len(source)}, ending in {source[-100:]}"
@@ -120,5 +123,7 @@ def _unreadable_file(error: OSError) -> JobError:
     """The error for a file that cannot be read, without its path."""
     reason = archive_files.reason_of(error)
     return JobError(
-        fault=Fault.USER, code="unreadable-file", message=f"expected a readable file; the system says: {reason}"
+        fault=Fault.USER,
+        code="unreadable-file",
+        message=f"expected a readable file; the system says: {reason}",
     )

@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.database import Database
-from workers.catalogue.tables import PsfChangeRow, PsfSeriesRow, PsfPinRow, PsfRow
+from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesRow
 from workers.versions.series import UPLOADED, series_of
 from workers.versions.status import PsfStatus, check_transition, check_version
 from workers.versions.validity import Validity
@@ -133,7 +133,9 @@ class Psfs:
             self._lock(session, series, owner)
             session.refresh(row, with_for_update=True)
             if _series(row, asked) != series:
-                raise DataError("changed-meanwhile", f"PSF {psf_id} was just put in another series; ask again")
+                raise DataError(
+                    "changed-meanwhile", f"PSF {psf_id} was just put in another series; ask again"
+                )
             before = PsfStatus(row.status)
             check_transition(before, asked.status)
             if asked.status == PsfStatus.CERTIFIED:

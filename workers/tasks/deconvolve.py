@@ -120,7 +120,9 @@ class _Work:
             return Noise(**self.request.noise.model_dump())
         recipe = self.request.psf_recipe
         instrument = self.request.picked_for if recipe is None else recipe.instrument
-        return None if instrument is None else noise_for(load_instrument(instrument), self.inputs.image.header)
+        return (
+            None if instrument is None else noise_for(load_instrument(instrument), self.inputs.image.header)
+        )
 
     @cached_property
     def possible_psfs(self) -> list[Psf]:

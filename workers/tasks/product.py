@@ -148,7 +148,9 @@ def _title(inputs: Inputs) -> str:
     return f"{' '.join(map(str, parts))}   PSF {inputs.psf_row.name} {inputs.psf_row.version}"
 
 
-def details_of(inputs: Inputs, result: Deconvolved, errors: ErrorPlanes | None, found: Effects) -> dict[str, Any]:
+def details_of(
+    inputs: Inputs, result: Deconvolved, errors: ErrorPlanes | None, found: Effects
+) -> dict[str, Any]:
     """The details of the product's row: how it was made, and what changed in the image.
 
     Bright pixels are those at or above the 99th percentile of the input; dark pixels are those at or below the first.

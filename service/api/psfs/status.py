@@ -93,7 +93,9 @@ class StatusView(BaseModel):
     valid_to: str | None = Field(description="null: open, or never certified")
     successor: str | None
     may_become: list[PsfStatus]
-    next_version: str | None = Field(description="one that its series has not had; null where it has no series")
+    next_version: str | None = Field(
+        description="one that its series has not had; null where it has no series"
+    )
     history: list[Change] = Field(description="the first change first; kept for ever")
 
 

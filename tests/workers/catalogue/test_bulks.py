@@ -302,7 +302,9 @@ def test_files_whose_paths_cannot_be_kept_are_images_that_failed(
     (taken,) = all_taken(catalogue, bulk_id, lease)
     assert taken.source == str(root / "a.fits")
     failed = {
-        item.error["code"]: item for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED) if item.error
+        item.error["code"]: item
+        for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)
+        if item.error
     }
     assert set(failed) == {"unreadable-file", "path-too-long", "path-not-utf-8"}
     assert row(catalogue, bulk_id).failed == 4
@@ -394,7 +396,9 @@ def test_the_pace_is_that_of_the_last_images(catalogue: Catalogue, gone_s: float
             connection.execute(one.values(ended_at=now - 10 * (11 - position)))
         began = update(BulkRow).where(BulkRow.id == bulk_id)
         connection.execute(began.values(running_since=now - 120, ended_at=now if gone_s else None))
-    assert catalogue.bulks.progress.pace(row(catalogue, bulk_id)).images_an_hour == pytest.approx(360.0, rel=0.05)
+    assert catalogue.bulks.progress.pace(row(catalogue, bulk_id)).images_an_hour == pytest.approx(
+        360.0, rel=0.05
+    )
 
 
 def test_images_of_open_bulks_are_counted_together(catalogue: Catalogue) -> None:
@@ -420,7 +424,12 @@ def test_whatever_is_asked_of_a_bulk_is_found_by_index(catalogue: Catalogue) -> 
         assert (
             third is not None and done(catalogue, first) and bulks.fail(second, BAD) and bulks.release(third)
         )
-        bulks.progress.pace(bulk), bulks.progress.to_look_at(bulk_id, 1.0), bulks.at_work(), bulks.progress.open_images()
+        (
+            bulks.progress.pace(bulk),
+            bulks.progress.to_look_at(bulk_id, 1.0),
+            bulks.at_work(),
+            bulks.progress.open_images(),
+        )
         (
             bulks.progress.items(bulk_id, ItemState.DONE, after=3, limit=51),
             bulks.progress.worst(bulk_id, after=(1.0, 3), limit=51),

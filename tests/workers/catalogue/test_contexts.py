@@ -22,7 +22,7 @@ LINE = PsfFilter("hri_euv", "174", "total")
 
 @pytest.fixture
 def certified(catalogue: Catalogue) -> Catalogue:
-    """Two years of one line, certified, and a draft."""
+    """Two years of one series, certified, and a draft."""
     for name, year in (("a", 2020), ("b", 2021)):
         catalogue.add(psf(name))
         certify(catalogue, name, f"1.{year - 2020}.0", years(year, year + 1))
@@ -53,7 +53,7 @@ def header(**cards: Any) -> dict[str, Any]:
 def pinned(catalogue: Catalogue, name: str) -> list[tuple[str, str | None, str | None, str]]:
     context = catalogue.contexts.named(name, OWNER)
     return [
-        (pin.line, iso(pin.valid_from), iso(pin.valid_to), pin.version)
+        (pin.series, iso(pin.valid_from), iso(pin.valid_to), pin.version)
         for pin in catalogue.contexts.pins(context.id, OWNER)
     ]
 
@@ -266,5 +266,5 @@ def test_a_deconvolution_in_a_context_does_not_leave_it_unasked(certified: Catal
     refused("no-psf-fits", lambda: picked_for_image(certified, header(), OWNER, None))
     now = picked_for_image(certified, header(), OWNER, "now")
     assert now is not None and now.one().name == "a" and now.context is None
-    assert picked_for_image(certified, header(wavelnth=193.0), OWNER, None) is None, "in no line: as before"
+    assert picked_for_image(certified, header(wavelnth=193.0), OWNER, None) is None, "in no series: as before"
     refused("no-psf-fits", lambda: picked_for_image(certified, header(wavelnth=193.0), OWNER, "other"))

@@ -20,7 +20,7 @@ from workers.versions.validity import Validity, seconds
 
 @pytest.fixture
 def three(catalogue: Catalogue) -> Catalogue:
-    """Three drafts of one line."""
+    """Three drafts of one series."""
     for name in ("a", "b", "c"):
         catalogue.add(psf(name))
     return catalogue
@@ -160,7 +160,7 @@ def test_a_draft_without_a_line_is_told_its_line_when_it_is_certified(catalogue:
     refused("no-line", lambda: certify(catalogue, "mine", "1.0.0"))
     said = {"instrument": "aia_3", "channel": "193", "kind": "total"}
     row = certify(catalogue, "mine", "1.0.0", **said)
-    assert (row.line, row.instrument, row.channel, row.kind) == ("aia_3/193/total", "aia_3", "193", "total")
+    assert (row.series, row.instrument, row.channel, row.kind) == ("aia_3/193/total", "aia_3", "193", "total")
     catalogue.add(psf("known"))
     refused("line-known", lambda: certify(catalogue, "known", "1.0.0", channel="304"))
 
@@ -220,7 +220,7 @@ def test_two_that_supersede_the_same_psf_at_once(three: Catalogue) -> None:
 
 @pytest.fixture
 def many(catalogue: Catalogue) -> Catalogue:
-    """Two lines with three certified versions each, one deprecated, and drafts."""
+    """Two series with three certified versions each, one deprecated, and drafts."""
     n = 0
     for channel in ("174", "304"):
         for year in (2020, 2021, 2022):

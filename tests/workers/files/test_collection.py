@@ -301,7 +301,7 @@ def test_a_service_at_work_loses_nothing(
     store, catalogue = Store(settings.data_dir), Catalogue(settings.catalogue_url)
     before = {blob.digest for blob in store.blobs()}
     assert len(before) >= 7 and collect(catalogue, store, -60.0).removed == ()
-    for part in ("file", "preview", "effects"):
+    for part in ("file", "preview", "changes"):
         local.download(product[part], tmp_path / part)
     local.close(), catalogue.close()
 

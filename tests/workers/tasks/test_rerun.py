@@ -21,7 +21,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.contract.contract import instrument_text
 from workers.lineage import Ancestor, made_by
-from workers.tasks import deconvolve as deconvolve_task
+from workers.tasks import product as product_task
 
 ON_TRANSIT = {"transit_id": "1" * 64, "seed": 5}
 LIMITS = FitsLimits(max_pixels=2**24)
@@ -77,7 +77,7 @@ def test_every_rerun_is_one_of_its_own(local: LocalService, made: dict[str, Any]
 def test_software_that_went_astray_is_found_out(
     local: LocalService, made: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = deconvolve_task.write_image
+    real = product_task.write_image
     first = read_plane(tmp_path / "first.fits", LIMITS)
 
     def off(path: Path, image: Any, **how: Any) -> None:
@@ -85,12 +85,12 @@ def test_software_that_went_astray_is_found_out(
         pixels[5, 7] += 0.25 * np.nanmax(first)
         real(path, type(image)(**{**vars(image), "pixels": pixels}), **how)
 
-    monkeypatch.setattr(deconvolve_task, "write_image", off)
+    monkeypatch.setattr(product_task, "write_image", off)
     row, report = again(local, "product", made["id"], tmp_path / "r.json")
     assert row["details"]["same"] is False and row["details"]["same_file"] is False
     assert report["arrays"]["IMAGE"]["largest_relative"] == pytest.approx(0.25, rel=1e-5)
     assert report["arrays"]["IMAGE"]["values_that_differ"] == 1 and report["arrays"]["ERROR"]["same"]
-    assert "by 0.25 of the largest value at most, in IMAGE" in report["sentence"]
+    assert "by at most 0.25 of the largest value, in IMAGE" in report["sentence"]
     assert report["first"]["file_sha256"] != report["again"]["file_sha256"]
     local.download(f"/v1/products/{made['id']}/file", tmp_path / "kept.fits")
     assert (tmp_path / "kept.fits").read_bytes() == (tmp_path / "first.fits").read_bytes()

@@ -79,12 +79,12 @@ def test_a_worker_of_one_thread_takes_no_second_one_for_the_picture(
 
         monkeypatch.setattr(deconvolve_task, name, wrapped)
 
-    noted("_preview")
+    noted("save_preview")
     noted("effects")
     local = LocalService(settings.model_copy(update={"worker_threads": threads}))
     local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"])
     local.close()
-    assert (of_threads["_preview"] == of_threads["effects"]) == (threads == 1)
+    assert (of_threads["save_preview"] == of_threads["effects"]) == (threads == 1)
 
 
 def test_a_job_redelivered_after_its_end_does_nothing(

@@ -8,7 +8,7 @@ from itertools import product
 import pytest
 
 from psfcore.errors import DataError
-from workers.versions.series import channel_of, line_of, word
+from workers.versions.series import channel_of, series_of, word
 from workers.versions.status import MAY_BECOME, PsfStatus, check_transition, check_version, next_version
 from workers.versions.validity import Validity, iso, seconds
 
@@ -123,9 +123,9 @@ def test_a_range_that_holds_nothing(start: str, end: str) -> None:
 
 
 def test_lines_and_their_names() -> None:
-    assert line_of("hri_euv", "174", "total") == "hri_euv/174/total"
-    assert line_of("mine", None, "total") == "mine/-/total"
-    assert line_of(None, "174", "total") is None
+    assert series_of("hri_euv", "174", "total") == "hri_euv/174/total"
+    assert series_of("mine", None, "total") == "mine/-/total"
+    assert series_of(None, "174", "total") is None
     assert (channel_of("aia_3", 193.0), channel_of("hri_euv", None), channel_of("mine", None)) == (
         "193",
         "174",

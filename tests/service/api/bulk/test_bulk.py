@@ -126,7 +126,7 @@ def test_uploads_become_products_and_a_manifest(
         file = api.get(line["file"]).content
         assert hashlib.sha256(file).hexdigest() == line["sha256"] and len(file) == line["bytes"]
         product = api.get(f"/v1/products/{line['product_id']}").json()
-        assert line["score"] == product["details"]["effects"]["artefacts"]["score"]
+        assert line["score"] == product["details"]["changes"]["artefacts"]["score"]
         assert line["flux_change_pct"] == product["details"]["flux_change_pct"]
         assert product["details"]["job_id"] == bulk["id"]
         assert line["psf_id"] == psf_id and line["seconds"] >= line["kernel_seconds"] > 0
@@ -332,7 +332,7 @@ def test_an_error_of_ours_stops_one_image_and_not_the_bulk(
             raise ZeroDivisionError("secret place")
         return real(context, bulk, request, taken)
 
-    monkeypatch.setattr("workers.bulk.task.treat", breaks)
+    monkeypatch.setattr("workers.bulk.task.deconvolve_one", breaks)
     bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
     work()
     bulk = seen(api, bulk)
@@ -547,7 +547,7 @@ def test_a_turn_that_fails_for_a_reason_of_its_own_stops_the_bulk_with_it(
 ) -> None:
     bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("workers.bulk.task._list", lambda *_: 1 / 0)
+        patched.setattr("workers.bulk.task.list_files", lambda *_: 1 / 0)
         work()
     stopped = seen(api, bulk)
     assert stopped["phase"] == "ERROR" and stopped["error"]["code"] == "internal-error"

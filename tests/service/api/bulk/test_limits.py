@@ -13,6 +13,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from tests.conftest import write_image
 from tests.service.conftest import upload
+from workers.bulk import listing
 from workers.bulk import task as bulk_task
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
@@ -127,7 +128,7 @@ def test_looking_for_files_is_stopped_where_it_takes_too_long_though_it_finds_no
     limited = settings.model_copy(update={"max_job_s": 30.0, "bulk_roots": str(archive)})
     clock = _Clock()
     monkeypatch.setattr(runner, "time", clock)
-    monkeypatch.setattr(bulk_task, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(listing, "TELL_EVERY_S", 0.0)
     looked: list[Any] = []
     real = os.scandir
 

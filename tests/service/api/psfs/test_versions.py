@@ -20,7 +20,7 @@ SEEN = {"TELESCOP": "SOLO/EUI/HRI_EUV", "DETECTOR": "HRI_EUV", "WAVELNTH": 174.0
 
 @pytest.fixture
 def psfs(api: TestClient, tmp_path: Path) -> list[str]:
-    """Ids of three drafts of one line, uploaded, and of one of another."""
+    """Ids of three drafts of one series, uploaded, and of one of another."""
     ids = []
     for size, channel in ((32, "174"), (48, "174"), (64, "174"), (80, "304")):
         write_psf(tmp_path / f"p{size}.fits", size=size)
@@ -55,7 +55,7 @@ def test_a_psf_s_life(api: TestClient, psfs: list[str]) -> None:
         ["certified"],
         "1.0.0",
     )
-    assert before["line"] == "hri_euv/174/total" and before["history"] == []
+    assert before["series"] == "hri_euv/174/total" and before["history"] == []
 
     answer = certify(api, first, "1.0.0", 2020, None, reason="the first good one")
     assert answer.status_code == 200, answer.text
@@ -185,7 +185,7 @@ def test_contexts_and_the_default(api: TestClient, psfs: list[str]) -> None:
     assert made.status_code == 201
     context = made.json()
     assert context["size"] == 1 and context["pins"][0] == {
-        "line": "hri_euv/174/total",
+        "series": "hri_euv/174/total",
         "valid_from": "2020-01-01T00:00:00Z",
         "valid_to": None,
         "psf_id": psfs[0],
@@ -355,4 +355,4 @@ def test_an_uploaded_psf_says_its_line_or_is_told_it(api: TestClient, tmp_path: 
     )
     problem(certify(api, psf["id"], "1.0.0"), 409, "no-line")
     said = certify(api, psf["id"], "1.0.0", instrument="aia_3", channel="193", kind="total").json()
-    assert said["line"] == "aia_3/193/total"
+    assert said["series"] == "aia_3/193/total"
