@@ -40,7 +40,9 @@ _ITEMS = sa.table(
 def upgrade() -> None:
     """Rename tables, columns and indexes, then what their rows contain."""
     op.rename_table("psf_lines", "psf_series")
-    if op.get_bind().dialect.name == "postgresql":  # the name of a primary key follows its table in a new database
+    if (
+        op.get_bind().dialect.name == "postgresql"
+    ):  # the name of a primary key follows its table in a new database
         op.execute("ALTER INDEX psf_lines_pkey RENAME TO psf_series_pkey")
     for table in ("psfs", "psf_pins", "psf_series"):
         op.execute(f"ALTER TABLE {table} RENAME COLUMN line TO series")
