@@ -148,7 +148,7 @@ async def _events(look: Look, over: Callable[[], bool], last_id: str | None) -> 
             now, text = Seen(last_id or "", BaseModel, False), ""
         if text or time.monotonic() - said_at > ALIVE_EVERY_S:
             said_at = time.monotonic()
-            yield text or ": alive\n\n"
+            yield text or ": still here\n\n"
         if now is None or now.ended:
             return
         last_id = now.id

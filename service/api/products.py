@@ -110,7 +110,7 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
     if digest is None:
         raise Problem(
             404,
-            "no-changes-picture",
+            "no-effects-picture",
             "expected a product whose job had changes_picture true; this job had it false: submit the job again with true",
         )
     return files.send(request, state.store, digest, "image/png", None)

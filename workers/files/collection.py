@@ -54,7 +54,7 @@ def collect(
         raise DataError(
             "nothing-named",
             f"expected a database that refers to some of the {len(there)} files of the store; this one refers to none: check "
-            "that the settings name the right database",,
+            "that the settings name the right database",
         )
     old = [blob for blob in left.values() if blob.kept_at < kept_before]
     if not dry_run and not even_most and 2 * len(old) > len(there):
