@@ -231,7 +231,7 @@ def test_what_failed_waits_for_the_end_of_an_equal_bulk(catalogue: Catalogue) ->
     assert other != ended
     for change, phase in ((catalogue.bulks.pause, "PAUSED"), (catalogue.bulks.resume, "RUNNING")):
         assert change(other)
-        with pytest.raises(DataError, match=f"bulk {other} is {phase}") as refused:
+        with pytest.raises(DataError, match=f"run {other} is {phase}") as refused:
             catalogue.bulks.retry(ended)
         assert refused.value.code == "equal-bulk-open"
         now = row(catalogue, ended)

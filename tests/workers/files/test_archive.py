@@ -158,7 +158,7 @@ def test_what_may_not_be_named(archive: Path, glob: str, code: str) -> None:
 
 def test_without_folders_that_are_allowed_nothing_is(archive: Path) -> None:
     assert archive_files.roots("") == ()
-    with pytest.raises(DataError, match="there is none"):
+    with pytest.raises(DataError, match="none is set"):
         archive_files.check_glob(f"{archive}/*.fits", ())
 
 

@@ -209,7 +209,7 @@ def test_a_worker_runs_its_own_operator_s_effects_and_no_others(
     job = taken.submit("gap-diagnose", transit_id=taken.upload_transit(transit)["id"])
     taken.close()
     worker = service_in(tmp_path / "data")
-    with pytest.raises(ServiceError, match="this worker adds none: submit the job again") as caught:
+    with pytest.raises(ServiceError, match="this worker has none: submit the job again") as caught:
         worker.wait(job)
     assert caught.value.code == "effects-changed" and asked == []
     worker.close()
@@ -227,7 +227,7 @@ def test_effects_whose_text_was_changed_are_another_diagnosis_and_refused_by_an_
     assert local.diagnose_gap(transit, correct=False)["id"] != first["id"] and len(asked) == 2
     waiting = local.submit("gap-diagnose", transit_id=local.upload_transit(transit)["id"])
     mine.write_text(EDGE_GLOW.replace("5.0", "7.0"))
-    with pytest.raises(ServiceError, match="or were changed since: submit the job again") as caught:
+    with pytest.raises(ServiceError, match="expected added effects whose files have the hashes .*: submit the job again") as caught:
         local.wait(waiting)
     assert caught.value.code == "effects-changed" and len(asked) == 2
     mine.unlink()

@@ -26,7 +26,7 @@ def test_the_machine(before: PsfStatus, after: PsfStatus) -> None:
     if (before, after) in ALLOWED:
         check_transition(before, after)
         return
-    with pytest.raises(DataError, match=f"a {before} PSF may become .*; got {after}") as caught:
+    with pytest.raises(DataError, match=f"expected status .* for a {before} PSF; got {after}") as caught:
         check_transition(before, after)
     assert caught.value.code == "wrong-transition"
     assert all(state in caught.value.message for state in MAY_BECOME[before])
@@ -86,7 +86,7 @@ def test_times(text: str, at: float) -> None:
     "text", ["2024", "5", "now", "2024-13-01", "2024-01-01 12:00", "2024-01-01T25:00", "", "1e9"]
 )
 def test_what_is_no_time(text: str) -> None:
-    with pytest.raises(DataError, match="expected a time as") as caught:
+    with pytest.raises(DataError, match="expected a time such as") as caught:
         seconds(text)
     assert caught.value.code == "bad-time"
 

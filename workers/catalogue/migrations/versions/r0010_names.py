@@ -50,8 +50,8 @@ def upgrade() -> None:
         op.drop_index(old, "psfs")
         op.create_index(new, "psfs", columns)
     for name in ("jobs", "reports", "stage_times"):
-        table = sa.table(name, sa.column("kind"))
-        op.execute(table.update().where(table.c.kind == OLD_KIND).values(kind=NEW_KIND))
+        rows = sa.table(name, sa.column("kind"))
+        op.execute(rows.update().where(rows.c.kind == OLD_KIND).values(kind=NEW_KIND))
     connection = op.get_bind()
     _rename_in_products(connection)
     _rename_in_jobs(connection)
