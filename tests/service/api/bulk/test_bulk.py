@@ -325,7 +325,7 @@ def test_what_fails_is_apart_and_tried_again(
 def test_an_error_of_ours_stops_one_image_and_not_the_bulk(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = bulk_image.treat
+    real = bulk_image.deconvolve_one
 
     def breaks(context: Any, bulk: Any, request: Any, taken: Any) -> Any:
         if taken.position == 1:
