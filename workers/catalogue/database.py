@@ -64,7 +64,7 @@ class Database:
 def open_engine(url: str) -> Engine:
     """An engine with the settings each database needs for many small concurrent writers."""
     if not url.startswith("sqlite"):
-        # Without a limit, a database that is cut off would hold whoever asks for minutes.
+        # Without a limit, a request to an unreachable database would wait for minutes.
         patience = {"connect_timeout": 5} if url.startswith("postgresql") else {}
         return create_engine(url, pool_pre_ping=True, connect_args=patience, json_serializer=_strict_json)
     engine = create_engine(url, connect_args={"timeout": PATIENCE_S}, json_serializer=_strict_json)

@@ -177,7 +177,7 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
 
 @router.put("/default", summary="Change the default context")
 def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
-    """Make a context, or none, the default. The history of changes is kept."""
+    """Set the default context; `context` null: no default. The history of changes is kept."""
     try:
         state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)
     except DataError as error:

@@ -208,7 +208,7 @@ def test_a_later_revision_is_refused_and_left_alone(catalogue: Catalogue) -> Non
     assert catalogue.schema.status().revision == "9999"
 
 
-def test_tables_that_were_never_ours_are_refused_and_left_alone(catalogue: Catalogue) -> None:
+def test_foreign_tables_are_refused_and_not_changed(catalogue: Catalogue) -> None:
     with catalogue._engine.begin() as connection:
         connection.execute(text("CREATE TABLE images (id VARCHAR(64) PRIMARY KEY, pixels TEXT)"))
     with pytest.raises(SchemaError, match=r"without a revision.*images\.owner.*images\.summary"):

@@ -28,7 +28,7 @@ from workers.tasks.stage_timer import STARTING
 Task = Callable[[Context, Mapping[str, Any]], str]
 
 
-def test_what_many_attempts_spend_is_added_up(catalogue: Catalogue) -> None:
+def test_times_of_many_attempts_are_summed(catalogue: Catalogue) -> None:
     def add() -> None:
         for _ in range(20):
             catalogue.stage_times.add("deconvolve", {"b": Spent(0.5, 2), "a": Spent(0.25, 1)})
@@ -66,7 +66,7 @@ def slow_reports(context: Context, _: Mapping[str, Any]) -> str:
     return "result"
 
 
-def test_an_attempt_leaves_its_stages_and_the_time_of_writing_is_in_none(
+def test_an_attempt_stores_its_stages_without_the_time_of_writing(
     tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = catalogue.jobs.progress
@@ -97,7 +97,7 @@ def passing(context: Context, _: Mapping[str, Any]) -> str:
 
 
 @pytest.mark.parametrize(("task", "phase"), [(fails, Phase.ERROR), (passing, Phase.QUEUED)])
-def test_attempts_that_end_badly_count_too(
+def test_failed_attempts_count_too(
     tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, task: Task, phase: Phase
 ) -> None:
     assert run(tmp_path, catalogue, monkeypatch, task).phase == phase
@@ -105,7 +105,7 @@ def test_attempts_that_end_badly_count_too(
 
 
 @pytest.mark.parametrize("trouble", ["away", "no table"])
-def test_a_job_s_outcome_stands_where_its_times_cannot_be_kept(
+def test_a_job_ends_normally_if_its_times_cannot_be_stored(
     tmp_path: Path,
     catalogue: Catalogue,
     monkeypatch: pytest.MonkeyPatch,
