@@ -162,11 +162,12 @@ def _largest(compared: Mapping[str, Comparison]) -> float | None:
 
 
 def _sentence(request: ResolvedRerun, first: Thing, again: Thing, compared: Mapping[str, Comparison]) -> str:
+    what = "PSF" if request.of == "psf" else request.of
     if first.file_sha256 == again.file_sha256:
-        return f"The new {request.of} is the same file, bit for bit."
+        return f"The new {what} is the same file, bit for bit."
     if all(one.same for one in compared.values()):
-        return f"The new {request.of} has the same values, bit for bit; only the headers of its file differ."
+        return f"The new {what} has the same values, bit for bit; only the headers of its file differ."
     differ = sorted(name for name, one in compared.items() if not one.same)
     largest = _largest(compared)
     by = "in shape or missing values" if largest is None else f"by at most {largest:.3g} of the largest value"
-    return f"The new {request.of} differs {by}, in {', '.join(differ)}."
+    return f"The new {what} differs {by}, in {', '.join(differ)}."

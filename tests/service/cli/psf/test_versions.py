@@ -130,7 +130,7 @@ def test_lineage_and_rerun(sun: Heliopsf, tmp_path: Path) -> None:
     assert told[3].startswith("    instrument-file ")
     assert json.loads((tmp_path / "l.json").read_text())["id"] == product["id"]
     again = ask("psf", "rerun", psf["id"], "--json", str(tmp_path / "r.json"))
-    assert again == "The new psf is the same file, bit for bit.\n"
+    assert again == "The new PSF is the same file, bit for bit.\n"
     assert json.loads((tmp_path / "r.json").read_text())["same_file"] is True
     assert "bit for bit" in ask("psf", "rerun", product["id"], "--product")
     assert [item["product_id"] for item in sun.affected(psf["id"])] == [product["id"]]
