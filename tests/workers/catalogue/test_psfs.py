@@ -85,7 +85,7 @@ def test_a_version_is_given_once_and_never_again(three: Catalogue) -> None:
     certify(three, "a", "1.0.0", years(2020, 2021))
     deprecate(three, "a")
     message = refused("version-taken", lambda: certify(three, "b", "1.0.0"))
-    assert "the next one free is 1.1.0" in message
+    assert "the next free version is 1.1.0" in message
     assert three.psfs.released("hri_euv/174/total", OWNER) == ["1.0.0"]
 
 

@@ -61,7 +61,7 @@ def test_the_next_version_is_after_the_highest_by_number(released: list[str], fo
     ],
 )
 def test_invalid_versions_are_refused_and_a_free_one_is_named(version: str | None, code: str) -> None:
-    with pytest.raises(DataError, match=r"the next one free is 1\.1\.0") as caught:
+    with pytest.raises(DataError, match=r"the next free version is 1\.1\.0") as caught:
         check_version(version, ["1.0.0"])
     assert caught.value.code == code
 

@@ -116,7 +116,7 @@ def test_contexts(sun: Heliopsf, tmp_path: Path) -> None:
     assert ask("context", "use", "--none") == "no default: what is certified\n"
     assert len(sun.default_context()["history"]) == 2
     ask("context", "use", code=2)
-    assert "no context with the id or name 'three'" in ask("context", "use", "three", code=1)
+    assert "expected the id or name of a context; got 'three'" in ask("context", "use", "three", code=1)
 
 
 def test_lineage_and_rerun(sun: Heliopsf, tmp_path: Path) -> None:
