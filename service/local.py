@@ -136,7 +136,7 @@ class LocalService(Operations):
         digests = {
             "file": row.file_sha256,
             "preview": row.preview_sha256,
-            "effects": row.details.get("effects_picture_sha256"),
+            "changes": row.details.get("changes_picture_sha256"),
             "report": row.details.get("report_sha256"),
             "output": row.details.get("output_sha256"),
             "page": row.details.get("page_sha256"),

@@ -1,4 +1,4 @@
-"""Bulk, many images deconvolved alike: ``/v1/bulk``."""
+"""Bulk runs, many images deconvolved in the same way: ``/v1/bulk``."""
 
 from __future__ import annotations
 
@@ -23,46 +23,44 @@ from workers.contract.phases import JobError
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)
 BulkId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
-LOOK_FROM = 1.0  # an artefact score from which on an image is to be looked at
+LOOK_FROM = 1.0  # images with this artefact score or more should be inspected
 
 
 class Counts(BaseModel):
-    """How many images are how far."""
+    """Numbers of images by state."""
 
-    total: int = Field(description="as far as they are listed")
+    total: int = Field(description="images listed so far")
     waiting: int
     at_work: int
     done: int
-    reused: int = Field(description="of those done: the product was there already")
+    reused: int = Field(description="done images whose product already existed")
     failed: int
-    to_look_at: int = Field(description=f"of those done: with an artefact score of {LOOK_FROM:g} or more")
+    to_look_at: int = Field(description=f"done images to inspect: artefact score {LOOK_FROM:g} or more")
 
 
 class BulkView(BaseModel):
-    """A bulk."""
+    """A bulk run."""
 
     id: str
     name: str
     phase: BulkPhase
     created_at: float
     ended_at: float | None
-    psf_id: str | None = Field(
-        description="the PSF of all images; null: that which the context pins for each"
-    )
+    psf_id: str | None = Field(description="the PSF of all images; null: the context pins one for each image")
     context_id: str | None
-    request: dict[str, Any] = Field(description="what was asked for, but for the ids of uploaded images")
+    request: dict[str, Any] = Field(description="the request, without the ids of uploaded images")
     images: Counts
-    images_an_hour: float | None = Field(description="by the last ones; null where nothing is known")
-    time_left_s: float | None
-    error: JobError | None = Field(description="why it could not go on")
-    results: str = Field(description="address of the manifest of what is done")
-    failures: str = Field(description="address of what failed, with reasons")
-    events: str = Field(description="address of its progress as server-sent events")
+    images_an_hour: float | None = Field(description="pace of the last hour; null: unknown")
+    time_left_s: float | None = Field(description="estimate; null: unknown or not running")
+    error: JobError | None = Field(description="why the run stopped; null: it did not stop with an error")
+    results: str = Field(description="address of the manifest of the done images")
+    failures: str = Field(description="address of the failed images, with reasons")
+    events: str = Field(description="address of the progress as server-sent events")
 
     @classmethod
     def of(cls, row: BulkRow, state: Shared) -> BulkView:
         """The view of a row."""
-        pace = state.catalogue.bulks.pace(row)
+        pace = state.catalogue.bulks.progress.pace(row)
         here = f"/v1/bulk/{row.id}"
         left = row.total - row.done - row.failed
         rate = None if row.phase in (BulkPhase.PAUSED, BulkPhase.ERROR) else pace.images_an_hour
@@ -82,7 +80,7 @@ class BulkView(BaseModel):
                 done=row.done,
                 reused=row.reused,
                 failed=row.failed,
-                to_look_at=state.catalogue.bulks.to_look_at(row.id, LOOK_FROM),
+                to_look_at=state.catalogue.bulks.progress.to_look_at(row.id, LOOK_FROM),
             ),
             images_an_hour=rate,
             time_left_s=left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
@@ -94,7 +92,7 @@ class BulkView(BaseModel):
 
 
 class BulkLine(BaseModel):
-    """A bulk, as a list shows it."""
+    """A bulk run in a list."""
 
     id: str
     name: str
@@ -107,7 +105,7 @@ class BulkLine(BaseModel):
 
     @classmethod
     def of(cls, row: BulkRow) -> BulkLine:
-        """The line of a row."""
+        """The view of a row in a list."""
         return cls(
             id=row.id,
             name=row.name,
@@ -124,7 +122,7 @@ class Failed(BaseModel):
     """An image that could not be deconvolved."""
 
     position: int
-    source: str = Field(description="the upload's id, or the file's path")
+    source: str = Field(description="id of the upload, or path of the file")
     attempts: int
     ended_at: float | None
     error: JobError
@@ -144,13 +142,15 @@ class Failed(BaseModel):
 @router.post(
     "",
     status_code=202,
-    summary="Have many images deconvolved alike",
-    responses={200: {"model": BulkView, "description": "An equal request is open; this is its bulk."}},
+    summary="Start a bulk run",
+    responses={
+        200: {"model": BulkView, "description": "An identical request is open; this is its bulk run."}
+    },
 )
 def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shared) -> BulkView:
-    """Write the bulk down; workers list its files and do its images. People's jobs go before.
+    """Deconvolve many images in the same way. Workers list the files and deconvolve the images, after all other jobs.
 
-    The PSF, or the context that pins one for each image, is fixed here. A product that is there is not made again.
+    The PSF, or the context that pins a PSF for each image, is fixed now. An existing product is not made again.
     """
     if body.keeps_products:
         check_room(state, caller.owner)
@@ -159,14 +159,14 @@ def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shar
     except DataError as error:
         raise problem(error) from error
     if new:
-        log.info("bulk %s: asked for, %d uploads", row.id, row.total, extra={"fields": {"bulk": row.id}})
+        log.info("bulk run %s: submitted, %d uploads", row.id, row.total, extra={"fields": {"bulk": row.id}})
         state.reconciler.wake()
     response.status_code = 202 if new else 200
     response.headers["Location"] = f"/v1/bulk/{row.id}"
     return BulkView.of(row, state)
 
 
-@router.get("", summary="List bulks")
+@router.get("", summary="List bulk runs")
 def list_bulks(
     request: Request,
     caller: Reading,
@@ -175,101 +175,105 @@ def list_bulks(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[BulkLine]:
-    """Bulks, newest first."""
+    """Bulk runs, newest first."""
     rows = state.catalogue.page(
         BulkRow, owner=caller.owner, limit=limit + 1, after=position(cursor), phase=phase
     )
     return page(request, rows, limit, BulkLine.of)
 
 
-@router.get("/{bulk_id}", summary="One bulk: how far it is, how fast, and until when")
+@router.get("/{bulk_id}", summary="One bulk run: progress, pace and time left")
 def get_bulk(bulk_id: BulkId, caller: Reading, state: Shared) -> BulkView:
-    """The bulk as it is now."""
+    """The bulk run as it is now."""
     return BulkView.of(find(state, caller, bulk_id), state)
 
 
-@router.get("/{bulk_id}/failures", summary="Images that failed, with reasons")
+@router.get("/{bulk_id}/failures", summary="Failed images, with reasons")
 def list_failures(
     bulk_id: BulkId,
     request: Request,
     caller: Reading,
     state: Shared,
-    limit: Annotated[int, Query(ge=1, le=200, description="rows a page")] = 50,
+    limit: Annotated[int, Query(ge=1, le=200, description="rows per page")] = 50,
     cursor: Cursor = None,
 ) -> Page[Failed]:
-    """What failed, in the bulk's order."""
+    """The failed images, in the order of the run."""
     row = find(state, caller, bulk_id)
     after = _after(cursor)
-    items = state.catalogue.bulks.items(row.id, ItemState.FAILED, after=after, limit=limit + 1)
+    items = state.catalogue.bulks.progress.items(row.id, ItemState.FAILED, after=after, limit=limit + 1)
     next_page = following(request, str(items[limit - 1].position)) if len(items) > limit else None
     return Page(items=[Failed.of(item) for item in items[:limit]], next=next_page)
 
 
-@router.post("/{bulk_id}/pause", summary="Pause a bulk")
+@router.post("/{bulk_id}/pause", summary="Pause a bulk run")
 def pause_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """Begin no more images; those at work are let end."""
+    """Begin no more images. Images that workers have are finished."""
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.pause(row.id), row, "LISTING or RUNNING")
     return BulkView.of(find(state, caller, bulk_id), state)
 
 
-@router.post("/{bulk_id}/resume", summary="Let a bulk go on")
+@router.post("/{bulk_id}/resume", summary="Resume a bulk run")
 def resume_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """Go on where it was."""
+    """Resume a paused or failed bulk run."""
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.resume(row.id), row, "PAUSED or ERROR")
     state.reconciler.wake()
     return BulkView.of(find(state, caller, bulk_id), state)
 
 
-@router.post("/{bulk_id}/cancel", summary="Cancel a bulk")
+@router.post("/{bulk_id}/cancel", summary="Cancel a bulk run")
 def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """End it: images at work stop within a step. What is done stays."""
+    """End the run. Images that workers have stop at their next step; finished products stay."""
     row = find(state, caller, bulk_id)
-    _done(state.catalogue.bulks.cancel(row.id), row, "any but COMPLETED and CANCELLED")
+    _done(state.catalogue.bulks.cancel(row.id), row, "LISTING, RUNNING, PAUSED or ERROR")
     bulk_turns.cancel_turns(state.catalogue, row.id)
     return BulkView.of(find(state, caller, bulk_id), state)
 
 
-@router.post("/{bulk_id}/retry", summary="Try again what failed")
+@router.post("/{bulk_id}/retry", summary="Retry failed images")
 def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """Let the images that failed wait again; what is done stays done.
+    """Queue the failed images again. Done images stay done.
 
-    An equal request that was sent since the bulk ended is open as a bulk of its own: 409 names it until it has ended.
+    409 if the run has ended and an identical request is open as another bulk run; the message names that run.
     """
     row = find(state, caller, bulk_id)
     try:
         changed = state.catalogue.bulks.retry(row.id)
     except DataError as error:
         raise Problem(409, error.code, error.message) from error
-    _done(changed is not None, row, "any but CANCELLED")
+    _done(changed is not None, row, "other than CANCELLED")
     state.reconciler.wake()
     return BulkView.of(find(state, caller, bulk_id), state)
 
 
 def find(state: Shared, caller: Caller, bulk_id: str) -> BulkRow:
-    """The bulk's row; ``Problem`` 404 where there is none of the caller's."""
+    """The row of a bulk run of the caller. Raises ``Problem`` 404."""
     row = state.catalogue.bulks.get(bulk_id)
     if row is None or row.owner != caller.owner:
-        raise Problem(404, "no-such-bulk", f"there is no bulk with id {bulk_id}")
+        raise Problem(
+            404,
+            "no-such-bulk",
+            f"expected the id of one of your bulk runs; got {bulk_id}: list your bulk runs",
+        )
     return row
 
 
 def goes_on(row: BulkRow) -> bool:
-    """Whether something may still happen to a bulk without anybody asking."""
+    """Whether the run may still change without a request."""
     return row.phase in AT_WORK
 
 
 def _done(changed: bool, row: BulkRow, expected: str) -> None:
     if not changed:
-        raise Problem(409, "wrong-phase", f"expected a bulk whose phase is {expected}; it is {row.phase}")
+        raise Problem(409, "wrong-phase", f"expected a bulk run in phase {expected}; this one is {row.phase}")
 
 
 def _after(cursor: str | None) -> int:
-    """The position in a cursor; ``Problem`` 422 where it is none of ours."""
+    """The position in a cursor. Raises ``Problem`` 422 if this service did not issue it."""
     parts = place(cursor, 1)
     if parts is None:
         return -1
     if not parts[0].isdecimal() or len(parts[0]) > 9:
-        raise Problem(422, "bad-cursor", "expected the cursor of an earlier page's `next`")
+        raise Problem(422, "bad-cursor", "expected the cursor in `next` of an earlier page; got another text")
     return int(parts[0])

@@ -1,4 +1,4 @@
-"""What a bulk has done, image by image: ``/v1/bulk/{id}/results``, as lines of JSON or as a table."""
+"""The results of a bulk run, image by image, as lines of JSON or as CSV: ``/v1/bulk/{id}/results``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from service.api.bulk import BulkId, find
 from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
+from workers.catalogue.bulk_progress import BulkProgress
 from workers.catalogue.bulk_tables import BulkItemRow
-from workers.catalogue.bulks import Bulks
 from workers.contract.bulk import ItemState
 
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)
@@ -32,35 +32,35 @@ class Change(BaseModel):
 
 
 class Result(BaseModel):
-    """An image that is done."""
+    """A done image."""
 
     position: int
-    source: str = Field(description="the upload's id, or the file's path")
+    source: str = Field(description="id of the upload, or path of the file")
     image_sha256: str
     psf_id: str
     product_id: str
-    file: str | None = Field(description="address of the product; null where the service does not keep it")
-    output: str | None = Field(description="path of the product in the output folder")
-    sha256: str = Field(description="of the product's file")
+    file: str | None = Field(description="address of the product; null: the service does not keep it")
+    output: str | None = Field(description="path of the product in the output folder; null: no output folder")
+    sha256: str = Field(description="SHA-256 of the product's file")
     bytes: int
-    reused: bool = Field(description="whether it was there already")
-    score: float = Field(description="of the artefact check: below 1 nothing was found")
+    reused: bool = Field(description="whether the product already existed")
+    score: float = Field(description="artefact score; below 1: no artefacts found")
     flux_change_pct: float
     bright: Change | None
     dark: Change | None
-    signs: dict[str, float | None] = Field(description="of artefacts, each")
+    signs: dict[str, float | None] = Field(description="the signs of artefacts, each with its value")
     steps_done: int
     stopped_because: str
     negative_pixels: int
     ended_at: float
-    seconds: float | None = Field(description="that the worker had it")
+    seconds: float | None = Field(description="time that the worker spent on the image; null: unknown")
     kernel_seconds: float | None = Field(
-        description="of it, deconvolving and looking at what that did; null where it was there already"
+        description="part of `seconds` spent on deconvolving and measuring changes; null: the product already existed"
     )
 
     @classmethod
     def of(cls, row: BulkItemRow) -> Result:
-        """The line of a row."""
+        """The view of a row."""
         assert row.statistics is not None
         told: dict[str, Any] = {"seconds": None, "kernel_seconds": None, **row.statistics}
         own = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)}
@@ -68,7 +68,7 @@ class Result(BaseModel):
         return cls.model_validate({**told, **own, "file": file})
 
     def flat(self) -> dict[str, Any]:
-        """As a row of a table."""
+        """The values of a CSV row."""
         told = self.model_dump(exclude=NESTED)
         for kind in CHANGES:
             change: Change | None = getattr(self, kind)
@@ -86,11 +86,11 @@ COLUMNS = [name for name in Result.model_fields if name not in NESTED] + [
 
 @router.get(
     "/{bulk_id}/results",
-    summary="The manifest of what is done: checksums, change and artefacts of each image",
+    summary="Manifest of the done images: checksums, changes and artefacts",
     response_class=Response,
     responses={
         200: {
-            "description": "One image a line: position, source, image_sha256, psf_id, product_id, file (address), "
+            "description": "One image per line: position, source, image_sha256, psf_id, product_id, file (address), "
             "output (path), sha256, bytes, reused, score, flux_change_pct, bright, dark, signs, and more.",
             "content": {NDJSON: {"schema": {"type": "string"}}, CSV: {"schema": {"type": "string"}}},
         }
@@ -102,27 +102,30 @@ def get_results(
     state: Shared,
     format: Literal["ndjson", "csv"] = "ndjson",
     order: Annotated[
-        Literal["bulk", "worst"], Query(description="as the bulk's images are, or the most doubtful first")
+        Literal["bulk", "worst"],
+        Query(description="`bulk`: order of the run; `worst`: highest artefact score first"),
     ] = "bulk",
-    limit: Annotated[int | None, Query(ge=1, le=1_000_000, description="lines; none: all")] = None,
+    limit: Annotated[
+        int | None, Query(ge=1, le=1_000_000, description="number of images; default: all")
+    ] = None,
 ) -> Response:
-    """All images that are done so far, as they come out of the database: there may be very many."""
+    """All images that are done so far, streamed from the database."""
     row = find(state, caller, bulk_id)
-    rows = _in_order(state.catalogue.bulks, row.id, order, limit)
+    rows = _in_order(state.catalogue.bulks.progress, row.id, order, limit)
     headers = {"Content-Disposition": f'attachment; filename="bulk-{bulk_id[:12]}.{format}"'}
     lines, media_type = (_table(rows), CSV) if format == "csv" else (_json_lines(rows), NDJSON)
     return StreamingResponse(lines, media_type=media_type, headers=headers)
 
 
-def _in_order(bulks: Bulks, bulk_id: str, order: str, limit: int | None) -> Iterator[list[Result]]:
-    """Results, a batch at a time; each batch is a look into the database of its own."""
+def _in_order(progress: BulkProgress, bulk_id: str, order: str, limit: int | None) -> Iterator[list[Result]]:
+    """Results in batches; each batch is one query."""
     left = limit
     after, behind = -1, None
     while left is None or left > 0:
         if order == "worst":
-            batch = bulks.worst(bulk_id, after=behind)
+            batch = progress.worst(bulk_id, after=behind)
         else:
-            batch = bulks.items(bulk_id, ItemState.DONE, after=after)
+            batch = progress.items(bulk_id, ItemState.DONE, after=after)
         if not batch:
             return
         after = batch[-1].position

@@ -1,7 +1,7 @@
 """Progress as server-sent events: ``/v1/jobs/{id}/events`` and ``/v1/bulk/{id}/events``.
 
-Read off the rows, which any server sees, once in ``LOOK_EVERY_S`` a stream. An event's id says what the row said, so
-that a client which comes back with it (``Last-Event-ID``) is told of what changed meanwhile, and of nothing else.
+A stream reads its row, which every server can see, once in ``LOOK_EVERY_S``. The id of an event is a hash of the row's
+state. A client that reconnects with this id (``Last-Event-ID``) gets only what has changed since.
 """
 
 from __future__ import annotations
@@ -42,35 +42,35 @@ router = APIRouter(tags=["events"], responses=RESPONSES)
 LastId = Annotated[str | None, Header(alias="Last-Event-ID", max_length=64)]
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Events `progress`, each with the whole view as its data, and `end` as the last one.",
+        "description": "Events `progress`, each with the whole view as its data; the last event is `end`.",
         "content": {TYPE: {}},
     },
-    204: {"description": "The last event that the client names was the end: there is nothing more to come."},
+    204: {"description": "The client's last event was `end`: no more events follow."},
 }
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a row says now: an id for it, the view of it, whether it is the last."""
+    """The state of a row: its id as an event, its view, and whether it is the last."""
 
     id: str
     view: Callable[[], BaseModel]
     ended: bool
 
 
-Look = Callable[[], Seen | None]  # none: the row is gone
+Look = Callable[[], Seen | None]  # None: the row was deleted
 
 
 @router.get(
     "/v1/jobs/{job_id}/events",
-    summary="A job's progress as events",
+    summary="The progress of a job as events",
     response_class=Response,
     responses=DESCRIBED,
 )
 async def follow_job(
     job_id: JobId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
 ) -> Response:
-    """The job now and whenever it changes, until it ends."""
+    """The job now and at every change, until it ends."""
     await run_in_threadpool(find_job, state, caller, job_id)
 
     def look() -> Seen | None:
@@ -85,14 +85,14 @@ async def follow_job(
 
 @router.get(
     "/v1/bulk/{bulk_id}/events",
-    summary="A bulk's progress as events",
+    summary="The progress of a bulk run as events",
     response_class=Response,
     responses=DESCRIBED,
 )
 async def follow_bulk(
     bulk_id: BulkId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
 ) -> Response:
-    """The bulk now and whenever it changes, until it ends. One that is paused goes on being followed."""
+    """The bulk run now and at every change, until it ends. The stream of a paused run stays open."""
     await run_in_threadpool(find_bulk, state, caller, bulk_id)
 
     def look() -> Seen | None:
@@ -106,10 +106,10 @@ async def follow_bulk(
 
 
 class _Stream(StreamingResponse):
-    """Gives its place back, however it ends."""
+    """A streaming response that calls ``close`` however it ends."""
 
     def __init__(self, events: AsyncIterator[str], close: Callable[[], None]) -> None:
-        # Proxies that gather what they pass on would hold events back.
+        # Tells proxies not to buffer: a buffer would delay events.
         super().__init__(events, media_type=TYPE, headers={"X-Accel-Buffering": "no"})
         self._close = close
 
@@ -123,7 +123,7 @@ class _Stream(StreamingResponse):
 async def _stream(request: Request, state: Shared, who: str, look: Look, last_id: str | None) -> Response:
     now = await run_in_threadpool(look)
     if now is not None and now.ended and now.id == last_id:
-        return Response(status_code=204)  # what tells a browser not to come back
+        return Response(status_code=204)  # 204 tells a browser not to reconnect
     state.streams.open(who)
     ends_at = time.monotonic() + state.settings.stream_s
 
@@ -142,7 +142,9 @@ async def _events(look: Look, over: Callable[[], bool], last_id: str | None) -> 
             now = await run_in_threadpool(look)
             text = await run_in_threadpool(_event, now, last_id)
         except SQLAlchemyError as error:
-            log.warning("a stream of events waits for the database: %s", str(error).splitlines()[0])
+            log.warning(
+                "a stream of events cannot read the database and waits: %s", str(error).splitlines()[0]
+            )
             now, text = Seen(last_id or "", BaseModel, False), ""
         if text or time.monotonic() - said_at > ALIVE_EVERY_S:
             said_at = time.monotonic()
@@ -154,7 +156,7 @@ async def _events(look: Look, over: Callable[[], bool], last_id: str | None) -> 
 
 
 def _event(now: Seen | None, last_id: str | None) -> str:
-    """The event for what is seen; nothing where the client knows it."""
+    """The event for a state; empty if the client already has it."""
     if now is None:
         return "event: gone\ndata: {}\n\n"
     if now.id == last_id and not now.ended:

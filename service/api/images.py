@@ -28,7 +28,7 @@ class ImageView(BaseModel):
     created_at: float
     bytes: int
     filename: str | None
-    header: dict[str, Any] = Field(description="what the FITS header says")
+    header: dict[str, Any] = Field(description="summary of the FITS header")
 
     @classmethod
     def of(cls, row: ImageRow) -> ImageView:
@@ -43,10 +43,10 @@ class ImageView(BaseModel):
     status_code=201,
     summary="Upload a FITS image",
     openapi_extra=uploads.OPENAPI_BODY,
-    responses={200: {"model": ImageView, "description": "The same file was uploaded before."}},
+    responses={200: {"model": ImageView, "description": "The same file was already uploaded."}},
 )
 async def upload_image(request: Request, response: Response, caller: Submitting, state: Shared) -> ImageView:
-    """Stream one FITS file in. Its header is inspected; its pixels are not touched here."""
+    """Upload one FITS file. The header is checked now; the pixels are read by the job that uses the image."""
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
     async with uploads.receive(request, state.store, state.limits, limit, take) as upload:
@@ -69,8 +69,12 @@ def list_images(
 
 @router.get("/{image_id}", summary="One uploaded image")
 def get_image(image_id: Identity, caller: Reading, state: Shared) -> ImageView:
-    """What is known of an uploaded image."""
+    """An uploaded image's metadata and a summary of its header."""
     row = state.catalogue.get(ImageRow, image_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-image", f"no image was uploaded with id {image_id}")
+        raise Problem(
+            404,
+            "no-such-image",
+            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue",
+        )
     return ImageView.of(row)

@@ -1,4 +1,4 @@
-"""Where a PSF or a product came from, and whether it comes out the same again: ``.../lineage``, ``.../rerun``."""
+"""The lineage of PSFs and products, ``.../lineage``, and reruns, ``.../rerun``."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from workers.lineage import Ancestor, lineage
 router = APIRouter(tags=["lineage"], responses=RESPONSES)
 
 
-@router.get("/v1/psfs/{psf_id}/lineage", summary="Where a PSF came from")
+@router.get("/v1/psfs/{psf_id}/lineage", summary="The lineage of a PSF")
 def get_psf_lineage(psf_id: Identity, caller: Reading, state: Shared) -> Ancestor:
-    """Inputs by hash, parameters, versions of code and libraries, jobs; and the same of every PSF that it came from."""
+    """Inputs by hash, parameters, versions of software and libraries, and job; also those of all PSFs that it was made from."""
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
         raise _missing("psf", psf_id)
     return lineage(state.catalogue, row)
 
 
-@router.get("/v1/products/{product_id}/lineage", summary="Where a product came from")
+@router.get("/v1/products/{product_id}/lineage", summary="The lineage of a product")
 def get_product_lineage(product_id: Identity, caller: Reading, state: Shared) -> Ancestor:
-    """Its image, its parameters, versions of code and libraries, its job; and the same of its PSF and that one's."""
+    """Image, parameters, versions of software and libraries, and job; also the lineage of its PSF."""
     row = state.catalogue.get(ProductRow, product_id, caller.owner)
     if row is None:
         raise _missing("product", product_id)
     return lineage(state.catalogue, row)
 
 
-@router.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again, and compare")
+@router.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again and compare")
 def rerun_psf(psf_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """A job with the parameters that the PSF was made with; its result is a report on what differs from the first."""
+    """Submit a job with the parameters of the PSF. Its result is a report on the differences from the first PSF."""
     return _rerun("psf", psf_id, response, caller, state)
 
 
-@router.post("/v1/products/{product_id}/rerun", status_code=202, summary="Make a product again, and compare")
+@router.post("/v1/products/{product_id}/rerun", status_code=202, summary="Make a product again and compare")
 def rerun_product(product_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """A job with the parameters that the product was made with; its result is a report on what differs from the first."""
+    """Submit a job with the parameters of the product. Its result is a report on the differences from the first product."""
     return _rerun("product", product_id, response, caller, state)
 
 
@@ -57,4 +57,8 @@ def _rerun(
 
 
 def _missing(of: str, identity: str) -> Exception:
-    return problem(DataError(f"no-such-{of}", f"the catalogue holds no {of} with id {identity}"))
+    return problem(
+        DataError(
+            f"no-such-{of}", f"expected the id of a {of} in the catalogue; got {identity}, which is not in it"
+        )
+    )

@@ -21,7 +21,7 @@ router = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES
 class ProductView(BaseModel):
     """A deconvolved image."""
 
-    id: str = Field(description="identity: the hash of input, PSF, method, parameters, algorithm version")
+    id: str = Field(description="identity: hash of image, PSF, method, parameters and algorithm version")
     created_at: float
     kind: str
     image_id: str
@@ -29,10 +29,14 @@ class ProductView(BaseModel):
     psf_version: str
     bytes: int
     sha256: str = Field(description="SHA-256 of the file")
-    details: dict[str, Any] = Field(description="method, versions, what changed in the image")
+    details: dict[str, Any] = Field(
+        description="method, parameters, versions, and what changed in the image (`changes`)"
+    )
     file: str = Field(description="address of the FITS file")
-    preview: str = Field(description="address of the picture: before, after, change")
-    effects: str | None = Field(description="address of the picture of all effects, where it was asked for")
+    preview: str = Field(description="address of the picture of before, after and change")
+    changes: str | None = Field(
+        description="address of the picture of all changes; null: the job did not request it"
+    )
 
     @classmethod
     def of(cls, row: ProductRow) -> ProductView:
@@ -50,7 +54,7 @@ class ProductView(BaseModel):
             details=row.details,
             file=f"{here}/file",
             preview=f"{here}/preview",
-            effects=f"{here}/effects" if row.details.get("effects_picture_sha256") else None,
+            changes=f"{here}/changes" if row.details.get("changes_picture_sha256") else None,
         )
 
 
@@ -64,7 +68,7 @@ def list_products(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[ProductView]:
-    """Products, newest first; of one image or of one PSF where asked."""
+    """Products, newest first. `image_id` and `psf_id` select those of one image or of one PSF."""
     rows = state.catalogue.page(
         ProductRow,
         owner=caller.owner,
@@ -78,7 +82,7 @@ def list_products(
 
 @router.get("/{product_id}", summary="One product")
 def get_product(product_id: Identity, caller: Reading, state: Shared) -> ProductView:
-    """What is known of a product."""
+    """A product's metadata, with links to its files."""
     return ProductView.of(_find(state, caller, product_id))
 
 
@@ -91,9 +95,7 @@ def get_product_file(product_id: Identity, request: Request, caller: Reading, st
     )
 
 
-@router.get(
-    "/{product_id}/preview", summary="Before, after and the change, as a picture", response_class=Response
-)
+@router.get("/{product_id}/preview", summary="Picture of before, after and change", response_class=Response)
 def get_product_preview(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The picture as PNG."""
     return files.send(
@@ -101,22 +103,26 @@ def get_product_preview(product_id: Identity, request: Request, caller: Reading,
     )
 
 
-@router.get("/{product_id}/effects", summary="What changed, as a picture", response_class=Response)
-def get_product_effects(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """Before, after, change, difference, ratio and histogram as PNG, where the job was asked for it."""
-    digest = _find(state, caller, product_id).details.get("effects_picture_sha256")
+@router.get("/{product_id}/changes", summary="Picture of all changes", response_class=Response)
+def get_product_changes(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """Before, after, change, difference, ratio and histogram as PNG, if the job requested `changes_picture`."""
+    digest = _find(state, caller, product_id).details.get("changes_picture_sha256")
     if digest is None:
         raise Problem(
             404,
             "no-effects-picture",
-            "expected a product made with changes_picture true; this one was made with false",
+            "expected a product whose job had changes_picture true; this job had it false: submit the job again with true",
         )
     return files.send(request, state.store, digest, "image/png", None)
 
 
 def _find(state: Shared, caller: Caller, product_id: str) -> ProductRow:
-    """The product's row; ``Problem`` 404 where there is none."""
+    """The product's row. Raises ``Problem`` 404."""
     row = state.catalogue.get(ProductRow, product_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-product", f"there is no product with id {product_id}")
+        raise Problem(
+            404,
+            "no-such-product",
+            f"expected the id of a product in the catalogue; got {product_id}, which is not in it",
+        )
     return row

@@ -1,4 +1,4 @@
-"""Reports on transits: ``/v1/reports``."""
+"""Reports on transits and reruns: ``/v1/reports``."""
 
 from __future__ import annotations
 
@@ -23,19 +23,25 @@ router = APIRouter(prefix="/v1/reports", tags=["reports"], responses=RESPONSES)
 
 
 class ReportView(BaseModel):
-    """What a study of a transit found."""
+    """The report of a job on a transit, or of a rerun."""
 
     id: str
     created_at: float
     kind: str
-    transit_id: str | None = Field(description="null for a report on a rerun")
-    about_id: str | None = Field(description="the PSF or the product that was made again")
+    transit_id: str | None = Field(description="null: a report on a rerun")
+    about_id: str | None = Field(
+        description="id of the PSF or product of a rerun; null: a report on a transit"
+    )
     bytes: int
-    details: dict[str, Any] = Field(description="the sentence to read first, and the figures that matter")
-    file: str = Field(description="address of the whole report, JSON")
-    preview: str | None = Field(description="address of a picture")
-    html: str | None = Field(description="address of the report as a page to read, which needs nothing else")
-    output: str | None = Field(description="address of what a rerun made, which is in no list")
+    details: dict[str, Any] = Field(description="the summary sentence and the main figures")
+    file: str = Field(description="address of the whole report as JSON")
+    preview: str | None = Field(description="address of the picture; null: the report has none")
+    html: str | None = Field(
+        description="address of the report as a self-contained HTML page; null: the report has none"
+    )
+    output: str | None = Field(
+        description="address of the FITS file that a rerun made, which is in no list; null: not a rerun"
+    )
 
     @classmethod
     def of(cls, row: ReportRow) -> ReportView:
@@ -66,7 +72,7 @@ def list_reports(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[ReportView]:
-    """Reports, newest first."""
+    """Reports, newest first. `transit_id` and `about_id` select those on one transit, PSF or product."""
     rows = state.catalogue.page(
         ReportRow,
         owner=caller.owner,
@@ -80,7 +86,7 @@ def list_reports(
 
 @router.get("/{report_id}", summary="One report")
 def get_report(report_id: Identity, caller: Reading, state: Shared) -> ReportView:
-    """What is known of a report."""
+    """A report's metadata, with links to its files."""
     return ReportView.of(_find(state, caller, report_id))
 
 
@@ -93,37 +99,43 @@ def get_report_file(report_id: Identity, request: Request, caller: Reading, stat
     )
 
 
-@router.get("/{report_id}/preview", summary="A picture of the report", response_class=Response)
+@router.get("/{report_id}/preview", summary="The report's picture", response_class=Response)
 def get_report_preview(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """The report's figures as PNG."""
+    """The figures of the report as PNG."""
     row = _find(state, caller, report_id)
     if row.preview_sha256 is None:
-        raise Problem(404, "no-preview", "this report has no picture")
+        raise Problem(404, "no-preview", "expected a report with a picture; this one has none: read its file")
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
 
 
-@router.get("/{report_id}/page", summary="The report as a page to read", response_class=Response)
+@router.get("/{report_id}/page", summary="The report as an HTML page", response_class=Response)
 def get_report_page(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """The report as HTML with its figures inside; the browser is told to load nothing else and to run no script."""
+    """The report as HTML with its figures inside. Its headers forbid scripts and all other content."""
     digest = _find(state, caller, report_id).details.get("page_sha256")
     if digest is None:
-        raise Problem(404, "no-page", "this report has no page; its file and its picture are all there is")
+        raise Problem(404, "no-page", "expected a report with a page; this one has none: read its file")
     answer = files.send(request, state.store, digest, "text/html; charset=utf-8", None)
     answer.headers["Content-Security-Policy"] = PAGE_POLICY
     return answer
 
 
-@router.get("/{report_id}/output", summary="What a rerun made, as FITS", response_class=Response)
+@router.get("/{report_id}/output", summary="The file that a rerun made, as FITS", response_class=Response)
 def get_report_output(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """The product or the PSF as it came out again."""
+    """The product or PSF that the rerun made."""
     digest = _find(state, caller, report_id).details.get("output_sha256")
     if digest is None:
-        raise Problem(404, "no-output", "this report is on no rerun: its file is all that its job made")
+        raise Problem(
+            404, "no-output", "expected the report of a rerun; this is another report: read its file"
+        )
     return files.send(request, state.store, digest, files.FITS_TYPE, f"again-{report_id[:12]}.fits")
 
 
 def _find(state: Shared, caller: Caller, report_id: str) -> ReportRow:
     row = state.catalogue.get(ReportRow, report_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-report", f"there is no report with id {report_id}")
+        raise Problem(
+            404,
+            "no-such-report",
+            f"expected the id of a report in the catalogue; got {report_id}, which is not in it",
+        )
     return row

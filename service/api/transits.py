@@ -23,7 +23,7 @@ router = APIRouter(prefix="/v1/transits", tags=["transits"], responses=RESPONSES
 class PointingView(BaseModel):
     """A pointing of a transit."""
 
-    fov: int = Field(description="its number in transit.json")
+    fov: int = Field(description="number of the pointing in transit.json")
     images: int
 
 
@@ -31,11 +31,11 @@ class FileView(BaseModel):
     """A file of a transit."""
 
     name: str
-    bytes: int = Field(description="as the archive declares; of a file in it, unpacked")
+    bytes: int = Field(description="unpacked size, as declared in the archive")
 
 
 class TransitView(BaseModel):
-    """An uploaded transit, by its table of contents and its transit.json."""
+    """An uploaded transit: the content of its archive and of its transit.json."""
 
     id: str = Field(description="SHA-256 of the archive")
     created_at: float
@@ -45,8 +45,10 @@ class TransitView(BaseModel):
     instrument: str | None
     images: int
     pointings: list[PointingView]
-    noise: NoiseFigures | None = Field(description="null where a job has to bring the figures")
-    known_psf: str | None = Field(description="file of the known part of the PSF; null: the instrument's")
+    noise: NoiseFigures | None = Field(description="noise figures; null: a job must give them")
+    known_psf: str | None = Field(
+        description="file of the known part of the PSF; null: the diffraction PSF of the instrument"
+    )
     unpacked_bytes: int
 
     @classmethod
@@ -56,7 +58,7 @@ class TransitView(BaseModel):
 
 
 class TransitDetails(TransitView):
-    """An uploaded transit with the files that its transit.json names."""
+    """An uploaded transit, with the files that its transit.json names."""
 
     files: list[FileView]
 
@@ -76,14 +78,14 @@ def _content(row: TransitRow) -> dict[str, object]:
     status_code=201,
     summary="Upload a transit",
     openapi_extra=uploads.OPENAPI_TRANSIT_BODY,
-    responses={200: {"model": TransitDetails, "description": "The same file was uploaded before."}},
+    responses={200: {"model": TransitDetails, "description": "The same file was already uploaded."}},
 )
 async def upload_transit(
     request: Request, response: Response, caller: Submitting, state: Shared
 ) -> TransitDetails:
-    """Stream one archive in: images of a transit, their transit.json, and the known part of the PSF if there is one.
+    """Upload one archive: the images of a transit, their transit.json and, optionally, the known part of the PSF.
 
-    Its table of contents and transit.json are checked; its pixels are not touched here.
+    The table of contents and transit.json are checked now; the pixels are read by the job that uses the transit.
     """
     settings, take = state.settings, Allowed(state, caller)
     async with uploads.receive_transit(
@@ -105,15 +107,19 @@ async def upload_transit(
 def list_transits(
     request: Request, caller: Reading, state: Shared, limit: Limit = 50, cursor: Cursor = None
 ) -> Page[TransitView]:
-    """Uploaded transits, newest first, without their files' names."""
+    """Uploaded transits, newest first, without the names of their files."""
     rows = state.catalogue.page(TransitRow, owner=caller.owner, limit=limit + 1, after=position(cursor))
     return page(request, rows, limit, TransitView.of)
 
 
 @router.get("/{transit_id}", summary="One uploaded transit")
 def get_transit(transit_id: Identity, caller: Reading, state: Shared) -> TransitDetails:
-    """What is known of an uploaded transit."""
+    """An uploaded transit, with its files."""
     row = state.catalogue.get(TransitRow, transit_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-transit", f"no transit was uploaded with id {transit_id}")
+        raise Problem(
+            404,
+            "no-such-transit",
+            f"expected the id of an uploaded transit; got {transit_id}, which is not in the catalogue",
+        )
     return TransitDetails.of(row)

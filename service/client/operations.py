@@ -101,7 +101,7 @@ class Operations(ABC):
         product = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(product, output, preview)
         if effects is not None:
-            self.download(product["effects"], effects)
+            self.download(product["changes"], effects)
         return product
 
     def build_psf(

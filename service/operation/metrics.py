@@ -118,7 +118,7 @@ class _Catalogued(Collector):
         images = GaugeMetricFamily(
             "heliopsf_bulk_images", "Images of bulks that have not ended", labels=["state"]
         )
-        for state, count in catalogue.bulks.open_images().items():
+        for state, count in catalogue.bulks.progress.open_images().items():
             images.add_metric([state], count)
         yield images
         workers = GaugeMetricFamily("heliopsf_workers", "Worker processes that are there")

@@ -27,7 +27,7 @@ from workers.lineage import lineage
 
 OWNER = "local"
 LINES = 200  # 20 instruments, 5 channels, 2 kinds
-A_LINE_YEARS = 50  # certified PSFs that follow one another in a line, at most
+A_SERIES_YEARS = 50  # certified PSFs that follow one another in a series, at most
 YEAR_S = 31_557_600.0
 ONE_IN = {"certified": 10, "deprecated": 5}  # of PSFs
 DEEP = 500  # rows before the last one that a cursor stands at, where there are so many
@@ -59,7 +59,7 @@ class Archive:
 
 
 def fill(catalogue: Catalogue, size: Size) -> Archive:
-    """Rows in lines, with statuses and ranges, products by the handful a PSF and a great many of one; by statements."""
+    """Rows in series, with statuses and ranges, products by the handful a PSF and a great many of one; by statements."""
     archive = Archive(catalogue, size)
     sqlite = catalogue._engine.dialect.name == "sqlite"
     hexed = "printf('%064x', {})" if sqlite else "lpad(to_hex(cast({} as bigint)), 64, '0')"
@@ -73,9 +73,9 @@ def fill(catalogue: Catalogue, size: Size) -> Archive:
         return hexed.format(f"(({n}) * 2654435761 % 4294967296)")
 
     line = f"n % {LINES}"
-    place = f"(n / {LINES})"  # of a PSF in its line
+    place = f"(n / {LINES})"  # of a PSF in its series
     certified = (
-        f"({place}) % {ONE_IN['certified']} = 0 AND ({place}) / {ONE_IN['certified']} < {A_LINE_YEARS}"
+        f"({place}) % {ONE_IN['certified']} = 0 AND ({place}) / {ONE_IN['certified']} < {A_SERIES_YEARS}"
     )
     deprecated = f"({place}) % {ONE_IN['deprecated']} = 3"
     instrument = f"'instrument_' || (({line}) / 10)"
@@ -85,7 +85,7 @@ def fill(catalogue: Catalogue, size: Size) -> Archive:
     of_psf = f"CASE WHEN n % 100 < {MUCH_USED_PCT} THEN 3 * {LINES} ELSE n END % {size.psfs}"
     statements = [
         f"""{numbers.format(size.psfs)}
-        INSERT INTO psfs (owner, id, created_at, name, version, instrument, channel, kind, line, status, valid_from,
+        INSERT INTO psfs (owner, id, created_at, name, version, instrument, channel, kind, series, status, valid_from,
             valid_to, successor_id, origin, file_sha256, bytes, preview_sha256, details)
         SELECT '{OWNER}', {key("n")}, 1e9 + n, 'psf ' || (n % 1000),
             CASE WHEN {certified} OR {deprecated} THEN '1.' || {place} || '.0' ELSE '0.1.0+' || n END,
@@ -96,7 +96,7 @@ def fill(catalogue: Catalogue, size: Size) -> Archive:
             CASE WHEN {deprecated} AND n % 2 = 0 THEN {key(line)} END,
             'built', {key("n")}, n, NULL, '{{"shape": [2048, 2048], "provenance": {{}}}}'
         FROM n""",
-        """INSERT INTO psf_lines (owner, line) SELECT DISTINCT owner, line FROM psfs WHERE status = 'certified'""",
+        """INSERT INTO psf_series (owner, series) SELECT DISTINCT owner, series FROM psfs WHERE status = 'certified'""",
         f"""{numbers.format(size.products)}
         INSERT INTO products (owner, id, created_at, kind, image_id, psf_id, psf_version, file_sha256, bytes,
             preview_sha256, details)
@@ -213,8 +213,8 @@ def _lineage(archive: Archive, rng: random.Random) -> Any:
 def _status(archive: Archive, rng: random.Random) -> Any:
     psfs = archive.catalogue.psfs
     row = archive.catalogue.get(PsfRow, archive.psf_id(rng.randrange(archive.size.psfs)), OWNER)
-    assert row is not None and row.line is not None
-    return psfs.changes(row.id, OWNER), psfs.released(row.line, OWNER)
+    assert row is not None and row.series is not None
+    return psfs.changes(row.id, OWNER), psfs.released(row.series, OWNER)
 
 
 # Every list and every look-up that the service answers from the catalogue, by name.
@@ -242,9 +242,9 @@ QUESTIONS: dict[str, Question] = {
     "PSFs of a version": _psfs(pick=lambda rng: {"version": f"1.{rng.randrange(50)}.0"}),
     "PSFs of no version": _psfs(pick=lambda rng: {"version": "99.0.0"}),
     "PSFs of a status": _psfs(deep=True, pick=lambda rng: {"status": "deprecated"}),
-    "PSFs of a line": _psfs(pick=_line),
-    "PSFs of a line, certified": _psfs(pick=lambda rng: {**_line(rng), "status": "certified"}),
-    "PSFs of a line and a version": _psfs(pick=lambda rng: {**_line(rng), "version": "1.0.0"}),
+    "PSFs of a series": _psfs(pick=_line),
+    "PSFs of a series, certified": _psfs(pick=lambda rng: {**_line(rng), "status": "certified"}),
+    "PSFs of a series and a version": _psfs(pick=lambda rng: {**_line(rng), "version": "1.0.0"}),
     "PSFs of an instrument and no version": _psfs(
         pick=lambda rng: {"instrument": f"instrument_{rng.randrange(20)}", "version": "99.0.0"}
     ),
@@ -252,7 +252,7 @@ QUESTIONS: dict[str, Question] = {
     "PSFs of an instrument valid at a time": _psfs(
         pick=lambda rng: {"instrument": f"instrument_{rng.randrange(20)}", "valid_at": _at(rng)}
     ),
-    "PSFs of a line in a context": _in_context,
+    "PSFs of a series in a context": _in_context,
     "the best PSF": _best,
     "the best PSF in a context": _best_in_context,
     "why none fits": _none_fits,

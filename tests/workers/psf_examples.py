@@ -9,7 +9,7 @@ from typing import Any
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ProductRow, PsfRow
-from workers.versions.series import line_of
+from workers.versions.series import series_of
 from workers.versions.status import PsfStatus
 from workers.versions.validity import Validity
 
@@ -44,9 +44,15 @@ def psf(
         "details": {},
         **values,
     }
-    line = line_of(instrument, channel, kind)
+    series = series_of(instrument, channel, kind)
     return PsfRow(
-        owner=owner, id=identity(name), instrument=instrument, channel=channel, kind=kind, line=line, **given
+        owner=owner,
+        id=identity(name),
+        instrument=instrument,
+        channel=channel,
+        kind=kind,
+        series=series,
+        **given,
     )
 
 

@@ -1,4 +1,4 @@
-"""One image of a bulk: from an upload or a file to a product in the service, a file in a folder, or both."""
+"""One image of a bulk run: from an upload or a file to a product in the service, a file in a folder, or both."""
 
 from __future__ import annotations
 
@@ -28,17 +28,18 @@ from workers.files.store import sha256_of, sync
 from workers.intake import estimates
 from workers.intake.requests import resolved_deconvolution
 from workers.tasks import deconvolve as deconvolve_task
+from workers.tasks import product
 from workers.tasks.context import Context
-from workers.tasks.psf_build import psf_of
+from workers.tasks.psf_build import requested_psf
 
-# The structures that stand for an image, of all that its effects tell: blocks of 4 px, tails of 1 %.
+# The structures that summarise the changes of an image: blocks of 4 px, tails of 1 %.
 BLOCK_PX, TAIL_PCT = 4, 1.0
 LOOK_AGAIN_S = 0.5
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an image became, as its row keeps it."""
+    """The result of an image, as the columns of its row."""
 
     image_sha256: str
     psf_id: str
@@ -54,22 +55,25 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Source:
-    """An image's file, what its header says, and what its product may be called after."""
+    """An image's file, the summary of its header, and the name from which its product's file name is made."""
 
-    copy: Path | None  # of a file of the archive; an upload is in the store
+    copy: Path | None  # the copy of an archive file; None for an upload, which is in the store
     sha256: str
     summary: dict[str, Any]
     name: str
 
 
-def treat(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Outcome:
-    """Deconvolve an image as the bulk asks, unless that was done before, or a job is at it: then when that has ended."""
+def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Outcome:
+    """Deconvolve an image of a bulk run, unless its product exists.
+
+    If another job is making the product now, wait for that job and use its product.
+    """
     with _source(context, taken) as source:
         wanted = _resolved(context, bulk, request, source)
         identity = product_identity(wanted)
         target = _target(context, request, source, identity)
         if target is not None and taken.attempt > 1:
-            _sweep(target)
+            _remove_partial_files(target)
         before = _done_before(context, wanted, identity, request, target)
         if before is None and target is not None:
             _make_folder(target.parent)
@@ -79,13 +83,16 @@ def treat(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> O
 
 
 def _waited(context: Context, request: BulkWork, identity: str) -> bool:
-    """Wait while a job makes the very product; whether one did. Where the service keeps none, nobody else makes it."""
+    """Wait while another job makes this product; whether there was one.
+
+    A run whose products the service does not keep never waits: no job makes the same file.
+    """
     waited = False
     if not request.keeps_products:
         return False
     while context.catalogue.jobs.at_work_on(context.owner, identity):
         waited = True
-        context.report("waiting for an equal job", 0, 1)  # raises where the bulk is to stop
+        context.report("waiting for an equal job", 0, 1)  # raises if the bulk run must stop
         _rest()
     return waited
 
@@ -99,7 +106,10 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
     if taken.uploaded:
         row = context.catalogue.get(ImageRow, taken.source, context.owner)
         if row is None:
-            raise DataError("no-such-image", f"no image was uploaded with id {taken.source}")
+            raise DataError(
+                "no-such-image",
+                f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue",
+            )
         yield _Source(None, row.id, row.summary, row.filename or "image")
         return
     allowed = archive_files.roots(context.settings.bulk_roots)
@@ -109,13 +119,15 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
             sha256 = archive_files.copy_hashed(path, copy, context.settings.max_upload_bytes)
         except OSError as error:
             reason = archive_files.reason_of(error)
-            raise DataError("unreadable-file", f"expected a file that can be read: {reason}") from error
+            raise DataError(
+                "unreadable-file", f"expected a readable file; the system says: {reason}"
+            ) from error
         summary = dataclasses.asdict(read_summary(copy, context.limits))
         yield _Source(copy, sha256, summary, path.name)
 
 
 def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Source) -> ResolvedDeconvolve:
-    """The deconvolution with its PSF: the bulk's own, or the one that its context pins for the image."""
+    """The deconvolution with its PSF: that of the bulk run, or the one that its context pins for the image."""
     wanted = Deconvolve(
         image_id=source.sha256,
         psf_id=bulk.psf_id,
@@ -126,7 +138,7 @@ def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Sourc
 
 
 def _target(context: Context, request: BulkWork, source: _Source, identity: str) -> Path | None:
-    """Where the product's file is to be; none where the service keeps it alone."""
+    """The path of the product's file in the output folder; None if only the service keeps it."""
     if request.output is None:
         return None
     allowed = archive_files.roots(context.settings.bulk_output_roots)
@@ -137,11 +149,11 @@ def _target(context: Context, request: BulkWork, source: _Source, identity: str)
 def _done_before(
     context: Context, wanted: ResolvedDeconvolve, identity: str, request: BulkWork, target: Path | None
 ) -> Outcome | None:
-    """The product that is there, put into the output folder where it is not yet; None where there is none."""
+    """The existing product, copied to the output folder if it is not there yet; None if there is no product."""
     if request.keeps_products:
         row = context.catalogue.get(ProductRow, identity, context.owner)
         return None if row is None else _kept(context, row, target, reused=True)
-    earlier = context.catalogue.bulks.done_before(context.owner, identity, str(target))
+    earlier = context.catalogue.bulks.progress.done_before(context.owner, identity, str(target))
     if earlier is None or target is None or not target.is_file() or sha256_of(target) != earlier.sha256:
         return None
     assert earlier.sha256 is not None and earlier.bytes is not None and earlier.score is not None
@@ -170,17 +182,17 @@ def _done_now(
 ) -> Outcome:
     needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
     estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
-    psf_row = psf_of(context, wanted)
-    # Asked for now: a store's local copy may be gone after a wait for an equal job, or after the PSF was built.
+    psf_row = requested_psf(context, wanted)
+    # Only now: the store's local copy may be gone after waiting for another job or building the PSF.
     image_file = source.copy or context.store.path(source.sha256)
     image = deconvolve_task.load(context, wanted, image_file, source.summary)
     started = time.perf_counter()
     made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
     kernel = {"kernel_seconds": round(time.perf_counter() - started, 3)}
     with context.store.temporary() as path:
-        deconvolve_task.write(made, path)
+        product.write(made, path)
         if request.keeps_products:
-            outcome = _kept(context, deconvolve_task.keep(made, path), target, reused=False)
+            outcome = _kept(context, product.keep(made, path), target, reused=False)
             return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
         assert target is not None
         sha256, size_bytes = sha256_of(path), path.stat().st_size
@@ -200,7 +212,7 @@ def _done_now(
 
 
 def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: bool) -> Outcome:
-    """The outcome where the service has the product."""
+    """The outcome for a product that the service keeps."""
     if target is not None and not (
         target.is_file() and target.stat().st_size == row.bytes and sha256_of(target) == row.file_sha256
     ):
@@ -214,14 +226,14 @@ def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: boo
         output=None if target is None else str(target),
         sha256=row.file_sha256,
         bytes=row.bytes,
-        score=float(row.details["effects"]["artefacts"]["score"]),
+        score=float(row.details["changes"]["artefacts"]["score"]),
         statistics=statistics_of(row.details),
     )
 
 
 def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
-    """Change and artefacts of an image, in short, of all that its product tells."""
-    found = details["effects"]
+    """A summary of the changes and artefacts that a product's details hold in full."""
+    found = details["changes"]
     changes = {
         row["kind"]: {"sum_pct": row["sum_pct"], "up_to_pct": row["up_to_pct"]}
         for row in found["structures"]
@@ -238,39 +250,43 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _sweep(target: Path) -> None:
-    """Remove what a worker that was killed left of this file."""
+def _remove_partial_files(target: Path) -> None:
+    """Remove partial copies of this file that a killed worker left."""
     if target.parent.is_dir():
         for partial in partials(target):
             partial.unlink(missing_ok=True)
 
 
 def _make_folder(folder: Path) -> None:
-    """Make an output folder before the work is done that would be lost without it. Raises DataError "output-not-written"."""
-    with _written_or_said():
+    """Make the output folder before the image is deconvolved, so that no work is lost.
+
+    Raises DataError "output-not-written".
+    """
+    with _write_errors():
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 def _put(source: Path, target: Path) -> None:
-    """Copy a file to its place; whoever looks there sees all of it, or nothing.
+    """Copy a file to its place in one step: a reader sees the whole file or none.
 
     Raises DataError "output-not-written".
     """
-    with _written_or_said():
+    with _write_errors():
         target.parent.mkdir(parents=True, exist_ok=True)
         with source.open("rb") as file, whole_file(target) as copy:
             shutil.copyfileobj(file, copy, 2**20)
-        sync(target.parent)  # its name too, before the image counts as done
+        sync(target.parent)  # the file name must be on the disk too before the image counts as done
 
 
 @contextmanager
-def _written_or_said() -> Iterator[None]:
+def _write_errors() -> Iterator[None]:
     try:
         yield
     except OSError as error:
         reason = archive_files.reason_of(error)
         raise DataError(
-            "output-not-written", f"expected an output folder that can be written to: {reason}"
+            "output-not-written",
+            f"expected an output folder that the service can write to; the system says: {reason}",
         ) from error

@@ -1,4 +1,4 @@
-"""From what a user asks of a bulk to its row: what it names is there, what it may not touch is refused, its PSF is fixed."""
+"""From a request for a bulk run to its row: check images and paths, and fix the PSF or the context."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ from workers.settings import Settings
 
 
 def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Settings) -> tuple[BulkRow, bool]:
-    """A new bulk, or the open one of an equal request; and whether it is new.
+    """A new bulk run, or the open one of an identical request; and whether it is new.
 
     Raises ``DataError``: "no-such-psf", "no-such-context", "no-such-image", "bad-path", "path-not-allowed".
     """
     psf_id, context_id = _pinned(request, catalogue, owner)
     images = list(dict.fromkeys(request.images))
-    missing = catalogue.bulks.first_not_uploaded(images, owner)
+    missing = catalogue.bulks.progress.first_not_uploaded(images, owner)
     if missing is not None:
-        raise DataError("no-such-image", f"no image was uploaded with id {missing}")
+        raise DataError(
+            "no-such-image", f"expected ids of uploaded images; got {missing}, which is not in the catalogue"
+        )
     _check_places(request, settings)
     asked = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
     now = time.time()
@@ -48,10 +50,13 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
 
 
 def _pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str | None, str | None]:
-    """The ids of the PSF or of the context: what they name stays as it is."""
+    """The id of the PSF or of the context. Ids are fixed, so a later change of a name does not change the run."""
     if request.psf_id is not None:
         if catalogue.get(PsfRow, request.psf_id, owner) is None:
-            raise DataError("no-such-psf", f"the catalogue holds no PSF with id {request.psf_id}")
+            raise DataError(
+                "no-such-psf",
+                f"expected the id of a PSF in the catalogue; got {request.psf_id}, which is not in it",
+            )
         return request.psf_id, None
     assert request.context is not None
     return None, catalogue.contexts.named(request.context, owner).id
@@ -65,10 +70,12 @@ def _check_places(request: BulkRequest, settings: Settings) -> None:
         return
     folder = Path(request.output.folder)
     if not folder.is_absolute() or ".." in folder.parts:
-        raise DataError("bad-path", "output: expected an absolute path without '..'")
+        raise DataError(
+            "bad-path", f"output: expected an absolute path without '..'; got {ascii(str(folder))[:200]}"
+        )
     archive_files.check_under(folder, archive_files.roots(settings.bulk_output_roots), "an output folder")
 
 
 def _key(asked: Mapping[str, Any], images: Sequence[str]) -> str:
-    """Identity of the request, whatever it is called."""
+    """The key of the request: identical requests have the same key, whatever their names."""
     return canonical_hash({**asked, "name": None, "images": list(images)})

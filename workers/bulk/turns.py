@@ -1,9 +1,9 @@
-"""Turns of bulk: jobs in the queue ``bulk`` in which a worker does one image after the other.
+"""Turns of bulk runs: jobs in the queue ``bulk`` in which a worker deconvolves one image after the other.
 
-A bulk has as many turns as there are worker processes, and never more than images left. They are jobs like all
-others, so that what is known of these holds: one worker has a turn, a lost one is queued again, a worker that stops
-hands it back. After each image a turn lets jobs of other kinds go first, after a minute turns of other bulks; it is
-gone once there is nothing left for it.
+A bulk run has as many turns as there are worker processes, but never more than images left. Turns are ordinary jobs:
+one worker has a turn, a lost turn is queued again, and a worker that stops hands its turn back. After each image a turn
+ends if jobs of other kinds wait; after a minute it ends so that turns of other bulk runs can follow. When the run has
+no work left, its turns are deleted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 def keep_turns(catalogue: Catalogue, settings: Settings) -> None:
-    """Give every bulk that goes on the turns that it needs; forget those that ended."""
+    """Queue the turns that every active bulk run needs; delete the turns that ended."""
     turns = catalogue.jobs.of_kind(KIND)
     for turn in turns:
         if Phase(turn.phase).ended:
@@ -41,7 +41,7 @@ def keep_turns(catalogue: Catalogue, settings: Settings) -> None:
 
 
 def cancel_turns(catalogue: Catalogue, bulk_id: str) -> None:
-    """Stop the turns of a bulk, each within a step of what it does."""
+    """Cancel the turns of a bulk run; each stops at its next report of progress."""
     for turn in catalogue.jobs.of_kind(KIND):
         if turn.parameters["bulk_id"] == bulk_id:
             catalogue.jobs.cancel(turn.id)
@@ -54,10 +54,10 @@ def _wanted(bulk: BulkRow, processes: int) -> int:
 
 
 def _forget(catalogue: Catalogue, turn: JobRow) -> None:
-    """An ended turn has nothing to say, unless it failed for a reason that the next one would meet too."""
+    """Delete an ended turn. If it failed for a reason that the next turn would meet too, stop the bulk run."""
     error = JobError.model_validate(turn.error) if turn.error else None
     if error is not None and error.fault != Fault.TRANSIENT and error.code != "worker-lost":
         bulk_id = turn.parameters["bulk_id"]
         if catalogue.bulks.stop_with(bulk_id, error):
-            log.error("bulk %s: stopped: %s", bulk_id, error.message)
+            log.error("bulk run %s: stopped: %s", bulk_id, error.message)
     catalogue.uws.destroy(turn.id)

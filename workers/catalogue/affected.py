@@ -1,4 +1,4 @@
-"""Products that were made with a PSF that is no longer to be used."""
+"""Products that were made with a deprecated PSF."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_SUCCESSORS = 32
 
 @dataclass(frozen=True)
 class Affected:
-    """A product, its PSF, and the certified PSF at the end of that one's successors, where there is one."""
+    """A product, its PSF, and the certified PSF at the end of the PSF's chain of successors (None if there is none)."""
 
     product: ProductRow
     psf: PsfRow
@@ -28,7 +28,7 @@ class Affected:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a page ended: PSFs come by id, and of each its products newest first."""
+    """Where a page ended. PSFs are sorted by id; the products of each PSF are sorted newest first."""
 
     psf_id: str
     created_at: float
@@ -47,9 +47,10 @@ class AffectedProducts:
             return _told(session, [psf], session.scalars(_products(psf, limit, after)).all())
 
     def page(self, owner: str, *, superseded: bool, limit: int, after: Place | None = None) -> list[Affected]:
-        """Products that were made with PSFs that are deprecated; superseded: and have a successor.
+        """Products that were made with deprecated PSFs; superseded: only with those that have a successor.
 
-        A join would put all products of a PSF in order before it gave the first; by steps, each reads what it gives.
+        A join would sort all products of a PSF before it returned the first one. Several queries read only the rows
+        that they return.
         """
         found: list[Affected] = []
         with self._database.reading() as session:
@@ -69,7 +70,7 @@ class AffectedProducts:
 
 
 def _next_psfs(owner: str, superseded: bool, after: str) -> Select[Any]:
-    """Deprecated PSFs by id, those alone that products were made with."""
+    """Deprecated PSFs that products were made with, by id."""
     used = exists().where(ProductRow.owner == PsfRow.owner, ProductRow.psf_id == PsfRow.id)
     query = select(PsfRow).where(
         PsfRow.owner == owner, PsfRow.status == PsfStatus.DEPRECATED, PsfRow.id > after, used
@@ -88,16 +89,16 @@ def _products(psf: PsfRow, limit: int, after: tuple[float, str] | None = None) -
 
 
 def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> list[ProductRow]:
-    """The first products of all these PSFs, in one statement: those of each in their order, PSF after PSF."""
+    """The first products of these PSFs, in one statement, PSF after PSF, newest first within a PSF."""
     each = [select(_products(psf, limit).subquery()) for psf in psfs]
     rows = session.scalars(select(ProductRow).from_statement(union_all(*each))).all()
     place = {psf.id: number for number, psf in enumerate(psfs)}
-    # A union promises no order.
+    # A union has no guaranteed order.
     return sorted(rows, key=lambda row: (-place[row.psf_id], row.created_at, row.id), reverse=True)
 
 
 def _told(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRow]) -> list[Affected]:
-    """Products with their PSFs, and the certified ones that the successors of these lead to."""
+    """Products with their PSFs and the certified PSFs to which the chains of successors lead."""
     known = {psf.id: psf for psf in psfs}
     for _ in range(MOST_SUCCESSORS):
         further = {psf.successor_id for psf in known.values() if psf.successor_id is not None} - known.keys()
@@ -112,7 +113,7 @@ def _told(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRo
 
 
 def _last_successor(known: dict[str, PsfRow], psf: PsfRow) -> PsfRow | None:
-    """The certified PSF at the end of the successors."""
+    """The certified PSF at the end of the chain of successors, or None."""
     at: PsfRow | None = psf
     for _ in range(MOST_SUCCESSORS):
         if at is None or at.successor_id is None:

@@ -1,4 +1,4 @@
-"""What is seen of bulks and their images: how far, how fast, what was found."""
+"""The progress of bulk runs and their images: how many, how fast, with which results."""
 
 from __future__ import annotations
 
@@ -12,40 +12,29 @@ from sqlalchemy import func, select, tuple_
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.database import Database
 from workers.catalogue.tables import ImageRow
-from workers.contract.bulk import AT_WORK, OPEN, ItemState
+from workers.contract.bulk import OPEN, ItemState
 
 BATCH = 1000
-# What the pace is told from: the last hour at most, and these images at most.
+# The pace is computed from at most the last hour, and at most this many images.
 PACE_S, PACE_IMAGES = 3600.0, 500
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a bulk goes, and what is at work now."""
+    """Images that workers have now, and images done per hour (None if unknown)."""
 
     taken: int
     images_an_hour: float | None
 
 
-class BulkLooks:
-    """Reading the tables of bulk; each method is one transaction."""
+class BulkProgress:
+    """Queries of the tables of bulk runs; each method is one transaction."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def get(self, bulk_id: str) -> BulkRow | None:
-        """The bulk's row, or None."""
-        with self._database.reading() as session:
-            return session.get(BulkRow, bulk_id)
-
-    def at_work(self) -> Sequence[BulkRow]:
-        """Bulks that go on, oldest first."""
-        query = select(BulkRow).where(BulkRow.phase.in_(sorted(AT_WORK)))
-        with self._database.reading() as session:
-            return sorted(session.scalars(query), key=lambda bulk: bulk.created_at)
-
     def first_not_uploaded(self, ids: Sequence[str], owner: str) -> str | None:
-        """The first of these ids that is no uploaded image of the owner's; None where all are."""
+        """The first of these ids that is not an uploaded image of the owner; None if all are."""
         rest = iter(ids)
         with self._database.reading() as session:
             while batch := list(islice(rest, BATCH)):
@@ -57,7 +46,7 @@ class BulkLooks:
         return None
 
     def pace(self, bulk: BulkRow) -> Pace:
-        """Images at work, and how many are done an hour, by the last of them since it last began."""
+        """Images that workers have now, and images done per hour since the run was last started or resumed."""
         until = bulk.ended_at or time.time()
         since = max(bulk.running_since or bulk.created_at, until - PACE_S)
         ended = select(BulkItemRow.ended_at).where(
@@ -71,13 +60,13 @@ class BulkLooks:
             count, first = session.execute(select(func.count(), func.min(last.c.ended_at))).one()
         if not count:
             return Pace(at_work, None)
-        # The first of so many ended when the others were still to do.
+        # The interval begins when the first of these images ended, so that image does not count.
         start, images = (first, count - 1) if count == PACE_IMAGES else (since, count)
         lasted = until - start
         return Pace(at_work, images * 3600.0 / lasted if lasted > 0 else None)
 
     def to_look_at(self, bulk_id: str, score: float) -> int:
-        """Images that are done whose score is this or more."""
+        """Number of done images with an artefact score of ``score`` or more."""
         query = select(func.count()).select_from(BulkItemRow)
         query = query.where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.score >= score)
         with self._database.reading() as session:
@@ -86,7 +75,7 @@ class BulkLooks:
     def items(
         self, bulk_id: str, state: ItemState, *, after: int = -1, limit: int = BATCH
     ) -> Sequence[BulkItemRow]:
-        """Images in a state, in the bulk's order, from behind ``after``."""
+        """Images in a state, in the order of the run, after position ``after``."""
         query = select(BulkItemRow).where(
             BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == state, BulkItemRow.position > after
         )
@@ -96,7 +85,7 @@ class BulkLooks:
     def worst(
         self, bulk_id: str, *, after: tuple[float, int] | None = None, limit: int = BATCH
     ) -> Sequence[BulkItemRow]:
-        """Images that are done, the most doubtful first, from behind ``after`` = (score, position)."""
+        """Done images, highest artefact score first, after ``after`` = (score, position)."""
         key = tuple_(BulkItemRow.score, BulkItemRow.position)
         query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.score.is_not(None))
         if after is not None:
@@ -106,7 +95,7 @@ class BulkLooks:
             return session.scalars(query).all()
 
     def done_before(self, owner: str, product_id: str, output: str) -> BulkItemRow | None:
-        """An image that became this product in this file, in any bulk of the owner's."""
+        """An image whose product is this one in this file, in any bulk run of the owner; None if there is none."""
         query = select(BulkItemRow).join(BulkRow, BulkRow.id == BulkItemRow.bulk_id)
         query = query.where(
             BulkItemRow.product_id == product_id,
@@ -118,7 +107,7 @@ class BulkLooks:
             return session.scalars(query.limit(1)).first()
 
     def open_images(self) -> dict[str, int]:
-        """Images of all bulks that have not ended, by how far they are."""
+        """Numbers of images in all bulk runs that have not ended: left, done, failed."""
         left = BulkRow.total - BulkRow.done - BulkRow.failed
         sums = [func.coalesce(func.sum(one), 0) for one in (left, BulkRow.done, BulkRow.failed)]
         query = select(*sums).where(BulkRow.phase.in_(sorted(OPEN)))

@@ -1,4 +1,4 @@
-"""The tables of bulk: each bulk, and each of its images."""
+"""The tables of bulk runs and of their images."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ _OPEN = text("phase IN ('ERROR', 'LISTING', 'PAUSED', 'RUNNING')")
 
 
 class BulkRow(Base):
-    """Many images that are deconvolved alike. Its counts are those of its items, changed where these change."""
+    """A bulk run: many images deconvolved in the same way. Its counts change in the transactions that change its items."""
 
     __tablename__ = "bulks"
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     owner: Mapped[str] = mapped_column(String(64))
     name: Mapped[str] = mapped_column(String(80))
     phase: Mapped[str] = mapped_column(String(16))
-    request: Mapped[dict[str, Any]]  # without the uploaded images' ids, which are items
+    request: Mapped[dict[str, Any]]  # without the ids of uploaded images, which are items
     request_key: Mapped[str] = mapped_column(String(64))
     psf_id: Mapped[str | None] = mapped_column(String(64))
     context_id: Mapped[str | None] = mapped_column(String(64))
     created_at: Mapped[float]
     running_since: Mapped[float | None]
     ended_at: Mapped[float | None]
-    listed: Mapped[bool]  # whether all its files are items
-    lister: Mapped[str | None] = mapped_column(String(32))  # the lease under which they are listed
+    listed: Mapped[bool]  # whether all its files have been listed as items
+    lister: Mapped[str | None] = mapped_column(String(32))  # the lease under which files are listed now
     total: Mapped[int] = mapped_column(default=0)
     done: Mapped[int] = mapped_column(default=0)
-    reused: Mapped[int] = mapped_column(default=0)  # of those done: what was there before
+    reused: Mapped[int] = mapped_column(default=0)  # done images whose product existed before
     failed: Mapped[int] = mapped_column(default=0)
     error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
         Index("bulks_listed", "owner", "created_at", "id"),
         Index("bulks_by_phase", "phase"),
-        # Two equal requests at the same moment: the second insert fails and finds the first.
+        # Of two identical requests at the same moment, the second insert fails and then finds the first.
         Index(
             "one_open_bulk_a_request",
             "owner",
@@ -52,13 +52,13 @@ class BulkRow(Base):
 
 
 class BulkItemRow(Base):
-    """An image of a bulk. Who has taken it holds the lease ``token`` of the job ``job_id``, and nobody else does."""
+    """An image of a bulk run. The worker that has it holds the lease ``token`` of the job ``job_id``."""
 
     __tablename__ = "bulk_items"
     bulk_id: Mapped[str] = mapped_column(String(32), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
     uploaded: Mapped[bool]
-    source: Mapped[str] = mapped_column(String(MOST_LETTERS))  # an upload's id, or a path
+    source: Mapped[str] = mapped_column(String(MOST_LETTERS))  # an upload's id, or a file's path
     state: Mapped[str] = mapped_column(String(16))
     attempts: Mapped[int] = mapped_column(default=0)
     job_id: Mapped[str | None] = mapped_column(String(32))
@@ -69,7 +69,7 @@ class BulkItemRow(Base):
     image_sha256: Mapped[str | None] = mapped_column(String(64))
     psf_id: Mapped[str | None] = mapped_column(String(64))
     product_id: Mapped[str | None] = mapped_column(String(64))
-    kept: Mapped[bool] = mapped_column(default=False)  # whether the service has the product
+    kept: Mapped[bool] = mapped_column(default=False)  # whether the service keeps the product
     output: Mapped[str | None] = mapped_column(String(1200))  # the file in the output folder
     sha256: Mapped[str | None] = mapped_column(String(64))
     bytes: Mapped[int | None] = mapped_column(BigInteger)

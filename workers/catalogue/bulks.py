@@ -1,7 +1,7 @@
-"""Bulks and their images in the catalogue: asked for, listed, taken, done.
+"""Bulk runs and their images in the catalogue: created, listed, taken, done.
 
-An image is taken by compare-and-set under the lease of a job (``workers.bulk.task``), and free again once that lease
-is gone. A bulk's counts and its end are written in the transaction that changes its images.
+A worker takes an image by compare-and-set under the lease of its job (``workers.bulk.task``). The image is free again
+when the lease is lost. The counts and the end of a run are written in the transaction that changes its images.
 """
 
 from __future__ import annotations
@@ -19,25 +19,26 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
-from workers.catalogue.bulk_progress import BATCH, BulkLooks
+from workers.catalogue.bulk_progress import BATCH, BulkProgress
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
+from workers.catalogue.database import Database
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import JobRow
 from workers.contract.bulk import AT_WORK, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError, Phase
 
-# Errors of files whose rows do not hold their paths: to try these again would find no file, or another one.
+# Errors of files whose paths the catalogue cannot store. They are not retried: the stored path names no file or another.
 NOT_UTF_8, TOO_LONG = "path-not-utf-8", "path-too-long"
 LOST = JobError(
     fault=Fault.INTERNAL,
     code="worker-lost",
-    message="a worker was lost each time that it worked on this image; it is not tried again",
+    message="every worker that began this image was lost; the image is not tried again unless the run is retried",
 )
 
 
 @dataclass(frozen=True)
 class Listed:
-    """An image to be worked on, or why it cannot be."""
+    """An image of a run, or the error if it cannot be used."""
 
     source: str
     uploaded: bool
@@ -46,7 +47,7 @@ class Listed:
 
 @dataclass(frozen=True)
 class Taken:
-    """The right to work on an image; what is written under a lost right does nothing."""
+    """The right to work on an image. Changes made after the right was lost have no effect."""
 
     bulk_id: str
     position: int
@@ -56,14 +57,29 @@ class Taken:
     lease: Lease
 
 
-class Bulks(BulkLooks):
-    """The tables of bulk; each method is one transaction, or one a batch."""
+class Bulks:
+    """The tables of bulk runs; each method is one transaction, or one transaction per batch."""
 
-    # A bulk -------------------------------------------------------------------------------------------
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self.progress = BulkProgress(database)
+
+    # A bulk run ---------------------------------------------------------------------------------------
+
+    def get(self, bulk_id: str) -> BulkRow | None:
+        """The run's row, or None."""
+        with self._database.reading() as session:
+            return session.get(BulkRow, bulk_id)
+
+    def at_work(self) -> Sequence[BulkRow]:
+        """Runs with work to do that are not paused or stopped, oldest first."""
+        query = select(BulkRow).where(BulkRow.phase.in_(sorted(AT_WORK)))
+        with self._database.reading() as session:
+            return sorted(session.scalars(query), key=lambda bulk: bulk.created_at)
 
     def create(self, row: BulkRow, uploaded: Iterable[str]) -> tuple[BulkRow, bool]:
-        """A new bulk with these uploads as its first images, or the open one of an equal request; whether it is new."""
-        for _ in range(3):  # the equal bulk may end between the two statements
+        """A new run with these uploads as its first images, or the open run of an identical request; whether it is new."""
+        for _ in range(3):  # the identical run may end between the two statements
             try:
                 with self._database.writing.begin() as session:
                     session.add(row)
@@ -74,34 +90,34 @@ class Bulks(BulkLooks):
                 existing = self._equal_open(row)
                 if existing is not None:
                     return existing, False
-        raise RuntimeError(f"bulk for request {row.request_key} neither inserted nor found")
+        raise RuntimeError(f"bulk run for request {row.request_key} neither inserted nor found")
 
     def pause(self, bulk_id: str) -> bool:
-        """LISTING, RUNNING -> PAUSED; images at work are let end."""
+        """LISTING, RUNNING -> PAUSED. Images that workers have are finished."""
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.PAUSED)
 
     def resume(self, bulk_id: str) -> bool:
-        """PAUSED, ERROR -> where it was."""
+        """PAUSED, ERROR -> RUNNING, or LISTING if its files are not all listed."""
         now = {"running_since": time.time(), "error": None}
         return self._set(bulk_id, STOPPED, BulkRow.listed, phase=BulkPhase.RUNNING, **now) or self._set(
             bulk_id, STOPPED, BulkRow.listed.is_(False), phase=BulkPhase.LISTING, **now
         )
 
     def cancel(self, bulk_id: str) -> bool:
-        """Any phase but an end -> CANCELLED."""
+        """Any open phase -> CANCELLED."""
         return self._set(bulk_id, OPEN, phase=BulkPhase.CANCELLED, ended_at=time.time())
 
     def stop_with(self, bulk_id: str, error: JobError) -> bool:
-        """LISTING, RUNNING -> ERROR, for a reason that is not one image's."""
+        """LISTING, RUNNING -> ERROR, for a reason that concerns more than one image."""
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.ERROR, error=error.model_dump(mode="json"))
 
     def retry(self, bulk_id: str) -> int | None:
-        """Let what failed wait again, but for files whose paths could not be kept; how many images that are.
+        """Queue the failed images again; returns their number, or None for a cancelled run.
 
-        None for a bulk that was cancelled.
-        Raises DataError "equal-bulk-open" for one that has ended, where an equal one is open.
+        Files whose paths could not be stored stay failed. Raises DataError "equal-bulk-open" if the run has ended and
+        an identical one is open.
         """
-        for _ in range(3):  # the equal bulk may end between the two statements
+        for _ in range(3):  # the identical run may end between the two statements
             try:
                 return self._retry(bulk_id)
             except IntegrityError:
@@ -110,10 +126,10 @@ class Bulks(BulkLooks):
             if equal is not None:
                 raise DataError(
                     "equal-bulk-open",
-                    f"expected no other open bulk of the same request; bulk {equal.id} is {equal.phase}: "
-                    "cancel it, or try again when it has ended",
+                    f"expected no other open bulk run of the same request; run {equal.id} is {equal.phase}: cancel that run, "
+                    "or try again when it has ended",
                 )
-        raise RuntimeError(f"bulk {bulk_id} neither opened again nor its equal found")
+        raise RuntimeError(f"bulk run {bulk_id} neither reopened nor its identical run found")
 
     def _retry(self, bulk_id: str) -> int | None:
         with self._database.writing.begin() as session:
@@ -134,7 +150,7 @@ class Bulks(BulkLooks):
             return changed
 
     def _equal_open(self, row: BulkRow) -> BulkRow | None:
-        """Another bulk, of an equal request, that is open."""
+        """Another open run of an identical request."""
         equal = select(BulkRow).where(
             BulkRow.owner == row.owner,
             BulkRow.request_key == row.request_key,
@@ -147,9 +163,9 @@ class Bulks(BulkLooks):
     # Listing ------------------------------------------------------------------------------------------
 
     def begin_listing(self, bulk_id: str, lease: Lease) -> bool:
-        """List files under this lease, from the start: what another listed before it was lost is forgotten.
+        """Begin to list the files under this lease. Files that a lost worker listed are deleted first.
 
-        False where the lease is lost, or there is nothing to list.
+        False if the lease is lost or there is nothing to list.
         """
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
@@ -161,7 +177,7 @@ class Bulks(BulkLooks):
             return True
 
     def add_listed(self, bulk_id: str, lease: Lease, images: Sequence[Listed]) -> bool:
-        """Add images to a bulk that is listed under this lease; False where the lease or the bulk is lost."""
+        """Add images to a run that is listed under this lease; False if the lease is lost or the run is not LISTING."""
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
@@ -171,7 +187,7 @@ class Bulks(BulkLooks):
             return True
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:
-        """LISTING -> RUNNING, or COMPLETED where nothing is left to do."""
+        """LISTING -> RUNNING, or COMPLETED if no image is left."""
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
@@ -184,9 +200,9 @@ class Bulks(BulkLooks):
     # Images -------------------------------------------------------------------------------------------
 
     def take(self, bulk_id: str, lease: Lease, max_attempts: int) -> Taken | None:
-        """An image whose worker was lost, or one that waits.
+        """Take an image whose worker was lost, or the next waiting one.
 
-        None where there is none, the bulk does not run, or the lease is lost.
+        None if no image is left, the run is not RUNNING, or the lease is lost.
         """
         while True:
             with self._database.writing.begin() as session:
@@ -207,12 +223,12 @@ class Bulks(BulkLooks):
                 return Taken(bulk_id, item.position, item.source, item.uploaded, item.attempts, lease)
 
     def release(self, taken: Taken) -> bool:
-        """Give an image back undone, as if it had not been taken."""
+        """Release an image as if it had not been taken."""
         values = {"state": ItemState.WAITING, "attempts": BulkItemRow.attempts - 1, "token": None}
         return bool(self._database.change(update(BulkItemRow).where(*_holding(taken)).values(**values)))
 
     def finish(self, taken: Taken, *, reused: bool, **values: Any) -> bool:
-        """An image is done; False where the right to it was lost, and whoever has it now does it."""
+        """Note that an image is done; False if the right to it was lost."""
         done = update(BulkItemRow).where(*_holding(taken)).values(
             state=ItemState.DONE, ended_at=time.time(), token=None, error=None, reused=reused, **values
         )  # fmt: skip
@@ -223,7 +239,7 @@ class Bulks(BulkLooks):
             return True
 
     def fail(self, taken: Taken, error: JobError) -> bool:
-        """An image cannot be done; False where the right to it was lost."""
+        """Note that an image failed; False if the right to it was lost."""
         failed = update(BulkItemRow).where(*_holding(taken)).values(
             state=ItemState.FAILED, ended_at=time.time(), token=None, error=error.model_dump(mode="json")
         )  # fmt: skip
@@ -245,12 +261,12 @@ class Bulks(BulkLooks):
 
 
 def new_id() -> str:
-    """An id for a bulk."""
+    """A new id for a bulk run."""
     return uuid.uuid4().hex
 
 
 def _add(session: Session, bulk_id: str, first: int, images: Iterable[Listed]) -> int:
-    """Insert images behind those that are there, some at a time; how many."""
+    """Insert images after position ``first`` - 1, in batches; returns their number."""
     numbered = enumerate(images, first)
     position = first
     while batch := [_values(bulk_id, number, image) for number, image in islice(numbered, BATCH)]:
@@ -274,12 +290,12 @@ def _values(bulk_id: str, position: int, image: Listed) -> Mapping[str, Any]:
 
 def _waiting(bulk_id: str) -> Any:
     query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.WAITING)
-    # Others that take at the same moment take the next ones.
+    # Workers that take an image at the same moment get different ones.
     return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
 
 
 def _left(bulk_id: str) -> Any:
-    """Taken under a lease that is gone."""
+    """Images that were taken under a lease that is lost."""
     held = select(JobRow.id).where(
         JobRow.id == BulkItemRow.job_id, JobRow.lease == BulkItemRow.token, JobRow.phase == Phase.EXECUTING
     )
@@ -290,7 +306,7 @@ def _left(bulk_id: str) -> Any:
 
 
 def _good(session: Session, lease: Lease) -> bool:
-    """Whether the job is still at work under this lease."""
+    """Whether the lease still holds."""
     held = select(JobRow.id).where(
         JobRow.id == lease.job_id, JobRow.lease == lease.token, JobRow.phase == Phase.EXECUTING
     )
@@ -316,7 +332,7 @@ def _count(session: Session, bulk_id: str, **values: Any) -> None:
 
 
 def _end_if_done(session: Session, bulk_id: str) -> None:
-    """Any phase but an end -> COMPLETED, where no image is left."""
+    """Any open phase -> COMPLETED, if all images are listed and none is left."""
     done = update(BulkRow).where(
         BulkRow.id == bulk_id,
         BulkRow.phase.in_(sorted(OPEN)),

@@ -1,6 +1,7 @@
 """The catalogue: images, transits, PSFs, products and jobs, in SQLite or PostgreSQL through SQLAlchemy.
 
-What is done with each subject has a file of its own; here they are put together, with what all rows have in common.
+Each subject has a class in a file of its own. The class here holds them together, with the operations that all
+content-addressed rows share.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ AnyRow = TypeVar(
 
 
 class Catalogue:
-    """All reading and writing of rows; each method, here and of each subject, is one transaction."""
+    """Reads and writes all rows. Each method, here and of each subject, is one transaction."""
 
     def __init__(self, url: str) -> None:
         self._database = Database(url)
@@ -63,7 +64,7 @@ class Catalogue:
         self.named_files = NamedFiles(self._database)
 
     def upgrade(self) -> None:
-        """Bring the database to this version's tables. Raises ``workers.catalogue.schema.SchemaError`` where that cannot be."""
+        """Upgrade the database to the tables of this version. Raises ``workers.catalogue.schema.SchemaError``."""
         self.schema.upgrade()
 
     def close(self) -> None:
@@ -71,15 +72,15 @@ class Catalogue:
         self._database.engine.dispose()
 
     def ping(self) -> None:
-        """Raise ``sqlalchemy.exc.SQLAlchemyError`` where the database does not answer."""
+        """Raise ``sqlalchemy.exc.SQLAlchemyError`` if the database does not answer."""
         with self._database.reading() as session:
             session.execute(select(1))
 
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row of that identity, and whether it is new.
 
-        quota_mib: of owners who have none of their own, where the row is held to it; none: what was made is kept. Raises
-        ``owner_rows.OverQuota``, and adds nothing.
+        quota_mib: the limit for owners without one of their own; None: no limit applies. Raises
+        ``workers.catalogue.owners.OverQuota`` and adds nothing if the row exceeds the limit.
         """
         try:
             with self._database.writing.begin() as session:

@@ -1,4 +1,4 @@
-"""What an operator asks of the catalogue: who is there, what is waiting, how much there is of everything."""
+"""Counts for operators: worker processes, jobs by kind and phase, waiting jobs, files."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class JobTally:
     jobs: int
     attempts: int
     retries: int
-    run_s: float  # of those that ended: from the last start to the end
+    run_s: float  # of jobs that ended: from the last start to the end
 
 
 @dataclass(frozen=True)
 class FileTally:
-    """Files of one kind, counted: what came from users, and what jobs made."""
+    """Files of one kind and origin, counted."""
 
     kind: str
     origin: str  # uploaded | built
@@ -44,7 +44,7 @@ class Census:
         self._database = database
 
     def announce(self, worker: str, started_at: float, version: str) -> None:
-        """Say that a worker process is there; those that have been silent for an hour are forgotten."""
+        """Note that a worker process is alive; delete those that have been silent for an hour."""
         now = self._database.now
         insert = sqlite.insert if self._database.sqlite else postgresql.insert
         said = {"started_at": started_at, "heartbeat_at": now, "version": version}
@@ -54,12 +54,12 @@ class Census:
             session.execute(there.on_conflict_do_update(index_elements=["name"], set_=said))
 
     def take_leave(self, worker: str) -> None:
-        """Say that a worker process ends."""
+        """Note that a worker process ends."""
         with self._database.writing.begin() as session:
             session.execute(delete(WorkerRow).where(WorkerRow.name == worker))
 
     def workers(self, lease_s: float) -> Sequence[WorkerRow]:
-        """Worker processes that were heard of within ``lease_s``."""
+        """Worker processes whose last heartbeat is at most ``lease_s`` seconds old."""
         query = select(WorkerRow).where(WorkerRow.heartbeat_at >= self._database.now - lease_s)
         with self._database.reading() as session:
             return session.scalars(query.order_by(WorkerRow.name)).all()
@@ -81,7 +81,7 @@ class Census:
             ]
 
     def tally_files(self) -> list[FileTally]:
-        """Files and their bytes, by what they are."""
+        """Numbers and bytes of files, by kind and origin."""
         found = []
         with self._database.reading() as session:
             for kind, upload in (("image", ImageRow), ("transit", TransitRow)):
@@ -100,19 +100,19 @@ class Census:
         return found
 
     def oldest_queued_at(self, queue: Queue | None = None) -> float | None:
-        """When the job was asked for that has waited longest, in a queue or in any; None where none waits."""
+        """Creation time of the oldest waiting job, in one queue or in all; None if no job waits."""
         waiting = select(func.min(JobRow.created_at)).where(JobRow.phase == Phase.QUEUED)
         with self._database.reading() as session:
             return session.scalar(waiting if queue is None else waiting.where(JobRow.queue == queue))
 
     def count_silent(self, lease_s: float) -> int:
-        """Jobs at work whose worker has been silent for longer than the lease."""
+        """Number of executing jobs whose worker has been silent for longer than the lease."""
         silent = (JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s)
         with self._database.reading() as session:
             return session.scalar(select(func.count()).select_from(JobRow).where(*silent)) or 0
 
     def count_unsubmitted(self, older_than_s: float) -> int:
-        """Queued jobs that nobody gave to the broker in that time, though nothing keeps them waiting."""
+        """Number of queued jobs older than this that were not given to the broker, although they could start."""
         left = (
             JobRow.phase == Phase.QUEUED,
             JobRow.submitted_at.is_(None),

@@ -1,4 +1,4 @@
-"""Contexts: sets of PSFs that stay as they are, so that what was looked up in one once is looked up the same for ever."""
+"""Contexts: immutable sets of PSFs. A lookup in a context always gives the same PSF."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workers.contract.identities import canonical_hash
 from workers.versions.status import PsfStatus
 from workers.versions.validity import Validity, iso
 
-NOW = "now"  # for a context: what is certified at this moment, whatever the owner's default is
+NOW = "now"  # in place of a context's name: the PSFs that are certified now, whatever the owner's default context is
 RESERVED = (NOW, "default")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$"  # shorter than an id
 _ID = re.compile(r"[0-9a-f]{64}")
@@ -28,7 +28,7 @@ _ID = re.compile(r"[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class Pin:
-    """A PSF for a range of times; none is the range that the PSF itself has."""
+    """A PSF for a range of times; validity None: the PSF's own range."""
 
     psf_id: str
     validity: Validity | None = None
@@ -43,14 +43,14 @@ class Contexts:
     def create(
         self, name: str, owner: str, by: str, *, reason: str = "", pins: Sequence[Pin] | None = None
     ) -> tuple[PsfContextRow, bool]:
-        """A context of these pins, or of all that is certified; and whether it is new.
+        """Create a context of these pins, or of all certified PSFs if ``pins`` is None; also returns whether it is new.
 
         Raises ``DataError``: "bad-name", "name-taken", "no-such-psf", "no-line", "nothing-to-pin", "ranges-overlap".
         """
         if not re.fullmatch(NAME, name) or name in RESERVED:
             raise DataError(
                 "bad-name",
-                f"expected a name of up to 63 letters, digits and . _ - that is not {' or '.join(RESERVED)}; got "
+                f"expected a name of up to 63 letters, digits and . _ - other than {' and '.join(RESERVED)}; got "
                 f"{ascii(name)[:80]}",
             )
         try:
@@ -65,7 +65,9 @@ class Contexts:
                 raise
             if existing.id != made.id:
                 raise DataError(
-                    "name-taken", f"context {name} is another set of PSFs, {existing.id}, and stays it"
+                    "name-taken",
+                    f"expected a name that no other context has; {name} is the context {existing.id} with other PSFs, and contexts "
+                    "never change: choose another name",
                 ) from None
             return existing, False
 
@@ -83,19 +85,22 @@ class Contexts:
         """The context of this id or name. Raises ``DataError`` "no-such-context"."""
         found = self.find(id_or_name, owner)
         if found is None:
-            raise DataError("no-such-context", f"there is no context with the id or name {id_or_name!r}")
+            raise DataError(
+                "no-such-context",
+                f"expected the id or name of a context; got {id_or_name!r}, which does not exist: list the contexts",
+            )
         return found
 
     def pins(self, context_id: str, owner: str) -> Sequence[PsfPinRow]:
-        """What a context pins, by line and time."""
+        """The pins of a context, sorted by series and time."""
         query = select(PsfPinRow).where(PsfPinRow.owner == owner, PsfPinRow.context_id == context_id)
         with self._database.reading() as session:
-            return session.scalars(query.order_by(PsfPinRow.line, PsfPinRow.valid_from)).all()
+            return session.scalars(query.order_by(PsfPinRow.series, PsfPinRow.valid_from)).all()
 
-    def any_pinned(self, context_id: str, line: str, owner: str) -> bool:
-        """Whether a context pins a PSF of the line."""
+    def any_pinned(self, context_id: str, series: str, owner: str) -> bool:
+        """Whether a context pins a PSF of the series."""
         query = select(PsfPinRow.psf_id).where(
-            PsfPinRow.owner == owner, PsfPinRow.context_id == context_id, PsfPinRow.line == line
+            PsfPinRow.owner == owner, PsfPinRow.context_id == context_id, PsfPinRow.series == series
         )
         with self._database.reading() as session:
             return session.scalars(query.limit(1)).first() is not None
@@ -103,14 +108,14 @@ class Contexts:
     # The default --------------------------------------------------------------------------------------
 
     def default(self, owner: str) -> PsfContextRow | None:
-        """The context that an owner's images are looked up in; none: what is certified at the moment."""
+        """The owner's default context, in which PSFs for images are looked up; None: the PSFs that are certified now."""
         query = select(DefaultContextRow.context_id).where(DefaultContextRow.owner == owner)
         with self._database.reading() as session:
             context_id = session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(1)).first()
             return None if context_id is None else session.get(PsfContextRow, (owner, context_id))
 
     def set_default(self, id_or_name: str | None, owner: str, by: str, reason: str = "") -> None:
-        """Move an owner's default; none: no context. Raises ``DataError`` "no-such-context"."""
+        """Set an owner's default context; None: no context. Raises ``DataError`` "no-such-context"."""
         context_id = None if id_or_name is None else self.named(id_or_name, owner).id
         with self._database.writing.begin() as session:
             session.add(
@@ -118,13 +123,13 @@ class Contexts:
             )
 
     def default_changes(self, owner: str, limit: int = 200) -> Sequence[DefaultContextRow]:
-        """Where an owner's default was moved to, the last move first."""
+        """The changes of an owner's default, latest first."""
         query = select(DefaultContextRow).where(DefaultContextRow.owner == owner)
         with self._database.reading() as session:
             return session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(limit)).all()
 
     def asked_for(self, context: str | None, owner: str) -> PsfContextRow | None:
-        """The context to look in where a request says this: an id, a name, NOW for none, or nothing for the default."""
+        """The context that a request means by an id or a name. NOW: no context (None); None: the owner's default."""
         if context is None:
             return self.default(owner)
         return None if context == NOW else self.named(context, owner)
@@ -132,29 +137,38 @@ class Contexts:
 
 def _certified(session: Session, owner: str) -> list[PsfPinRow]:
     query = select(PsfRow).where(PsfRow.owner == owner, PsfRow.status == PsfStatus.CERTIFIED)
-    rows = session.scalars(query.order_by(PsfRow.line, PsfRow.valid_from)).all()
+    rows = session.scalars(query.order_by(PsfRow.series, PsfRow.valid_from)).all()
     if not rows:
-        raise DataError("nothing-to-pin", "expected certified PSFs to pin; there is none yet")
+        raise DataError(
+            "nothing-to-pin",
+            "expected certified PSFs to pin; no PSF is certified yet: certify one first, or name the PSFs to pin",
+        )
     return [_pin(row, None) for row in rows]
 
 
 def _given(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]:
     if not pins:
-        raise DataError("nothing-to-pin", "expected PSFs to pin; got an empty list")
+        raise DataError("nothing-to-pin", "expected at least one PSF to pin; got an empty list")
     rows = []
     for pin in pins:
         row = session.get(PsfRow, (owner, pin.psf_id))
         if row is None:
-            raise DataError("no-such-psf", f"the catalogue holds no PSF with id {pin.psf_id}")
+            raise DataError(
+                "no-such-psf",
+                f"expected the id of a PSF in the catalogue; got {pin.psf_id}, which is not in it",
+            )
         rows.append(_pin(row, pin.validity))
-    rows.sort(key=lambda pinned: (pinned.line, pinned.valid_from))
+    rows.sort(key=lambda pinned: (pinned.series, pinned.valid_from))
     _check_apart(rows)
     return rows
 
 
 def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
-    if row.line is None:
-        raise DataError("no-line", f"expected PSFs of a known instrument; PSF {row.id} names none")
+    if row.series is None:
+        raise DataError(
+            "no-line",
+            f"expected PSFs with an instrument; PSF {row.id} has none: certify it with an instrument first",
+        )
     own = Validity(
         -math.inf if row.valid_from is None else row.valid_from,
         math.inf if row.valid_to is None else row.valid_to,
@@ -162,7 +176,7 @@ def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
     pinned = validity or own
     return PsfPinRow(
         owner=row.owner,
-        line=row.line,
+        series=row.series,
         valid_from=pinned.start,
         valid_to=pinned.end,
         psf_id=row.id,
@@ -173,21 +187,21 @@ def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
 def _check_apart(rows: Sequence[PsfPinRow]) -> None:
     for one, other in pairwise(rows):
         first, second = Validity(one.valid_from, one.valid_to), Validity(other.valid_from, other.valid_to)
-        if one.line == other.line and first.overlaps(second):
+        if one.series == other.series and first.overlaps(second):
             raise DataError(
                 "ranges-overlap",
-                f"expected one PSF of {one.line} at any time; got PSF {one.psf_id} for {first} and PSF "
-                f"{other.psf_id} for {second}",
+                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and PSF "
+                f"{other.psf_id}, {second}, overlap",
             )
 
 
 def _context(name: str, owner: str, by: str, reason: str, rows: Iterable[PsfPinRow]) -> PsfContextRow:
-    """The row of a context; its id goes into the rows of its pins."""
+    """The row of a context. Also writes its id into the rows of its pins."""
     pins = list(rows)
     identity = canonical_hash(
         {
             "name": name,
-            "pins": [[pin.line, iso(pin.valid_from), iso(pin.valid_to), pin.psf_id] for pin in pins],
+            "pins": [[pin.series, iso(pin.valid_from), iso(pin.valid_to), pin.psf_id] for pin in pins],
         }
     )
     for pin in pins:

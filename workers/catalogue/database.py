@@ -1,4 +1,4 @@
-"""The database as the catalogue reaches it: an engine set up for many small writers, and two kinds of transactions."""
+"""The database connection: an engine set up for many small writers, and two kinds of transactions."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from sqlalchemy import (
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session, sessionmaker
 
-PATIENCE_S = 30.0  # with others that write to SQLite
+PATIENCE_S = 30.0  # how long to wait for other writers of SQLite
 
 
 class Database:
-    """An engine, and sessions on it: ``writing`` holds SQLite's write lock from the start, ``reading`` needs no lock."""
+    """An engine and its sessions. ``writing`` takes SQLite's write lock at the start; ``reading`` takes no lock."""
 
     def __init__(self, url: str) -> None:
         self.engine = open_engine(url)
@@ -36,16 +36,16 @@ class Database:
 
     @property
     def sqlite(self) -> bool:
-        """True where the database is SQLite."""
+        """Whether the database is SQLite."""
         return self.engine.dialect.name == "sqlite"
 
     @property
     def now(self) -> ColumnElement[float]:
-        """Seconds since 1970 by the database's clock, as an expression: the one clock that all machines share.
+        """Seconds since 1970 by the database's clock, which all machines share, as an SQL expression.
 
-        It is that of the statement it stands in, and on SQLite, whose processes share a machine anyway, whole ms.
+        It is the time at which the statement began, on SQLite in whole milliseconds.
         """
-        # Of PostgreSQL's clocks the one by which indexes can be searched.
+        # PostgreSQL can use an index with this clock, because it is constant within a statement.
         now = (
             "(julianday('now') - 2440587.5) * 86400.0"
             if self.sqlite
@@ -54,7 +54,7 @@ class Database:
         return literal_column(f"({now})", Double)
 
     def change(self, statement: Update) -> int:
-        """One UPDATE in a transaction of its own; returns how many rows it changed."""
+        """Run one UPDATE in a transaction of its own; returns the number of changed rows."""
         with self.writing.begin() as session:
             result = session.execute(statement)
             assert isinstance(result, CursorResult)
@@ -64,7 +64,7 @@ class Database:
 def open_engine(url: str) -> Engine:
     """An engine with the settings each database needs for many small concurrent writers."""
     if not url.startswith("sqlite"):
-        # Without a limit, a database that is cut off would hold whoever asks for minutes.
+        # Without a limit, a request to an unreachable database would wait for minutes.
         patience = {"connect_timeout": 5} if url.startswith("postgresql") else {}
         return create_engine(url, pool_pre_ping=True, connect_args=patience, json_serializer=_strict_json)
     engine = create_engine(url, connect_args={"timeout": PATIENCE_S}, json_serializer=_strict_json)
@@ -88,25 +88,27 @@ def open_engine(url: str) -> Engine:
 
 
 def _write_ahead(connection: sqlite3.Connection) -> None:
-    """Have SQLite keep a write-ahead log. Of several that make a database at once all but one are told to try again."""
+    """Switch SQLite to a write-ahead log. If several processes create a database at once, all but one must try again."""
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
             connection.execute("PRAGMA journal_mode=WAL")
             return
-        except sqlite3.OperationalError as error:  # the connection's own patience does not cover this change
+        except (
+            sqlite3.OperationalError
+        ) as error:  # the connection's own timeout does not cover this statement
             if "locked" not in str(error) or time.monotonic() > deadline:
                 raise
             time.sleep(0.02)
 
 
 def _strict_json(value: Any) -> str:
-    """JSON without NaN and infinity, which PostgreSQL refuses and clients cannot read."""
+    """JSON. Raises ValueError for NaN and infinity, which PostgreSQL refuses and clients cannot read."""
     return json.dumps(value, allow_nan=False)
 
 
 def make_missing(metadata: MetaData, connection: Connection) -> None:
-    """Make those of the tables and indexes that are not there."""
+    """Create the tables and indexes that are missing."""
     metadata.create_all(connection)
     for table in metadata.sorted_tables:
         for index in table.indexes:

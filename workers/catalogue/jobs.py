@@ -1,8 +1,8 @@
-"""Jobs in the catalogue: asked for, claimed, at work, ended.
+"""Jobs in the catalogue: submitted, claimed, executing, ended.
 
-The job table is the only truth about jobs; the broker may lose what it likes. Every change of a job's phase
-is a compare-and-set on the row, so that any number of workers, servers and reconcilers may try at once. What they
-compare of each other's times, as heartbeats, is written and read by the database's clock.
+The table of jobs is the only source of truth about jobs: the broker may lose messages. Every change of a job's phase is
+a compare-and-set on the row, so any number of workers, servers and reconcilers may try at once. Times that they compare
+with each other, such as heartbeats, come from the database's clock.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to work on a job: changes made under a lost lease do nothing."""
+    """The right to work on a job. Changes made under a lost lease have no effect."""
 
     job_id: str
     token: str
@@ -38,7 +38,7 @@ class Lease:
 
 @dataclass(frozen=True)
 class Waiting:
-    """A job to be given to the broker."""
+    """A job to give to the broker."""
 
     id: str
     queue: Queue
@@ -60,13 +60,14 @@ class Jobs:
         queue: Queue | None = None,
         estimate: dict[str, Any] | None = None,
     ) -> tuple[JobRow, bool]:
-        """A new queued job, or the live one of an equal request, which goes up where it waits in a less urgent queue.
+        """A new queued job, or the live job of an identical request; also returns whether it is new.
 
-        Also whether it is new. ``queue``: none is that of its kind. A job that was cancelled, or that ends on terms, is
-        not shared: the new one has a key of its own, waits while that one is at work, and finds what it made, if it did.
+        A shared job that waits in a less urgent queue moves to ``queue``. queue None: the queue of the job's kind. A
+        cancelled job and a job with UWS terms are not shared: the new job gets a key of its own, waits while the other
+        one executes, and then finds its result, if there is one.
         """
         queue = queue or queue_of(kind)
-        for _ in range(3):  # the equal job may end badly between the two statements
+        for _ in range(3):  # the identical job may fail between the two statements
             key, existing = self._shared(owner, request_key)
             if existing is not None:
                 return self._moved_up(existing, queue), False
@@ -91,9 +92,10 @@ class Jobs:
         raise RuntimeError(f"job for request {request_key} neither inserted nor found")
 
     def _shared(self, owner: str, request_key: str) -> tuple[str, JobRow | None]:
-        """The live job that an equal request shares, or None, with the key that it has or that a new one gets.
+        """The live job that an identical request shares, or None, and the key of that job or of a new one.
 
-        The key of a job beside one that is not shared follows from that one: equal requests after it find it.
+        The key of a job beside one that is not shared follows from that job's id, so that later identical requests find
+        the new job.
         """
         key = request_key
         live = select(JobRow, TermsRow.job_id).outerjoin(TermsRow, TermsRow.job_id == JobRow.id)
@@ -123,19 +125,19 @@ class Jobs:
             return session.get(JobRow, job_id)
 
     def mark_submitted(self, *job_ids: str) -> None:
-        """Note that the broker has been given the jobs' ids."""
+        """Note that the broker has received the jobs' ids."""
         self._set(
             [JobRow.id.in_(job_ids)], submitted_at=self._database.now, submissions=JobRow.submissions + 1
         )
 
     def forget_submission(self, job_id: str) -> None:
-        """Note that a queued job's message was taken from the broker, but not the job."""
+        """Note that a worker took a queued job's message from the broker but did not claim the job."""
         self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
 
     def claim(self, job_id: str, worker: str) -> Lease | None:
-        """QUEUED -> EXECUTING, for exactly one of those that try; None for all others.
+        """QUEUED -> EXECUTING for exactly one of the workers that try; None for all others.
 
-        None too, and the job is submitted again later, while another that makes the same is at work.
+        Also None while another job with the same result executes; the job is submitted again later.
         """
         lease = Lease(job_id, uuid.uuid4().hex)
         now = self._database.now
@@ -152,17 +154,17 @@ class Jobs:
                 steps=0,
                 stage="",
             )
-        except IntegrityError:  # one_at_work_a_result
+        except IntegrityError:  # the index one_at_work_a_result
             self.forget_submission(job_id)
             return None
         return lease if claimed else None
 
     def heartbeat(self, lease: Lease) -> bool:
-        """Say that the job is alive; False where the lease is lost or the job was cancelled."""
+        """Note that the job is alive; False if the lease is lost or the job was cancelled."""
         return self._set([*_held(lease), JobRow.cancel_requested.is_(False)], heartbeat_at=self._database.now)
 
     def progress(self, lease: Lease, stage: str, step: int, steps: int) -> bool:
-        """Write how far the job is, which is a heartbeat too; False as for ``heartbeat``."""
+        """Store the job's progress, which is also a heartbeat; False as for ``heartbeat``."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             stage=stage,
@@ -188,16 +190,16 @@ class Jobs:
         )
 
     def requeue(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED under the lease, after a passing failure: submitted again after the usual wait.
+        """EXECUTING -> QUEUED under the lease, after a transient failure. The job is submitted again after the usual wait.
 
-        A job that was cancelled is aborted.
+        A cancelled job is aborted instead.
         """
         return self._set(
             _held(lease), **self._again(), submitted_at=self._database.now, submissions=JobRow.attempt
         )
 
     def abort(self, lease: Lease) -> bool:
-        """EXECUTING -> ABORTED under the lease, once the worker has stopped."""
+        """EXECUTING -> ABORTED under the lease, when the worker has stopped a cancelled job."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(True)],
             phase=Phase.ABORTED,
@@ -206,9 +208,9 @@ class Jobs:
         )
 
     def cancel(self, job_id: str) -> None:
-        """PENDING, QUEUED -> ABORTED at once; an executing job is asked to stop; an ended one stays as it is."""
+        """PENDING, QUEUED -> ABORTED. An executing job is asked to stop; an ended job does not change."""
         at_work = JobRow.phase == Phase.EXECUTING
-        self._set(  # in one statement, between two the job may be claimed or queued again
+        self._set(  # one statement: between two, the job could be claimed or queued again
             [JobRow.id == job_id, JobRow.phase.in_((Phase.PENDING, Phase.QUEUED, Phase.EXECUTING))],
             phase=case((at_work, JobRow.phase), else_=Phase.ABORTED.value),
             ended_at=case((at_work, JobRow.ended_at), else_=self._database.now),
@@ -216,7 +218,7 @@ class Jobs:
         )
 
     def hand_back(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED under the lease: the worker stops, the job is not to blame, the attempt not counted."""
+        """EXECUTING -> QUEUED under the lease because the worker stops. The attempt does not count."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             phase=Phase.QUEUED,
@@ -227,16 +229,16 @@ class Jobs:
         )
 
     def give_up_silent(self, lease_s: float, max_attempts: int) -> list[str]:
-        """Take back jobs whose worker fell silent; returns the ids of those queued again.
+        """Queue jobs again whose worker has been silent for longer than the lease; returns their ids.
 
-        A job that was cancelled is aborted, and one that was started ``max_attempts`` times is an error.
+        A cancelled job is aborted instead. A job that was started ``max_attempts`` times ends in ERROR.
         """
         silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
         too_often = and_(JobRow.cancel_requested.is_(False), JobRow.attempt >= max_attempts)
         error = JobError(
             fault=Fault.INTERNAL,
             code="worker-lost",
-            message=f"the worker was lost {max_attempts} times while it ran this job; it is not tried again",
+            message=f"the worker was lost {max_attempts} times while it ran this job; the job is not tried again",
         )
         ended = {
             "phase": Phase.ERROR,
@@ -249,15 +251,15 @@ class Jobs:
             for job_id in session.scalars(lost.returning(JobRow.id)):
                 log.error("job %s: %s (%s)", job_id, error.message, error.code)
         with self._database.writing.begin() as session:
-            # Others may have been cancelled, or have fallen silent too often, since the statement before.
+            # Other jobs may have been cancelled, or lost too often, since the previous statement.
             back = update(JobRow).where(*silent, ~too_often).values(**self._again(), submitted_at=None)
             taken = session.execute(back.returning(JobRow.id, JobRow.phase))
             return [job_id for job_id, phase in taken if phase == Phase.QUEUED]
 
     def unsubmitted(self, resubmit_s: float, limit: int = 1000) -> list[Waiting]:
-        """Queued jobs that the broker was never given, or seems to have lost: the most urgent first, then the oldest.
+        """Queued jobs that the broker never received or seems to have lost, by queue, then oldest first.
 
-        The wait doubles with each submission of a job, so that a long queue is not submitted over and over.
+        The wait doubles with each submission of a job, so that a long queue is not submitted again and again.
         """
         waits = {number: resubmit_s * 2 ** (number - 1) for number in range(2, 9)}
         wait_s = case(
@@ -276,18 +278,18 @@ class Jobs:
         return found
 
     def of_kind(self, kind: str) -> Sequence[JobRow]:
-        """All jobs of a kind that has few, in whatever phase."""
+        """All jobs of a kind, in any phase. For kinds that have few jobs."""
         with self._database.reading() as session:
             return session.scalars(select(JobRow).where(JobRow.kind == kind)).all()
 
     def others_wait(self, kind: str) -> bool:
-        """Whether a job of another kind waits to be started, and could be."""
+        """Whether a job of another kind waits and could start now."""
         query = select(JobRow.id).where(JobRow.phase == Phase.QUEUED, JobRow.kind != kind, no_equal_at_work())
         with self._database.reading() as session:
             return session.scalars(query.limit(1)).first() is not None
 
     def at_work_on(self, owner: str, work_key: str) -> bool:
-        """Whether a job that makes this is at work."""
+        """Whether a job with this result executes now."""
         query = select(JobRow.id).where(
             JobRow.owner == owner, JobRow.work_key == work_key, _is_at_work(JobRow.phase)
         )
@@ -295,7 +297,7 @@ class Jobs:
             return session.scalars(query.limit(1)).first() is not None
 
     def _again(self) -> dict[str, Any]:
-        """What makes an executing job wait again; or ends it, where it was cancelled and nobody should claim it."""
+        """Values that queue an executing job again, or abort it if it was cancelled."""
         cancelled = JobRow.cancel_requested.is_(True)
         return {
             "phase": case((cancelled, Phase.ABORTED.value), else_=Phase.QUEUED.value),
@@ -316,12 +318,12 @@ class Jobs:
             return [(estimate or {}, float(seconds)) for estimate, seconds in session.execute(query)]
 
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
-        """One UPDATE; True where it changed a row."""
+        """Run one UPDATE; whether it changed a row."""
         return bool(self._database.change(update(JobRow).where(and_(*conditions)).values(**values)))
 
 
 def no_equal_at_work() -> ColumnElement[bool]:
-    """True of a queued job unless another that makes the same is at work, whose end it waits for."""
+    """A condition: no other job with the same result executes now."""
     other = aliased(JobRow)
     at_work = select(other.id).where(
         other.owner == JobRow.owner,
@@ -332,7 +334,7 @@ def no_equal_at_work() -> ColumnElement[bool]:
 
 
 def _is_at_work(phase: InstrumentedAttribute[str]) -> ColumnElement[bool]:
-    # In the statement's text, where the databases see that the partial index has all such jobs.
+    # Literal in the statement's text, so that the databases see that they can use the partial index.
     return phase == literal(Phase.EXECUTING.value, literal_execute=True)
 
 

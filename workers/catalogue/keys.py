@@ -1,7 +1,7 @@
-"""Keys that let their owners in: made once, shown once, and from then on known by a hash alone.
+"""API keys of owners. A key is shown once, when it is made; the database keeps only the hash of its secret.
 
-A key reads ``hpsf_ID_SECRET``. The id is public (lists and logs show it); the secret is 256 random bits, so that one
-round of SHA-256 is enough to keep it by: there is nothing in it to guess, unlike in a password.
+A key has the form ``hpsf_ID_SECRET``. The id is public: lists and logs show it. The secret is 256 random bits. One round
+of SHA-256 protects it, because it cannot be guessed as a password can.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from workers.catalogue.tables import KeyRow
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 LABEL_LENGTH = 80
 _KEY = re.compile(r"hpsf_([0-9a-f]{16})_([A-Za-z0-9_-]{43})", re.ASCII)
-_USE_NOTED_EVERY_S = 60.0  # a write a minute, not a write a request
+_USE_NOTED_EVERY_S = 60.0  # at most one write a minute, not one per request
 _NOBODY = hashlib.sha256(b"nobody").hexdigest()
 
 
 class Scope(StrEnum):
-    """What a key is good for; each says all that it allows, and none includes another."""
+    """What a key allows. No scope includes another."""
 
     READ = "read"
     SUBMIT = "submit"
@@ -37,7 +37,7 @@ class Scope(StrEnum):
 
 
 class KeyRefused(Exception):
-    """A key that lets nobody in; ``code`` and the message say why, and never show it."""
+    """A key is not valid; ``code`` and the message say why and never contain the key."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -53,11 +53,15 @@ class Keys:
     def make(
         self, owner: str, scopes: Collection[Scope], *, label: str = "", expires_at: float | None = None
     ) -> str:
-        """A new key, as its owner is to be told it: nobody can be told again."""
+        """Make a key and return it; it cannot be shown again. Raises ValueError."""
         if not OWNER.fullmatch(owner):
-            raise ValueError(f"expected an owner of small letters, digits, '.', '_' and '-'; got {owner!r}")
+            raise ValueError(
+                f"expected an owner of lower-case letters, digits, '.', '_' and '-'; got {owner!r}"
+            )
         if not scopes:
-            raise ValueError("expected a scope at least; a key without any is good for nothing")
+            raise ValueError(
+                "expected at least one scope; got none, and a key without a scope allows nothing"
+            )
         identity, secret = secrets.token_hex(8), secrets.token_urlsafe(32)
         row = KeyRow(
             id=identity,
@@ -73,39 +77,44 @@ class Keys:
         return f"hpsf_{identity}_{secret}"
 
     def check(self, key: str) -> KeyRow:
-        """The row of a key that is good now, whose use is noted. Raises ``KeyRefused``."""
+        """The row of a valid key; notes its use. Raises ``KeyRefused``."""
         parts = _KEY.fullmatch(key)
         if parts is None:
-            raise KeyRefused("bad-key", "expected a key of the form hpsf_ID_SECRET; got something else")
+            raise KeyRefused(
+                "bad-key", "expected a key of the form hpsf_ID_SECRET; got something else: copy the whole key"
+            )
         with self._database.reading() as session:
             row = session.get(KeyRow, parts[1])
         same = hmac.compare_digest(_hash(parts[2]), _NOBODY if row is None else row.secret_sha256)
         if row is None or not same:
-            raise KeyRefused("bad-key", "this key is not known here")
+            raise KeyRefused(
+                "bad-key",
+                "expected a key of this service; this one is unknown here: ask the operator for a key",
+            )
         now = time.time()
-        # Only who has the secret is told these.
+        # Only a caller who has the secret learns these reasons.
         if row.revoked_at is not None:
-            raise KeyRefused("key-revoked", f"key {row.id} was revoked; ask for another")
+            raise KeyRefused("key-revoked", f"key {row.id} was revoked: ask the operator for a new one")
         if row.expires_at is not None and row.expires_at <= now:
-            raise KeyRefused("key-expired", f"key {row.id} has expired; ask for another")
+            raise KeyRefused("key-expired", f"key {row.id} has expired: ask the operator for a new one")
         if row.last_used_at is None or row.last_used_at < now - _USE_NOTED_EVERY_S:
             self._note_use(row.id, now)
         return row
 
     def all(self) -> Sequence[KeyRow]:
-        """All keys, those of today and of the past, oldest first."""
+        """All keys, including revoked and expired ones, oldest first."""
         with self._database.reading() as session:
             return session.scalars(select(KeyRow).order_by(KeyRow.created_at, KeyRow.id)).all()
 
     def revoke(self, identity: str) -> bool:
-        """Let a key in no more, from the next request on; False where there is none with this id."""
+        """Revoke a key from the next request on; False if there is no key with this id."""
         revoked = update(KeyRow).where(KeyRow.id == identity)
         return bool(
             self._database.change(revoked.values(revoked_at=func.coalesce(KeyRow.revoked_at, time.time())))
         )
 
     def any_good(self) -> bool:
-        """Whether there is a key that lets anybody in now."""
+        """Whether any key is valid now."""
         good = select(KeyRow.id).where(
             KeyRow.revoked_at.is_(None), or_(KeyRow.expires_at.is_(None), KeyRow.expires_at > time.time())
         )

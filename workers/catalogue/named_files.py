@@ -1,7 +1,7 @@
-"""Which files the database names, whoever's they are.
+"""The files that the database refers to, of all owners.
 
-A file is named where its hash stands in any text or JSON of any table, so that nothing has to be known of what tables
-there are. That may be too much, as of a key's hash; it is never too little.
+A row refers to a file if the file's hash appears in any text or JSON column. The search needs no knowledge of the
+tables. It may find hashes that name no file, such as that of a key; it never misses a file.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from workers.catalogue.tables import Base
 
 BATCH = 1000
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-# Very many lines on what rows of images and products name already.
-_PASSED_OVER = frozenset({BulkItemRow.__tablename__})
+# This table is very long and refers only to files that images and products refer to too.
+_SKIPPED = frozenset({BulkItemRow.__tablename__})
 
 
 class NamedFiles:
-    """Hashes of files, as rows have them."""
+    """Finds the hashes of files in all rows."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def all(self) -> Iterator[str]:
-        """Every hash that is named, some of them more than once; read a batch at a time."""
+        """Every hash in the database, some of them more than once; rows are read in batches."""
         for table in Base.metadata.sorted_tables:
-            if table.name not in _PASSED_OVER:
+            if table.name not in _SKIPPED:
                 yield from self._in(table)
 
     def _in(self, table: Table) -> Iterator[str]:

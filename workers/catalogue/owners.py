@@ -1,7 +1,7 @@
-"""What each owner has kept, in bytes, and how much that may be.
+"""How many bytes each owner keeps, and the owner's quota.
 
-Counted are files that a row of the owner's names as its own: uploads, PSFs, products, reports; not their pictures. The
-count is changed in the transaction that adds the row.
+The files of the owner's uploads, PSFs, products and reports count; their pictures do not. The count changes in the
+transaction that adds the row.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from workers.catalogue.tables import ImageRow, OwnerRow, ProductRow, PsfRow, Rep
 
 COUNTED = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow)
 MIB = 2**20
-NOT_KEPT = "what this makes could not be kept"  # for Usage.no_room, of work
+NOT_KEPT = "the result of this job could not be kept"  # a reason for Usage.no_room
 
 
 @dataclass(frozen=True)
 class Usage:
-    """What an owner has kept; no limit is none."""
+    """The bytes that an owner keeps, and the limit; limit_bytes None: no limit."""
 
     owner: str
     used_bytes: int
     limit_bytes: int | None
 
     def allows(self, more_bytes: int = 0) -> bool:
-        """Whether so much more may be kept."""
+        """Whether this many more bytes fit."""
         return self.limit_bytes is None or self.used_bytes + more_bytes <= self.limit_bytes
 
     @property
     def full(self) -> bool:
-        """True where nothing more may be kept."""
+        """Whether no more bytes fit."""
         return not self.allows(1)
 
     def no_room(self, why: str) -> str:
-        """What is told where there is no room. why: half a sentence on what it is needed for."""
+        """The message if there is no room. why: a clause that says what the room is needed for."""
         assert self.limit_bytes is not None
         return (
-            f"expected room for it: {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are used, and "
-            f"{why} (the operator sets quotas)"
+            f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are used, and "
+            f"{why}: ask the operator for a larger quota"
         )
 
 
 class OverQuota(Exception):
-    """More bytes than were left. usage: before them."""
+    """A file does not fit into the owner's quota. usage: without the file."""
 
     def __init__(self, usage: Usage) -> None:
         super().__init__(usage.owner)
@@ -62,27 +62,27 @@ class Owners:
         self._database = database
 
     def usage(self, owner: str, quota_mib: int) -> Usage:
-        """What an owner has kept. quota_mib: the limit of those who have none of their own; 0 is none."""
+        """The usage of an owner. quota_mib: the limit for owners without one of their own; 0: unlimited."""
         with self._database.reading() as session:
             return _usage(session, owner, quota_mib)
 
     def all(self, quota_mib: int) -> list[Usage]:
-        """All owners who have kept anything or have a limit of their own."""
+        """The usage of all owners who keep files or have a limit of their own."""
         with self._database.reading() as session:
             names = session.scalars(select(OwnerRow.owner).order_by(OwnerRow.owner)).all()
         return [self.usage(name, quota_mib) for name in names]
 
     def set_quota(self, owner: str, quota_mib: int | None) -> None:
-        """Give an owner a limit of its own; 0 is no limit, none is the limit of all."""
+        """Set an owner's own limit; 0: unlimited; None: the default limit."""
         with self._database.writing.begin() as session:
             add_bytes(session, owner, 0)
             session.execute(update(OwnerRow).where(OwnerRow.owner == owner).values(quota_mib=quota_mib))
 
     def recount(self) -> Sequence[str]:
-        """Count what is there anew; the owners whose count was wrong."""
+        """Count all files again and correct the counts; returns the owners whose count was wrong."""
         wrong = []
         with self._database.writing.begin() as session:
-            # Who adds a row meanwhile waits with its bytes until this is done.
+            # A transaction that adds a row meanwhile waits for these locks before it counts its bytes.
             rows = session.scalars(select(OwnerRow).with_for_update()).all()
             truth: dict[str, int] = {}
             for table in COUNTED:
@@ -95,7 +95,7 @@ class Owners:
                     wrong.append(row.owner)
                     row.bytes = right
             for owner, total in truth.items():
-                # It came while this waited, and may have been counted already.
+                # This owner's row may have been added, with its bytes, while this transaction waited.
                 add_bytes(session, owner, 0)
                 session.execute(update(OwnerRow).where(OwnerRow.owner == owner).values(bytes=total))
                 wrong.append(owner)
@@ -103,7 +103,7 @@ class Owners:
 
 
 def add_bytes(session: Session, owner: str, count: int) -> None:
-    """Count bytes that an owner has kept, in the transaction that adds what they are of."""
+    """Add bytes to an owner's count, in the transaction that adds the row of the file."""
     insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
     row = insert(OwnerRow).values(owner=owner, bytes=count)
     session.execute(
@@ -112,10 +112,10 @@ def add_bytes(session: Session, owner: str, count: int) -> None:
 
 
 def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int) -> None:
-    """Raise OverQuota where bytes that are counted already are more than were left.
+    """Raise OverQuota if ``count`` bytes, which are counted already, did not fit.
 
-    Others of the owner's wait with their bytes until this transaction ends: of uploads that each fit, and together do
-    not, the last are refused.
+    Other transactions of the owner wait until this one ends. If several uploads fit one by one but not together, the
+    last ones are refused.
     """
     counted = _usage(session, owner, quota_mib)
     before = replace(counted, used_bytes=counted.used_bytes - count)

@@ -1,4 +1,4 @@
-"""Parts of jobs that several workers share, taken by compare-and-set under a lease of their own."""
+"""Parts of jobs that several workers share. A worker takes a part by compare-and-set under a lease of the part."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workers.catalogue.tables import PartRow
 
 @dataclass(frozen=True)
 class Part:
-    """The right to work on a part; who lost it may still bring the result, if nobody else has."""
+    """The right to work on a part. A worker that lost it may still deliver the result, unless another one has."""
 
     owner: str
     request_key: str
@@ -30,7 +30,7 @@ class Parts:
         self._database = database
 
     def open(self, owner: str, request_key: str, count: int) -> None:
-        """Make the parts 0 to count - 1 that are not there yet."""
+        """Create those of the parts 0 to count - 1 that do not exist."""
         with self._database.writing.begin() as session:
             there = set(
                 session.scalars(
@@ -42,7 +42,7 @@ class Parts:
                     session.add(PartRow(owner=owner, request_key=request_key, number=number))
 
     def take(self, owner: str, request_key: str, lease_s: float) -> Part | None:
-        """A part that is open, or whose holder fell silent; None where there is none."""
+        """Take an open part, or one whose worker has been silent for ``lease_s``; None if there is none."""
         free = [
             PartRow.owner == owner,
             PartRow.request_key == request_key,
@@ -61,22 +61,22 @@ class Parts:
                 return part
 
     def heartbeat(self, part: Part) -> bool:
-        """Say that the part is worked on; False where it was taken by another, or is done."""
+        """Renew the lease; False if another worker took the part or the part is done."""
         return self._set(_holding(part), heartbeat_at=self._database.now)
 
     def finish(self, part: Part, result: dict[str, Any]) -> bool:
-        """Write a part's result; False where it has one.
+        """Store a part's result; False if it has one.
 
-        Whoever else took the part meanwhile: a result follows from the request alone, so the first one counts.
+        The first result counts, even from a worker that lost the part: every worker computes the same result.
         """
         return self._set(_undone(part), result=result, token=None)
 
     def release(self, part: Part) -> None:
-        """Give a part back undone."""
+        """Release a part without a result."""
         self._set(_holding(part), token=None)
 
     def results(self, owner: str, request_key: str) -> list[dict[str, Any]]:
-        """Results of the parts that are done, in order."""
+        """Results of the done parts, by number."""
         query = select(PartRow.result).where(
             PartRow.owner == owner, PartRow.request_key == request_key, PartRow.result.is_not(None)
         )

@@ -1,7 +1,7 @@
-"""PSFs in the catalogue: found by what they are and what they are valid for, certified and deprecated.
+"""PSFs in the catalogue: found by their properties and validity, certified and deprecated.
 
-A change of status holds the lock on its line's row (PostgreSQL) or the database's one write lock (SQLite), from before
-it looks at the line's other PSFs until it is written: of two that cannot both be, the second sees the first.
+A change of status holds a lock from before it reads the other PSFs of the series until it is written: the lock on the
+series' row (PostgreSQL), or the database's write lock (SQLite). Of two conflicting changes, the second sees the first.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.database import Database
-from workers.catalogue.tables import PsfChangeRow, PsfLineRow, PsfPinRow, PsfRow
-from workers.versions.series import UPLOADED, line_of
+from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesRow
+from workers.versions.series import UPLOADED, series_of
 from workers.versions.status import PsfStatus, check_transition, check_version
 from workers.versions.validity import Validity
 
 
 @dataclass(frozen=True)
 class StatusAsked:
-    """What a PSF is to become, and all that is said with it."""
+    """A requested change of a PSF's status."""
 
     status: PsfStatus
     reason: str
     version: str | None = None
     validity: Validity | None = None
     successor_id: str | None = None
-    supersedes: tuple[str, ...] = ()  # certified PSFs of the line, deprecated in the same step
-    # Of a draft of which nobody has said it yet.
+    supersedes: tuple[str, ...] = ()  # certified PSFs of the series that are deprecated in the same step
+    # Only for a draft that lacks them.
     instrument: str | None = None
     channel: str | None = None
     kind: str | None = None
@@ -41,7 +41,7 @@ class StatusAsked:
 
 @dataclass(frozen=True)
 class PsfFilter:
-    """What PSFs are looked for by; none is anything."""
+    """The filters of a search for PSFs; None: any value."""
 
     instrument: str | None = None
     channel: str | None = None
@@ -53,32 +53,32 @@ class PsfFilter:
     valid_at: float | None = None
 
     @property
-    def line(self) -> str | None:
-        """The line, where all that makes one is given."""
+    def series(self) -> str | None:
+        """The series, if instrument, channel and kind are all given; otherwise None."""
         whole = self.instrument and self.channel and self.kind
-        return line_of(self.instrument, self.channel, self.kind or "") if whole else None
+        return series_of(self.instrument, self.channel, self.kind or "") if whole else None
 
 
 class Psfs:
-    """What is done with PSFs beside adding and getting them; each method is one transaction."""
+    """Searches for PSFs and changes of their status; each method is one transaction."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def describe(self, psf_id: str, owner: str, *, tables_sha256: str, preview_sha256: str) -> None:
-        """Note where the tables and the picture of a PSF are; both follow from its file, which stays as it is."""
+        """Store the hashes of a PSF's tables and picture, which were made from its unchanged file."""
         with self._database.writing.begin() as session:
             row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
             if row is not None:
                 row.details = {**row.details, "tables_sha256": tables_sha256}
                 row.preview_sha256 = preview_sha256
 
-    # Found by what they are ---------------------------------------------------------------------------
+    # Searches -----------------------------------------------------------------------------------------
 
     def page(
         self, wanted: PsfFilter, owner: str, *, limit: int, after: tuple[float, str] | None = None
     ) -> Sequence[PsfRow]:
-        """PSFs newest first, from ``after`` = (created_at, id) of the last row seen."""
+        """PSFs newest first, after ``after`` = (created_at, id) of the last row of the previous page."""
         query = _query(wanted, owner)
         if after is not None:
             query = query.where(tuple_(PsfRow.created_at, PsfRow.id) < after)
@@ -86,7 +86,7 @@ class Psfs:
             return session.scalars(query.order_by(*_NEWEST_FIRST).limit(limit)).all()
 
     def emptied_by(self, wanted: PsfFilter, owner: str) -> str | None:
-        """The first filter, in their order, that leaves nothing beside those before it; none where PSFs are left."""
+        """The name of the first filter that, with those before it, leaves no PSF; None if PSFs are left."""
         met = PsfFilter()
         with self._database.reading() as session:
             for name in (field.name for field in fields(PsfFilter)):
@@ -96,67 +96,70 @@ class Psfs:
                 met = replace(met, **{name: value})
                 first = (
                     _query(met, owner).order_by(*_NEWEST_FIRST).limit(1)
-                )  # in the order that lists have an index for
+                )  # in the order of the index for lists
                 if session.scalars(first).first() is None:
                     return name.removesuffix("_id")
         return None
 
-    def any_certified(self, line: str, owner: str) -> bool:
-        """Whether a PSF of the line is certified."""
-        certified = and_(PsfRow.owner == owner, PsfRow.line == line, PsfRow.status == PsfStatus.CERTIFIED)
+    def any_certified(self, series: str, owner: str) -> bool:
+        """Whether the series has a certified PSF."""
+        certified = and_(PsfRow.owner == owner, PsfRow.series == series, PsfRow.status == PsfStatus.CERTIFIED)
         with self._database.reading() as session:
             return bool(session.scalar(select(exists().where(certified))))
 
     # Status -------------------------------------------------------------------------------------------
 
     def changes(self, psf_id: str, owner: str) -> Sequence[PsfChangeRow]:
-        """What was made of a PSF, the first change first."""
+        """The changes of a PSF's status, oldest first."""
         query = select(PsfChangeRow).where(PsfChangeRow.owner == owner, PsfChangeRow.psf_id == psf_id)
         with self._database.reading() as session:
             return session.scalars(query.order_by(PsfChangeRow.number)).all()
 
-    def released(self, line: str, owner: str) -> Sequence[str]:
-        """The versions that PSFs of a line were certified under."""
+    def released(self, series: str, owner: str) -> Sequence[str]:
+        """The versions under which PSFs of a series were certified."""
         with self._database.reading() as session:
-            return session.scalars(_released(line, owner)).all()
+            return session.scalars(_released(series, owner)).all()
 
     def change(self, psf_id: str, owner: str, asked: StatusAsked, by: str) -> PsfRow:
-        """Certify a PSF, change the range of a certified one, deprecate it, or name a deprecated one's successor.
+        """Certify a PSF, change the range of a certified PSF, deprecate it, or name the successor of a deprecated PSF.
 
-        Raises ``DataError``: "no-such-psf", "no-line", "line-known", "wrong-transition", "not-of-this-change", what
-        ``check_version`` does, "ranges-overlap", "not-to-supersede", "no-such-successor", "successor-named",
-        "changed-meanwhile". Nothing is changed then.
+        Raises ``DataError`` and changes nothing: "no-such-psf", "no-line", "line-known", "wrong-transition",
+        "not-of-this-change", "ranges-overlap", "not-to-supersede", "no-such-successor", "successor-named",
+        "changed-meanwhile", and the errors of ``check_version``.
         """
         with self._database.writing.begin() as session:
             row = _found(session, psf_id, owner)
-            line = _line(row, asked)
-            self._lock(session, line, owner)
+            series = _series(row, asked)
+            self._lock(session, series, owner)
             session.refresh(row, with_for_update=True)
-            if _line(row, asked) != line:
-                raise DataError("changed-meanwhile", f"PSF {psf_id} was just put in another line; ask again")
+            if _series(row, asked) != series:
+                raise DataError(
+                    "changed-meanwhile",
+                    f"another request just put PSF {psf_id} in another series: send this request again",
+                )
             before = PsfStatus(row.status)
             check_transition(before, asked.status)
             if asked.status == PsfStatus.CERTIFIED:
-                _certify(session, row, line, asked, by)
+                _certify(session, row, series, asked, by)
             else:
                 _deprecate(session, row, asked, by)
             return row
 
-    def _lock(self, session: Session, line: str, owner: str) -> None:
-        """Hold the line until the transaction ends; SQLite's is held by now."""
+    def _lock(self, session: Session, series: str, owner: str) -> None:
+        """Lock the series until the transaction ends. On SQLite the transaction already holds the write lock."""
         insert = sqlite.insert if self._database.sqlite else postgresql.insert
-        session.execute(insert(PsfLineRow).values(owner=owner, line=line).on_conflict_do_nothing())
-        session.get(PsfLineRow, (owner, line), with_for_update=True)
+        session.execute(insert(PsfSeriesRow).values(owner=owner, series=series).on_conflict_do_nothing())
+        session.get(PsfSeriesRow, (owner, series), with_for_update=True)
 
 
 _NEWEST_FIRST = (PsfRow.created_at.desc(), PsfRow.id.desc())
 
 
 def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
-    """PSFs that meet a filter, in no order yet.
+    """A query of PSFs that meet the filters, unsorted.
 
-    What is few by itself, the PSFs of a context or of a time, is found first and joined. That it is distinct keeps SQLite
-    from walking all PSFs in the order of a list until some of these turn up.
+    The PSFs of a context or of a time are few: a subquery finds them first. The subquery is DISTINCT, because otherwise
+    SQLite walks all PSFs in the order of the list until it meets some of them.
     """
     query = select(PsfRow).where(PsfRow.owner == owner)
     if wanted.context_id is not None:
@@ -164,8 +167,8 @@ def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
     elif wanted.valid_at is not None:
         query = query.join(latest := _latest_from(wanted, owner).subquery(), PsfRow.id == latest.c.psf_id)
         query = query.where(PsfRow.valid_to > wanted.valid_at)
-    # A line's name stands for all that makes it: indexes begin with it.
-    whole = ("line",) if wanted.line is not None else ("instrument", "channel", "kind")
+    # The series replaces instrument, channel and kind, because indexes begin with it.
+    whole = ("series",) if wanted.series is not None else ("instrument", "channel", "kind")
     for name in (*whole, "name", "version", "status"):
         value = getattr(wanted, name)
         if value is not None:
@@ -174,66 +177,72 @@ def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
 
 
 def _pinned(wanted: PsfFilter, owner: str) -> Select[Any]:
-    """Ids of the PSFs that a context pins, for a time where one is asked for."""
+    """Ids of the PSFs that a context pins, for a time if one is given."""
     query = select(PsfPinRow.psf_id).where(
         PsfPinRow.owner == owner, PsfPinRow.context_id == wanted.context_id
     )
-    if wanted.line is not None:
-        query = query.where(PsfPinRow.line == wanted.line)
+    if wanted.series is not None:
+        query = query.where(PsfPinRow.series == wanted.series)
     if wanted.valid_at is not None:
         query = query.where(PsfPinRow.valid_from <= wanted.valid_at, PsfPinRow.valid_to > wanted.valid_at)
     return query.distinct()  # one may be pinned for several ranges
 
 
 def _latest_from(wanted: PsfFilter, owner: str) -> Select[Any]:
-    """Of each line the id of the certified PSF whose range began last; ranges do not overlap: no other can hold the time."""
+    """For each series, the id of the certified PSF whose range began last before the time.
+
+    Ranges of a series do not overlap, so no other PSF of the series can be valid at the time.
+    """
     latest = (
         select(PsfRow.id)
         .where(
-            PsfRow.owner == PsfLineRow.owner,
-            PsfRow.line == PsfLineRow.line,
+            PsfRow.owner == PsfSeriesRow.owner,
+            PsfRow.series == PsfSeriesRow.series,
             PsfRow.status == PsfStatus.CERTIFIED,
             PsfRow.valid_from <= wanted.valid_at,
         )
         .order_by(PsfRow.valid_from.desc())
         .limit(1)
-        .correlate(PsfLineRow)
+        .correlate(PsfSeriesRow)
         .scalar_subquery()
     )
     query = select(latest.label("psf_id")).distinct()
-    query = query.select_from(PsfLineRow).where(PsfLineRow.owner == owner)
-    if wanted.line is not None:
-        query = query.where(PsfLineRow.line == wanted.line)
+    query = query.select_from(PsfSeriesRow).where(PsfSeriesRow.owner == owner)
+    if wanted.series is not None:
+        query = query.where(PsfSeriesRow.series == wanted.series)
     elif wanted.instrument is not None:
-        query = query.where(PsfLineRow.line.startswith(f"{wanted.instrument}/", autoescape=True))
+        query = query.where(PsfSeriesRow.series.startswith(f"{wanted.instrument}/", autoescape=True))
     return query
 
 
-def _released(line: str, owner: str) -> Select[Any]:
+def _released(series: str, owner: str) -> Select[Any]:
     released = PsfRow.status.in_((PsfStatus.CERTIFIED, PsfStatus.DEPRECATED))
-    return select(PsfRow.version).where(PsfRow.owner == owner, PsfRow.line == line, released)
+    return select(PsfRow.version).where(PsfRow.owner == owner, PsfRow.series == series, released)
 
 
 def _found(session: Session, psf_id: str, owner: str) -> PsfRow:
     row = session.get(PsfRow, (owner, psf_id))
     if row is None:
-        raise DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+        raise DataError(
+            "no-such-psf",
+            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
+        )
     return row
 
 
-def _line(row: PsfRow, asked: StatusAsked) -> str:
-    """The line of a PSF, with what is now said of it. Raises ``DataError`` "line-known" or "no-line"."""
-    instrument, channel, kind = _said_of_line(row, asked)
-    line = line_of(instrument, channel, kind)
-    if line is None:
+def _series(row: PsfRow, asked: StatusAsked) -> str:
+    """The series of a PSF, completed by the request. Raises ``DataError`` "line-known" or "no-line"."""
+    instrument, channel, kind = _said_of_series(row, asked)
+    series = series_of(instrument, channel, kind)
+    if series is None:
         raise DataError(
             "no-line",
-            f"expected an instrument, which the file of PSF {row.id} does not name: say instrument, channel and kind",
+            f"expected an instrument, because the file of PSF {row.id} names none: give instrument, channel and kind",
         )
-    return line
+    return series
 
 
-def _said_of_line(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | None, str]:
+def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | None, str]:
     open_to = row.status == PsfStatus.DRAFT
     known = {
         "instrument": row.instrument,
@@ -243,7 +252,9 @@ def _said_of_line(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | No
     for name, value in known.items():
         said = getattr(asked, name)
         if said is not None and value is not None and said != value:
-            raise DataError("line-known", f"{name}: PSF {row.id} has {value!r}, which stays; got {said!r}")
+            raise DataError(
+                "line-known", f"{name}: expected {value!r}, which PSF {row.id} has and keeps; got {said!r}"
+            )
     return (
         row.instrument or asked.instrument,
         row.channel or asked.channel,
@@ -251,15 +262,16 @@ def _said_of_line(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | No
     )
 
 
-def _certify(session: Session, row: PsfRow, line: str, asked: StatusAsked, by: str) -> None:
+def _certify(session: Session, row: PsfRow, series: str, asked: StatusAsked, by: str) -> None:
     _refuse(asked, "deprecation", successor_id=asked.successor_id)
     version = row.version
     if row.status == PsfStatus.DRAFT:
-        others = session.scalars(_released(line, row.owner)).all()
+        others = session.scalars(_released(series, row.owner)).all()
         version = check_version(asked.version, others)
     elif asked.version not in (None, row.version):
         raise DataError(
-            "not-of-this-change", f"a certified PSF keeps its version, {row.version}; got {asked.version}"
+            "not-of-this-change",
+            f"expected version {row.version}, which the certified PSF keeps; got {asked.version}",
         )
     validity = asked.validity or _validity(row)
     for superseded_id in asked.supersedes:
@@ -267,24 +279,24 @@ def _certify(session: Session, row: PsfRow, line: str, asked: StatusAsked, by: s
         if (
             superseded is None
             or superseded is row
-            or superseded.line != line
+            or superseded.series != series
             or superseded.status != PsfStatus.CERTIFIED
         ):
             raise DataError(
-                "not-to-supersede", f"supersedes: expected certified PSFs of {line}; got {superseded_id}"
+                "not-to-supersede", f"supersedes: expected certified PSFs of {series}; got {superseded_id}"
             )
         _write(session, superseded, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=row.id)
     session.flush()
-    other = _overlapping(session, row, line, validity)
+    other = _overlapping(session, row, series, validity)
     if other is not None:
         raise DataError(
             "ranges-overlap",
-            f"expected a range that no certified PSF of {line} has a part of; got {validity}, and PSF {other.id} "
-            f"({other.name} {other.version}) has {_validity(other)}: deprecate it, name it "
-            "under supersedes, or certify it for another range first",
+            f"expected a range that overlaps with no certified PSF of {series}; got {validity}, which overlaps with that of "
+            f"PSF {other.id} ({other.name} {other.version}), {_validity(other)}: deprecate that PSF, name it "
+            "in `supersedes`, or change its range first",
         )
-    row.instrument, row.channel, row.kind = _said_of_line(row, asked)
-    row.line = line
+    row.instrument, row.channel, row.kind = _said_of_series(row, asked)
+    row.series = series
     _write(
         session,
         row,
@@ -298,17 +310,20 @@ def _certify(session: Session, row: PsfRow, line: str, asked: StatusAsked, by: s
 
 
 def _validity(row: PsfRow) -> Validity:
-    """The range that a PSF has; all times where it was given none."""
+    """The range of a PSF; all times if it has none."""
     if row.valid_from is None or row.valid_to is None:
         return Validity()
     return Validity(row.valid_from, row.valid_to)
 
 
-def _overlapping(session: Session, row: PsfRow, line: str, validity: Validity) -> PsfRow | None:
-    """The certified PSF of the line that shares a time with the range. Theirs do not overlap: the last to begin decides."""
+def _overlapping(session: Session, row: PsfRow, series: str, validity: Validity) -> PsfRow | None:
+    """The certified PSF of the series whose range overlaps with this one, or None.
+
+    Their ranges do not overlap each other, so only the last one that begins before the end can overlap.
+    """
     query = select(PsfRow).where(
         PsfRow.owner == row.owner,
-        PsfRow.line == line,
+        PsfRow.series == series,
         PsfRow.status == PsfStatus.CERTIFIED,
         PsfRow.id != row.id,
         PsfRow.valid_from < validity.end,
@@ -326,25 +341,25 @@ def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> No
         supersedes=asked.supersedes or None,
     )
     if row.status == PsfStatus.DEPRECATED and (row.successor_id is not None or asked.successor_id is None):
-        has = f"successor {row.successor_id}, which stays" if row.successor_id else "none"
+        has = f"successor {row.successor_id}, which it keeps" if row.successor_id else "no successor"
         raise DataError(
             "successor-named",
-            f"PSF {row.id} is deprecated and has {has}; expected a first successor, got {asked.successor_id or 'none'}",
+            f"expected the first successor of the deprecated PSF {row.id}, which has {has}; got {asked.successor_id or 'none'}",
         )
     if asked.successor_id is not None:
         successor = session.get(PsfRow, (row.owner, asked.successor_id))
-        if successor is None or successor.line != row.line or successor.status != PsfStatus.CERTIFIED:
+        if successor is None or successor.series != row.series or successor.status != PsfStatus.CERTIFIED:
             raise DataError(
                 "no-such-successor",
-                f"successor: expected a certified PSF of {row.line}; got {asked.successor_id}"
+                f"successor: expected a certified PSF of {row.series}; got {asked.successor_id}"
                 + (
                     ""
                     if successor is None
-                    else f", a {successor.status} one of {successor.line or 'no line'}"
+                    else f", which is {successor.status} and of {successor.series or 'no series'}"
                 ),
             )
         if successor is row:
-            raise DataError("no-such-successor", f"successor: expected another PSF than {row.id} itself")
+            raise DataError("no-such-successor", f"successor: expected a PSF other than {row.id} itself")
     _write(session, row, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=asked.successor_id)
 
 
@@ -352,12 +367,13 @@ def _refuse(asked: StatusAsked, other: str, **given: object) -> None:
     for name, value in given.items():
         if value is not None:
             raise DataError(
-                "not-of-this-change", f"{name}: expected with a {other} alone; got it for {asked.status}"
+                "not-of-this-change",
+                f"{name}: expected only with a {other}; got it with status {asked.status}: leave it out",
             )
 
 
 def _write(session: Session, row: PsfRow, reason: str, by: str, **values: object) -> None:
-    """The change itself, and its line in the PSF's history."""
+    """Change the row and add the change to the PSF's history."""
     before, version_before = row.status, row.version
     for name, value in values.items():
         setattr(row, name, value)

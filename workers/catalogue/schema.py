@@ -1,8 +1,8 @@
-"""The database's revision: what it is at, what this version wants, and the way from one to the other.
+"""The revision of the database, the revision that this version needs, and the upgrade.
 
-Revisions are in ``workers/migrations/versions`` and run by alembic, which is loaded where it is asked. Any number of
-processes may start at once: the first one to hold the database's lock upgrades it in one transaction, the others wait
-and find it done.
+Revisions are in ``workers/catalogue/migrations/versions``. Alembic runs them; it is imported only when needed. Any number
+of processes may start at once: the first one that gets the database's lock upgrades it in one transaction; the others
+wait and find it upgraded.
 """
 
 from __future__ import annotations
@@ -23,53 +23,53 @@ if TYPE_CHECKING:
     from alembic.config import Config
 
 REVISIONS = Path(__file__).parent / "migrations"
-LOCK = 0x68656C696F  # of PostgreSQL's advisory locks the one that upgrades take: "helio"
-# Alembic keeps the environment that runs in a variable of its module: one upgrade at a time in this process.
+LOCK = 0x68656C696F  # PostgreSQL's advisory lock for upgrades: "helio"
+# Alembic keeps its running environment in a module variable, so this process may run one upgrade at a time.
 _ONE_AT_A_TIME = threading.Lock()
 
 State = Literal["empty", "unversioned", "older", "current", "newer"]
 
 
 class SchemaError(Exception):
-    """The database is not one that this version can bring to its own tables; the message says why."""
+    """This version cannot upgrade the database; the message says why."""
 
 
 @dataclass(frozen=True)
 class SchemaStatus:
-    """The revision that a database is at, and the one that this version works with."""
+    """The revision of a database, and the one that this version needs."""
 
-    revision: str | None  # none: the database says none
+    revision: str | None  # None: the database has no revision
     wanted: str
     state: State
 
 
 @dataclass(frozen=True)
 class SchemaFaults:
-    """What the database lacks of what this version works with."""
+    """Tables, columns and indexes of this version that the database lacks."""
 
     tables: tuple[str, ...]
     columns: tuple[str, ...]
     indexes: tuple[str, ...]
-    empty: bool  # there is none of our tables
+    empty: bool  # the database has none of the tables
 
 
 class Schema:
-    """Looks at the database's tables, and brings them to this version's."""
+    """Inspects the tables of the database and upgrades them."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def upgrade(self) -> None:
-        """Bring the database, new, older or made before there were revisions, to this version's.
+        """Upgrade a database that is empty, older, or made before there were revisions.
 
-        Raises ``SchemaError`` where it is of a later version, or holds tables that were never ours.
+        Raises ``SchemaError`` if it is of a later version or holds foreign tables.
         """
         from alembic import command
 
         if self.status().state == "current":
             return
         with _ONE_AT_A_TIME, self._database.engine.begin() as connection:
-            if not self._database.sqlite:  # SQLite's write lock is held by now
+            if not self._database.sqlite:  # on SQLite the transaction already holds the write lock
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": LOCK})
             status = _status(connection)
             if status.state == "newer":
@@ -81,31 +81,31 @@ class Schema:
             command.upgrade(config, "head")
 
     def check(self) -> None:
-        """Raise ``SchemaError``, saying what to do, where the database is not at this version's revision."""
+        """Raise ``SchemaError``, which says what to do, if the database is not at the revision of this version."""
         status = self.status()
         if status.state == "newer":
             raise SchemaError(_too_new(status))
         if status.state != "current":
-            found = {"empty": "empty", "unversioned": "at no revision"}.get(
+            found = {"empty": "empty", "unversioned": "without a revision"}.get(
                 status.state, f"at revision {status.revision}"
             )
             raise SchemaError(
-                f"the database is {found}; heliopsf {software_version()} works with revision {status.wanted}: "
-                "bring it there with `heliopsf database upgrade`, or by starting a server of this version"
+                f"expected a database at revision {status.wanted}, which heliopsf {software_version()} needs; it is {found}: "
+                "upgrade it with `heliopsf database upgrade`, or start a server of this version"
             )
 
     def mend(self) -> None:
-        """Make again the tables and indexes that somebody removed from a database at this version's revision."""
+        """Create again tables and indexes that were removed from a database at the revision of this version."""
         with self._database.engine.begin() as connection:
             make_missing(Base.metadata, connection)
 
     def status(self) -> SchemaStatus:
-        """The database's revision; nothing is made."""
+        """The revision of the database; changes nothing."""
         with self._database.engine.execution_options(read_only=True).connect() as connection:
             return _status(connection)
 
     def faults(self) -> SchemaFaults:
-        """What the database lacks; nothing is made."""
+        """What the database lacks; changes nothing."""
         with self._database.engine.execution_options(read_only=True).connect() as connection:
             return _faults(Base.metadata, connection)
 
@@ -121,7 +121,7 @@ def _config() -> Config:
 
 @lru_cache(maxsize=1)
 def _revisions() -> tuple[str, frozenset[str]]:
-    """The revision that this version works with, and all that it knows."""
+    """The revision that this version needs, and all revisions that it knows."""
     from alembic.script import ScriptDirectory
 
     script = ScriptDirectory.from_config(_config())
@@ -149,23 +149,23 @@ def _status(connection: Connection) -> SchemaStatus:
 
 def _too_new(status: SchemaStatus) -> str:
     return (
-        f"the database is at revision {status.revision}, which is not known here: heliopsf "
-        f"{software_version()} knows revisions up to {status.wanted}; use the version that made it"
+        f"the database is at revision {status.revision}, which this version does not know: heliopsf "
+        f"{software_version()} knows revisions up to {status.wanted}; use the version that made the database"
     )
 
 
 def _check_baseline(connection: Connection) -> None:
-    """Tables without a revision are adopted where they have the columns that the first revision gives them.
+    """Raise ``SchemaError`` unless tables without a revision have all columns of the first revision.
 
-    Tables and indexes that are not there are made by it: versions before it made them at each start.
+    The first revision creates missing tables and indexes, as the versions before it did at each start.
     """
     from workers.catalogue.migrations.versions.r0001_baseline import METADATA as BASELINE
 
     lacking = _faults(BASELINE, connection).columns
     if lacking:
         raise SchemaError(
-            "the database has tables without a revision: expected those of heliopsf 0.1, got tables without "
-            f"{', '.join(lacking)}; give this version an empty database"
+            "expected an empty database or one of heliopsf; this one has tables without a revision and without the columns "
+            f"{', '.join(lacking)}: give this version an empty database"
         )
 
 

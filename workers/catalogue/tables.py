@@ -1,7 +1,7 @@
 """The tables of the catalogue.
 
-Times are seconds since 1970 (UTC). What changes here is brought to databases that are there already by a revision in
-``workers/migrations/versions``.
+Times are seconds since 1970 (UTC). A change here needs a revision in ``workers/catalogue/migrations/versions``, which
+upgrades existing databases.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ DEFAULT_OWNER = "local"
 
 
 class Base(DeclarativeBase):
-    """Root of the tables."""
+    """Base class of the tables."""
 
     type_annotation_map = {  # noqa: RUF012 - SQLAlchemy's own convention
         dict[str, Any]: JSON,
         list[str]: JSON,
-        float: Double,  # what it means without this depends on SQLAlchemy's version
+        float: Double,  # without this the type depends on SQLAlchemy's version
     }
 
 
@@ -33,12 +33,12 @@ _EXECUTING = text("phase = 'EXECUTING'")
 
 
 def _listed(table: str, *by: str) -> Index:
-    """The index that a list of an owner's rows is read from in its order, all or those with one value in columns."""
+    """The index for lists of an owner's rows, newest first; ``by``: of rows with one value in these columns."""
     return Index("_".join((table, "listed", *(("by", *by) if by else ()))), "owner", *by, "created_at", "id")
 
 
 class Uploaded:
-    """Columns of an upload; its id is the hash of its bytes."""
+    """Columns of an upload; its id is the SHA-256 of its bytes."""
 
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -56,16 +56,16 @@ class ImageRow(Uploaded, Base):
 
 
 class TransitRow(Uploaded, Base):
-    """An uploaded transit, as the archive that was sent."""
+    """An uploaded transit: the archive as it was sent."""
 
     __tablename__ = "transits"
     __table_args__ = (_listed("transits"),)
 
 
 class PsfRow(Base):
-    """A PSF, uploaded, built or fitted. Its content is immutable: another content is another row.
+    """A PSF, uploaded, built or fitted. Its content never changes: another content is another row.
 
-    ``version`` is what its file says, until the PSF is certified under a version of its line.
+    ``version`` is that of the file until the PSF is certified; then it is the version within its series.
     """
 
     __tablename__ = "psfs"
@@ -77,9 +77,9 @@ class PsfRow(Base):
     instrument: Mapped[str | None]
     channel: Mapped[str | None]  # the wavelength in whole angstrom, as 174
     kind: Mapped[str] = mapped_column(server_default="total")  # total, a component's name, uploaded
-    line: Mapped[str | None]  # of these three; none without an instrument
+    series: Mapped[str | None]  # instrument/channel/kind; None without an instrument
     status: Mapped[str]
-    # Of a PSF that is or was certified: times of observation, open ends as infinities.
+    # Only if the PSF is or was certified: the range of times of observation; an open end is an infinity.
     valid_from: Mapped[float | None]
     valid_to: Mapped[float | None]
     successor_id: Mapped[str | None] = mapped_column(String(64))
@@ -98,19 +98,19 @@ class PsfRow(Base):
                 "instrument",
                 "channel",
                 "kind",
-                "line",
-                "line status",
+                "series",
+                "series status",
                 "name",
                 "version",
                 "status",
             )
         ),
-        Index("psfs_by_validity", "owner", "line", "status", "valid_from"),
-        # Every version is given once in its line, and never again.
+        Index("psfs_by_validity", "owner", "series", "status", "valid_from"),
+        # A version is used only once in a series.
         Index(
             "one_psf_a_version",
             "owner",
-            "line",
+            "series",
             "version",
             unique=True,
             sqlite_where=_RELEASED,
@@ -120,16 +120,16 @@ class PsfRow(Base):
     )
 
 
-class PsfLineRow(Base):
-    """A line of PSFs that some PSF was certified in. Who changes what is certified in it holds this row's lock."""
+class PsfSeriesRow(Base):
+    """A series with at least one certified PSF. A change of status in the series locks this row."""
 
-    __tablename__ = "psf_lines"
+    __tablename__ = "psf_series"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    line: Mapped[str] = mapped_column(String(128), primary_key=True)
+    series: Mapped[str] = mapped_column(String(128), primary_key=True)
 
 
 class PsfChangeRow(Base):
-    """A change of a PSF's status: who made it, when and why. Rows are added and never changed."""
+    """A change of a PSF's status: who made it, when and why. Rows are never changed or deleted."""
 
     __tablename__ = "psf_changes"
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
@@ -150,7 +150,7 @@ class PsfChangeRow(Base):
 
 
 class PsfContextRow(Base):
-    """A named set of PSFs, one a line and range of times. Immutable; its id is the hash of its name and its pins."""
+    """A named set of PSFs, one per series and range of times. Immutable; its id is the hash of its name and pins."""
 
     __tablename__ = "psf_contexts"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -168,12 +168,12 @@ class PsfContextRow(Base):
 
 
 class PsfPinRow(Base):
-    """A PSF that a context pins for a line and a range of times of observation."""
+    """A PSF that a context pins for a series and a range of times of observation."""
 
     __tablename__ = "psf_pins"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     context_id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    line: Mapped[str] = mapped_column(String(128), primary_key=True)
+    series: Mapped[str] = mapped_column(String(128), primary_key=True)
     valid_from: Mapped[float] = mapped_column(primary_key=True)
     valid_to: Mapped[float]
     psf_id: Mapped[str] = mapped_column(String(64))
@@ -181,7 +181,7 @@ class PsfPinRow(Base):
 
 
 class DefaultContextRow(Base):
-    """The context that an owner's images are looked up in from this moment on; none: what is certified. The last counts."""
+    """A change of an owner's default context; None: the PSFs certified now. The last row is valid."""
 
     __tablename__ = "default_contexts"
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
@@ -195,7 +195,7 @@ class DefaultContextRow(Base):
 
 
 class ProductRow(Base):
-    """A deconvolved image; its id is the identity of the request that made it."""
+    """A deconvolved image; its id is the identity of its request."""
 
     __tablename__ = "products"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -214,7 +214,7 @@ class ProductRow(Base):
 
 
 class JobRow(Base):
-    """A job. ``work_key`` is the identity of what it makes; so is ``request_key``, unless an equal live job has that."""
+    """A job. ``work_key`` is the identity of its result. ``request_key`` is the same unless another live job has it."""
 
     __tablename__ = "jobs"
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -222,7 +222,7 @@ class JobRow(Base):
     kind: Mapped[str]
     parameters: Mapped[dict[str, Any]]
     request_key: Mapped[str] = mapped_column(String(64))
-    work_key: Mapped[str | None] = mapped_column(String(64))  # none while PENDING
+    work_key: Mapped[str | None] = mapped_column(String(64))  # None while PENDING
     phase: Mapped[str] = mapped_column(String(16))
     queue: Mapped[str] = mapped_column(String(16), default=Queue.INTERACTIVE, server_default="interactive")
     created_at: Mapped[float] = mapped_column(index=True)
@@ -240,10 +240,12 @@ class JobRow(Base):
     stage: Mapped[str] = mapped_column(default="")
     result_id: Mapped[str | None] = mapped_column(String(64))
     error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
-    estimate: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))  # when it was taken
+    estimate: Mapped[dict[str, Any] | None] = mapped_column(
+        JSON(none_as_null=True)
+    )  # made when the job was submitted
 
     __table_args__ = (
-        # Two equal requests at the same moment: the second insert fails and finds the first.
+        # Of two identical requests at the same moment, the second insert fails and then finds the first.
         Index(
             "one_live_job_a_request",
             "owner",
@@ -252,7 +254,7 @@ class JobRow(Base):
             sqlite_where=phase.in_(sorted(LIVE)),
             postgresql_where=phase.in_(sorted(LIVE)),
         ),
-        # Two jobs that make the same: the second one's claim fails while the first is at work.
+        # Of two jobs with the same result, the second cannot be claimed while the first executes.
         Index(
             "one_at_work_a_result",
             "owner",
@@ -265,23 +267,23 @@ class JobRow(Base):
         Index("jobs_waiting", "phase", "queue", "created_at", "submitted_at"),
         _listed("jobs"),
         _listed("jobs", "phase"),
-        # All that tally() asks for, so that it never reads the rows themselves.
+        # Contains all columns that tally() needs, so that it does not read the rows.
         Index("jobs_tallied", "kind", "phase", "attempt", "started_at", "ended_at"),
     )
 
 
 class TermsRow(Base):
-    """What a UWS client said of a job beside its parameters. A job without such a row has no name and no limits."""
+    """The UWS terms of a job. A job without such a row has no run id and no limits."""
 
     __tablename__ = "job_terms"
     job_id: Mapped[str] = mapped_column(String(32), primary_key=True)
     run_id: Mapped[str | None] = mapped_column(default=None)
-    execution_duration_s: Mapped[int] = mapped_column(default=0)  # 0: as long as it takes
+    execution_duration_s: Mapped[int] = mapped_column(default=0)  # 0: unlimited
     destruction_at: Mapped[float | None] = mapped_column(default=None, index=True)
 
 
 class ReportRow(Base):
-    """What a study of a transit found (a cross-validation), or a thing made again; its id is the identity of the request."""
+    """The report of a job on a transit, or on a rerun; its id is the identity of the request."""
 
     __tablename__ = "reports"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -289,7 +291,7 @@ class ReportRow(Base):
     created_at: Mapped[float]
     kind: Mapped[str]
     transit_id: Mapped[str | None] = mapped_column(String(64))
-    about_id: Mapped[str | None] = mapped_column(String(64))  # the PSF or product that was made again
+    about_id: Mapped[str | None] = mapped_column(String(64))  # the PSF or product of a rerun
     file_sha256: Mapped[str] = mapped_column(String(64))
     bytes: Mapped[int] = mapped_column(BigInteger, index=True)
     preview_sha256: Mapped[str | None] = mapped_column(String(64))
@@ -301,7 +303,7 @@ class ReportRow(Base):
 class PartRow(Base):
     """A part of a job that several workers share: open, taken under a token, or done with its result.
 
-    Parts belong to the request, not to the job: what is done stays done when the job is tried again.
+    Parts belong to the request, not to the job: results stay when the job is tried again.
     """
 
     __tablename__ = "parts"
@@ -314,7 +316,7 @@ class PartRow(Base):
 
 
 class WorkerRow(Base):
-    """A worker process that is there, at work or not; it says so again and again, and takes its leave."""
+    """A running worker process. It renews its heartbeat and deletes the row when it ends."""
 
     __tablename__ = "workers"
     name: Mapped[str] = mapped_column(String(128), primary_key=True)  # host:process, as in a job's row
@@ -324,7 +326,7 @@ class WorkerRow(Base):
 
 
 class StageTimeRow(Base):
-    """What all attempts of jobs of a kind spent in a stage. It stays when the jobs are gone."""
+    """The total time that attempts of jobs of a kind spent in a stage. It stays when the jobs are deleted."""
 
     __tablename__ = "stage_times"
     kind: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -334,19 +336,19 @@ class StageTimeRow(Base):
 
 
 class OwnerRow(Base):
-    """How many bytes an owner has kept, and the limit where it is not that of all."""
+    """The bytes that an owner keeps, and the owner's own limit; quota_mib None: the default limit."""
 
     __tablename__ = "owners"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     bytes: Mapped[int] = mapped_column(BigInteger, default=0)
-    quota_mib: Mapped[int | None]  # 0: no limit
+    quota_mib: Mapped[int | None]  # 0: unlimited
 
 
 class KeyRow(Base):
-    """A key that lets its owner in. The secret itself is nowhere: only its hash is kept."""
+    """An API key of an owner. Only the hash of the secret is stored."""
 
     __tablename__ = "keys"
-    id: Mapped[str] = mapped_column(String(16), primary_key=True)  # the part of the key that may be seen
+    id: Mapped[str] = mapped_column(String(16), primary_key=True)  # the public part of the key
     owner: Mapped[str] = mapped_column(String(64), index=True)
     secret_sha256: Mapped[str] = mapped_column(String(64))
     scopes: Mapped[list[str]]

@@ -1,4 +1,4 @@
-"""Jobs as clients of the UWS interface have them: set up before they start, on terms, destroyed, listed all at once."""
+"""Jobs of the UWS interface: they are set up before they start, have time limits, and can be destroyed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class JobLine:
 
 
 class UwsJobs:
-    """What the UWS interface does with the table of jobs beside the jobs' own course; each method is one transaction."""
+    """Changes to the table of jobs that only UWS clients request; each method is one transaction."""
 
     def __init__(self, database: Database, jobs: Jobs) -> None:
         self._database, self._jobs = database, jobs
@@ -47,7 +47,7 @@ class UwsJobs:
         execution_duration_s: int = 0,
         destruction_at: float | None = None,
     ) -> JobRow:
-        """A new PENDING job with the parameters that were given so far. It shares nothing with equal requests."""
+        """A new PENDING job with the parameters given so far. Identical requests do not share it."""
         row = JobRow(
             id=uuid.uuid4().hex,
             owner=owner,
@@ -69,7 +69,7 @@ class UwsJobs:
         return row
 
     def amend(self, job_id: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> bool:
-        """Change what was given for a PENDING job; False, and nothing changed, in any other phase."""
+        """Change the parameters of a PENDING job; False, and nothing changed, in any other phase."""
         with self._database.writing.begin() as session:
             row = session.get(JobRow, job_id, with_for_update=True)
             if row is None or row.phase != Phase.PENDING:
@@ -85,11 +85,10 @@ class UwsJobs:
         request_key: str,
         estimate: dict[str, Any] | None = None,
     ) -> bool:
-        """PENDING -> QUEUED with the parameters that ``given`` was resolved to.
+        """PENDING -> QUEUED with ``parameters``, which were resolved from ``given``.
 
-        False where the job is not PENDING, or what was given for it has changed since. Where an equal request has a
-        live job already this one runs under a key of its own: not while that job is at work, and then it finds what
-        that job made.
+        False if the job is not PENDING or its parameters are no longer ``given``. If an identical request has a live
+        job, this job gets a key of its own; it waits until that job ends and then finds its result.
         """
         for key in (request_key, canonical_hash({"request_key": request_key, "job": job_id})):
             try:
@@ -102,10 +101,10 @@ class UwsJobs:
                 return True
             except IntegrityError:
                 continue
-        raise RuntimeError(f"job {job_id} has an equal under a key of its own")
+        raise RuntimeError(f"another job has the key that belongs to job {job_id} alone")
 
     def destroy(self, job_id: str) -> bool:
-        """Remove the job in whatever phase; a worker that has it loses its lease and stops. What it made stays."""
+        """Delete the job in any phase. Its worker loses the lease and stops. Results stay."""
         with self._database.writing.begin() as session:
             session.execute(delete(TermsRow).where(TermsRow.job_id == job_id))
             result = session.execute(delete(JobRow).where(JobRow.id == job_id))
@@ -113,19 +112,19 @@ class UwsJobs:
             return bool(result.rowcount)
 
     def terms(self, job_id: str) -> TermsRow:
-        """The terms of a job."""
+        """The UWS terms of a job: run id, time limit, destruction time."""
         with self._database.reading() as session:
             return session.get(TermsRow, job_id) or TermsRow(job_id=job_id, execution_duration_s=0)
 
     def set_terms(self, job_id: str, **values: Any) -> None:
-        """Change terms of a job."""
+        """Change UWS terms of a job."""
         with self._database.writing.begin() as session:
-            # The lock on the job's row orders changes, and a job that is gone gets no terms.
+            # The lock on the job's row orders changes; a deleted job gets no terms.
             if session.get(JobRow, job_id, with_for_update=True) is not None:
                 session.merge(TermsRow(job_id=job_id, **values))
 
     def end_by_terms(self) -> list[str]:
-        """Ask jobs that execute longer than their terms allow to stop; destroy those that are due, and return their ids."""
+        """Stop jobs that exceed their time limit; destroy jobs whose destruction time has come, and return their ids."""
         now = self._database.now
         too_long = select(JobRow.id).join(TermsRow, TermsRow.job_id == JobRow.id)
         too_long = too_long.where(
@@ -149,7 +148,7 @@ class UwsJobs:
         from_time: float | None = None,
         last: int | None = None,
     ) -> list[JobLine]:
-        """All jobs of an owner, newest first; of some phases, created at ``from_time`` or later, the ``last`` ones."""
+        """Jobs of an owner, newest first. phases: only these; from_time: created then or later; last: at most this many."""
         query = select(JobRow.id, JobRow.phase, JobRow.owner, JobRow.created_at, TermsRow.run_id)
         query = query.outerjoin(TermsRow, TermsRow.job_id == JobRow.id).where(JobRow.owner == owner)
         if phases:

@@ -1,7 +1,7 @@
-"""Files of an archive: where the operator lets them be read and written, which of them a pattern names, what they are called.
+"""Files of an archive of images: allowed folders, patterns that match files, and names of output files.
 
-A path that a request names is resolved first, symbolic links and all, and must then lie below a folder that the
-operator allows. So must every file that a pattern finds, and again when it is read.
+A path of a request is resolved first, with its symbolic links, and must then lie below a folder that the operator
+allows. The same holds for every file that a pattern matches, and again when the file is read.
 """
 
 from __future__ import annotations
@@ -29,49 +29,47 @@ _CHUNK = 2**20
 
 @dataclass(frozen=True)
 class Found:
-    """What a pattern names: a file, or an entry of a folder that cannot be looked at, and why."""
+    """A file that a pattern matches, or an entry of a folder that could not be inspected, with the error."""
 
     path: Path
     error: DataError | None = None
 
 
 def roots(folders: str) -> tuple[Path, ...]:
-    """Folders in a setting, as the system separates paths, each resolved."""
+    """The resolved folders of a setting, which are separated as in PATH."""
     return tuple(Path(folder).resolve() for folder in folders.split(os.pathsep) if folder.strip())
 
 
 def check_under(path: Path, allowed: Sequence[Path], what: str = "a path") -> Path:
-    """The path resolved, where it lies below a folder that is allowed.
+    """The resolved path, if it lies below an allowed folder.
 
-    Raises DataError "path-not-allowed", or "bad-path" where its links lead nowhere.
+    Raises DataError "path-not-allowed", and "bad-path" if its links cannot be resolved.
     """
     try:
         resolved = _resolved(path)
     except OSError as error:
         raise DataError(
             "bad-path",
-            f"expected {what} that leads somewhere; got {ascii(str(path))[:200]}: {reason_of(error)}",
+            f"expected {what} that can be resolved; got {ascii(str(path))[:200]}: {reason_of(error)}",
         ) from error
     if any(resolved.is_relative_to(root) for root in allowed):
         return resolved
-    none = (
-        "a folder that the operator allows; there is none (HELIOPSF_BULK_ROOTS, HELIOPSF_BULK_OUTPUT_ROOTS)"
-    )
+    none = "a folder that the operator allows; none is set (HELIOPSF_BULK_ROOTS, HELIOPSF_BULK_OUTPUT_ROOTS)"
     where = ", ".join(map(str, allowed)) or none
     raise DataError("path-not-allowed", f"expected {what} below {where}; got {ascii(str(path))[:200]}")
 
 
 def check_glob(glob: str, allowed: Sequence[Path]) -> None:
-    """DataError "bad-path" or "path-not-allowed" for a pattern whose fixed part is no folder that may be read."""
+    """Raise DataError "bad-path" or "path-not-allowed" if the fixed part of a pattern is not in an allowed folder."""
     folder, _parts = _split(glob)
     check_under(folder, allowed)
 
 
 def find(glob: str, allowed: Sequence[Path], tick: Callable[[], None] = lambda: None) -> Iterator[Found]:
-    """Files that a pattern names, each once: those of a folder by name, then those below it. Links out are not followed.
+    """The files that a pattern matches, each once: those of a folder by name, then those of its subfolders.
 
-    An entry that is meant and cannot be looked at comes with its error. ``tick`` is called for each folder and each
-    entry, whether it is meant or not; what it raises ends the walk.
+    Links that lead out of the allowed folders are not followed. A matching entry that cannot be inspected is yielded
+    with its error. ``tick`` is called for every folder and entry; an exception from it ends the walk.
     Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
     """
     folder, parts = _split(glob)
@@ -79,7 +77,7 @@ def find(glob: str, allowed: Sequence[Path], tick: Callable[[], None] = lambda: 
 
 
 def matches(path: Path, where: dict[str, Condition], limits: FitsLimits) -> bool:
-    """Whether the header of a file's image says what is asked. Raises DataError where there is none to ask."""
+    """Whether the header of a file's image meets all conditions. Raises DataError if it cannot be read."""
     if not where:
         return True
     header = first_image_header(path, limits)
@@ -87,36 +85,38 @@ def matches(path: Path, where: dict[str, Condition], limits: FitsLimits) -> bool
 
 
 def copy_hashed(source: Path, target: Path, max_bytes: int) -> str:
-    """Copy a file; the SHA-256 of what was copied. Raises DataError "too-large", OSError.
+    """Copy a file; returns the SHA-256 of the copy. Raises DataError "too-large", OSError.
 
-    What is worked on is the copy: an archive may change meanwhile.
+    The task works on the copy, because a file of the archive may change meanwhile.
     """
     digest, size = hashlib.sha256(), 0
     with source.open("rb") as file, target.open("wb") as copy:
         while chunk := file.read(_CHUNK):
             size += len(chunk)
             if size > max_bytes:
-                raise DataError("too-large", f"expected a file of at most {max_bytes} bytes; got more")
+                raise DataError(
+                    "too-large", f"expected a file of at most {max_bytes} bytes; got a larger one"
+                )
             digest.update(chunk)
             copy.write(chunk)
     return digest.hexdigest()
 
 
 def safe_name(name: str, identity: str) -> str:
-    """What a product's file is called: after its image, with nothing in it but letters, digits and . _ -"""
+    """The name of a product's file: from its image's name, of letters, digits and . _ - only."""
     stem = _NOT_IN_A_NAME.sub("_", _FITS_ENDING.sub("", PurePath(name).name)).strip("._-")[:80] or "image"
     return f"{stem}-{identity[:16]}.fits"
 
 
 def shown(path: PurePath) -> str:
-    """A path as text that any database and any answer takes: bytes that are not UTF-8 as \\xff."""
+    """A path as valid UTF-8 text: other bytes are shown as \\xff."""
     return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
-    """The folder before the first part with a wildcard in it, and the parts from there on.
+    """The folder before the first part with a wildcard, and the parts from there on.
 
-    Of several ** in a row there is one; the last part is never one.
+    Several ** in a row become one, and a final ** becomes ** and *.
     """
     path = PurePath(glob)
     if not path.is_absolute() or ".." in path.parts:
@@ -134,12 +134,12 @@ def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
 def _walk(
     top: Path, parts: tuple[str, ...], allowed: Sequence[Path], tick: Callable[[], None]
 ) -> Iterator[Found]:
-    """Each folder is looked through once, for all parts that may come next there: several ** do not multiply."""
+    """Walk each folder once, for all parts that may match next in it, so that several ** do not multiply the work."""
     left = [(top, frozenset({0}))]
     while left:
         folder, places = left.pop()
         tick()
-        places |= {place + 1 for place in places if parts[place] == ANY_FOLDERS}  # it may stand for none
+        places |= {place + 1 for place in places if parts[place] == ANY_FOLDERS}  # ** also matches no folder
         below: list[tuple[Path, frozenset[int]]] = []
         for entry in _entries(folder):
             tick()
@@ -147,7 +147,9 @@ def _walk(
             try:
                 meant, further = _meant(entry, parts, places, allowed)
             except OSError as error:
-                message = f"expected a file or folder that can be looked at: {reason_of(error)}"
+                message = (
+                    f"expected a file or folder that can be inspected; the system says: {reason_of(error)}"
+                )
                 yield Found(path, DataError("unreadable-file", message))
                 continue
             if meant:
@@ -160,9 +162,9 @@ def _walk(
 def _meant(
     entry: os.DirEntry[str], parts: tuple[str, ...], places: frozenset[int], allowed: Sequence[Path]
 ) -> tuple[bool, frozenset[int]]:
-    """Whether an entry is a file that is meant; the parts that may come next in it, none where it is no folder.
+    """Whether an entry is a matching file, and the parts that may match next in it (empty unless it is a folder).
 
-    Raises OSError where that cannot be seen.
+    Raises OSError if the entry cannot be inspected.
     """
     further = {place for place in places if parts[place] == ANY_FOLDERS}
     if further and (entry.name.startswith(".") or not entry.is_dir(follow_symlinks=False)):
@@ -183,25 +185,25 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
     except OSError as error:
         raise DataError(
             "unreadable-folder",
-            f"expected a folder that can be read; got {shown(folder)}: {reason_of(error)}",
+            f"expected a readable folder; got {shown(folder)}: {reason_of(error)}",
         ) from error
 
 
 def _resolved(path: Path) -> Path:
-    """The path without links in it. Raises OSError."""
+    """The path with all links resolved. Raises OSError."""
     try:
         return path.resolve()
-    except RuntimeError as error:  # what Python before 3.13 raises for links that lead round in a circle
+    except RuntimeError as error:  # Python before 3.13 raises this for circular links
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP)) from error
 
 
 def reason_of(error: OSError) -> str:
-    """What the system says of it, without the path."""
+    """The system's message, without the path."""
     return error.strerror or type(error).__name__
 
 
 def _named(name: str, pattern: str) -> bool:
-    """Whether a name is meant; what begins with a full stop is hidden from wildcards."""
+    """Whether a name matches; wildcards do not match names that begin with a full stop."""
     return fnmatchcase(name, pattern) and (not name.startswith(".") or pattern.startswith("."))
 
 
@@ -220,7 +222,7 @@ def _same(value: Any, other: Any) -> bool:
 
 
 def _compared(value: Any, sign: str, other: Any) -> bool:
-    """Numbers with numbers, texts with texts, as ISO times are ordered; whatever else is not met."""
+    """Compare numbers with numbers and texts with texts (ISO times sort as texts). Other pairs only meet !=."""
     if isinstance(value, bool) or isinstance(value, str) != isinstance(other, str):
         return sign == "!="
     match sign:

@@ -1,7 +1,7 @@
-"""Files that no row names any more, found and removed: what a job left that was killed between keeping and writing down.
+"""Removal of files to which no row refers. A job leaves such files if it is killed before it writes its row.
 
-What was kept of late is left alone: an upload keeps its file before it writes its row. A file that is kept at the very
-moment it is removed has its row a little later, so the rows are looked at a second time before it is gone for good.
+Recent files stay, because an upload stores its file before its row. If a file is stored again at the moment of its
+removal, its row appears a little later: the rows are therefore read a second time before the file is deleted for good.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Blob, Store
 
-SECOND_LOOK_AFTER_S = 10.0  # uploads write their rows at once after their files, jobs in seconds
+SECOND_LOOK_AFTER_S = 10.0  # an upload writes its row directly after its file, a job within seconds
 
 
 @dataclass(frozen=True)
 class Collected:
-    """What was found; of a dry run, what would be removed."""
+    """The files of the store, and those that were removed, or would be removed in a dry run."""
 
-    files: int  # that are kept
+    files: int  # in the store
     bytes: int
     removed: tuple[Blob, ...]
 
     @property
     def removed_bytes(self) -> int:
-        """What the removed files took."""
+        """The size of the removed files."""
         return sum(blob.bytes for blob in self.removed)
 
 
@@ -39,10 +39,11 @@ def collect(
     even_most: bool = False,
     second_look_after_s: float = SECOND_LOOK_AFTER_S,
 ) -> Collected:
-    """Remove files that were kept last before so many seconds, and that nothing names; one collection at a time.
+    """Remove files that were last stored more than ``older_than_s`` ago and to which no row refers.
 
-    Raises DataError "nothing-named" where no file at all is named: then the database is another one; "most-unnamed" where
-    more than half would go, which jobs that are killed do not leave, unless ``even_most``.
+    Run one collection at a time. Raises DataError "nothing-named" if no row refers to any file: then the database belongs
+    to another store. Raises DataError "most-unnamed" if more than half of the files would be removed, unless
+    ``even_most``: killed jobs do not leave that many.
     """
     kept_before = time.time() - older_than_s
     there = {blob.digest: blob for blob in store.blobs()}
@@ -52,14 +53,16 @@ def collect(
     if there and len(left) == len(there):
         raise DataError(
             "nothing-named",
-            f"expected a database that names some of the {len(there)} files; this one names none: is it the right one?",
+            f"expected a database that refers to some of the {len(there)} files of the store; this one refers to none: check "
+            "that the settings name the right database",
         )
     old = [blob for blob in left.values() if blob.kept_at < kept_before]
     if not dry_run and not even_most and 2 * len(old) > len(there):
         raise DataError(
             "most-unnamed",
-            f"expected a database that names most of the {len(there)} files; {len(old)} old ones are named by nothing in "
-            "this one: is it the right one? Nothing was removed; if all of them are to go, say --even-most",
+            f"expected a database that refers to most of the {len(there)} files of the store; this one does not refer to "
+            f"{len(old)} old files: check that the settings name the right database. Nothing was removed; to remove them "
+            "all, add --even-most",
         )
     if not dry_run:
         old = _removed(old, catalogue, store, kept_before, second_look_after_s)
@@ -69,8 +72,8 @@ def collect(
 def _removed(
     old: list[Blob], catalogue: Catalogue, store: Store, kept_before: float, second_look_after_s: float
 ) -> list[Blob]:
-    """Those of the files that were removed, and that nothing named even then."""
-    # First: what a killed collection left aside is missing until here, where it is named.
+    """Remove these files; returns those to which no row refers even after the removal."""
+    # First restore files that a killed collection moved aside, if a row refers to them.
     store.settle(catalogue.named_files.all())
     gone = [blob for blob in old if store.remove(blob.digest, kept_before)]
     put_back = store.settle(catalogue.named_files.all(), after_s=second_look_after_s)

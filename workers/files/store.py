@@ -1,7 +1,7 @@
-"""Files by the hash of their content, in a local folder; in ``workers.files.s3_store`` also in S3.
+"""Files by the hash of their content, in a local folder. ``workers.files.s3_store`` does the same with S3.
 
-A file is written beside its place under a temporary name, forced to disk and renamed, so that a file that
-exists is whole. Names come from hashes alone, never from a client.
+A file is written under a temporary name, forced to disk and renamed, so that an existing file is whole. File names come
+from hashes only, never from a client.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from pathlib import Path
 
 
 class StoreAway(ConnectionError):
-    """Where the files are does not answer; it may in a moment."""
+    """The storage does not answer now; a later attempt may succeed."""
 
 
 @dataclass(frozen=True)
 class Blob:
-    """A file that is kept."""
+    """A file of the store."""
 
     digest: str
     bytes: int
-    kept_at: float  # when it was kept last, though it may have been there before
+    kept_at: float  # when it was last stored; it may be older
 
 
 class Store:
@@ -40,9 +40,9 @@ class Store:
         self._tmp.mkdir(parents=True, exist_ok=True)
 
     def sweep(self, older_than_s: float = 86_400.0) -> None:
-        """Remove temporary files that a killed process left behind."""
+        """Remove temporary files that killed processes left."""
         for path in self._tmp.iterdir():
-            # Whoever works beside this ends with its files, and another sweep may be at them too.
+            # Running tasks remove their files when they end, and another sweep may run now.
             with suppress(FileNotFoundError):
                 if time.time() - path.stat().st_mtime > older_than_s:
                     if path.is_dir():
@@ -51,17 +51,17 @@ class Store:
                         path.unlink()
 
     def path(self, digest: str) -> Path:
-        """Where the file of this SHA-256 is, or would be, to be opened soon."""
+        """The path of the file with this SHA-256, for opening it soon; the file need not exist."""
         return self._blobs / digest[:2] / digest
 
     def check(self) -> None:
-        """Raise OSError where files cannot be kept now."""
+        """Raise OSError if files cannot be stored now."""
         with self.temporary() as probe:
             probe.write_bytes(b"heliopsf")
 
     @contextmanager
     def temporary(self) -> Iterator[Path]:
-        """A free path to write to; whatever is still there at the end is removed."""
+        """A free path to write to; a file that is still there at the end is removed."""
         path = self._tmp / uuid.uuid4().hex
         try:
             yield path
@@ -70,7 +70,7 @@ class Store:
 
     @contextmanager
     def temporary_folder(self) -> Iterator[Path]:
-        """An empty folder to unpack into, removed at the end with all that it holds."""
+        """An empty folder, removed at the end with its content."""
         folder = self._tmp / uuid.uuid4().hex
         folder.mkdir()
         try:
@@ -79,7 +79,7 @@ class Store:
             shutil.rmtree(folder)
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
-        """Move a finished file to its place, durably; returns its SHA-256 (computed where not given)."""
+        """Move a finished file into the store and force it to disk; returns its SHA-256, computed if not given."""
         digest = digest or sha256_of(temporary)
         target = self.path(digest)
         target.parent.mkdir(exist_ok=True)
@@ -89,16 +89,16 @@ class Store:
         return digest
 
     def blobs(self) -> Iterator[Blob]:
-        """All files that are kept."""
+        """All files of the store."""
         for folder in sorted(self._blobs.iterdir()):
             for path in sorted(folder.iterdir()):
                 found = path.stat()
                 yield Blob(path.name, found.st_size, found.st_mtime)
 
     def remove(self, digest: str, kept_before: float) -> bool:
-        """Remove a file, unless it is gone or was kept again since; whether it was removed.
+        """Remove a file unless it is gone or was stored again since ``kept_before``; whether it was removed.
 
-        It is put aside first and looked at there, so that a file that is kept at this very moment is not lost.
+        The file is moved aside and checked there, so that a file that is stored at the same moment is not lost.
         """
         aside = self._tmp / uuid.uuid4().hex
         target = self.path(digest)
@@ -107,17 +107,17 @@ class Store:
         except FileNotFoundError:
             return False
         if aside.stat().st_mtime >= kept_before:
-            os.replace(aside, target)  # whatever was put there meanwhile is the same
+            os.replace(aside, target)  # a file stored there meanwhile has the same content
             return False
         aside.unlink()
         return True
 
     def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """End what ``remove`` began: of the files it left aside, those that are named go back, the others for good.
+        """Finish ``remove``: restore those of the files moved aside that are in ``named``, and delete the others.
 
-        ``named`` is read where something is aside, so many seconds later. Returns what was put back.
+        ``named`` is read ``after_s`` seconds later, and only if a file is aside. Returns the restored hashes.
         """
-        return set()  # in a folder, what is aside is looked at there and then
+        return set()  # in a folder, remove() itself checks the file that it moved aside
 
 
 def sha256_of(path: Path) -> str:
@@ -127,7 +127,7 @@ def sha256_of(path: Path) -> str:
 
 
 def sync(path: Path) -> None:
-    """Have a file, or a folder's names, on the disk before anything is said of it."""
+    """Force a file, or the names in a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -12,7 +12,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfContextRow, PsfRow
-from workers.versions.series import TOTAL, channel_of, instrument_of, line_of
+from workers.versions.series import TOTAL, channel_of, instrument_of, series_of
 from workers.versions.status import PsfStatus
 from workers.versions.validity import iso, seconds
 
@@ -101,7 +101,7 @@ def look_for_image(
         raise DataError(
             "no-date",
             f"expected DATE-BEG or DATE-OBS as 2024-03-01T12:00:00 in the image's header, since PSFs of "
-            f"{line_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}",
+            f"{series_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}",
         )
     return found
 
@@ -114,15 +114,15 @@ def picked_for_image(
     Raises ``DataError`` as ``look_for_image`` does, and "no-psf-fits" if the series has PSFs, but none in the context.
     """
     instrument, channel = _seen_through(header)
-    line = line_of(instrument, channel, TOTAL)
+    series = series_of(instrument, channel, TOTAL)
     pinned = catalogue.contexts.asked_for(context, owner)
-    if line is not None and pinned is not None and catalogue.contexts.any_pinned(pinned.id, line, owner):
+    if series is not None and pinned is not None and catalogue.contexts.any_pinned(pinned.id, series, owner):
         return look_for_image(catalogue, header, owner, context)
-    certified = line is not None and catalogue.psfs.any_certified(line, owner)
+    certified = series is not None and catalogue.psfs.any_certified(series, owner)
     if pinned is not None and (certified or context is not None):
         raise DataError(
             "no-psf-fits",
-            f"expected context {pinned.name} to pin a PSF of {line or 'an instrument'}; it pins none: name a PSF, or "
+            f"expected context {pinned.name} to pin a PSF of {series or 'an instrument'}; it pins none: name a PSF, or "
             f"use context {NOW!r} for the PSFs that are certified now",
         )
     return look_for_image(catalogue, header, owner, context) if certified else None

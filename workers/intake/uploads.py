@@ -9,7 +9,7 @@ from pathlib import PurePath
 from psfcore.fits.header import HeaderSummary
 from psfcore.transit.archive import ArchiveContents
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
-from workers.versions.series import UPLOADED, channel_of, instrument_of, line_of
+from workers.versions.series import UPLOADED, channel_of, instrument_of, series_of
 from workers.versions.status import PsfStatus
 
 
@@ -81,7 +81,7 @@ def uploaded_psf_row(
         instrument=instrument,
         channel=channel,
         kind=kind,
-        line=line_of(instrument, channel, kind),
+        series=series_of(instrument, channel, kind),
         status=PsfStatus.DRAFT,
         origin="uploaded",
         file_sha256=sha256,

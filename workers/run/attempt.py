@@ -14,9 +14,9 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.stage_times import StageTimes
 from workers.contract.phases import Phase
 from workers.run.stopping import Stopping
+from workers.tasks.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class Attempt:
     stopped: threading.Event = field(default_factory=threading.Event)
     ended: threading.Event = field(default_factory=threading.Event)
     last_report: float = 0.0
-    times: StageTimes = field(default_factory=StageTimes)
+    times: StageTimer = field(default_factory=StageTimer)
 
     @contextmanager
     def beating(self) -> Iterator[None]:
@@ -115,7 +115,7 @@ class Assistance:
     job_id: str
     stopping: Stopping
     looked_at: float = field(default_factory=time.monotonic)
-    times: StageTimes = field(default_factory=StageTimes)
+    times: StageTimer = field(default_factory=StageTimer)
 
     def report(self, stage: str, step: int, _steps: int) -> None:
         """Assistants call this at each step. Raises ``Cancelled`` if the job has ended or this worker must stop."""

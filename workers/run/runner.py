@@ -15,7 +15,6 @@ from workers import logs
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import NOT_KEPT
-from workers.catalogue.stage_times import StageTimes
 from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.kinds import KINDS
 from workers.contract.phases import Fault, JobError, Phase
@@ -25,6 +24,7 @@ from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTo
 from workers.run.stopping import Stopping
 from workers.settings import Settings
 from workers.tasks.context import Context, TurnOver
+from workers.tasks.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
 
@@ -170,7 +170,7 @@ class Runner:
         )
         return any(row is not None for row in found)
 
-    def _keep_times(self, job: JobRow, times: StageTimes) -> None:
+    def _keep_times(self, job: JobRow, times: StageTimer) -> None:
         """Add the stage times of an attempt to the sums. Its outcome is recorded already, so a failure here is only logged."""
         try:
             self._catalogue.stage_times.add(job.kind, times.end())

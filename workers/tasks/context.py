@@ -1,4 +1,4 @@
-"""What a task may use."""
+"""What a task may use: the catalogue, the store, the settings, and the functions of its runner."""
 
 from __future__ import annotations
 
@@ -8,28 +8,30 @@ from dataclasses import dataclass, field
 from psfcore.fits.header import FitsLimits
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.stage_times import StageTimes
 from workers.contract.phases import JobError
 from workers.files.store import Store
 from workers.settings import Settings
+from workers.tasks.stage_timer import StageTimer
 
 
 class TurnOver(Exception):
-    """The job lets others go first: it is queued again as if it had not been started."""
+    """A turn of a bulk run ends early so that other jobs can run; its job is queued again as if it had not started."""
 
 
 def _not_alone(_work: Callable[[], None]) -> JobError | None:
-    raise NotImplementedError("only the task runner makes a job's error of an exception")
+    raise NotImplementedError("only the runner of a job turns an exception into a job error")
 
 
 @dataclass(frozen=True)
 class Context:
-    """Where things are, and how to say how far the work is; ``report`` raises where it should stop.
+    """What a task may use.
 
-    ``call_for_help(n)`` asks up to n idle workers to share the job's parts. For jobs that are many pieces of work:
-    ``guarded(work)`` does one and returns what it died of, ``others_wait()`` says whether to end with ``TurnOver``,
-    and ``lease`` is what the pieces are taken under. ``times`` counts the stages that are reported; a job whose pieces
-    have stages of their own, which are not the job's, counts those there.
+    report(stage, step, steps): reports progress; raises if the job must stop.
+    call_for_help(n): asks up to n idle workers to share the job's parts.
+    guarded(work): for a job of many pieces: runs one piece and returns its error, or None.
+    others_wait(): for a job of many pieces: True if the task should raise ``TurnOver``.
+    lease: the lease under which a job takes its pieces.
+    times: times the reported stages. A job whose pieces report their own stages times those instead.
     """
 
     catalogue: Catalogue
@@ -42,9 +44,9 @@ class Context:
     guarded: Callable[[Callable[[], None]], JobError | None] = _not_alone
     others_wait: Callable[[], bool] = lambda: False
     lease: Lease | None = None
-    times: StageTimes = field(default_factory=StageTimes)
+    times: StageTimer = field(default_factory=StageTimer)
 
     @property
     def limits(self) -> FitsLimits:
-        """Limits of the files that are opened."""
+        """Limits for the FITS files that a task opens."""
         return FitsLimits(max_pixels=self.settings.max_pixels)

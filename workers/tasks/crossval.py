@@ -1,7 +1,8 @@
-"""The task ``cross-validate``: how well a fit is known, its folds shared by as many workers as are idle.
+"""The task ``cross-validate``: how well a transit determines the fit, by fitting folds of its images.
 
-Folds are parts in the catalogue: taken by compare-and-set under a lease, done once, kept when the job is tried again.
-The job's own worker does what nobody else takes, so that help is welcome and never needed.
+Idle workers share the folds. A fold is a part in the catalogue: a worker takes it by compare-and-set under a lease, does
+it once, and its result stays if the job is tried again. The job's own worker does all folds that no other worker takes,
+so the job needs no help.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from workers.contract.identities import psf_fit_identity
 from workers.contract.resolved import ResolvedCrossValidate
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
-from workers.tasks.psf_fit import load_transit
+from workers.tasks.transits import load_transit
 
 WAIT_S = 0.5
 MOST_HELPERS = 16
 
 
 def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Cross-validate a transit's fit; returns the id of the report."""
+    """Cross-validate the fit of a transit; returns the report's id."""
     request = ResolvedCrossValidate.model_validate(parameters)
     identity = psf_fit_identity(request)
     if context.catalogue.get(ReportRow, identity, context.owner) is not None:
@@ -55,13 +56,13 @@ def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> None:
-    """Take folds of a job that runs elsewhere, until none is left."""
+    """Do folds of a job that runs on another worker, until no fold is left."""
     request = ResolvedCrossValidate.model_validate(parameters)
     identity = psf_fit_identity(request)
     part = context.catalogue.parts.take(context.owner, identity, context.settings.lease_s)
     if part is None:
         return
-    context.catalogue.parts.release(part)  # reading and fitting a transit takes longer than a lease may last
+    context.catalogue.parts.release(part)  # reading and fitting a transit takes longer than a lease
     transit = load_transit(context, request)[0]
     wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
     solution = _solution(context, request, transit)
@@ -72,7 +73,7 @@ def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> 
 
 
 def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit) -> Solution:
-    """The fit of all images, which every fold begins from: each worker makes its own, for its scenes are large."""
+    """The fit of all images, from which every fold starts. Each worker makes its own, because the scenes are large."""
     return invert(
         transit, shape_named(request.shape), threads=context.settings.threads, progress=context.report
     )
@@ -81,7 +82,7 @@ def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit
 def _exact(
     context: Context, identity: str, solution: Solution, wanted: tuple[FoldSample, ...]
 ) -> tuple[FoldFit, ...]:
-    """Every fold a fit of its own, done here or by whoever helps."""
+    """Fit every fold anew, here or on the workers that help."""
     catalogue, owner = context.catalogue, context.owner
     catalogue.parts.open(owner, identity, len(wanted))
     context.call_for_help(min(MOST_HELPERS, len(wanted) - 1))
@@ -92,7 +93,7 @@ def _exact(
             return tuple(FoldFit.from_json(result) for result in done)
         part = catalogue.parts.take(owner, identity, context.settings.lease_s)
         if part is None:
-            time.sleep(WAIT_S)  # the rest is with other workers
+            time.sleep(WAIT_S)  # other workers have the remaining folds
             continue
         _one(context, solution, wanted, part, done=len(done))
 
@@ -100,17 +101,17 @@ def _exact(
 def _one(
     context: Context, solution: Solution, wanted: tuple[FoldSample, ...], part: Part, *, done: int
 ) -> None:
-    """One fold; what it raises gives the fold back."""
+    """Do one fold. If it raises, the fold is released for another worker."""
     try:
-        fit = exact_fit(solution, wanted[part.number], progress=_alive(context, part, done, len(wanted)))
+        fit = exact_fit(solution, wanted[part.number], progress=_heartbeat(context, part, done, len(wanted)))
     except BaseException:
         context.catalogue.parts.release(part)
         raise
     context.catalogue.parts.finish(part, fit.to_json())
 
 
-def _alive(context: Context, part: Part, done: int, folds: int) -> Callable[[str, int, int], None]:
-    """Progress of a fold: says that the part is alive, and lets the job's own report stop it."""
+def _heartbeat(context: Context, part: Part, done: int, folds: int) -> Callable[[str, int, int], None]:
+    """A progress function for a fold: renews the part's lease, and raises if the job must stop."""
     last = time.monotonic()
 
     def report(_stage: str, _step: int, _steps: int) -> None:
@@ -158,27 +159,28 @@ def _save(
 
 
 def sentence(found: Bands, folds: int) -> str:
-    """What a person reads first."""
+    """The sentence at the top of the report."""
     total, held_out = found.values["total"], found.held_out
     return (
-        f"{folds} fits with images held out and drawn again: {100 * total[2]:.1f} % of the light is scattered diffusely "
-        f"(1 sigma {100 * total[1]:.1f} to {100 * total[3]:.1f} %); held-out discs are {held_out['mean_pct']:+.1f} % off "
-        f"on the mean, {held_out['rms_pct']:.1f} % rms, {held_out['largest_pct']:.1f} % at most{_freely(found)}."
+        f"{folds} fits with held-out blocks and bootstrapped images: {100 * total[2]:.1f} % of the light is scattered "
+        f"diffusely (1 sigma: {100 * total[1]:.1f} to {100 * total[3]:.1f} %). The residual of held-out images is "
+        f"{held_out['mean_pct']:+.1f} % on average, {held_out['rms_pct']:.1f} % rms and {held_out['largest_pct']:.1f} % at "
+        f"most.{_free_shells(found)}"
     )
 
 
-def _freely(found: Bands) -> str:
-    """How a fit without a formula compares."""
+def _free_shells(found: Bands) -> str:
+    """How the fit of free shells, which assumes no formula, compares with the fit of the formula."""
     if found.shells is None:
         return ""
     near, largest = found.shells.near_centre, found.shells.largest
     said = (
-        f"; without a formula {near.points:+.1f} ± {near.sigma:.1f} % of the light more is within "
+        f" A fit without a formula puts {near.points:+.1f} ± {near.sigma:.1f} % more of the light within "
         f"{NEAR_CENTRE_PX:g} px"
     )
     if not largest.parts:
-        return f"{said}, and at no distance do the two part by more than {PARTING_SIGMAS:g} errors"
+        return f"{said}; at no radius do the two fits differ by more than {PARTING_SIGMAS:g} standard errors."
     return (
-        f"{said}; the two part most within {largest.within_px:.3g} px, by {largest.points:+.1f} ± "
-        f"{largest.sigma:.1f} % of the light"
+        f"{said}; the two fits differ most within {largest.within_px:.3g} px, by {largest.points:+.1f} ± "
+        f"{largest.sigma:.1f} % of the light."
     )

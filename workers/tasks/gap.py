@@ -1,4 +1,8 @@
-"""The task ``gap-diagnose``: an uploaded transit in, a report on its gap out, and the PSF with the answer in the model."""
+"""The task ``gap-diagnose``: an uploaded transit in, a report on its gap out, and a corrected PSF if one is found.
+
+The gap is the rms of the residuals over the images, with the expected noise removed in quadrature. The corrected PSF is
+that of a model which contains the effects that explain the gap.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +26,8 @@ from workers.contract.identities import corrected_psf_identity, diffraction_iden
 from workers.contract.resolved import ResolvedGapDiagnose
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
-from workers.tasks.psf_build import given_psf, psf_row
-from workers.tasks.psf_fit import load_transit
+from workers.tasks.psfs import given_psf, psf_row
+from workers.tasks.transits import load_transit
 
 KIND = "gap"
 
@@ -53,34 +57,37 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
         try:
             corrected = _save_psf(context, identity, found, provenance)
         except DataError as error:
-            # An added effect may answer for images and not for a point alone: its diagnosis stands.
-            caution = f"The PSF with the answer in the model could not be made: {error.message}"
+            # An added effect may be defined for images but not for a point source. The diagnosis itself stays valid.
+            caution = f"The corrected PSF could not be made: {error.message}"
             found = replace(found, cautions=(*found.cautions, caution))
     _save(context, request, identity, found, provenance, corrected)
     return identity
 
 
 def _added(context: Context, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
-    """The effects that are added. The worker runs code that its own operator names, never what a job says."""
+    """The operator's own effects. A worker runs code that its own settings name, never code that a job names.
+
+    Raises DataError "effects-changed" if they are not those of the time when the job was submitted.
+    """
     if request.added_effects != context.settings.added_effects:
         raise DataError(
             "effects-changed",
-            f"expected the effects that the job was taken with ({', '.join(request.added_effects) or 'none'}); this worker "
-            f"adds {', '.join(context.settings.added_effects) or 'none'}: submit the job again",
+            f"expected the added effects of the job ({', '.join(request.added_effects) or 'none'}); this worker has "
+            f"{', '.join(context.settings.added_effects) or 'none'}: submit the job again",
         )
     added = added_effects(request.added_effects)
     here = tuple(one.sha256 for one in added)
     if here != request.added_effects_sha256:
         raise DataError(
             "effects-changed",
-            f"expected the texts that the job was taken with ({_short(request.added_effects_sha256)}); this worker's are "
-            f"others ({_short(here)}), or were changed since: submit the job again",
+            f"expected added effects whose files have the hashes {_short(request.added_effects_sha256)}; this worker's "
+            f"files have {_short(here)}: submit the job again",
         )
     return added
 
 
 def _short(hashes: tuple[str, ...]) -> str:
-    return ", ".join(one[:12] for one in hashes) or "not noted"
+    return ", ".join(one[:12] for one in hashes) or "unknown"
 
 
 def _provenance(
@@ -104,7 +111,7 @@ def _provenance(
 
 
 def _save_psf(context: Context, report_id: str, found: Diagnosis, provenance: dict[str, Any]) -> str:
-    """The PSF with the answer in the model, its tables and picture; its row a new draft. Returns its id."""
+    """Save the corrected PSF, its tables and its picture as a new draft; returns its id."""
     identity = corrected_psf_identity(report_id)
     parents = {"transit": provenance["transit_sha256"], "report": report_id}
     if provenance["started_from_psf"] is not None:
@@ -145,7 +152,7 @@ def _save(
     provenance: dict[str, Any],
     corrected: str | None,
 ) -> None:
-    """JSON, page and picture into the store, the row into the catalogue."""
+    """Write JSON, HTML page and picture into the store, and add the row to the catalogue."""
     said = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected}}
     with (
         context.store.temporary() as text,

@@ -1,4 +1,4 @@
-"""Reports: what made them, and their way into the store and the catalogue."""
+"""Saving reports: their provenance, their files in the store, and their row in the catalogue."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workers.tasks.context import Context
 
 
 def provenance_of(context: Context, request: ResolvedOnTransit) -> dict[str, Any]:
-    """What whatever a job makes of a transit was made from, and with."""
+    """The inputs, parameters and versions from which a job makes its result."""
     return {
         "transit_sha256": request.transit_id,
         "parameters": request.model_dump(mode="json", exclude_none=True),
@@ -38,7 +38,7 @@ def keep_report(
     transit_id: str | None = None,
     about_id: str | None = None,
 ) -> None:
-    """A report's files, written already, into the store; its row, with these details, into the catalogue."""
+    """Move a report's written files into the store and add its row, with these details, to the catalogue."""
     file_sha256 = context.store.keep(text)
     of_page = {} if page is None else {"page_sha256": context.store.keep(page)}
     context.catalogue.add(
@@ -58,5 +58,5 @@ def keep_report(
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """JSON for people too; a number that is none would be no JSON and is an error of ours."""
+    """Write indented JSON. Raises ValueError for NaN and infinity, which JSON does not have."""
     path.write_text(json.dumps(content, indent=1, allow_nan=False), "utf-8")

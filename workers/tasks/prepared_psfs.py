@@ -1,6 +1,6 @@
-"""PSFs that this process has read, put on images' pixels and transformed: done once, shared by the images that follow.
+"""A cache of PSFs that were read, resampled to an image's pixels and transformed, for the images that follow.
 
-An engine works on one image at a time, and so does a worker process.
+The cache is not shared between threads: a worker process works on one image at a time, and so does an engine.
 """
 
 from __future__ import annotations
@@ -23,14 +23,17 @@ Thing = TypeVar("Thing", Psf, tuple[Psf, Engine])
 
 
 class PreparedPsfs:
-    """The last ones used, as many as ``max_bytes`` hold; the very last one is always kept."""
+    """Keeps the PSFs and engines used last, up to ``max_bytes``; the last one always stays."""
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
         self._kept: OrderedDict[Hashable, tuple[object, int]] = OrderedDict()
 
     def on_pixels_of(self, header: Header, path: Path, limits: FitsLimits) -> Psf:
-        """The PSF in a file, which never changes, on the pixels of an image with this header; the same object again."""
+        """The PSF of a file on the pixels of an image with this header; repeated calls return the same object.
+
+        The file must never change.
+        """
         whole = self._once((path, limits), lambda: read_psf(path, limits, parts=False), _kernel_bytes)
         factor = binning_factor(whole, header)
         if factor == 1:
@@ -38,12 +41,12 @@ class PreparedPsfs:
         return self._once((path, limits, factor), lambda: rebinned(whole, factor), _kernel_bytes)
 
     def engine_for(self, psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
-        """The engine for a PSF and a shape. A PSF is known by identity: pass the same object."""
+        """The engine for a PSF and a shape. Pass the same PSF object again: the cache compares identity, not content."""
 
         def make() -> tuple[Psf, Engine]:
             return psf, new_engine(psf, shape, span, threads)
 
-        # The PSF is kept with its engine, so that no other can have its id meanwhile.
+        # The PSF is kept with its engine, so that Python cannot give its id() to another PSF.
         return self._once((id(psf), shape, span, threads), make, lambda made: made[1].nbytes)[1]
 
     def _once(self, key: Hashable, make: Callable[[], Thing], size: Callable[[Thing], int]) -> Thing:
@@ -53,7 +56,7 @@ class PreparedPsfs:
         self._kept.move_to_end(key)
         while len(self._kept) > 1 and sum(nbytes for _, nbytes in self._kept.values()) > self.max_bytes:
             self._kept.popitem(last=False)
-        return self._kept[key][0]  # type: ignore[return-value]  # what was kept under this key
+        return self._kept[key][0]  # type: ignore[return-value]  # stored under this key above
 
 
 def _kernel_bytes(psf: Psf) -> int:

@@ -1,29 +1,26 @@
-"""The task ``psf-fit``: an uploaded transit in, a PSF version with its errors and its report out."""
+"""The task ``psf-fit``: an uploaded transit in, a PSF with its errors and a report out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from psfcore.errors import DataError
-from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.fits.psfs import write_psf
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.scatter.fit_plot import fit_png
 from psfcore.scatter.report import fit_json
-from psfcore.transit.archive import unpack
-from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
-from psfcore.transit.transit import Kernel, Transit
-from workers.catalogue.tables import PsfRow, TransitRow
+from workers.catalogue.tables import PsfRow
 from workers.contract.identities import diffraction_identity, psf_fit_identity
-from workers.contract.resolved import ResolvedOnTransit, ResolvedPsfFit
+from workers.contract.resolved import ResolvedPsfFit
 from workers.tasks.context import Context
 from workers.tasks.keep_report import provenance_of, write_json
-from workers.tasks.psf_build import built_psf, psf_row
+from workers.tasks.psfs import psf_row
+from workers.tasks.transits import load_transit
 
 
 def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Fit a transit and add the PSF to the catalogue; returns its id."""
+    """Fit the scatter to a transit and add the PSF to the catalogue; returns the PSF's id."""
     request = ResolvedPsfFit.model_validate(parameters)
     identity = psf_fit_identity(request)
     if context.catalogue.get(PsfRow, identity, context.owner) is not None:
@@ -41,50 +38,10 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
     return identity
 
 
-def load_transit(
-    context: Context,
-    request: ResolvedOnTransit,
-    *,
-    diffraction: Kernel | None = None,
-) -> tuple[Transit, Prepared]:
-    """The transit of a request, unpacked, read and prepared.
-
-    diffraction: where the transit brings none; none: built as the request says.
-    """
-    upload = context.catalogue.get(TransitRow, request.transit_id, context.owner)
-    if upload is None:
-        raise DataError("no-such-transit", f"no transit was uploaded with id {request.transit_id}")
-    images = int(upload.summary["images"])
-    context.report("reading", 0, images)
-    with context.store.temporary_folder() as folder:
-        unpack(context.store.path(request.transit_id), folder, context.settings.archive_limits)
-        return read_prepared(
-            folder,
-            context.limits,
-            progress=lambda done, of: context.report("reading", done, of),
-            diffraction=lambda _instrument, _shape: (
-                _built_diffraction(context, request) if diffraction is None else diffraction
-            ),
-            noise=None if request.noise is None else request.noise.noise(),
-            saturation_dn=request.saturation_dn,
-        )
-
-
-def _built_diffraction(
-    context: Context,
-    request: ResolvedOnTransit,
-) -> Kernel:
-    """The diffraction of the transit's instrument, built now or before; cut to nothing, it sums to 1 on 2048 px."""
-    if request.diffraction_recipe is None:
-        raise DataError("no-known-psf", "expected known_psf in transit.json; got none")
-    row = built_psf(context, request.diffraction_recipe)
-    return read_psf(context.store.path(row.file_sha256), context.limits, parts=False).kernel
-
-
 def _save(
     context: Context, request: ResolvedPsfFit, identity: str, fit: TransitFit, prepared: Prepared
 ) -> None:
-    """The PSF's file, its report and its picture into the store, its row into the catalogue."""
+    """Write the PSF's file, report and picture into the store, and add its row to the catalogue."""
     provenance = {
         "psf_id": identity,
         "inputs_sha256": fit.transit.sha256,

@@ -17,8 +17,8 @@ from workers.contract.identities import report_identity
 from workers.contract.resolved import ResolvedReport
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
-from workers.tasks.psf_build import given_psf
-from workers.tasks.psf_fit import load_transit
+from workers.tasks.psfs import given_psf
+from workers.tasks.transits import load_transit
 
 KIND = "report"
 POINT_PX = 17
@@ -47,7 +47,7 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def _point() -> Kernel:
-    """A diffraction that does nothing: where a PSF is given it holds the diffraction, and nothing asks for more."""
+    """A diffraction PSF that changes nothing. A given PSF already contains the diffraction."""
     point = np.zeros((POINT_PX, POINT_PX))
     point[POINT_PX // 2, POINT_PX // 2] = 1.0
     return point

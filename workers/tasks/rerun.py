@@ -1,6 +1,6 @@
-"""The task ``rerun``: a product or a PSF is made again from its own parameters, and compared with the first.
+"""The task ``rerun``: make a product or a PSF again from its stored parameters, and compare it with the first one.
 
-Nothing that is there is changed: what the rerun makes is kept beside its report alone.
+The catalogue is not changed: the new file is kept with the report only.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from workers.contract.resolved import ResolvedRerun
 from workers.lineage import Made, lineage
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, write_json
-from workers.tasks.psf_build import named_psf
+from workers.tasks.psfs import named_psf
 
 KIND = "rerun"
 SCHEMA = 1
 Thing = ProductRow | PsfRow
 
 
-class _Apart(Catalogue):
-    """The catalogue as if some things had not been made yet. What is added is kept in ``made`` and not written."""
+class _RerunCatalogue(Catalogue):
+    """The catalogue with some rows hidden, as if they had not been made yet. Added rows go to ``made`` only."""
 
     def __init__(self, real: Catalogue, hidden: frozenset[str]) -> None:
-        vars(self).update(vars(real))  # the same database and subjects; no engine of its own
+        vars(self).update(vars(real))  # the same database connection and tables
         self._hidden = hidden
         self.made: list[object] = []
 
     def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
-        """The row of this identity, or None where it is there and hidden too."""
+        """The row of this identity; None if there is none or it is hidden."""
         return None if identity in self._hidden else super().get(table, identity, owner)
 
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
-        """Keep the row here, where it takes no room."""
+        """Remember the row; write nothing and count nothing."""
         self.made.append(row)
         return row, True
 
 
 def rerun(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Make a thing again and compare; returns the report's id."""
+    """Make a product or a PSF again and compare; returns the report's id."""
     request = ResolvedRerun.model_validate(parameters)
     identity = rerun_identity(request, context.job_id)
     if context.catalogue.get(ReportRow, identity, context.owner) is not None:
@@ -67,26 +67,30 @@ def _first(context: Context, request: ResolvedRerun) -> Thing:
         return named_psf(context, request.id)
     row = context.catalogue.get(ProductRow, request.id, context.owner)
     if row is None:
-        raise DataError("no-such-product", f"there is no product with id {request.id}")
+        raise DataError(
+            "no-such-product",
+            f"expected the id of a product in the catalogue; got {request.id}, which is not in it: list the products",
+        )
     return row
 
 
 def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing:
-    """The thing as it comes out today, not in the catalogue; its file is in the store."""
+    """The product or PSF as it is made today. Its file is in the store; its row is not in the catalogue."""
     named = first.details.get("parents") or {}
-    apart = _Apart(
+    rerun_catalogue = _RerunCatalogue(
         context.catalogue, frozenset({first.id, *([named["report"]] if "report" in named else [])})
     )
     parameters = dict(request.parameters)
     if request.kind == "psf-build":
         parameters |= {"instrument": None, "instrument_file": _instrument_text(context, first)}
-    KINDS[request.kind].load_task()(dataclasses.replace(context, catalogue=apart), parameters)
+    KINDS[request.kind].load_task()(dataclasses.replace(context, catalogue=rerun_catalogue), parameters)
     # Last comes what was asked for; before it what it needed and nobody has any more.
-    made = [row for row in apart.made if isinstance(row, type(first))]
+    made = [row for row in rerun_catalogue.made if isinstance(row, type(first))]
     if not made:
         raise DataError(
             "not-made-again",
-            f"expected the rerun to make a {request.of} as the first run did; it came to another end, as with other data",
+            f"expected the rerun to make a {request.of} as the first run did; it made none: compare the versions of software "
+            "and libraries in the lineage",
         )
     found = made[-1]
     assert isinstance(found, ProductRow | PsfRow)
@@ -94,14 +98,14 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
 
 
 def _instrument_text(context: Context, first: Thing) -> str:
-    """The instrument's text as it was: shipped ones change with the software."""
+    """The text of the instrument file that the first run used: shipped files change with the software."""
     psf = read_psf(context.store.path(first.file_sha256), context.limits)
     text: str = psf.provenance["instrument_toml"]
     return text
 
 
 def _arrays(context: Context, row: Thing) -> dict[str, NDArray[Any]]:
-    """All that a thing's file holds of numbers per pixel, by name."""
+    """The image arrays of a product or PSF file, by name."""
     path = context.store.path(row.file_sha256)
     if isinstance(row, ProductRow):
         return {"IMAGE": read_plane(path, context.limits), **read_planes(path)}
@@ -133,7 +137,7 @@ def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing,
         write_json(text, said)
         named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
         details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
-        context.report("comparing", 1, 1)  # whoever cancelled keeps nothing
+        context.report("comparing", 1, 1)  # raises if the job was cancelled: then no report is kept
         keep_report(context, identity, KIND, text=text, details=details, about_id=request.id)
 
 
@@ -145,17 +149,18 @@ def _made(context: Context, row: Thing) -> dict[str, Any]:
 
 
 def _largest(compared: Mapping[str, Comparison]) -> float | None:
-    """The largest of the arrays' differences; None where one of them has no measure."""
+    """The largest of the arrays' relative differences; None if one of them has no measure."""
     each = [one.largest_relative for one in compared.values()]
     return None if None in each else max((one for one in each if one is not None), default=0.0)
 
 
 def _sentence(request: ResolvedRerun, first: Thing, again: Thing, compared: Mapping[str, Comparison]) -> str:
+    what = "PSF" if request.of == "psf" else request.of
     if first.file_sha256 == again.file_sha256:
-        return f"The {request.of} made again is the same file, bit for bit."
+        return f"The new {what} is the same file, bit for bit."
     if all(one.same for one in compared.values()):
-        return f"The {request.of} made again has the same values, bit for bit; what its file says beside them differs."
+        return f"The new {what} has the same values, bit for bit; only the headers of its file differ."
     differ = sorted(name for name, one in compared.items() if not one.same)
     largest = _largest(compared)
-    by = "without a common measure" if largest is None else f"by {largest:.3g} of the largest value at most"
-    return f"The {request.of} made again differs {by}, in {', '.join(differ)}."
+    by = "in shape or missing values" if largest is None else f"by at most {largest:.3g} of the largest value"
+    return f"The new {what} differs {by}, in {', '.join(differ)}."

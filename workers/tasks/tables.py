@@ -1,4 +1,4 @@
-"""The task ``psf-tables``: the tables and the picture of a PSF that was uploaded, or made before there were tables."""
+"""The task ``psf-tables``: make the tables and the picture of a PSF that has none, such as an uploaded one."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from psfcore.drawing.plots import psf_png
 from psfcore.fits.psfs import read_psf
 from workers.contract.requests import PsfTables
 from workers.tasks.context import Context
-from workers.tasks.psf_build import keep_tables, named_psf
+from workers.tasks.psfs import keep_tables, named_psf
 
 
 def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Make the tables of a PSF of the catalogue, and its picture where it has none; returns the PSF's id."""
+    """Make the tables of a PSF of the catalogue, and its picture if it is missing; returns the PSF's id."""
     request = PsfTables.model_validate(parameters)
     row = named_psf(context, request.psf_id)
     context.report("reading", 0, 3)

@@ -1,4 +1,4 @@
-"""Lines of PSFs: those of one instrument, channel and kind, of which an image needs one."""
+"""Series of PSFs: the PSFs of one instrument, channel and kind. An image needs one PSF of its series."""
 
 from __future__ import annotations
 
@@ -9,34 +9,36 @@ from typing import Any
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import load_instrument
 
-TOTAL = "total"  # a whole PSF, which images are deconvolved with
-UPLOADED = "uploaded"  # a PSF of which nobody said whether it is a whole one
+TOTAL = "total"  # a whole PSF, with which images are deconvolved
+UPLOADED = "uploaded"  # an uploaded PSF whose kind is not known
 WORD = r"^[a-z0-9][a-z0-9_.-]{0,39}$"
 _NOT_OF_A_WORD = re.compile(r"[^a-z0-9_.]+")
 
 
-def line_of(instrument: str | None, channel: str | None, kind: str) -> str | None:
-    """What a PSF is one of: instrument, channel and kind; none where the instrument is not known."""
+def series_of(instrument: str | None, channel: str | None, kind: str) -> str | None:
+    """The name of a series, instrument/channel/kind; None if the instrument is unknown."""
     return f"{instrument}/{channel or '-'}/{kind}" if instrument else None
 
 
 def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str | None:
-    """The channel, as 174: the wavelength in whole angstrom, or that of a shipped instrument where none is said."""
+    """The channel: the wavelength in whole angstrom, such as 174; without one, that of the shipped instrument."""
     if wavelength_angstrom is None and instrument in instrument_names():
         wavelength_angstrom = load_instrument(instrument).wavelength_angstrom
-    if wavelength_angstrom is None or not 0.5 <= wavelength_angstrom < 1e6:  # a card may say anything
+    if (
+        wavelength_angstrom is None or not 0.5 <= wavelength_angstrom < 1e6
+    ):  # a header card may contain any number
         return None
     return str(round(wavelength_angstrom))
 
 
 def instrument_of(header: Mapping[str, Any]) -> str | None:
-    """The instrument of an upload's header: one that is known here, else its DETECTOR or INSTRUME as a word."""
+    """The instrument in the summary of an upload's header: a shipped one, else its DETECTOR or INSTRUME as a name."""
     known: str | None = header["instrument"]
     return known or word(header["detector"] or header["instrume"])
 
 
 def word(text: str | None) -> str | None:
-    """A header's text as a name: small letters, digits, _ and full stops; none where nothing is left."""
+    """A header's text as a name of lower-case letters, digits, _ and full stops; None if nothing is left."""
     if text is None:
         return None
     return _NOT_OF_A_WORD.sub("_", text.lower()).strip("_.")[:40] or None

@@ -1,13 +1,13 @@
-"""What a PSF may become, and how its versions are numbered; nothing here knows of a database.
+"""The status of a PSF, its allowed changes, and version numbers. This module uses no database.
 
     draft ----------> certified ----------> deprecated
                       |      ^              |        ^
                       +------+              +--------+
                   another range         a successor named
 
-A draft may be used by whoever names it. A certified PSF is what images of its line get where none is named: it has a
-version of its own, and a range of times of observation that no other certified PSF of its line shares. A deprecated one
-stays for those who ask for it; its successor, once named, stays.
+A draft is used only by requests that name it. A certified PSF is used for images of its series if a request names no PSF:
+it has a version of its own, and a range of times of observation that overlaps with no other certified PSF of its series.
+A deprecated PSF stays available by name. Its successor cannot change once it is named.
 """
 
 from __future__ import annotations
@@ -39,34 +39,35 @@ MAY_BECOME = {
 
 
 def check_transition(before: PsfStatus, after: PsfStatus) -> None:
-    """Raises ``DataError`` "wrong-transition" where a PSF may not go from one to the other."""
+    """Raise ``DataError`` "wrong-transition" if the status may not change in this way."""
     if after not in MAY_BECOME[before]:
         allowed = " or ".join(sorted(MAY_BECOME[before]))
-        raise DataError("wrong-transition", f"a {before} PSF may become {allowed}; got {after}")
+        raise DataError("wrong-transition", f"expected status {allowed} for a {before} PSF; got {after}")
 
 
 def next_version(released: Iterable[str]) -> str:
-    """The version after the highest of those given: its second number one higher, or the first version of all."""
+    """The version after the highest one given: its second number plus one; without any, FIRST_VERSION."""
     highest = max((_numbers(version) for version in released), default=None)
     return FIRST_VERSION if highest is None else f"{highest[0]}.{highest[1] + 1}.0"
 
 
 def check_version(version: str | None, released: Iterable[str]) -> str:
-    """The version, where it may be given to a PSF of a line whose others are ``released``.
+    """Return the version if it is valid and not among the ``released`` versions of the series.
 
-    Raises ``DataError`` "version-missing", "bad-version" or "version-taken", which say which could be given.
+    Raises ``DataError`` "version-missing", "bad-version" or "version-taken"; the messages name a free version.
     """
     others = list(released)
-    free = f"the next one free is {next_version(others)}"
+    free = f"the next free version is {next_version(others)}"
     if version is None:
-        raise DataError("version-missing", f"expected a version as 1.2.0, got none; {free}")
+        raise DataError("version-missing", f"expected a version such as 1.2.0, got none; {free}")
     if not _VERSION.fullmatch(version):
         raise DataError(
-            "bad-version", f"expected a version as 1.2.0 (three numbers), got {ascii(version)[:60]}; {free}"
+            "bad-version",
+            f"expected a version of three numbers such as 1.2.0, got {ascii(version)[:60]}; {free}",
         )
     if version in others:
         raise DataError(
-            "version-taken", f"expected a version that the line has not had, got {version}; {free}"
+            "version-taken", f"expected a version that is new in the series, got {version}; {free}"
         )
     return version
 

@@ -1,7 +1,7 @@
-"""Times of observation, and the ranges of them that a PSF is valid for.
+"""Times of observation, and the ranges of times for which a PSF is valid.
 
-In the database times are seconds since 1970 (UTC) and an open end is an infinity, so that ranges compare as numbers.
-Outside they are ISO 8601, and an open end is none.
+In the database, times are seconds since 1970 (UTC) and an open end is an infinity, so that ranges compare as numbers. In
+requests and answers, times are ISO 8601 and an open end is null.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _TIME = re.compile(TIME, re.ASCII)
 
 
 def seconds(text: str, name: str = "time") -> float:
-    """Seconds since 1970 of a time as 2024-03-01T12:00:00Z, or of a day's start; without a zone it is UTC.
+    """Seconds since 1970 of a time such as 2024-03-01T12:00:00Z, or of the start of a day; without a zone, UTC.
 
     Raises ``DataError`` "bad-time".
     """
@@ -27,16 +27,16 @@ def seconds(text: str, name: str = "time") -> float:
             raise ValueError
         when = datetime.fromisoformat(text)
         at = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-        iso(at)  # what cannot be said again, at the end of all years, is none either
+        iso(at)  # raises for times near the year 9999 that cannot be written back
         return at
     except (ValueError, OverflowError) as error:
         raise DataError(
-            "bad-time", f"{name}: expected a time as 2024-03-01T12:00:00Z, got {ascii(text)[:60]}"
+            "bad-time", f"{name}: expected a time such as 2024-03-01T12:00:00Z, got {ascii(text)[:60]}"
         ) from error
 
 
 def iso(at: float) -> str | None:
-    """The time in ISO 8601, UTC, to the microsecond; none for an infinity."""
+    """The time in ISO 8601, UTC, to the microsecond; None for an infinity."""
     if math.isinf(at):
         return None
     text = datetime.fromtimestamp(at, UTC).replace(tzinfo=None).isoformat()
@@ -45,14 +45,14 @@ def iso(at: float) -> str | None:
 
 @dataclass(frozen=True)
 class Validity:
-    """The times from ``start`` on, before ``end``."""
+    """The times from ``start`` (included) to ``end`` (excluded)."""
 
     start: float = -math.inf
     end: float = math.inf
 
     @classmethod
     def of(cls, start: str | None, end: str | None) -> Validity:
-        """Of texts; none is an open end. Raises ``DataError`` "bad-time" or "empty-range"."""
+        """The range between two ISO 8601 times; None: an open end. Raises ``DataError`` "bad-time" or "empty-range"."""
         made = cls(
             -math.inf if start is None else seconds(start, "valid_from"),
             math.inf if end is None else seconds(end, "valid_to"),
@@ -66,7 +66,7 @@ class Validity:
         return self.start <= at < self.end
 
     def overlaps(self, other: Validity) -> bool:
-        """Whether some time is in both."""
+        """Whether the ranges have a time in common."""
         return self.start < other.end and other.start < self.end
 
     def __str__(self) -> str:

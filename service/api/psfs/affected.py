@@ -1,4 +1,4 @@
-"""Products made with PSFs that are no longer to be used: ``/v1/affected``, ``/v1/psfs/{id}/affected``."""
+"""Products made with deprecated PSFs: ``/v1/affected``, ``/v1/psfs/{id}/affected``."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ router = APIRouter(tags=["PSFs"], responses=RESPONSES)
 
 
 class AffectedView(BaseModel):
-    """A product, the PSF that it was made with, and what to make it again with."""
+    """A product, its PSF, and its replacement PSF, if any."""
 
     product_id: str
     image_id: str
     created_at: float
     psf_id: str
-    psf_version: str = Field(description="as it was called when the product was made")
+    psf_version: str = Field(description="version of the PSF when the product was made")
     psf_status: str
     successor: str | None
     redo_with: str | None = Field(
-        description="the certified PSF at the end of the successors; null: there is none"
+        description="id of the replacement PSF: the certified PSF at the end of the chain of successors; null: there is none"
     )
 
     @classmethod
@@ -54,11 +54,11 @@ def list_affected(
     request: Request,
     caller: Reading,
     state: Shared,
-    superseded: Annotated[bool, Query(description="those alone whose PSF has a successor")] = False,
+    superseded: Annotated[bool, Query(description="only products whose PSF has a successor")] = False,
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[AffectedView]:
-    """Products whose PSF is deprecated: by PSF, and of each the newest first."""
+    """Products whose PSF is deprecated, sorted by PSF, then newest first."""
     at = paging.place(cursor, 3)
     after = None if at is None else Place(at[0], paging.number(at[1]), at[2])
     found = state.catalogue.affected.page(caller.owner, superseded=superseded, limit=limit + 1, after=after)
@@ -74,10 +74,14 @@ def list_affected_by_psf(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[AffectedView]:
-    """Products that were made with this PSF, whatever its status, newest first."""
+    """Products made with this PSF, whatever its status, newest first."""
     psf = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if psf is None:
-        raise problem(DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}"))
+        raise problem(
+            DataError(
+                "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+            )
+        )
     found = state.catalogue.affected.of_psf(psf, limit=limit + 1, after=paging.position(cursor))
     return _page(request, found, limit, whole=False)
 

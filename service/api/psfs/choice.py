@@ -1,4 +1,4 @@
-"""One PSF: the one that fits filters, ``/v1/psfs/best``, or an image, ``/v1/images/{id}/psf``."""
+"""The one PSF that meets filters, ``/v1/psfs/best``, or fits an image, ``/v1/images/{id}/psf``."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ router = APIRouter(tags=["PSFs"], responses=RESPONSES)
 
 
 class Choice(BaseModel):
-    """The one PSF that fits, and what it was looked for by."""
+    """The one PSF that fits, and the filters of the search."""
 
     psf: PsfView
-    context: str | None = Field(description="id of the context that it was found in; null: among all PSFs")
+    context: str | None = Field(description="id of the context of the search; null: all PSFs were searched")
     instrument: str | None
     channel: str | None
     kind: str | None
-    valid_at: str | None = Field(description="the time that it is valid at; null: none was given")
+    valid_at: str | None = Field(description="time of observation of the search; null: not given")
 
 
-@router.get("/v1/psfs/best", summary="The one PSF that fits")
+@router.get("/v1/psfs/best", summary="The one PSF that meets filters")
 def get_best_psf(caller: Reading, state: Shared, filters: Filters, context: InContext = None) -> Choice:
-    """The PSF with these properties; without a status and a context, of the certified ones.
+    """The PSF with these properties. Without a status and a context, only certified PSFs are searched.
 
-    404 says which filter left none; 409 names all that are left where there are several.
+    404 names the filter that left no PSF; 409 lists the PSFs if several are left.
     """
     return _choice(lambda: look(state.catalogue, filters, caller.owner, context))
 
@@ -51,10 +51,14 @@ def get_psf_for_image(
     context: InContext = None,
     kind: Annotated[str, Query(pattern=WORD)] = TOTAL,
 ) -> Choice:
-    """The PSF of the image's instrument, channel and time of observation, by what its header says."""
+    """The PSF for the instrument, channel and time of observation in the image's header."""
     row = state.catalogue.get(ImageRow, image_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-image", f"no image was uploaded with id {image_id}")
+        raise Problem(
+            404,
+            "no-such-image",
+            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue",
+        )
     return _choice(lambda: look_for_image(state.catalogue, row.summary, caller.owner, context, kind))
 
 
@@ -68,7 +72,7 @@ def _choice(search: Callable[[], Found]) -> Choice:
                 "name": psf.name,
                 "version": psf.version,
                 "status": psf.status,
-                "line": psf.line,
+                "series": psf.series,
                 "valid_from": None if psf.valid_from is None else iso(psf.valid_from),
                 "valid_to": None if psf.valid_to is None else iso(psf.valid_to),
             }

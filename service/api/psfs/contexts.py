@@ -1,4 +1,4 @@
-"""Contexts, sets of PSFs that stay as they are: ``/v1/contexts``."""
+"""Contexts, immutable sets of PSFs: ``/v1/contexts``."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from workers.versions.validity import TIME, Validity, iso
 
 router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES)
 
-Time = Annotated[str, Field(pattern=TIME, description="as 2024-03-01T12:00:00Z; UTC without a zone")]
-Reason = Annotated[str, Field(max_length=400, pattern=TEXT, description="why, for those who ask later")]
+Time = Annotated[str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; UTC without a zone")]
+Reason = Annotated[
+    str, Field(max_length=400, pattern=TEXT, description="the reason, stored for later readers")
+]
 IdOrName = Annotated[
-    str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="its id or its name")
+    str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="id or name of the context")
 ]
 
 
 class PinAsked(BaseModel):
-    """A PSF to pin; without a range, for the one that it has."""
+    """A PSF to pin; default range: that of the PSF."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -38,31 +40,31 @@ class PinAsked(BaseModel):
 
 
 class ContextAsked(BaseModel):
-    """A context to make: of these PSFs, or of all that are certified now."""
+    """A context to create, of these PSFs or of all PSFs that are certified now."""
 
     model_config = ConfigDict(extra="forbid")
 
-    name: str = Field(pattern=NAME, description="not now, and not default")
+    name: str = Field(pattern=NAME, description="any name except `now` and `default`")
     reason: Reason = ""
     pins: list[PinAsked] | None = Field(
-        None, max_length=10_000, description="null: all that is certified now"
+        None, max_length=10_000, description="null: all PSFs that are certified now"
     )
 
 
 class PinView(BaseModel):
-    """The PSF of a line for a range of times of observation."""
+    """The PSF of a series for a range of times of observation."""
 
-    line: str = Field(description="instrument/channel/kind")
-    valid_from: str | None = Field(description="null: from ever")
-    valid_to: str | None = Field(description="null: open")
+    series: str = Field(description="instrument/channel/kind")
+    valid_from: str | None = Field(description="null: no lower limit")
+    valid_to: str | None = Field(description="null: no upper limit")
     psf_id: str
-    version: str = Field(description="the PSF's when it was pinned")
+    version: str = Field(description="version of the PSF when it was pinned")
 
     @classmethod
     def of(cls, row: PsfPinRow) -> PinView:
         """The view of a row."""
         return cls(
-            line=row.line,
+            series=row.series,
             valid_from=iso(row.valid_from),
             valid_to=iso(row.valid_to),
             psf_id=row.psf_id,
@@ -71,14 +73,14 @@ class PinView(BaseModel):
 
 
 class ContextView(BaseModel):
-    """A context. It never changes; a change is another context."""
+    """A context. It never changes: other pins make another context."""
 
     id: str = Field(description="SHA-256 of its name and its pins")
     name: str
     created_at: float
     created_by: str
     reason: str
-    size: int = Field(description="how many pins it has")
+    size: int = Field(description="number of pins")
 
     @classmethod
     def of(cls, row: PsfContextRow) -> ContextView:
@@ -94,24 +96,24 @@ class ContextView(BaseModel):
 
 
 class WholeContext(ContextView):
-    """A context with all that it pins."""
+    """A context with its pins."""
 
-    pins: list[PinView] = Field(description="by line and time")
+    pins: list[PinView] = Field(description="sorted by series and time")
 
 
 class DefaultAsked(BaseModel):
-    """The context that images are to be looked up in from now on."""
+    """The new default context, in which PSFs for images are looked up."""
 
     model_config = ConfigDict(extra="forbid")
 
     context: ContextName | None = Field(
-        description="its id or its name; null: what is certified at the moment"
+        description="id or name; null: the PSFs that are certified at the time of a request"
     )
     reason: Reason = ""
 
 
 class Move(BaseModel):
-    """A move of the default."""
+    """A change of the default context."""
 
     context: str | None
     at: float
@@ -125,20 +127,22 @@ class Move(BaseModel):
 
 
 class DefaultView(BaseModel):
-    """The default context, and where it was before."""
+    """The default context and its history."""
 
-    context: ContextView | None = Field(description="null: what is certified at the moment")
-    history: list[Move] = Field(description="the last 200 moves, the last first; all are kept")
+    context: ContextView | None = Field(
+        description="null: the PSFs that are certified at the time of a request"
+    )
+    history: list[Move] = Field(description="the last 200 changes, latest first; all are stored")
 
 
 @router.post(
     "",
     status_code=201,
-    summary="Make a context",
-    responses={200: {"model": WholeContext, "description": "It was made before."}},
+    summary="Create a context",
+    responses={200: {"model": WholeContext, "description": "The same context already exists."}},
 )
 def create_context(body: ContextAsked, response: Response, caller: Certifying, state: Shared) -> WholeContext:
-    """Pin PSFs under a name: those given, or all that are certified now."""
+    """Pin PSFs under a name: the given ones, or all that are certified now."""
     contexts = state.catalogue.contexts
     try:
         pins = None if body.pins is None else [_pin(asked) for asked in body.pins]
@@ -161,7 +165,7 @@ def list_contexts(
 
 @router.get("/default", summary="The default context")
 def get_default_context(caller: Reading, state: Shared) -> DefaultView:
-    """The context that images are looked up in where a request names none."""
+    """The context in which the PSF for an image is looked up if a request names no context."""
     contexts = state.catalogue.contexts
     row = contexts.default(caller.owner)
     return DefaultView(
@@ -170,9 +174,9 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
     )
 
 
-@router.put("/default", summary="Move the default")
+@router.put("/default", summary="Change the default context")
 def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
-    """Name another context, or none, as the default. Where it was before stays written down."""
+    """Set the default context; `context` null: no default. The history of changes is kept."""
     try:
         state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)
     except DataError as error:
@@ -180,9 +184,9 @@ def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) 
     return get_default_context(caller, state)
 
 
-@router.get("/{context}", summary="One context, with its pins")
+@router.get("/{context}", summary="One context with its pins")
 def get_context(context: IdOrName, caller: Reading, state: Shared) -> WholeContext:
-    """What a context pins."""
+    """A context and the PSFs that it pins."""
     try:
         return _whole(state, state.catalogue.contexts.named(context, caller.owner))
     except DataError as error:

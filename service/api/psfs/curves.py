@@ -1,7 +1,7 @@
-"""What a PSF says: questions about a version under ``/v1/psfs/{id}``, answered from its stored tables.
+"""Curves and weights of a PSF, under ``/v1/psfs/{id}``, answered from its stored tables.
 
-The tables are made when a PSF is built or fitted. One that was uploaded, or made before there were tables, has none
-until a job ``psf-tables`` makes them: the web process holds no numerics, and an upload is not kept waiting.
+A job makes the tables when it builds or fits a PSF. An uploaded or old PSF has no tables until a job ``psf-tables`` makes
+them: the web process does no numerical work, and an upload must not wait for it.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from service.http.state import Shared
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
 
-# Enters every ETag: raised by hand when an answer changes that the same tables give.
+# Part of every ETag. Increase it when the same tables give another answer.
 ANSWERS_VERSION = 1
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
-Radius = Annotated[float, Query(description="px, from the PSF's centre")]
+Radius = Annotated[float, Query(description="distance from the PSF's centre, px")]
 ByComponent = dict[str, list[float]]
 
 
 class PsfSaid(BaseModel):
-    """What stands in every answer: which PSF, and on what array its weights are."""
+    """Part of every answer: the PSF, and the array of its weights."""
 
     name: str
     version: str
@@ -46,27 +46,29 @@ class PsfSaid(BaseModel):
 
 
 class CurveAnswer(PsfSaid):
-    """Light beyond radii, in percent; TOTAL and each component by name."""
+    """1 - encircled energy at radii, in percent, for TOTAL and each component."""
 
     radii_px: list[float]
     light_beyond_pct: ByComponent
-    sigma_points: ByComponent = Field(description="1-sigma errors; of a fitted PSF alone")
-    resolution: str = Field(description="what the table resolves, and by how much interpolation may be off")
+    sigma_points: ByComponent = Field(description="1-sigma errors; only for a fitted PSF")
+    resolution: str = Field(description="resolution of the table, and the largest error of interpolation")
 
 
 class ProfileAnswer(PsfSaid):
-    """Mean weight of a pixel by ring."""
+    """Mean weight of the pixels of each ring."""
 
     radius_px: list[float]
     pixels: list[int]
     mean_weight: ByComponent
-    sigma: ByComponent = Field(description="1-sigma errors; of a fitted PSF alone")
-    azimuthal_rms_over_mean: list[float] = Field(description="how uneven TOTAL is round a ring")
+    sigma: ByComponent = Field(description="1-sigma errors; only for a fitted PSF")
+    azimuthal_rms_over_mean: list[float] = Field(
+        description="rms variation of TOTAL along a ring, over its mean"
+    )
     resolution: str
 
 
 class EncircledAnswer(PsfSaid):
-    """Light within a radius, as a fraction of all light."""
+    """Encircled energy: light within a radius, as a fraction of all light."""
 
     radius_px: float
     light_within: dict[str, float]
@@ -85,12 +87,14 @@ class AnnulusAnswer(PsfSaid):
 
 
 class ComparisonAnswer(BaseModel):
-    """Two PSFs, `other` minus `one`."""
+    """Differences of two PSFs, `other` minus `one`."""
 
     one: PsfSaid
     other: PsfSaid
     radii_px: list[float]
-    difference_points: ByComponent = Field(description="of the light beyond each radius, percentage points")
+    difference_points: ByComponent = Field(
+        description="difference of the light beyond each radius, in percentage points"
+    )
     sigma_points: ByComponent
     largest_points: dict[str, float]
     difference_of_sums: float
@@ -100,32 +104,37 @@ class ComparisonAnswer(BaseModel):
     resolution: str
 
 
-@router.get("/{psf_id}/curve", summary="Light beyond radii", response_model=CurveAnswer)
+@router.get(
+    "/{psf_id}/curve", summary="Light beyond radii (1 - encircled energy)", response_model=CurveAnswer
+)
 def get_curve(
     psf_id: Identity,
     request: Request,
     caller: Reading,
     state: Shared,
     radii: Annotated[
-        str | None, Query(max_length=12_000, description="px, as 1,10,100; none: those of the table")
+        str | None,
+        Query(max_length=12_000, description="px, such as 1,10,100; default: the radii of the table"),
     ] = None,
 ) -> Response:
-    """The cumulative curve, with errors where the PSF was fitted."""
+    """1 - encircled energy at radii, with errors for a fitted PSF."""
     wanted = None if radii is None else _numbers(radii)
     return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.curve(tables, wanted))
 
 
 @router.get("/{psf_id}/profile", summary="Mean weight by radius", response_model=ProfileAnswer)
 def get_profile(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """The radial profile, and how uneven the PSF is round each ring."""
+    """The radial profile, and the variation of the PSF along each ring."""
     return _answer(request, caller, state, [psf_id], psf_lookup.profile)
 
 
-@router.get("/{psf_id}/encircled", summary="Light within a radius", response_model=EncircledAnswer)
+@router.get(
+    "/{psf_id}/encircled", summary="Light within a radius (encircled energy)", response_model=EncircledAnswer
+)
 def get_encircled(
     psf_id: Identity, radius: Radius, request: Request, caller: Reading, state: Shared
 ) -> Response:
-    """Encircled energy."""
+    """Encircled energy, as a fraction of all light."""
     return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.encircled(tables, radius))
 
 
@@ -133,27 +142,27 @@ def get_encircled(
 def get_annulus(
     psf_id: Identity, inner: Radius, outer: Radius, request: Request, caller: Reading, state: Shared
 ) -> Response:
-    """Light farther than `inner`, and not farther than `outer`."""
+    """Light beyond `inner` and up to `outer`, as a fraction of all light."""
     return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.annulus(tables, inner, outer))
 
 
-@router.get("/{psf_id}/compare/{other_id}", summary="Two PSFs side by side", response_model=ComparisonAnswer)
+@router.get("/{psf_id}/compare/{other_id}", summary="Compare two PSFs", response_model=ComparisonAnswer)
 def get_comparison(
     psf_id: Identity, other_id: Identity, request: Request, caller: Reading, state: Shared
 ) -> Response:
-    """Differences of curves in points and of totals, the second less the first."""
+    """Differences of curves, in percentage points, and of totals: the second PSF minus the first."""
     return _answer(request, caller, state, [psf_id, other_id], psf_lookup.compare)
 
 
-@router.get("/{psf_id}/cutout", summary="The middle of a PSF as FITS", response_class=Response)
+@router.get("/{psf_id}/cutout", summary="The central part of a PSF as FITS", response_class=Response)
 def get_cutout(
     psf_id: Identity,
-    size: Annotated[int, Query(ge=1, description="edge in px, at most the PSF's own")],
+    size: Annotated[int, Query(ge=1, description="edge length in px, at most that of the PSF")],
     request: Request,
     caller: Reading,
     state: Shared,
 ) -> Response:
-    """The central weights, not renormalised, centre at [size // 2, size // 2]."""
+    """The central weights, not renormalised; the centre is at [size // 2, size // 2]."""
     row = _find(state, caller, psf_id)
     headers = _headers(f"{row.file_sha256} cutout {size}")
     if files.known(request, headers["ETag"]):
@@ -169,7 +178,7 @@ def get_cutout(
 def _answer(
     request: Request, caller: Caller, state: Shared, psf_ids: list[str], ask: Callable[..., dict[str, Any]]
 ) -> Response:
-    """The answer of the tables of these PSFs, or 304 where the client has it already."""
+    """The answer from the tables of these PSFs, or 304 if the client already has it."""
     rows = [_find(state, caller, psf_id) for psf_id in psf_ids]
     digests = [_tables_of(row) for row in rows]
     headers = _headers(f"{' '.join(digests)} {request.url.path} {request.url.query}")
@@ -205,8 +214,8 @@ def _no_tables(row: PsfRow) -> Problem:
     return Problem(
         409,
         "no-tables",
-        f"expected a PSF with tables; {row.name} {row.version} ({row.origin}) has none yet: the job "
-        f'{{"kind": "psf-tables", "parameters": {{"psf_id": "{row.id}"}}}} sent to /v1/jobs makes them',
+        f"expected a PSF with tables; {row.name} {row.version} ({row.origin}) has none yet: make them with the job "
+        f'{{"kind": "psf-tables", "parameters": {{"psf_id": "{row.id}"}}}}, sent to /v1/jobs',
     )
 
 
@@ -214,11 +223,17 @@ def _numbers(text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise Problem(422, "bad-radius", f"radii: expected numbers and commas; got {text!r:.60}") from error
+        raise Problem(
+            422,
+            "bad-radius",
+            f"radii: expected numbers separated by commas, such as 1,10,100; got {text!r:.60}",
+        ) from error
 
 
 def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+        raise Problem(
+            404, "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+        )
     return row

@@ -1,4 +1,4 @@
-"""What PSFs are looked for by, as the query of an address."""
+"""The filters of a search for PSFs, as query parameters."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from workers.versions.status import PsfStatus
 from workers.versions.validity import TIME, seconds
 
 PRINTABLE = r"^[^\x00-\x1f\x7f]+$"
-TEXT = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"  # of people's words: PostgreSQL keeps no NUL
+TEXT = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"  # for free text: PostgreSQL cannot store NUL
 Text = Annotated[str | None, Query(max_length=80, pattern=PRINTABLE)]
 Time = Annotated[
     str | None,
-    Query(pattern=TIME, description="a time of observation, as 2024-03-01T12:00:00Z; UTC without a zone"),
+    Query(pattern=TIME, description="time of observation, such as 2024-03-01T12:00:00Z; UTC without a zone"),
 ]
 InContext = Annotated[
     str | None,
     Query(
-        max_length=64, pattern=PRINTABLE, description=f"id or name of a context; {NOW}: what is certified now"
+        max_length=64,
+        pattern=PRINTABLE,
+        description=f"id or name of a context; `{NOW}`: the PSFs that are certified now",
     ),
 ]
 
@@ -32,14 +34,14 @@ def _filter(
     instrument: Text = None,
     channel: Annotated[
         str | None,
-        Query(max_length=40, pattern=PRINTABLE, description="wavelength in whole angstrom, as 174"),
+        Query(max_length=40, pattern=PRINTABLE, description="wavelength in whole angstrom, such as 174"),
     ] = None,
     kind: Annotated[
         str | None,
         Query(
             max_length=40,
             pattern=PRINTABLE,
-            description="total, uploaded, or a component's name, as diffraction",
+            description="`total`, `uploaded`, or a component's name such as `diffraction`",
         ),
     ] = None,
     name: Text = None,
@@ -51,7 +53,7 @@ def _filter(
         raise Problem(
             422,
             "not-valid-at-any-time",
-            f"valid_at: expected it for certified PSFs; got it with status {status}",
+            f"valid_at: expected it only with certified PSFs; got it with status {status}: leave one of the two out",
         )
     try:
         at = None if valid_at is None else seconds(valid_at, "valid_at")

@@ -1,4 +1,4 @@
-"""How far a PSF may be trusted, and what it is valid for: ``/v1/psfs/{id}/status``."""
+"""The status and validity of a PSF: ``/v1/psfs/{id}/status``."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from workers.versions.validity import TIME, Validity, iso
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
-Time = Annotated[str, Field(pattern=TIME, description="as 2024-03-01T12:00:00Z; UTC without a zone")]
+Time = Annotated[str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; UTC without a zone")]
 Word = Annotated[str, Field(pattern=WORD)]
 
 
 class StatusChange(BaseModel):
-    """What a PSF is to become. A draft is certified; a certified PSF gets another range, or is deprecated."""
+    """A change of a PSF's status: certify a draft, change the range of a certified PSF, or deprecate it."""
 
     model_config = ConfigDict(extra="forbid")
 
     status: PsfStatus
-    reason: str = Field("", max_length=400, pattern=TEXT, description="why, for those who ask later")
+    reason: str = Field("", max_length=400, pattern=TEXT, description="the reason, stored for later readers")
     version: str | None = Field(
-        None, max_length=40, description="of a draft: three numbers, as 1.2.0, that its line has not had"
+        None, max_length=40, description="for a draft: three numbers such as 1.2.0, new in the series"
     )
-    valid_from: Time | None = Field(None, description="the first time of observation; null: from ever")
-    valid_to: Time | None = Field(None, description="the time before which it ends; null: open")
+    valid_from: Time | None = Field(None, description="first time of observation; null: no lower limit")
+    valid_to: Time | None = Field(None, description="end of the range, excluded; null: no upper limit")
     supersedes: list[Identity] = Field(
-        [], max_length=100, description="certified PSFs of the line that are deprecated in the same step"
+        [], max_length=100, description="certified PSFs of the series to deprecate in the same step"
     )
     successor: Identity | None = Field(
-        None, description="of a deprecated PSF: the certified one to use instead"
+        None, description="for a deprecated PSF: the certified PSF to use instead"
     )
-    instrument: Word | None = Field(None, description="of a draft whose file names none")
-    channel: Word | None = Field(None, description="of a draft whose file names no wavelength")
-    kind: Word | None = Field(None, description="of a draft that was uploaded, as total")
+    instrument: Word | None = Field(None, description="for a draft whose file names no instrument")
+    channel: Word | None = Field(None, description="for a draft whose file names no wavelength")
+    kind: Word | None = Field(None, description="for an uploaded draft, such as `total`")
 
 
 class Change(BaseModel):
-    """A change that was made."""
+    """A past change of status."""
 
     at: float
     by: str
@@ -82,34 +82,38 @@ class Change(BaseModel):
 
 
 class StatusView(BaseModel):
-    """A PSF's status, what it may become, and how it came to this."""
+    """A PSF's status, its allowed changes, and its history."""
 
     id: str
     status: PsfStatus
     version: str
-    line: str | None = Field(description="instrument/channel/kind; null where the instrument is not known")
-    valid_from: str | None = Field(description="null: from ever, or never certified")
-    valid_to: str | None = Field(description="null: open, or never certified")
+    series: str | None = Field(description="instrument/channel/kind; null: the instrument is unknown")
+    valid_from: str | None = Field(description="null: no lower limit, or never certified")
+    valid_to: str | None = Field(description="null: no upper limit, or never certified")
     successor: str | None
     may_become: list[PsfStatus]
-    next_version: str | None = Field(description="one that its line has not had; null where it has no line")
-    history: list[Change] = Field(description="the first change first; kept for ever")
+    next_version: str | None = Field(description="a free version of the series; null: the PSF has no series")
+    history: list[Change] = Field(description="oldest first; never deleted")
 
 
 @router.get("/{psf_id}/status", summary="A PSF's status and its history")
 def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusView:
-    """What a PSF is, what it may become, and who made it so, when and why."""
+    """The status of a PSF, its allowed changes, and who changed it, when and why."""
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
-        raise problem(DataError("no-such-psf", f"the catalogue holds no PSF with id {psf_id}"))
+        raise problem(
+            DataError(
+                "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+            )
+        )
     return _view(state, caller, row)
 
 
 @router.post("/{psf_id}/status", summary="Certify or deprecate a PSF")
 def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, state: Shared) -> StatusView:
-    """Certify a draft, change a certified PSF's range, deprecate it, or name a deprecated one's successor.
+    """Certify a draft, change the range of a certified PSF, deprecate it, or name the successor of a deprecated PSF.
 
-    Ranges of certified PSFs of a line may not overlap: 409 names the one in the way.
+    The ranges of certified PSFs of a series must not overlap: 409 names the PSF whose range overlaps.
     """
     try:
         row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)
@@ -140,11 +144,11 @@ def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
         id=row.id,
         status=PsfStatus(row.status),
         version=row.version,
-        line=row.line,
+        series=row.series,
         valid_from=None if row.valid_from is None else iso(row.valid_from),
         valid_to=None if row.valid_to is None else iso(row.valid_to),
         successor=row.successor_id,
         may_become=sorted(MAY_BECOME[PsfStatus(row.status)]),
-        next_version=None if row.line is None else next_version(psfs.released(row.line, caller.owner)),
+        next_version=None if row.series is None else next_version(psfs.released(row.series, caller.owner)),
         history=[Change.of(change) for change in psfs.changes(row.id, caller.owner)],
     )

@@ -31,27 +31,29 @@ router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
 
 class PsfView(BaseModel):
-    """A PSF. Its content never changes: another content has another id. What changes is how far it is trusted."""
+    """A PSF. Its content never changes (another content has another id); its status may change."""
 
     id: str
     created_at: float
     name: str
     version: str
     instrument: str | None
-    channel: str | None = Field(description="wavelength in whole angstrom; null where it is not known")
+    channel: str | None = Field(description="wavelength in whole angstrom; null: unknown")
     kind: str = Field(
-        description="total, a component's name as diffraction, or uploaded where nobody said which"
+        description="`total`, a component's name such as `diffraction`, or `uploaded` if the kind is unknown"
     )
     status: PsfStatus
-    valid_from: str | None = Field(description="time of observation; null: from ever, or never certified")
-    valid_to: str | None = Field(description="null: open, or never certified")
-    successor: str | None = Field(description="id of the PSF to use instead, of a deprecated one")
-    origin: str = Field(description="built here, fitted to a transit, or uploaded")
+    valid_from: str | None = Field(
+        description="time of observation; null: no lower limit, or never certified"
+    )
+    valid_to: str | None = Field(description="null: no upper limit, or never certified")
+    successor: str | None = Field(description="for a deprecated PSF: id of the PSF to use instead")
+    origin: str = Field(description="`built`, `fitted` (to a transit) or `uploaded`")
     bytes: int
-    details: dict[str, Any] = Field(description="shape, curve, parameters, where it came from")
+    details: dict[str, Any] = Field(description="shape, curve, parameters and provenance")
     file: str = Field(description="address of the FITS file")
-    preview: str | None = Field(description="address of a picture; null for an uploaded PSF without tables")
-    report: str | None = Field(description="address of the fit's report; null where nothing was fitted")
+    preview: str | None = Field(description="address of the picture; null: an uploaded PSF without tables")
+    report: str | None = Field(description="address of the fit's report; null: not a fitted PSF")
 
     @classmethod
     def of(cls, row: PsfRow) -> PsfView:
@@ -81,9 +83,9 @@ class PsfView(BaseModel):
 @router.post(
     "",
     status_code=201,
-    summary="Upload a PSF of your own",
+    summary="Upload a PSF",
     openapi_extra=uploads.OPENAPI_BODY,
-    responses={200: {"model": PsfView, "description": "The same file was uploaded before."}},
+    responses={200: {"model": PsfView, "description": "The same file was already uploaded."}},
 )
 async def upload_psf(
     request: Request,
@@ -107,13 +109,13 @@ async def upload_psf(
         str | None,
         Query(
             pattern=WORD,
-            description="total, for a whole PSF; default: uploaded, which images are not given unasked",
+            description="`total` for a whole PSF; default: `uploaded`, which is used only by requests that name the PSF",
         ),
     ] = None,
 ) -> PsfView:
-    """Stream a PSF in: one 2-D image, its centre at [n//2, n//2], its sum at most 1.
+    """Upload a PSF: one 2-D image with its centre at [n//2, n//2] and a sum of at most 1.
 
-    The header is inspected here; a job that uses the PSF says what its pixels lack.
+    The header is checked now. The pixels are checked by the job that uses the PSF.
     """
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
@@ -147,7 +149,7 @@ def list_psfs(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[PsfView]:
-    """PSFs, newest first; with a time, those that are certified for it, or that the context pins for it."""
+    """PSFs, newest first. With `valid_at`: those certified for that time, or pinned for it by the context."""
     try:
         wanted = _in_context(state, caller, filters, context)
     except DataError as error:
@@ -158,7 +160,7 @@ def list_psfs(
 
 @router.get("/{psf_id}", summary="One PSF version")
 def get_psf(psf_id: Identity, caller: Reading, state: Shared) -> PsfView:
-    """What is known of a PSF version."""
+    """A PSF's metadata, with links to its files."""
     return PsfView.of(_find(state, caller, psf_id))
 
 
@@ -169,28 +171,34 @@ def get_psf_file(psf_id: Identity, request: Request, caller: Reading, state: Sha
     return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, f"psf-{psf_id[:12]}.fits")
 
 
-@router.get("/{psf_id}/preview", summary="A picture of the PSF", response_class=Response)
+@router.get("/{psf_id}/preview", summary="The PSF's picture", response_class=Response)
 def get_psf_preview(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The PSF, its radial profile and its cumulative curve as PNG."""
     row = _find(state, caller, psf_id)
     if row.preview_sha256 is None:
-        raise Problem(404, "no-preview", "an uploaded PSF has no picture until a job psf-tables draws it")
+        raise Problem(
+            404,
+            "no-preview",
+            "expected a PSF with a picture; an uploaded PSF has none until a job psf-tables draws it: submit that job",
+        )
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
 
 
-@router.get("/{psf_id}/report", summary="What a fit found, as JSON", response_class=Response)
+@router.get("/{psf_id}/report", summary="The report of a fit, as JSON", response_class=Response)
 def get_psf_report(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """Parameters with errors, curves and bands, every image's residual, and what these data cannot say."""
+    """Parameters with errors, curves with bands, the residual of every image, and the limits of the data."""
     digest = _find(state, caller, psf_id).details.get("report_sha256")
     if digest is None:
         raise Problem(
-            404, "no-report", "this PSF was not fitted to a transit; its details say where it is from"
+            404,
+            "no-report",
+            "expected a fitted PSF; this one was not fitted to a transit: its lineage says how it was made",
         )
     return files.send(request, state.store, digest, "application/json", f"psf-{psf_id[:12]}.json")
 
 
 def _in_context(state: Shared, caller: Caller, filters: PsfFilter, context: str | None) -> PsfFilter:
-    """The filters with the context that a list is asked for in. Raises ``DataError`` "no-such-context"."""
+    """The filters with the context of the request. Raises ``DataError`` "no-such-context"."""
     if context is None:
         return filters
     if context == NOW:
@@ -199,8 +207,10 @@ def _in_context(state: Shared, caller: Caller, filters: PsfFilter, context: str 
 
 
 def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
-    """The PSF's row; ``Problem`` 404 where there is none."""
+    """The PSF's row. Raises ``Problem`` 404."""
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-psf", f"the catalogue holds no PSF with id {psf_id}")
+        raise Problem(
+            404, "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+        )
     return row

@@ -103,7 +103,7 @@ def certify(
             reason=reason,
             **line,
         )
-    click.echo(f"{said['line']} {said['version']}: {said['status']}{_validity(said)}")
+    click.echo(f"{said['series']} {said['version']}: {said['status']}{_validity(said)}")
 
 
 @click.command("deprecate")
@@ -117,7 +117,7 @@ def deprecate(psf_id: str, successor: str | None, reason: str, server: str | Non
         said = service.deprecate_psf(psf_id, successor, reason=reason)
         count = sum(1 for _ in service.affected(psf_id))
     instead = f", use {said['successor']}" if said["successor"] else ""
-    click.echo(f"{said['line']} {said['version']}: {said['status']}{instead}")
+    click.echo(f"{said['series']} {said['version']}: {said['status']}{instead}")
     click.echo(f"products made with it: {count}")
 
 

@@ -1,4 +1,4 @@
-"""Progress as server-sent events, from a server that listens: what comes, when, how it ends, and to whom."""
+"""Progress as server-sent events from a running server."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_job_is_followed_to_its_end(live: Live) -> None:
     assert live.streams() == 0
 
 
-def test_who_comes_back_hears_of_what_changed_meanwhile(live: Live) -> None:
+def test_a_reconnected_client_gets_what_changed_meanwhile(live: Live) -> None:
     job_id, lease = live.job()
     first = Following(f"{live.url}/v1/jobs/{job_id}/events")
     wait_for(lambda: len(first.said("id:")) == 1, "an event", timeout_s=10)
@@ -132,7 +132,7 @@ def test_who_comes_back_hears_of_what_changed_meanwhile(live: Live) -> None:
     assert httpx.get(f"{live.url}/v1/jobs/{job_id}/events", headers=ended).status_code == 204
 
 
-def test_a_stream_says_that_it_is_there(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_idle_stream_sends_comments(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events, "ALIVE_EVERY_S", 0.1)
     job_id, lease = live.job()
     following = Following(f"{live.url}/v1/jobs/{job_id}/events")
@@ -142,7 +142,7 @@ def test_a_stream_says_that_it_is_there(live: Live, monkeypatch: pytest.MonkeyPa
     assert following.said("event:") == ["progress", "end"]
 
 
-def test_a_caller_has_so_many_streams_and_no_more(live: Live) -> None:
+def test_the_number_of_streams_per_caller_is_limited(live: Live) -> None:
     (job_id, lease), (other_id, _) = live.job(), live.job()
     both = [Following(f"{live.url}/v1/jobs/{one}/events") for one in (job_id, other_id)]
     wait_for(lambda: all(one.said("event:") for one in both), "two are open", timeout_s=10)
@@ -153,7 +153,7 @@ def test_a_caller_has_so_many_streams_and_no_more(live: Live) -> None:
     assert httpx.get(f"{live.url}/v1/jobs/{job_id}/events").status_code == 200
 
 
-def test_who_goes_away_gives_the_place_back(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_connection_frees_its_stream(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events, "ALIVE_EVERY_S", 0.1)
     job_id, _ = live.job()
     with httpx.stream("GET", f"{live.url}/v1/jobs/{job_id}/events") as answer:
@@ -200,7 +200,7 @@ def test_a_bulk_is_followed(live: Live) -> None:
     assert following.said("event:") == ["progress", "progress", "end"]
 
 
-def test_a_stream_lasts_so_long_and_is_gone_on_with(
+def test_a_stream_ends_after_its_time_and_can_be_continued(
     settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(events, "LOOK_EVERY_S", 0.02)

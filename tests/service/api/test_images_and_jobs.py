@@ -1,4 +1,4 @@
-"""The main job over HTTP: upload, ask, look, download; and what is already there is not done again."""
+"""The main job over HTTP: upload, submit, wait, download; existing results are not computed again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transits over HTTP: taken in by their table of contents, listed, described; and what is wrong with one is told."""
+"""Transits over HTTP: uploaded, listed, described, and refused with a reason."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_a_transit_goes_in_and_is_described(
     assert form.status_code == 200 and form.json() == transit, "the same bytes are the same transit"
 
 
-def test_what_a_transit_may_lack(api: TestClient, tmp_path: Path) -> None:
+def test_optional_parts_of_a_transit(api: TestClient, tmp_path: Path) -> None:
     bare = write_transit(tmp_path / "bare", images=2, noise=None, known_psf=None, instrument=None)
     transit = api.post(WHERE, content=as_zip(members_of(bare))).json()
     assert (transit["noise"], transit["known_psf"], transit["instrument"]) == (None, None, None)
@@ -216,7 +216,7 @@ def refused(api: TestClient, settings: Settings, content: bytes, status: int, co
     ],
     ids=["text", "image", "two-letters", "zeros", "gzipped-image", "nothing", "half-a-zip", "half-a-gzip"],
 )
-def test_what_is_no_archive(
+def test_files_that_are_not_archives_are_refused(
     api: TestClient, settings: Settings, content: bytes, status: int, code: str
 ) -> None:
     refused(api, settings, content, status, code, "expected")

@@ -50,7 +50,7 @@ def anns(
         digest = store.keep(path)
     files = {"file_sha256": digest, "preview_sha256": digest}
     shown = {
-        "effects_picture_sha256": digest,
+        "changes_picture_sha256": digest,
         "page_sha256": digest,
         "report_sha256": digest,
         "tables_sha256": digest,
@@ -73,7 +73,7 @@ def anns(
             name="s3cret",
             version="1",
             instrument="hri_euv",
-            line="hri_euv/174/total",
+            series="hri_euv/174/total",
             status="draft",
             origin="built",
         ),

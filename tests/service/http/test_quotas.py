@@ -164,7 +164,7 @@ def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
             "quota-exceeded",
             "user",
         )
-        assert "of 1.0 MiB are used, and what this makes could not be kept" in job["error"]["message"]
+        assert "of 1.0 MiB are used, and the result of this job could not be kept" in job["error"]["message"]
     assert len(api.get("/v1/products").json()["items"]) == 1, "what was at work when the room ended"
     assert jobs[first]["phase"] == "COMPLETED"
     assert jobs[equal]["phase"] == "COMPLETED" and jobs[equal]["result"] == jobs[first]["result"], (

@@ -18,7 +18,7 @@ from workers.run.runner import Runner
 from workers.settings import Settings
 
 
-def test_an_upload_s_copy_that_is_removed_during_a_wait_is_fetched_again(
+def test_a_local_copy_removed_during_a_wait_is_downloaded_again(
     tmp_path: Path, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with s3_bucket(monkeypatch) as (url, _):

@@ -1,4 +1,4 @@
-"""Bulks and their images as rows: what is taken, lost, done, paused, tried again; counts that hold; fifty thousand of them."""
+"""Bulk runs and their images as rows: taken, lost, done, paused, retried; consistent counts; fifty thousand images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sqlalchemy import func, select, update
 from psfcore.errors import DataError
 from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
-from workers.bulk import task as bulk_task
+from workers.bulk import listing
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.bulks import Listed, Taken, new_id
 from workers.catalogue.catalogue import Catalogue
@@ -68,7 +68,7 @@ def all_taken(catalogue: Catalogue, bulk_id: str, lease: Lease) -> Iterator[Take
 
 
 def check_counts(catalogue: Catalogue, bulk_id: str) -> None:
-    """What the bulk counts is what its images are."""
+    """The counts of the run equal those of its images."""
     query = select(BulkItemRow.state, func.count()).where(BulkItemRow.bulk_id == bulk_id)
     with catalogue._engine.connect() as connection:
         states = dict(connection.execute(query.group_by(BulkItemRow.state)).all())  # type: ignore[arg-type]
@@ -81,7 +81,7 @@ def test_images_are_taken_in_order_and_the_last_one_ends_the_bulk(catalogue: Cat
     bulk_id, lease = made(catalogue, 3), turn(catalogue)
     taken = list(all_taken(catalogue, bulk_id, lease))
     assert [one.position for one in taken] == [0, 1, 2]
-    assert catalogue.bulks.pace(row(catalogue, bulk_id)).taken == 3
+    assert catalogue.bulks.progress.pace(row(catalogue, bulk_id)).taken == 3
     assert done(catalogue, taken[0]) and done(catalogue, taken[1], reused=True)
     assert row(catalogue, bulk_id).phase == BulkPhase.RUNNING
     assert catalogue.bulks.fail(taken[2], BAD)
@@ -91,7 +91,7 @@ def test_images_are_taken_in_order_and_the_last_one_ends_the_bulk(catalogue: Cat
     check_counts(catalogue, bulk_id)
 
 
-def test_what_is_done_twice_counts_once(catalogue: Catalogue) -> None:
+def test_an_image_done_twice_counts_once(catalogue: Catalogue) -> None:
     bulk_id, lease = made(catalogue, 2), turn(catalogue)
     taken = catalogue.bulks.take(bulk_id, lease, 3)
     assert taken is not None
@@ -135,11 +135,11 @@ def test_an_image_of_a_lost_worker_is_taken_by_another_and_its_result_counts(cat
     assert not done(catalogue, first, score=9.0), "the lost one comes back too late"
     assert catalogue.bulks.take(bulk_id, lost, 3) is None, "and gets nothing more"
     assert done(catalogue, second)
-    (item,) = catalogue.bulks.items(bulk_id, ItemState.DONE)
+    (item,) = catalogue.bulks.progress.items(bulk_id, ItemState.DONE)
     assert (item.attempts, item.score) == (2, 0.5)
 
 
-def test_an_image_that_costs_workers_is_put_apart(catalogue: Catalogue) -> None:
+def test_an_image_whose_workers_are_lost_fails(catalogue: Catalogue) -> None:
     bulk_id = made(catalogue, 2)
     for _ in range(3):
         taken = catalogue.bulks.take(bulk_id, turn(catalogue), 3)
@@ -147,14 +147,14 @@ def test_an_image_that_costs_workers_is_put_apart(catalogue: Catalogue) -> None:
         catalogue.jobs.give_up_silent(-1.0, 99)
     taken = catalogue.bulks.take(bulk_id, turn(catalogue), 3)
     assert taken is not None and taken.position == 1, "the others go on"
-    (item,) = catalogue.bulks.items(bulk_id, ItemState.FAILED)
+    (item,) = catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)
     assert item.error is not None and item.error["code"] == "worker-lost" and item.attempts == 3
     assert done(catalogue, taken)
     assert row(catalogue, bulk_id).phase == BulkPhase.COMPLETED
     check_counts(catalogue, bulk_id)
 
 
-def test_an_image_given_back_is_as_if_it_had_not_been_taken(catalogue: Catalogue) -> None:
+def test_a_released_image_is_as_if_it_had_not_been_taken(catalogue: Catalogue) -> None:
     bulk_id, lease = made(catalogue, 1), turn(catalogue)
     for _ in range(5):
         taken = catalogue.bulks.take(bulk_id, lease, 3)
@@ -185,7 +185,7 @@ def test_the_last_image_ends_a_bulk_that_is_paused(catalogue: Catalogue) -> None
     assert row(catalogue, bulk_id).phase == BulkPhase.COMPLETED
 
 
-def test_what_failed_is_tried_again_and_nothing_else(catalogue: Catalogue) -> None:
+def test_retry_queues_only_failed_images(catalogue: Catalogue) -> None:
     bulk_id, lease = made(catalogue, 3), turn(catalogue)
     first, second, third = all_taken(catalogue, bulk_id, lease)
     done(catalogue, first), catalogue.bulks.fail(second, BAD), catalogue.bulks.fail(third, BAD)
@@ -197,7 +197,7 @@ def test_what_failed_is_tried_again_and_nothing_else(catalogue: Catalogue) -> No
     check_counts(catalogue, bulk_id)
 
 
-def test_an_equal_request_finds_the_open_bulk_alone(catalogue: Catalogue) -> None:
+def test_an_identical_request_finds_only_an_open_run(catalogue: Catalogue) -> None:
     first = made(catalogue, 2)
     assert made(catalogue, 2) == first and made(catalogue, 2, key="other") != first
     assert row(catalogue, first).total == 2
@@ -225,13 +225,13 @@ def ends_unseen(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, bulk_id: 
     monkeypatch.setattr(database, "reading", reading)
 
 
-def test_what_failed_waits_for_the_end_of_an_equal_bulk(catalogue: Catalogue) -> None:
+def test_retry_is_refused_while_an_identical_run_is_open(catalogue: Catalogue) -> None:
     ended = with_a_failure(catalogue)
     other = made(catalogue, 2)
     assert other != ended
     for change, phase in ((catalogue.bulks.pause, "PAUSED"), (catalogue.bulks.resume, "RUNNING")):
         assert change(other)
-        with pytest.raises(DataError, match=f"bulk {other} is {phase}") as refused:
+        with pytest.raises(DataError, match=f"run {other} is {phase}") as refused:
             catalogue.bulks.retry(ended)
         assert refused.value.code == "equal-bulk-open"
         now = row(catalogue, ended)
@@ -242,7 +242,7 @@ def test_what_failed_waits_for_the_end_of_an_equal_bulk(catalogue: Catalogue) ->
     check_counts(catalogue, ended)
 
 
-def test_what_failed_is_tried_again_where_the_equal_bulk_ends_meanwhile(
+def test_retry_succeeds_if_the_identical_run_ends_meanwhile(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended = with_a_failure(catalogue)
@@ -251,7 +251,7 @@ def test_what_failed_is_tried_again_where_the_equal_bulk_ends_meanwhile(
     assert row(catalogue, ended).phase == "RUNNING"
 
 
-def test_a_bulk_whose_equal_ends_meanwhile_is_a_new_one(
+def test_a_request_whose_identical_run_ends_meanwhile_makes_a_new_run(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = made(catalogue, 2)
@@ -261,7 +261,7 @@ def test_a_bulk_whose_equal_ends_meanwhile_is_a_new_one(
     check_counts(catalogue, second)
 
 
-def test_files_are_listed_under_a_lease_and_from_the_start_by_the_next(catalogue: Catalogue) -> None:
+def test_a_second_worker_lists_files_from_the_start(catalogue: Catalogue) -> None:
     bulk_id, lost = made(catalogue, 1, listed=False), turn(catalogue)
     bulks = catalogue.bulks
     assert bulks.take(bulk_id, lost, 3) is None, "nothing is done before all is listed"
@@ -279,7 +279,7 @@ def test_files_are_listed_under_a_lease_and_from_the_start_by_the_next(catalogue
     assert row(catalogue, bulk_id).failed == 1
 
 
-def test_files_whose_paths_cannot_be_kept_are_images_that_failed(
+def test_files_whose_paths_cannot_be_stored_are_failed_images(
     catalogue: Catalogue, settings: Settings, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"
@@ -297,12 +297,14 @@ def test_files_whose_paths_cannot_be_kept_are_images_that_failed(
     bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
     assert catalogue.bulks.begin_listing(bulk_id, lease)
     files = [{"glob": f"{root}/**/*.fits", "where": {"NAXIS": 2}}]
-    listed = list(bulk_task._listed(context, BulkWork.model_validate({"files": files})))
+    listed = list(listing._listed(context, BulkWork.model_validate({"files": files})))
     assert catalogue.bulks.add_listed(bulk_id, lease, listed) and catalogue.bulks.end_listing(bulk_id, lease)
     (taken,) = all_taken(catalogue, bulk_id, lease)
     assert taken.source == str(root / "a.fits")
     failed = {
-        item.error["code"]: item for item in catalogue.bulks.items(bulk_id, ItemState.FAILED) if item.error
+        item.error["code"]: item
+        for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)
+        if item.error
     }
     assert set(failed) == {"unreadable-file", "path-too-long", "path-not-utf-8"}
     assert row(catalogue, bulk_id).failed == 4
@@ -311,16 +313,16 @@ def test_files_whose_paths_cannot_be_kept_are_images_that_failed(
     message = failed["path-too-long"].error["message"]  # type: ignore[index]
     assert message.startswith(f"expected a path of at most 1024 characters; got {len(str(long))}")
     assert message.endswith("5/long.fits")
-    sources = [item.source for item in catalogue.bulks.items(bulk_id, ItemState.FAILED)]
+    sources = [item.source for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)]
     assert f"{root}/\\xff\\xfe/Sonne\\xf6.fits" in sources
-    assert max(map(len, sources)) == bulk_task.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
+    assert max(map(len, sources)) == listing.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
     check_counts(catalogue, bulk_id)
     assert done(catalogue, taken) and catalogue.bulks.retry(bulk_id) == 1, "no row tells where the others lie"
     assert [one.source for one in all_taken(catalogue, bulk_id, lease)] == [str(root / "loop.fits")]
     check_counts(catalogue, bulk_id)
 
 
-def test_a_listing_that_is_paused_goes_on_listing(catalogue: Catalogue) -> None:
+def test_a_run_paused_while_listing_resumes_listing(catalogue: Catalogue) -> None:
     bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
     bulks = catalogue.bulks
     assert bulks.begin_listing(bulk_id, lease) and bulks.pause(bulk_id)
@@ -328,30 +330,30 @@ def test_a_listing_that_is_paused_goes_on_listing(catalogue: Catalogue) -> None:
     assert bulks.resume(bulk_id) and row(catalogue, bulk_id).phase == BulkPhase.LISTING
 
 
-def test_the_most_doubtful_come_first_over_pages(catalogue: Catalogue) -> None:
+def test_images_are_sorted_by_artefact_score_over_pages(catalogue: Catalogue) -> None:
     bulk_id, lease = made(catalogue, 7), turn(catalogue)
     scores = [0.5, 2.0, 0.1, 2.0, 9.0, 0.5]
     for taken, score in zip(all_taken(catalogue, bulk_id, lease), scores, strict=False):
         done(catalogue, taken, score=score)
     found: list[BulkItemRow] = []
-    while page := catalogue.bulks.worst(
+    while page := catalogue.bulks.progress.worst(
         bulk_id, after=(found[-1].score or 0.0, found[-1].position) if found else None, limit=2
     ):
         found += page
     assert [item.score for item in found] == sorted(scores, reverse=True)
     assert len({item.position for item in found}) == 6
-    assert catalogue.bulks.to_look_at(bulk_id, 1.0) == 3
+    assert catalogue.bulks.progress.to_look_at(bulk_id, 1.0) == 3
 
 
-def test_uploads_that_are_not_there_are_named(catalogue: Catalogue) -> None:
+def test_missing_uploads_are_named(catalogue: Catalogue) -> None:
     catalogue.add(ImageRow(owner="o", id="a" * 64, created_at=1.0, bytes=1, summary={}))
-    assert catalogue.bulks.first_not_uploaded(["a" * 64], "o") is None
-    assert catalogue.bulks.first_not_uploaded(["a" * 64, "b" * 64], "o") == "b" * 64
-    assert catalogue.bulks.first_not_uploaded(["a" * 64], "other") == "a" * 64
+    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64], "o") is None
+    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64, "b" * 64], "o") == "b" * 64
+    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64], "other") == "a" * 64
 
 
 def test_fifty_thousand_images(catalogue: Catalogue) -> None:
-    """Made in seconds; to take and to end one costs what it costs with ten, where few and where most are done."""
+    """Created in seconds. Taking and finishing one costs as much as in a run of ten, whether few or most are done."""
 
     def cost(bulk_id: str) -> float:
         lease, times = turn(catalogue), []
@@ -360,7 +362,7 @@ def test_fifty_thousand_images(catalogue: Catalogue) -> None:
             taken = catalogue.bulks.take(bulk_id, lease, 3)
             assert taken is not None and done(catalogue, taken)
             bulk = row(catalogue, bulk_id)
-            catalogue.bulks.pace(bulk), catalogue.bulks.to_look_at(bulk_id, 1.0)
+            catalogue.bulks.progress.pace(bulk), catalogue.bulks.progress.to_look_at(bulk_id, 1.0)
             times.append(time.perf_counter() - start)
         return sorted(times)[len(times) // 2]
 
@@ -394,22 +396,24 @@ def test_the_pace_is_that_of_the_last_images(catalogue: Catalogue, gone_s: float
             connection.execute(one.values(ended_at=now - 10 * (11 - position)))
         began = update(BulkRow).where(BulkRow.id == bulk_id)
         connection.execute(began.values(running_since=now - 120, ended_at=now if gone_s else None))
-    assert catalogue.bulks.pace(row(catalogue, bulk_id)).images_an_hour == pytest.approx(360.0, rel=0.05)
+    assert catalogue.bulks.progress.pace(row(catalogue, bulk_id)).images_an_hour == pytest.approx(
+        360.0, rel=0.05
+    )
 
 
 def test_images_of_open_bulks_are_counted_together(catalogue: Catalogue) -> None:
-    assert catalogue.bulks.open_images() == {"left": 0, "done": 0, "failed": 0}
+    assert catalogue.bulks.progress.open_images() == {"left": 0, "done": 0, "failed": 0}
     first, lease = made(catalogue, 3, key="a"), turn(catalogue)
     made(catalogue, 2, key="b")
     one, other, _ = all_taken(catalogue, first, lease)
     done(catalogue, one), catalogue.bulks.fail(other, BAD)
-    assert catalogue.bulks.open_images() == {"left": 3, "done": 1, "failed": 1}
+    assert catalogue.bulks.progress.open_images() == {"left": 3, "done": 1, "failed": 1}
     catalogue.bulks.cancel(first)
-    assert catalogue.bulks.open_images() == {"left": 2, "done": 0, "failed": 0}
+    assert catalogue.bulks.progress.open_images() == {"left": 2, "done": 0, "failed": 0}
 
 
-def test_whatever_is_asked_of_a_bulk_is_found_by_index(catalogue: Catalogue) -> None:
-    """No statement reads through all images, of this bulk or of others, and none sorts them."""
+def test_every_query_of_a_run_uses_an_index(catalogue: Catalogue) -> None:
+    """No statement scans or sorts all images, of this run or of others."""
     bulk_id, lease = made(catalogue, 50), turn(catalogue)
     bulks = catalogue.bulks
     first, second = bulks.take(bulk_id, lease, 3), bulks.take(bulk_id, lease, 3)
@@ -420,12 +424,17 @@ def test_whatever_is_asked_of_a_bulk_is_found_by_index(catalogue: Catalogue) -> 
         assert (
             third is not None and done(catalogue, first) and bulks.fail(second, BAD) and bulks.release(third)
         )
-        bulks.pace(bulk), bulks.to_look_at(bulk_id, 1.0), bulks.at_work(), bulks.open_images()
         (
-            bulks.items(bulk_id, ItemState.DONE, after=3, limit=51),
-            bulks.worst(bulk_id, after=(1.0, 3), limit=51),
+            bulks.progress.pace(bulk),
+            bulks.progress.to_look_at(bulk_id, 1.0),
+            bulks.at_work(),
+            bulks.progress.open_images(),
         )
-        bulks.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
+        (
+            bulks.progress.items(bulk_id, ItemState.DONE, after=3, limit=51),
+            bulks.progress.worst(bulk_id, after=(1.0, 3), limit=51),
+        )
+        bulks.progress.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
         catalogue.page(BulkRow, owner="o", limit=51, after=(1.0, "a"))
     asked = [one for one in sent if one[0].lstrip().startswith(("SELECT", "UPDATE"))]
     assert len(asked) >= 18

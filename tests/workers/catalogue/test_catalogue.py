@@ -1,4 +1,4 @@
-"""The job's row as a machine: who may change it, when, and what a loss of the worker does."""
+"""The phases of a job's row: who may change it, when, and what happens if the worker is lost."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_lost_lease_changes_nothing(catalogue: Catalogue) -> None:
     assert phase(catalogue, job) == Phase.COMPLETED
 
 
-def test_cancel_of_each_phase(catalogue: Catalogue) -> None:
+def test_cancelling_in_each_phase(catalogue: Catalogue) -> None:
     queued = submitted(catalogue, "a")
     catalogue.jobs.cancel(queued.id)
     assert phase(catalogue, queued) == Phase.ABORTED
@@ -96,7 +96,7 @@ def test_cancel_of_each_phase(catalogue: Catalogue) -> None:
     assert phase(catalogue, done) == Phase.COMPLETED
 
 
-def test_a_silent_worker_loses_its_job_and_three_are_enough(
+def test_a_silent_worker_loses_its_job_and_the_third_loss_ends_it(
     catalogue: Catalogue, caplog: pytest.LogCaptureFixture
 ) -> None:
     job, lease = claimed(catalogue)
@@ -129,7 +129,7 @@ def waiting(catalogue: Catalogue) -> list[str]:
     return [job.id for job in catalogue.jobs.unsubmitted(0.05)]
 
 
-def test_what_the_broker_lost_is_submitted_again_but_not_at_once(catalogue: Catalogue) -> None:
+def test_a_lost_message_is_submitted_again_after_a_wait(catalogue: Catalogue) -> None:
     job = submitted(catalogue)
     assert waiting(catalogue) == [job.id]
     catalogue.jobs.mark_submitted(job.id)
@@ -238,7 +238,7 @@ def test_a_cancel_is_not_lost_while_silent_workers_are_given_up(
     assert phase(catalogue, job) == Phase.ABORTED
 
 
-def test_a_cancelled_job_that_was_started_often_enough_is_no_error(catalogue: Catalogue) -> None:
+def test_a_cancelled_job_after_the_last_attempt_is_aborted(catalogue: Catalogue) -> None:
     job, _ = claimed(catalogue)
     catalogue.jobs.cancel(job.id)
     assert catalogue.jobs.give_up_silent(-1.0, 1) == []

@@ -1,4 +1,4 @@
-"""Contexts that stay as they are, the default and its history, and the one PSF that fits an image."""
+"""Immutable contexts, the default context and its history, and the one PSF that fits an image."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LINE = PsfFilter("hri_euv", "174", "total")
 
 @pytest.fixture
 def certified(catalogue: Catalogue) -> Catalogue:
-    """Two years of one line, certified, and a draft."""
+    """Two years of one series, certified, and a draft."""
     for name, year in (("a", 2020), ("b", 2021)):
         catalogue.add(psf(name))
         certify(catalogue, name, f"1.{year - 2020}.0", years(year, year + 1))
@@ -53,12 +53,12 @@ def header(**cards: Any) -> dict[str, Any]:
 def pinned(catalogue: Catalogue, name: str) -> list[tuple[str, str | None, str | None, str]]:
     context = catalogue.contexts.named(name, OWNER)
     return [
-        (pin.line, iso(pin.valid_from), iso(pin.valid_to), pin.version)
+        (pin.series, iso(pin.valid_from), iso(pin.valid_to), pin.version)
         for pin in catalogue.contexts.pins(context.id, OWNER)
     ]
 
 
-def test_a_context_pins_what_is_certified_and_stays(certified: Catalogue) -> None:
+def test_a_context_pins_certified_psfs_and_never_changes(certified: Catalogue) -> None:
     made, new = certified.contexts.create("first", OWNER, "tester", reason="a start")
     assert new and (made.pins, made.created_by, made.reason) == (2, "tester", "a start")
     there = pinned(certified, "first")
@@ -104,7 +104,7 @@ def test_a_context_of_given_psfs(certified: Catalogue) -> None:
     assert turned.pins == 3
 
 
-def test_contexts_that_cannot_be(certified: Catalogue) -> None:
+def test_invalid_contexts_are_refused(certified: Catalogue) -> None:
     create = certified.contexts.create
     for name in ("", "now", "default", "a b", "../x", "x" * 64, "a" * 64, "-x"):
         refused("bad-name", lambda name=name: create(name, OWNER, "x"))
@@ -120,7 +120,7 @@ def test_contexts_that_cannot_be(certified: Catalogue) -> None:
         assert certified.contexts.find(name, OWNER) is None
 
 
-def test_many_who_make_one_context_at_once_make_it_once(certified: Catalogue) -> None:
+def test_simultaneous_identical_contexts_are_made_once(certified: Catalogue) -> None:
     start = threading.Barrier(6)
 
     def make(_: int) -> tuple[str, bool]:
@@ -133,7 +133,7 @@ def test_many_who_make_one_context_at_once_make_it_once(certified: Catalogue) ->
     assert len({identity for identity, _ in made}) == 1 and sum(new for _, new in made) == 1
 
 
-def test_the_default_is_moved_and_its_way_is_kept(certified: Catalogue) -> None:
+def test_the_default_context_changes_and_keeps_a_history(certified: Catalogue) -> None:
     contexts = certified.contexts
     assert contexts.default(OWNER) is None and contexts.default_changes(OWNER) == []
     first, _ = contexts.create("first", OWNER, "x")
@@ -157,14 +157,14 @@ def test_the_default_is_moved_and_its_way_is_kept(certified: Catalogue) -> None:
 # The one PSF ----------------------------------------------------------------------------------------
 
 
-def test_the_best_is_certified_unless_more_is_asked(certified: Catalogue) -> None:
+def test_only_certified_psfs_are_searched_by_default(certified: Catalogue) -> None:
     at = seconds("2020-06-01")
     assert look(certified, PsfFilter("hri_euv", valid_at=at), OWNER, None).one().name == "a"
     assert look(certified, PsfFilter(version="1.1.0"), OWNER, None).one().name == "b"
     assert look(certified, PsfFilter(status="draft"), OWNER, None).one().name == "draft"
 
 
-def test_where_several_fit_all_are_named(certified: Catalogue) -> None:
+def test_several_fitting_psfs_are_all_named(certified: Catalogue) -> None:
     found = look(certified, LINE, OWNER, None)
     message = refused("several-psfs-fit", found.one)
     assert all(identity(name) in message for name in ("a", "b")) and identity("draft") not in message
@@ -183,13 +183,11 @@ def test_where_several_fit_all_are_named(certified: Catalogue) -> None:
         (PsfFilter(name="draft"), "no PSF with name draft has status certified"),
     ],
 )
-def test_where_none_fits_the_filter_that_left_none_is_named(
-    certified: Catalogue, wanted: PsfFilter, says: str
-) -> None:
+def test_the_filter_that_left_no_psf_is_named(certified: Catalogue, wanted: PsfFilter, says: str) -> None:
     assert says in refused("no-psf-fits", look(certified, wanted, OWNER, None).one)
 
 
-def test_the_default_context_is_looked_in_and_now_looks_past_it(certified: Catalogue) -> None:
+def test_the_default_context_is_searched_unless_the_request_says_now(certified: Catalogue) -> None:
     certified.contexts.create("old", OWNER, "x", pins=[Pin(identity("draft"), years(None, None))])
     certified.contexts.set_default("old", OWNER, "x")
     at = seconds("2020-06-01")
@@ -240,7 +238,7 @@ def test_an_image_of_an_instrument_that_is_not_shipped_is_found_by_its_header_s_
     assert look_for_image(catalogue, cards, OWNER, None).one().name == "aia"
 
 
-def test_a_deconvolution_picks_where_something_was_certified_and_says_so_where_it_does_not_fit(
+def test_a_deconvolution_uses_the_certified_psf_or_says_why_it_does_not_fit(
     certified: Catalogue,
 ) -> None:
     found = picked_for_image(certified, header(), OWNER, None)
@@ -258,7 +256,7 @@ def test_a_deconvolution_picks_where_something_was_certified_and_says_so_where_i
     refused("no-psf-fits", far.one)
 
 
-def test_a_deconvolution_in_a_context_does_not_leave_it_unasked(certified: Catalogue) -> None:
+def test_a_deconvolution_in_a_context_uses_no_psf_outside_it(certified: Catalogue) -> None:
     certified.add(psf("other", channel="304"))
     certified.contexts.create("other", OWNER, "x", pins=[Pin(identity("other"))])
     refused("no-psf-fits", lambda: picked_for_image(certified, header(), OWNER, "other"))
@@ -266,5 +264,5 @@ def test_a_deconvolution_in_a_context_does_not_leave_it_unasked(certified: Catal
     refused("no-psf-fits", lambda: picked_for_image(certified, header(), OWNER, None))
     now = picked_for_image(certified, header(), OWNER, "now")
     assert now is not None and now.one().name == "a" and now.context is None
-    assert picked_for_image(certified, header(wavelnth=193.0), OWNER, None) is None, "in no line: as before"
+    assert picked_for_image(certified, header(wavelnth=193.0), OWNER, None) is None, "in no series: as before"
     refused("no-psf-fits", lambda: picked_for_image(certified, header(wavelnth=193.0), OWNER, "other"))

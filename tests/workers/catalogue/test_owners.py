@@ -1,4 +1,4 @@
-"""What an owner has kept is held to what may be kept where it is counted, whoever counts at the same moment."""
+"""Quotas are kept when several transactions add files at the same moment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def send(catalogue: Catalogue, row: ImageRow, quota_mib: int = 1) -> bool:
         return False
 
 
-def test_of_uploads_at_once_as_many_come_in_as_fit(catalogue: Catalogue) -> None:
+def test_simultaneous_uploads_are_accepted_up_to_the_quota(catalogue: Catalogue) -> None:
     with ThreadPoolExecutor(8) as pool:
         came_in = list(pool.map(lambda n: send(catalogue, image(n, MIB // 4)), range(12)))
     assert sum(came_in) == 4
@@ -43,7 +43,7 @@ def test_an_owner_s_own_limit_counts(catalogue: Catalogue) -> None:
 
 
 @pytest.mark.parametrize("size_bytes", [0, MIB])
-def test_what_no_upload_brings_is_kept(catalogue: Catalogue, size_bytes: int) -> None:
+def test_results_of_jobs_are_not_held_to_the_quota(catalogue: Catalogue, size_bytes: int) -> None:
     assert send(catalogue, image(1, MIB))
     assert catalogue.add(image(2, size_bytes))[1]
     assert catalogue.owners.usage("o", 1).used_bytes == MIB + size_bytes

@@ -1,4 +1,4 @@
-"""PSFs in the catalogue: certified, deprecated, followed by others; and found by what they are and when they hold."""
+"""PSFs in the catalogue: certified, deprecated, superseded; found by properties and validity."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workers.versions.validity import Validity, seconds
 
 @pytest.fixture
 def three(catalogue: Catalogue) -> Catalogue:
-    """Three drafts of one line."""
+    """Three drafts of one series."""
     for name in ("a", "b", "c"):
         catalogue.add(psf(name))
     return catalogue
@@ -51,7 +51,7 @@ def test_a_draft_is_certified_under_a_version_and_a_range(three: Catalogue) -> N
     assert abs(change.at - time.time()) < 5
 
 
-def test_ranges_of_a_line_may_not_overlap_and_the_refusal_names_the_other(three: Catalogue) -> None:
+def test_ranges_of_a_series_may_not_overlap_and_the_error_names_the_other_psf(three: Catalogue) -> None:
     certify(three, "a", "1.0.0", years(2020, 2022))
     message = refused("ranges-overlap", lambda: certify(three, "b", "1.1.0", years(2021, 2023)))
     assert identity("a") in message and "[2020-01-01T00:00:00Z, 2022-01-01T00:00:00Z)" in message
@@ -63,13 +63,13 @@ def test_ranges_of_a_line_may_not_overlap_and_the_refusal_names_the_other(three:
 @pytest.mark.parametrize(
     "validity", [years(None, None), years(2019, 2030), years(2020, 2021), years(2021, None)]
 )
-def test_a_range_in_any_place_over_several_others_is_refused(three: Catalogue, validity: Validity) -> None:
+def test_a_range_that_overlaps_several_others_is_refused(three: Catalogue, validity: Validity) -> None:
     certify(three, "a", "1.0.0", years(2020, 2021))
     certify(three, "b", "1.1.0", years(2024, 2025))
     refused("ranges-overlap", lambda: certify(three, "c", "1.2.0", validity))
 
 
-def test_other_lines_and_owners_have_ranges_of_their_own(three: Catalogue) -> None:
+def test_other_series_and_owners_have_ranges_of_their_own(three: Catalogue) -> None:
     three.add(psf("other channel", channel="304"))
     three.add(psf("other kind", kind="diffraction"))
     three.add(psf("a", owner="somebody"))
@@ -85,7 +85,7 @@ def test_a_version_is_given_once_and_never_again(three: Catalogue) -> None:
     certify(three, "a", "1.0.0", years(2020, 2021))
     deprecate(three, "a")
     message = refused("version-taken", lambda: certify(three, "b", "1.0.0"))
-    assert "the next one free is 1.1.0" in message
+    assert "the next free version is 1.1.0" in message
     assert three.psfs.released("hri_euv/174/total", OWNER) == ["1.0.0"]
 
 
@@ -112,7 +112,7 @@ def test_a_psf_supersedes_others_in_one_step(three: Catalogue) -> None:
         assert [change.status for change in three.psfs.changes(row.id, OWNER)] == ["certified", "deprecated"]
 
 
-def test_what_cannot_be_superseded_leaves_everything_as_it_was(three: Catalogue) -> None:
+def test_an_invalid_supersession_changes_nothing(three: Catalogue) -> None:
     certify(three, "a", "1.0.0")
     three.add(psf("far", channel="304"))
     certify(three, "far", "1.0.0")
@@ -126,7 +126,7 @@ def test_what_cannot_be_superseded_leaves_everything_as_it_was(three: Catalogue)
     )
 
 
-def test_deprecation_names_a_certified_successor_of_the_line(three: Catalogue) -> None:
+def test_deprecation_names_a_certified_successor_of_the_series(three: Catalogue) -> None:
     certify(three, "a", "1.0.0", years(2020, 2021))
     three.add(psf("far", channel="304"))
     certify(three, "far", "1.0.0")
@@ -155,12 +155,12 @@ def test_wrong_transitions_change_nothing(three: Catalogue) -> None:
     refused("not-of-this-change", lambda: three.psfs.change(identity("c"), OWNER, with_successor, "x"))
 
 
-def test_a_draft_without_a_line_is_told_its_line_when_it_is_certified(catalogue: Catalogue) -> None:
+def test_a_draft_without_a_series_gets_one_when_it_is_certified(catalogue: Catalogue) -> None:
     catalogue.add(psf("mine", instrument=None, channel=None, kind="uploaded", origin="uploaded"))
     refused("no-line", lambda: certify(catalogue, "mine", "1.0.0"))
     said = {"instrument": "aia_3", "channel": "193", "kind": "total"}
     row = certify(catalogue, "mine", "1.0.0", **said)
-    assert (row.line, row.instrument, row.channel, row.kind) == ("aia_3/193/total", "aia_3", "193", "total")
+    assert (row.series, row.instrument, row.channel, row.kind) == ("aia_3/193/total", "aia_3", "193", "total")
     catalogue.add(psf("known"))
     refused("line-known", lambda: certify(catalogue, "known", "1.0.0", channel="304"))
 
@@ -195,7 +195,7 @@ def test_of_two_certifications_at_once_one_wins(catalogue: Catalogue, attempt: i
     assert [change.status for change in catalogue.psfs.changes(row.id, OWNER)] == ["certified"]
 
 
-def test_of_two_that_ask_for_one_version_at_once_one_gets_it(catalogue: Catalogue) -> None:
+def test_of_two_simultaneous_requests_for_one_version_one_succeeds(catalogue: Catalogue) -> None:
     for n in range(6):
         catalogue.add(psf(str(n)))
     ended = together(
@@ -220,7 +220,7 @@ def test_two_that_supersede_the_same_psf_at_once(three: Catalogue) -> None:
 
 @pytest.fixture
 def many(catalogue: Catalogue) -> Catalogue:
-    """Two lines with three certified versions each, one deprecated, and drafts."""
+    """Two series with three certified versions each, one deprecated, and drafts."""
     n = 0
     for channel in ("174", "304"):
         for year in (2020, 2021, 2022):
@@ -257,7 +257,7 @@ def many(catalogue: Catalogue) -> Catalogue:
         (PsfFilter(instrument="mine"), []),
     ],
 )  # fmt: skip
-def test_lists_hold_what_the_filters_say_newest_first(
+def test_lists_contain_psfs_that_meet_the_filters_newest_first(
     many: Catalogue, wanted: PsfFilter, names: list[str]
 ) -> None:
     assert [row.name for row in many.psfs.page(wanted, OWNER, limit=50)] == names
@@ -281,7 +281,7 @@ def test_lists_hold_what_the_filters_say_newest_first(
         (PsfFilter(kind="diffraction", status="certified"), "status"),
     ],
 )
-def test_the_filter_that_left_nothing_is_known(
+def test_the_first_filter_that_leaves_no_psf_is_found(
     many: Catalogue, wanted: PsfFilter, filter_name: str | None
 ) -> None:
     assert many.psfs.emptied_by(wanted, OWNER) == filter_name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import insert, inspect, select, text
@@ -18,13 +20,18 @@ from sqlalchemy.exc import DatabaseError
 
 from tests.tables import RUN_REVISIONS
 from tests.whole.stack import Missing, postgres_database
+from workers.bulk import intake
+from workers.catalogue import schema
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.migrations.versions.r0001_baseline import METADATA as BASELINE
 from workers.catalogue.migrations.versions.r0003_psf_versions import BATCH
+from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.schema import Schema, SchemaError
-from workers.catalogue.tables import Base, ImageRow, ProductRow, PsfRow
+from workers.catalogue.stage_times import Spent
+from workers.catalogue.tables import Base, ImageRow, ProductRow, PsfRow, ReportRow
+from workers.contract.identities import canonical_hash
 from workers.settings import Settings
-from workers.versions.series import line_of
+from workers.versions.series import series_of
 
 OLD_ROWS = {
     "images": {"bytes": 5, "filename": "a.fits", "summary": {"instrument": "hri_euv"}},
@@ -125,7 +132,7 @@ def test_a_database_from_before_revisions_is_adopted_with_its_data(catalogue: Ca
 
 
 @pytest.mark.parametrize(
-    ("row", "line"),
+    ("row", "series"),
     [
         ({"origin": "built", "details": {"wavelength_angstrom": 171.07}}, ("hri_euv", "171", "total")),
         (
@@ -149,8 +156,8 @@ def test_a_database_from_before_revisions_is_adopted_with_its_data(catalogue: Ca
         ),
     ],
 )
-def test_psfs_get_the_line_that_their_rows_tell_of(
-    catalogue: Catalogue, row: dict[str, Any], line: tuple[str | None, ...]
+def test_psfs_get_the_series_that_follows_from_their_rows(
+    catalogue: Catalogue, row: dict[str, Any], series: tuple[str | None, ...]
 ) -> None:
     make_as_before_revisions(catalogue)
     with catalogue._engine.begin() as connection:
@@ -161,8 +168,8 @@ def test_psfs_get_the_line_that_their_rows_tell_of(
     catalogue.upgrade()
     psf = catalogue.get(PsfRow, "9" * 64, "o")
     assert psf is not None and psf.status == "draft"
-    assert (psf.instrument, psf.channel, psf.kind) == line
-    assert psf.line == line_of(*line)
+    assert (psf.instrument, psf.channel, psf.kind) == series
+    assert psf.series == series_of(*series)
 
 
 def test_more_psfs_than_are_filled_at_a_time_are_all_filled(catalogue: Catalogue) -> None:
@@ -175,7 +182,7 @@ def test_more_psfs_than_are_filled_at_a_time_are_all_filled(catalogue: Catalogue
         connection.execute(insert(BASELINE.tables["psfs"]), rows)
     catalogue.upgrade()
     with catalogue._engine.connect() as connection:
-        assert set(connection.scalars(select(PsfRow.line))) == {"hri_euv/174/total"}
+        assert set(connection.scalars(select(PsfRow.series))) == {"hri_euv/174/total"}
 
 
 def test_a_revision_between_is_upgraded(catalogue: Catalogue) -> None:
@@ -201,10 +208,10 @@ def test_a_later_revision_is_refused_and_left_alone(catalogue: Catalogue) -> Non
     assert catalogue.schema.status().revision == "9999"
 
 
-def test_tables_that_were_never_ours_are_refused_and_left_alone(catalogue: Catalogue) -> None:
+def test_foreign_tables_are_refused_and_not_changed(catalogue: Catalogue) -> None:
     with catalogue._engine.begin() as connection:
         connection.execute(text("CREATE TABLE images (id VARCHAR(64) PRIMARY KEY, pixels TEXT)"))
-    with pytest.raises(SchemaError, match=r"expected those of heliopsf 0\.1.*images\.owner.*images\.summary"):
+    with pytest.raises(SchemaError, match=r"without a revision.*images\.owner.*images\.summary"):
         catalogue.upgrade()
     assert inspect(catalogue._engine).get_table_names() == ["images"]
 
@@ -220,6 +227,8 @@ def test_an_upgrade_that_fails_leaves_nothing_behind(catalogue: Catalogue) -> No
 
 STARTS = """
 import sys, time
+from workers.bulk import intake
+from workers.catalogue import schema
 from workers.catalogue.catalogue import Catalogue
 catalogue = Catalogue(sys.argv[1])
 time.sleep(max(0.0, float(sys.argv[2]) - time.time()))
@@ -243,3 +252,136 @@ def test_processes_that_start_at_once_make_one_upgrade(url: str, catalogue: Cata
     assert differences(catalogue) == []
     with catalogue._engine.connect() as connection:
         assert connection.scalar(text("SELECT count(*) FROM alembic_version")) == 1
+
+
+# Revision 0010: new names -----------------------------------------------------------------------------
+
+# Rows as version 0.1.0 (revision 0009) wrote them, shortened; the deconvolution is that of its `heliopsf demo`.
+PARAMETERS = {
+    "image_id": "f" * 64, "psf_id": "0" * 64, "psf_recipe": {"instrument": "hri_euv", "size": 2048},
+    "method": {"stop": "fixed", "name": "richardson-lucy", "steps": 20}, "error_draws": 0, "effects_picture": False,
+}  # fmt: skip
+DETAILS = {
+    "method": {"stop": "fixed", "edges": None, "margin_px": None, "name": "richardson-lucy", "steps": 20},
+    "algorithm_version": 1, "parameters": PARAMETERS, "job_id": "1" * 32, "flux_change_pct": 0.01,
+    "effects": {"structures": [], "artefacts": {"score": 0.4}}, "effects_picture_sha256": "9" * 64,
+}  # fmt: skip
+BULK_REQUEST = {
+    "name": "a week", "psf_id": "0" * 64, "files": [], "output": None, "context": None,
+    "parameters": {"method": PARAMETERS["method"], "error_draws": 0, "effects_picture": True},
+}  # fmt: skip
+ROWS_BEFORE_0010: dict[str, list[dict[str, Any]]] = {
+    "psfs": [
+        {
+            "owner": "local", "id": "0" * 64, "created_at": 1.0, "name": "hri_euv", "version": "1.0.0",
+            "instrument": "hri_euv", "channel": "174", "kind": "total", "line": "hri_euv/174/total",
+            "status": "certified", "valid_from": 0.0, "valid_to": 9e9, "origin": "built", "file_sha256": "a" * 64,
+            "bytes": 7, "details": '{"shape": [4, 4]}',
+        },
+    ],
+    "psf_lines": [{"owner": "local", "line": "hri_euv/174/total"}],
+    "psf_pins": [
+        {
+            "owner": "local", "context_id": "c" * 64, "line": "hri_euv/174/total", "valid_from": 0.0,
+            "valid_to": 9e9, "psf_id": "0" * 64, "version": "1.0.0",
+        },
+    ],
+    "products": [
+        {
+            "owner": "local", "id": letter * 64, "created_at": 2.0, "kind": "deconvolved-image", "image_id": "f" * 64,
+            "psf_id": "0" * 64, "psf_version": "1.0.0", "file_sha256": "b" * 64, "bytes": 9,
+            "preview_sha256": "d" * 64, "details": json.dumps(details),
+        }
+        for letter, details in (("1", DETAILS), ("2", {"job_id": "1" * 32}))
+    ],
+    "jobs": [
+        {
+            "id": letter * 32, "owner": "local", "kind": kind, "parameters": json.dumps(parameters),
+            "request_key": letter * 64, "work_key": letter * 64, "phase": "COMPLETED", "queue": "interactive",
+            "created_at": 3.0, "submissions": 1, "attempt": 1, "cancel_requested": False, "step": 1, "steps": 1,
+            "stage": "saving",
+        }
+        for letter, kind, parameters in (
+            ("1", "deconvolve", PARAMETERS),
+            ("2", "evaluate", {"transit_id": "3" * 64, "seed": 0}),
+            ("4", "rerun", {"of": "product", "id": "1" * 64, "kind": "deconvolve", "parameters": PARAMETERS}),
+        )
+    ],
+    "reports": [
+        {
+            "owner": "local", "id": letter * 64, "created_at": 4.0, "kind": kind, "transit_id": "3" * 64,
+            "file_sha256": "e" * 64, "bytes": 3, "details": '{"sentence": "A sentence."}',
+        }
+        for letter, kind in (("5", "evaluate"), ("6", "gap"))
+    ],
+    "stage_times": [{"kind": "evaluate", "stage": "reading", "seconds": 1.5, "steps": 3}],
+    "bulks": [
+        {
+            "id": "b" * 32, "owner": "local", "name": "a week", "phase": "RUNNING", "request": json.dumps(BULK_REQUEST),
+            "request_key": canonical_hash({**BULK_REQUEST, "name": None, "images": ["8" * 64, "7" * 64]}),
+            "psf_id": "0" * 64, "created_at": 5.0, "listed": True, "total": 2, "done": 0, "reused": 0, "failed": 0,
+        }
+    ],
+    "bulk_items": [
+        {
+            "bulk_id": "b" * 32, "position": number, "uploaded": True, "source": letter * 64, "state": "WAITING",
+            "attempts": 0, "reused": False, "kept": False,
+        }
+        for number, letter in enumerate("87")
+    ],
+}  # fmt: skip
+
+
+@pytest.fixture
+def renamed(catalogue: Catalogue) -> Catalogue:
+    """A database at revision 0009 with these rows, upgraded."""
+    with catalogue._engine.begin() as connection:
+        config = schema._config()
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0009")
+        for table, rows in ROWS_BEFORE_0010.items():
+            columns = ", ".join(rows[0])
+            values = ", ".join(f":{name}" for name in rows[0])
+            connection.execute(text(f"INSERT INTO {table} ({columns}) VALUES ({values})"), rows)
+    catalogue.upgrade()
+    assert catalogue.schema.status().state == "current" and differences(catalogue) == []
+    return catalogue
+
+
+def test_a_line_of_psfs_is_a_series_after_the_upgrade(renamed: Catalogue) -> None:
+    psf = renamed.get(PsfRow, "0" * 64, "local")
+    assert psf is not None and psf.series == "hri_euv/174/total"
+    assert renamed.psfs.any_certified("hri_euv/174/total", "local")
+    assert renamed.contexts.any_pinned("c" * 64, "hri_euv/174/total", "local")
+    (found,) = renamed.psfs.page(PsfFilter("hri_euv", "174", "total", valid_at=1e9), "local", limit=9)
+    assert found.id == psf.id
+
+
+def test_changes_and_their_picture_have_their_names_after_the_upgrade(renamed: Catalogue) -> None:
+    product, other = (renamed.get(ProductRow, letter * 64, "local") for letter in "12")
+    assert product is not None and other is not None and other.details == {"job_id": "1" * 32}
+    assert product.details["changes"] == DETAILS["effects"]
+    assert product.details["changes_picture_sha256"] == "9" * 64
+    assert product.details["parameters"]["changes_picture"] is False
+    assert "effects" not in json.dumps(product.details)
+    for job_id, parameters in (("1", {}), ("4", {"of": "product", "id": "1" * 64, "kind": "deconvolve"})):
+        job = renamed.jobs.get(job_id * 32)
+        assert job is not None and "effects" not in json.dumps(job.parameters)
+        whole = {name: value for name, value in PARAMETERS.items() if name != "effects_picture"}
+        whole["changes_picture"] = False
+        assert job.parameters == ({**parameters, "parameters": whole} if parameters else whole)
+
+
+def test_the_kind_evaluate_is_report_after_the_upgrade(renamed: Catalogue) -> None:
+    job = renamed.jobs.get("2" * 32)
+    assert job is not None and job.kind == "report" and job.parameters == {"transit_id": "3" * 64, "seed": 0}
+    kinds = {row.kind for row in renamed.page(ReportRow, owner="local", limit=9)}
+    assert kinds == {"report", "gap"}
+    assert renamed.stage_times.all() == {("report", "reading"): Spent(1.5, 3)}
+
+
+def test_an_open_bulk_run_is_found_by_an_identical_request_after_the_upgrade(renamed: Catalogue) -> None:
+    bulk = renamed.bulks.get("b" * 32)
+    assert bulk is not None and bulk.request["parameters"]["changes_picture"] is True
+    assert "effects" not in json.dumps(bulk.request)
+    assert bulk.request_key == intake._key(bulk.request, ["8" * 64, "7" * 64])

@@ -23,7 +23,7 @@ def phase(catalogue: Catalogue, job: JobRow) -> Phase:
     return Phase(row.phase)
 
 
-def test_a_pending_job_waits_to_be_told(catalogue: Catalogue) -> None:
+def test_a_pending_job_waits_until_it_is_started(catalogue: Catalogue) -> None:
     job = drafted(catalogue)
     assert phase(catalogue, job) == Phase.PENDING and not Phase.PENDING.ended
     assert catalogue.jobs.claim(job.id, "me") is None
@@ -61,7 +61,7 @@ def test_each_phase_after_pending(catalogue: Catalogue) -> None:
     assert not catalogue.uws.amend(dropped.id, lambda given: {})
 
 
-def test_of_many_that_start_a_job_one_does_and_equal_ones_all_run_in_turn(catalogue: Catalogue) -> None:
+def test_one_of_many_starts_of_a_job_succeeds_and_identical_jobs_run_in_turn(catalogue: Catalogue) -> None:
     job = drafted(catalogue)
     with ThreadPoolExecutor(8) as pool:
         told = list(pool.map(lambda _: catalogue.uws.start(job.id, job.parameters, {}, "k"), range(16)))
@@ -88,7 +88,7 @@ def test_a_change_that_fails_changes_nothing(catalogue: Catalogue) -> None:
     assert row is not None and row.parameters == job.parameters
 
 
-def test_a_destroyed_job_is_lost_to_its_worker(catalogue: Catalogue) -> None:
+def test_the_worker_of_a_destroyed_job_loses_its_lease(catalogue: Catalogue) -> None:
     job = drafted(catalogue, run_id="mine", destruction_at=time.time() + 60)
     assert catalogue.uws.start(job.id, job.parameters, {}, "k")
     lease = catalogue.jobs.claim(job.id, "me")

@@ -1,4 +1,4 @@
-"""Which files of an archive a pattern names, which header is meant, and what lies where nobody may look."""
+"""Files of an archive: patterns, header conditions, and paths outside the allowed folders."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def found(archive: Path, glob: str) -> list[str]:
         ("**/0*/**/0*/**/*.fits", []),
     ],
 )
-def test_what_a_pattern_names(archive: Path, glob: str, names: list[str]) -> None:
+def test_the_files_that_a_pattern_matches(archive: Path, glob: str, names: list[str]) -> None:
     if glob == "out/*.fits":
         with pytest.raises(DataError, match="expected a path below"):
             found(archive, glob)
@@ -76,7 +76,7 @@ def test_files_come_before_those_of_folders_below_each_by_name(archive: Path) ->
 
 
 @pytest.mark.parametrize("pattern", ["/**" * 12 + "/*.fits", "/**/d*" * 5 + "/**/*.fits", "/**/*" * 8])
-def test_each_folder_is_looked_through_once_however_many_stand_for_any_folders(
+def test_each_folder_is_read_once_with_several_double_stars(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pattern: str
 ) -> None:
     root = tmp_path / "archive"
@@ -98,7 +98,7 @@ def test_each_folder_is_looked_through_once_however_many_stand_for_any_folders(
     assert len(ticks) == 13 + 13, "for each folder and each entry"
 
 
-def test_a_walk_that_finds_nothing_ticks_and_ends_where_it_is_told(archive: Path) -> None:
+def test_a_walk_that_finds_nothing_ticks_and_can_be_stopped(archive: Path) -> None:
     ticks: list[None] = []
 
     def tick() -> None:
@@ -112,7 +112,7 @@ def test_a_walk_that_finds_nothing_ticks_and_ends_where_it_is_told(archive: Path
 
 
 @pytest.mark.parametrize("glob", ["*.fits", "**/*.fits", "*/*.fits"])
-def test_a_link_to_itself_comes_with_its_error_and_the_others_go_on(archive: Path, glob: str) -> None:
+def test_a_circular_link_is_yielded_with_its_error_and_the_walk_continues(archive: Path, glob: str) -> None:
     for name in ("loop.fits", "2021/loop.fits"):
         (archive / name).symlink_to(archive / name)
     (archive / "z.fits").write_bytes(b"x")
@@ -150,15 +150,15 @@ def test_paths_are_shown_as_text_that_can_be_stored(tmp_path: Path) -> None:
         ("/", "path-not-allowed"),
     ],
 )
-def test_what_may_not_be_named(archive: Path, glob: str, code: str) -> None:
+def test_paths_outside_the_allowed_folders_are_refused(archive: Path, glob: str, code: str) -> None:
     with pytest.raises(DataError) as caught:
         list(archive_files.find(glob.format(archive=archive), [archive]))
     assert caught.value.code == code
 
 
-def test_without_folders_that_are_allowed_nothing_is(archive: Path) -> None:
+def test_without_allowed_folders_every_path_is_refused(archive: Path) -> None:
     assert archive_files.roots("") == ()
-    with pytest.raises(DataError, match="there is none"):
+    with pytest.raises(DataError, match="none is set"):
         archive_files.check_glob(f"{archive}/*.fits", ())
 
 
@@ -192,7 +192,7 @@ def test_folders_of_a_setting_are_resolved(archive: Path, tmp_path: Path) -> Non
         ({"NOTHERE": {"!=": 1}}, False),
     ],
 )
-def test_what_a_header_must_say(tmp_path: Path, where: dict[str, Any], met: bool) -> None:
+def test_headers_that_meet_conditions(tmp_path: Path, where: dict[str, Any], met: bool) -> None:
     path = tmp_path / "i.fits"
     cards = {
         "INSTRUME": "EUI ",
@@ -209,7 +209,7 @@ def test_what_a_header_must_say(tmp_path: Path, where: dict[str, Any], met: bool
 @pytest.mark.parametrize(
     "where", [{"instrume": 1}, {"A": {}}, {"A": []}, {"A": {"=~": "x"}}, {"A": None}, {"A": float("nan")}]
 )
-def test_conditions_that_are_none(where: dict[str, Any]) -> None:
+def test_invalid_conditions_are_refused(where: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         TypeAdapter(Where).validate_python(where)
 

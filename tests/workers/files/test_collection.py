@@ -1,4 +1,4 @@
-"""Files that nothing names: found by looking at every row, left alone while they are young, removed and nothing else."""
+"""Removal of files to which no row refers: recent files stay, and no other file is removed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def image(digest: str) -> ImageRow:
     return ImageRow(owner="o", id=digest, created_at=1.0, bytes=1, summary={})
 
 
-def test_what_no_row_names_goes_and_what_one_names_stays(store: Store, catalogue: Catalogue) -> None:
+def test_files_without_a_row_are_removed_and_others_stay(store: Store, catalogue: Catalogue) -> None:
     named, deep, orphan = kept(store, b"a"), kept(store, b"b"), kept(store, b"cc")
     catalogue.add(image(named))
     report = ReportRow(
@@ -72,14 +72,14 @@ def test_what_no_row_names_goes_and_what_one_names_stays(store: Store, catalogue
     assert collect(catalogue, store, -60.0).removed == ()
 
 
-def test_what_is_young_is_left_alone(store: Store, catalogue: Catalogue) -> None:
+def test_recent_files_stay(store: Store, catalogue: Catalogue) -> None:
     catalogue.add(image(kept(store, b"a")))
     orphan = kept(store, b"an upload whose row is not written yet")
     assert collect(catalogue, store, DAY_S).removed == ()
     assert store.path(orphan).exists()
 
 
-def test_an_upload_in_progress_of_an_old_orphan_is_not_taken(
+def test_an_old_orphan_that_is_being_uploaded_again_stays(
     tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is kept again after the rows were looked at: its own row comes later still."""
@@ -148,7 +148,7 @@ def test_an_upload_at_the_moment_of_the_removal_is_not_lost(
     assert orphan in names(remote, "blobs") and names(remote, "aside") == set()
 
 
-def test_a_row_that_comes_a_little_later_is_waited_for(
+def test_a_row_that_is_written_a_little_later_saves_its_file(
     remote: remote_store.RemoteStore, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     catalogue.add(image(kept(remote, b"a")))
@@ -191,7 +191,7 @@ def left_aside(
     return sent, orphan
 
 
-def test_what_a_killed_collection_left_aside_is_settled_by_the_next(
+def test_the_next_collection_settles_files_that_a_killed_one_left_aside(
     remote: remote_store.RemoteStore, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent, _ = left_aside(remote, catalogue, monkeypatch)
@@ -239,7 +239,7 @@ def test_a_collection_killed_anywhere_loses_nothing(
     assert steps == 8, "two were put aside and deleted, one came back, both copies went"
 
 
-def test_a_dry_run_leaves_alone_what_is_aside(
+def test_a_dry_run_changes_no_file_aside(
     remote: remote_store.RemoteStore, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left_aside(remote, catalogue, monkeypatch)
@@ -260,30 +260,28 @@ def test_nothing_is_left_aside(remote: remote_store.RemoteStore, catalogue: Cata
     assert list(objects(remote)) == [f"blobs/{named[:2]}/{named}"]
 
 
-def test_what_is_aside_stays_where_the_database_is_not_believed(
+def test_files_aside_stay_if_the_database_seems_wrong(
     remote: remote_store.RemoteStore, catalogue: Catalogue
 ) -> None:
     orphan, _ = kept(remote, b"orphan"), kept(remote, b"a")
     assert remote.remove(orphan, time.time() + 60.0)
-    with pytest.raises(DataError, match="is it the right one"):
+    with pytest.raises(DataError, match="name the right database"):
         collect(catalogue, remote, -60.0)
     assert names(remote, "aside") == {orphan}
 
 
-def test_a_database_that_names_nothing_is_not_believed(store: Store, catalogue: Catalogue) -> None:
+def test_a_database_that_refers_to_no_file_is_refused(store: Store, catalogue: Catalogue) -> None:
     kept(store, b"a")
-    with pytest.raises(DataError, match="is it the right one"):
+    with pytest.raises(DataError, match="name the right database"):
         collect(catalogue, store, -60.0)
     assert len(list(store.blobs())) == 1
 
 
-def test_a_database_that_names_less_than_half_is_believed_where_that_is_said(
-    store: Store, catalogue: Catalogue
-) -> None:
+def test_a_database_that_refers_to_few_files_needs_even_most(store: Store, catalogue: Catalogue) -> None:
     """As after a move to another database on the same files."""
     catalogue.add(image(kept(store, b"new")))
     orphans = {kept(store, bytes([number])) for number in range(2)}
-    with pytest.raises(DataError, match=r"2 old ones are named by nothing.*--even-most"):
+    with pytest.raises(DataError, match=r"does not refer to 2 old files.*--even-most"):
         collect(catalogue, store, -60.0)
     assert len(list(store.blobs())) == 3
     assert {blob.digest for blob in collect(catalogue, store, -60.0, dry_run=True).removed} == orphans
@@ -291,7 +289,7 @@ def test_a_database_that_names_less_than_half_is_believed_where_that_is_said(
     assert {blob.digest for blob in found.removed} == orphans and len(list(store.blobs())) == 1
 
 
-def test_a_service_at_work_loses_nothing(
+def test_a_collection_beside_a_running_service_loses_no_file(
     settings: Settings, tmp_path: Path, image_file: Path, psf_file: Path
 ) -> None:
     local = LocalService(settings)
@@ -301,7 +299,7 @@ def test_a_service_at_work_loses_nothing(
     store, catalogue = Store(settings.data_dir), Catalogue(settings.catalogue_url)
     before = {blob.digest for blob in store.blobs()}
     assert len(before) >= 7 and collect(catalogue, store, -60.0).removed == ()
-    for part in ("file", "preview", "effects"):
+    for part in ("file", "preview", "changes"):
         local.download(product[part], tmp_path / part)
     local.close(), catalogue.close()
 

@@ -1,4 +1,4 @@
-"""Files by their hash, in a folder and in S3: kept whole or not at all, removed only where nobody kept them since."""
+"""Files by their hash, in a folder and in S3: stored whole or not at all, removed only if not stored again."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_an_abandoned_file_is_removed(store: Store, tmp_path: Path) -> None:
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
 
 
-def test_a_sweep_meets_others_that_end_with_their_files(
+def test_a_sweep_tolerates_files_that_vanish(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tmp = tmp_path / "data" / "tmp"
@@ -73,7 +73,7 @@ def test_a_sweep_meets_others_that_end_with_their_files(
     assert [path.name for path in tmp.iterdir()] == ["kept"]
 
 
-def test_a_file_that_is_not_there_says_so(store: Store) -> None:
+def test_a_missing_file_raises_an_error(store: Store) -> None:
     with pytest.raises(FileNotFoundError):
         store.path("a" * 64).open("rb")
 
@@ -84,7 +84,7 @@ def test_the_same_file_may_be_kept_by_many_at_once(store: Store) -> None:
     assert len(digests) == 1 and [blob.digest for blob in store.blobs()] == list(digests)
 
 
-def test_what_is_kept_is_listed(store: Store) -> None:
+def test_stored_files_are_listed(store: Store) -> None:
     contents = {kept(store, content): len(content) for content in (b"a", b"bb", b"ccc")}
     found = {blob.digest: blob for blob in store.blobs()}
     assert {digest: blob.bytes for digest, blob in found.items()} == contents
@@ -138,7 +138,7 @@ def s3_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]
         yield opened
 
 
-def test_a_file_that_is_named_after_all_is_put_back(s3_store: Store, tmp_path: Path) -> None:
+def test_a_file_aside_with_a_row_is_restored(s3_store: Store, tmp_path: Path) -> None:
     wanted, other = kept(s3_store), kept(s3_store, b"other")
     for digest in (wanted, other):
         assert s3_store.remove(digest, kept_before=time.time() + 3600.0)
@@ -222,7 +222,7 @@ def test_a_copy_in_use_is_not_removed(tmp_path: Path, monkeypatch: pytest.Monkey
         assert remote.copies() == digests
 
 
-def test_what_comes_damaged_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_damaged_download_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with s3_bucket(monkeypatch) as (url, _):
         store = Remote(tmp_path, monkeypatch, url).store
         digest = kept(store)
@@ -235,7 +235,9 @@ def test_what_comes_damaged_is_not_taken(tmp_path: Path, monkeypatch: pytest.Mon
         assert not (tmp_path / "data" / "copies" / digest[:2] / digest).exists()
 
 
-def test_a_server_that_is_away_is_a_passing_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unavailable_server_is_a_transient_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with s3_bucket(monkeypatch) as (url, server):
         store = Remote(tmp_path, monkeypatch, url).store
         digest = kept(store)
@@ -255,6 +257,6 @@ def test_a_server_that_is_away_is_a_passing_failure(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("url", ["http://x/y", "s3://", "file:///etc", "bucket"])
-def test_a_url_that_is_none_is_refused(tmp_path: Path, url: str) -> None:
+def test_an_invalid_url_is_refused(tmp_path: Path, url: str) -> None:
     with pytest.raises(ValidationError):
         Settings(data_dir=tmp_path, store_url=url)

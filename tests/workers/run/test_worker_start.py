@@ -29,9 +29,9 @@ def put_at(catalogue: Catalogue, revision: str | None) -> None:
 @pytest.mark.parametrize(
     ("revision", "said"),
     [
-        ("9999", ("at revision 9999", "not known here", "use the version that made it")),
-        ("0003", ("at revision 0003", "works with revision", "`heliopsf database upgrade`")),
-        (None, ("at no revision", "`heliopsf database upgrade`")),
+        ("9999", ("at revision 9999", "does not know", "use the version that made the database")),
+        ("0003", ("at revision 0003", "expected a database at revision", "`heliopsf database upgrade`")),
+        (None, ("without a revision", "`heliopsf database upgrade`")),
     ],
 )
 def test_what_is_wrong_with_a_revision_and_what_to_do(

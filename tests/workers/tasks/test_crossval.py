@@ -1,4 +1,4 @@
-"""The job cross-validate: shared and exact folds, folds counted in the catalogue, workers that come and go."""
+"""The job cross-validate: shared and exact folds, folds as parts in the catalogue, workers that are lost."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_both_schemes_compare_with_a_fit_without_a_formula(reports: dict[str, An
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Folds that cost nothing: this is about who does them."""
+    """Folds that take no time: these tests are about which worker does them."""
 
     def fold(solution: Any, draw: Any, **_: Any) -> crossval_task.FoldFit:
         curve = tuple(50.0 - k for k in range(7))
@@ -110,7 +110,7 @@ def submit(service: LocalService, transit: Path, seed: int) -> str:
     return str(job["id"])
 
 
-def test_a_worker_killed_half_way_loses_no_fold_and_counts_none_twice(
+def test_a_killed_worker_loses_no_fold_and_no_fold_counts_twice(
     service: LocalService, settings: Settings, transit: Path, quick: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[tuple[int, int]] = []
@@ -185,7 +185,7 @@ def test_another_worker_shares_the_folds(
     catalogue.close()
 
 
-def test_a_part_is_done_once_whoever_tries(settings: Settings) -> None:
+def test_a_part_gets_one_result_from_several_workers(settings: Settings) -> None:
     catalogue = Catalogue(settings.catalogue_url)
     catalogue.upgrade()
     catalogue.parts.open("o", "k" * 64, 2)

@@ -1,4 +1,4 @@
-"""The job gap-diagnose: from an archive of a transit to report, page, picture and a PSF with the answer in the model."""
+"""The job gap-diagnose: from an archive of a transit to a report, page, picture and a corrected PSF."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ def made(service: LocalService, transit: Path, tmp_path_factory: pytest.TempPath
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """What a diagnosis is asked for; the answer is one that was made before."""
+    """The arguments of each diagnosis, whose result is replaced by a prepared one."""
     monkeypatch.setattr(gap_task, "gap_png", lambda found, report: b"\x89PNG")
     return answer_at_once(monkeypatch, small_gaps.found())
 
 
-def test_the_answer_and_its_size_are_found_and_what_it_was_made_of_is_told(made: dict[str, Any]) -> None:
+def test_the_report_names_the_effect_its_size_and_the_inputs(made: dict[str, Any]) -> None:
     row, report = made["row"], made["json"]
     assert row["kind"] == "gap" and row["html"] == f"/v1/reports/{row['id']}/page"
     assert report["schema"] == "gap/1" and report["verdict"] == "attributed"
@@ -78,7 +78,7 @@ def test_the_answer_and_its_size_are_found_and_what_it_was_made_of_is_told(made:
     assert report["inputs_sha256"] == small_gaps.with_offset().sha256
 
 
-def test_its_page_and_picture_are_kept(made: dict[str, Any]) -> None:
+def test_the_page_and_the_picture_are_stored(made: dict[str, Any]) -> None:
     html = (made["folder"] / "r.html").read_text("utf-8")
     check_stands_alone(html)
     assert "A light leak" not in html and "The dark level subtracted from every readout is wrong." in html
@@ -106,7 +106,7 @@ def test_the_corrected_psf_is_a_new_draft_that_names_its_parents_effects_and_the
     assert service.ask(psf["id"], "encircled", radius=10.0)
 
 
-def test_the_corrected_psf_is_made_again_and_neither_it_nor_its_report_is_there_twice(
+def test_a_rerun_of_the_corrected_psf_adds_no_second_psf_or_report(
     service: LocalService, transit: Path, asked: list[dict[str, Any]]
 ) -> None:
     def counts() -> list[int]:
@@ -121,7 +121,7 @@ def test_the_corrected_psf_is_made_again_and_neither_it_nor_its_report_is_there_
     assert counts() == [psfs, reports + 1]
 
 
-def test_an_equal_request_is_answered_with_what_is_there(
+def test_an_identical_request_gets_the_existing_report(
     service: LocalService, made: dict[str, Any], transit: Path, asked: list[dict[str, Any]]
 ) -> None:
     again = service.diagnose_gap(transit, seed=3)
@@ -133,7 +133,7 @@ def test_an_equal_request_is_answered_with_what_is_there(
         ) == 1  # type: ignore[arg-type]
 
 
-def test_a_job_that_lost_its_worker_after_the_psf_is_done_again_with_one_result(
+def test_a_job_whose_worker_was_lost_after_the_psf_was_saved_gives_one_result(
     service: LocalService, transit: Path, asked: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save, calls = gap_task._save, []
@@ -151,7 +151,7 @@ def test_a_job_that_lost_its_worker_after_the_psf_is_done_again_with_one_result(
     assert psfs.count(row["details"]["corrected_psf_id"]) == 1
 
 
-def test_a_fitted_psf_is_where_the_fit_starts_and_a_parent_of_the_next(
+def test_a_given_psf_is_the_start_of_the_fit_and_a_parent_of_the_corrected_psf(
     service: LocalService, made: dict[str, Any], transit: Path, asked: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     parent = made["row"]["details"]["corrected_psf_id"]
@@ -167,7 +167,7 @@ def test_a_fitted_psf_is_where_the_fit_starts_and_a_parent_of_the_next(
     assert started == {"name": "hri_euv-gap-corrected", "version": f"0.1.0+{parent[:8]}", "id": parent}
 
 
-def test_no_psf_is_made_where_none_is_wanted(
+def test_no_corrected_psf_is_made_without_a_request(
     service: LocalService, transit: Path, asked: list[dict[str, Any]]
 ) -> None:
     before = len(service._catalogue.page(PsfRow, owner=DEFAULT_OWNER, limit=100))
@@ -205,19 +205,19 @@ def test_an_operator_s_effects_are_tried_and_hashed(
 def test_a_worker_runs_its_own_operator_s_effects_and_no_others(
     transit: Path, asked: list[dict[str, Any]], tmp_path: Path
 ) -> None:
-    """A job that was taken with effects which the worker was not started with."""
+    """A job was submitted with added effects that the worker does not have."""
     (tmp_path / "mine.py").write_text("raise SystemExit('code that a job named was run')")
     taken = service_in(tmp_path / "data", str(tmp_path / "mine.py"))
     job = taken.submit("gap-diagnose", transit_id=taken.upload_transit(transit)["id"])
     taken.close()
     worker = service_in(tmp_path / "data")
-    with pytest.raises(ServiceError, match="this worker adds none: submit the job again") as caught:
+    with pytest.raises(ServiceError, match="this worker has none: submit the job again") as caught:
         worker.wait(job)
     assert caught.value.code == "effects-changed" and asked == []
     worker.close()
 
 
-def test_effects_whose_text_was_changed_are_another_diagnosis_and_refused_by_an_earlier_job(
+def test_changed_effect_files_make_another_diagnosis_and_an_earlier_job_refuses_them(
     transit: Path, asked: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     mine = tmp_path / "mine.py"
@@ -229,7 +229,9 @@ def test_effects_whose_text_was_changed_are_another_diagnosis_and_refused_by_an_
     assert local.diagnose_gap(transit, correct=False)["id"] != first["id"] and len(asked) == 2
     waiting = local.submit("gap-diagnose", transit_id=local.upload_transit(transit)["id"])
     mine.write_text(EDGE_GLOW.replace("5.0", "7.0"))
-    with pytest.raises(ServiceError, match="or were changed since: submit the job again") as caught:
+    with pytest.raises(
+        ServiceError, match=r"expected added effects whose files have the hashes .*: submit the job again"
+    ) as caught:
         local.wait(waiting)
     assert caught.value.code == "effects-changed" and len(asked) == 2
     mine.unlink()
@@ -239,7 +241,7 @@ def test_effects_whose_text_was_changed_are_another_diagnosis_and_refused_by_an_
     local.close()
 
 
-def test_a_diagnosis_stands_where_the_psf_of_its_answer_cannot_be_made(
+def test_a_diagnosis_is_valid_without_its_corrected_psf(
     transit: Path, asked: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def cannot(*_: object, **__: object) -> None:
@@ -255,7 +257,7 @@ def test_a_diagnosis_stands_where_the_psf_of_its_answer_cannot_be_made(
     local.close()
 
 
-def test_diagnoses_of_other_parameters_are_others() -> None:
+def test_other_parameters_make_another_diagnosis() -> None:
     first = ResolvedGapDiagnose(transit_id="a" * 64)
     others: tuple[dict[str, Any], ...] = (
         {"seed": 2},

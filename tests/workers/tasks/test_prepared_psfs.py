@@ -1,4 +1,4 @@
-"""PSFs that a process prepared: once for the images that follow, the same figures, within bounds."""
+"""The cache of prepared PSFs: made once, equal to uncached ones, bounded in size."""
 
 from __future__ import annotations
 
@@ -21,9 +21,7 @@ LIMITS = FitsLimits(max_pixels=512 * 512)
 SHAPE = (96, 128)
 
 
-def test_a_psf_is_read_once_and_is_what_it_would_be_otherwise(
-    psf_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_psf_is_read_once_and_equals_the_file(psf_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = PreparedPsfs(2**30)
     first = prepared.on_pixels_of(Header(), psf_file, LIMITS)
     monkeypatch.delattr(prepared_psfs, "read_psf")
@@ -57,7 +55,7 @@ def test_an_engine_is_made_once_for_a_psf_and_a_shape(psf_file: Path) -> None:
     assert len({id(one) for one in (engine, *others)}) == 4
 
 
-def test_the_least_recently_used_are_forgotten_and_the_last_never(psf_file: Path) -> None:
+def test_the_least_recently_used_are_removed_but_never_the_last(psf_file: Path) -> None:
     psf = read_psf(psf_file, LIMITS, parts=False)
     size = new_engine(psf, SHAPE, SHAPE, 1).nbytes
     assert size > 2 * 4 * SHAPE[0] * SHAPE[1]
@@ -72,7 +70,7 @@ def test_the_least_recently_used_are_forgotten_and_the_last_never(psf_file: Path
     assert tiny.engine_for(psf, SHAPE, SHAPE, 1) is only
 
 
-def test_jobs_share_what_was_prepared(
+def test_jobs_share_prepared_psfs(
     local: LocalService, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[object] = []

@@ -87,7 +87,7 @@ def test_the_product_says_what_it_was_made_of(fitted: dict[str, Any], transit: P
     assert (fitted["folder"] / "p.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_its_covariance_makes_psfs_that_spread_as_the_curve_says(fitted: dict[str, Any]) -> None:
+def test_psfs_sampled_from_the_covariance_spread_as_the_band_of_the_curve(fitted: dict[str, Any]) -> None:
     psf = read_psf(fitted["folder"] / "psf.fits", LIMITS)
     assert psf.fitted is not None and psf.fitted.parameters == ("b_px", "c", "total")
     radii = np.array([2.0, 20.0, 100.0])
@@ -98,7 +98,7 @@ def test_its_covariance_makes_psfs_that_spread_as_the_curve_says(fitted: dict[st
     assert curves.std(axis=0) == pytest.approx([sigma[r] for r in radii], rel=0.15)
 
 
-def test_progress_counts_the_whole_and_never_goes_back(fitted: dict[str, Any]) -> None:
+def test_progress_never_decreases(fitted: dict[str, Any]) -> None:
     shares = [
         step / steps for stage, step, steps in fitted["told"] if stage not in ("reading", "building the PSF")
     ]
@@ -107,7 +107,7 @@ def test_progress_counts_the_whole_and_never_goes_back(fitted: dict[str, Any]) -
     assert min(shares) >= 0 and max(shares) <= 1
 
 
-def test_an_equal_request_is_answered_with_the_psf_that_is_there(
+def test_an_identical_request_gets_the_existing_psf(
     service: LocalService, fitted: dict[str, Any], transit: Path
 ) -> None:
     again = service.fit_psf(transit)
@@ -115,7 +115,7 @@ def test_an_equal_request_is_answered_with_the_psf_that_is_there(
 
 
 @pytest.mark.slow
-def test_a_fit_made_again_is_the_same_bit_for_bit(service: LocalService, fitted: dict[str, Any]) -> None:
+def test_a_rerun_of_a_fit_is_the_same_bit_for_bit(service: LocalService, fitted: dict[str, Any]) -> None:
     psf_id = fitted["psf"]["id"]
     report = service.get(service.wait(service.submit("rerun", of="psf", id=psf_id))["result"])
     assert report["details"]["same"] is True, report["details"]["sentence"]
@@ -149,7 +149,7 @@ def images_of(transit: Path) -> list[dict[str, Any]]:
     return images
 
 
-def test_no_occulter_where_it_should_be(service: LocalService, transit: Path, tmp_path: Path) -> None:
+def test_images_without_an_occulter_are_refused(service: LocalService, transit: Path, tmp_path: Path) -> None:
     elsewhere = [image | {"x": 64.0, "y": 110.0} for image in images_of(transit)]
     with pytest.raises(ServiceError) as caught:
         service.fit_psf(changed(transit, tmp_path / "t", images=elsewhere))
@@ -157,7 +157,9 @@ def test_no_occulter_where_it_should_be(service: LocalService, transit: Path, tm
 
 
 @pytest.mark.slow
-def test_one_pointing_alone_is_a_stated_limit(service: LocalService, transit: Path, tmp_path: Path) -> None:
+def test_a_transit_of_one_pointing_states_a_limit(
+    service: LocalService, transit: Path, tmp_path: Path
+) -> None:
     two = [image for image in images_of(transit) if image["fov"] < 3]
     psf = service.fit_psf(changed(transit, tmp_path / "t", images=two))
     assert any(limit.startswith("2 pointings") for limit in psf["details"]["fit"]["limits"])
@@ -182,7 +184,9 @@ def test_a_known_psf_of_the_wrong_kind(service: LocalService, transit: Path, tmp
     assert caught.value.code == "too-small" or (caught.value.code or "").startswith("known-psf-")
 
 
-def test_an_archive_that_climbs_or_lacks_a_file(service: LocalService, transit: Path, tmp_path: Path) -> None:
+def test_an_archive_with_paths_outside_or_a_missing_file_is_refused(
+    service: LocalService, transit: Path, tmp_path: Path
+) -> None:
     climbs, lacks = tmp_path / "climbs.zip", tmp_path / "lacks.zip"
     with zipfile.ZipFile(climbs, "w") as archive:
         archive.write(transit / "transit.json", "transit.json")
@@ -195,7 +199,7 @@ def test_an_archive_that_climbs_or_lacks_a_file(service: LocalService, transit: 
         assert getattr(caught.value, "code", None) == code
 
 
-def test_noise_figures_must_come_from_somewhere(service: LocalService, transit: Path, tmp_path: Path) -> None:
+def test_a_fit_needs_noise_figures(service: LocalService, transit: Path, tmp_path: Path) -> None:
     folder = changed(transit, tmp_path / "t", noise=None)
     with pytest.raises(Exception) as caught:
         service.fit_psf(folder)

@@ -95,14 +95,14 @@ def test_its_page_stands_alone_and_shows_every_image(made: dict[str, Any]) -> No
     assert (made["folder"] / "r.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_an_equal_request_is_answered_with_the_report_that_is_there(
+def test_an_identical_request_gets_the_existing_report(
     service: LocalService, made: dict[str, Any], transit: Path
 ) -> None:
     again = service.evaluate(transit, seed=3, dark_offsets=False)
     assert again["id"] == made["row"]["id"] and again["created_at"] == made["row"]["created_at"]
 
 
-def test_a_given_psf_is_judged_without_a_fit(
+def test_a_given_psf_is_evaluated_without_a_fit(
     service: LocalService, transit: Path, true_psf: Path, tmp_path: Path
 ) -> None:
     psf_id = service.upload_psf(true_psf)["id"]
@@ -135,7 +135,7 @@ def test_a_given_psf_needs_no_diffraction(
     assert getattr(caught.value, "code", None) == "no-known-psf"
 
 
-def test_what_is_wrong_with_a_request(service: LocalService, transit: Path, tmp_path: Path) -> None:
+def test_invalid_requests_are_refused(service: LocalService, transit: Path, tmp_path: Path) -> None:
     with pytest.raises(Exception) as caught:
         service.evaluate(transit, psf_id="0" * 64)
     assert getattr(caught.value, "code", None) == "no-such-psf"

@@ -1,4 +1,4 @@
-"""Where things came from, and whether they come out the same when they are made again."""
+"""Lineages and reruns of products and PSFs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.contract.identities import instrument_text
 from workers.lineage import Ancestor, made_by
-from workers.tasks import deconvolve as deconvolve_task
+from workers.tasks import product as product_task
 
 ON_TRANSIT = {"transit_id": "1" * 64, "seed": 5}
 LIMITS = FitsLimits(max_pixels=2**24)
@@ -66,7 +66,7 @@ def test_a_product_made_again_is_the_same_bit_for_bit_and_changes_nothing(
     assert len(local._catalogue.page(ProductRow, owner=OWNER, limit=10)) == 1
 
 
-def test_every_rerun_is_one_of_its_own(local: LocalService, made: dict[str, Any], tmp_path: Path) -> None:
+def test_every_rerun_is_a_job_of_its_own(local: LocalService, made: dict[str, Any], tmp_path: Path) -> None:
     first, _ = again(local, "product", made["id"], tmp_path / "1.json")
     second, _ = again(local, "product", made["id"], tmp_path / "2.json")
     assert first["id"] != second["id"]
@@ -74,10 +74,10 @@ def test_every_rerun_is_one_of_its_own(local: LocalService, made: dict[str, Any]
     assert [row.id for row in reports] == [second["id"], first["id"]]
 
 
-def test_software_that_went_astray_is_found_out(
+def test_a_rerun_finds_software_that_gives_other_values(
     local: LocalService, made: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = deconvolve_task.write_image
+    real = product_task.write_image
     first = read_plane(tmp_path / "first.fits", LIMITS)
 
     def off(path: Path, image: Any, **how: Any) -> None:
@@ -85,12 +85,12 @@ def test_software_that_went_astray_is_found_out(
         pixels[5, 7] += 0.25 * np.nanmax(first)
         real(path, type(image)(**{**vars(image), "pixels": pixels}), **how)
 
-    monkeypatch.setattr(deconvolve_task, "write_image", off)
+    monkeypatch.setattr(product_task, "write_image", off)
     row, report = again(local, "product", made["id"], tmp_path / "r.json")
     assert row["details"]["same"] is False and row["details"]["same_file"] is False
     assert report["arrays"]["IMAGE"]["largest_relative"] == pytest.approx(0.25, rel=1e-5)
     assert report["arrays"]["IMAGE"]["values_that_differ"] == 1 and report["arrays"]["ERROR"]["same"]
-    assert "by 0.25 of the largest value at most, in IMAGE" in report["sentence"]
+    assert "by at most 0.25 of the largest value, in IMAGE" in report["sentence"]
     assert report["first"]["file_sha256"] != report["again"]["file_sha256"]
     local.download(f"/v1/products/{made['id']}/file", tmp_path / "kept.fits")
     assert (tmp_path / "kept.fits").read_bytes() == (tmp_path / "first.fits").read_bytes()
@@ -115,7 +115,7 @@ def test_a_product_made_before_parameters_were_written_down_is_made_again_from_i
     assert caught.value.code == "parameters-unknown"
 
 
-def test_what_was_uploaded_or_is_not_there_is_not_made_again(local: LocalService, psf_file: Path) -> None:
+def test_uploaded_and_unknown_psfs_cannot_be_rerun(local: LocalService, psf_file: Path) -> None:
     psf_id = local.upload_psf(psf_file)["id"]
     for of, named, code in (
         ("psf", psf_id, "not-made-here"),
@@ -127,7 +127,7 @@ def test_what_was_uploaded_or_is_not_there_is_not_made_again(local: LocalService
         assert caught.value.code == code
 
 
-def test_a_psf_built_with_a_mask_is_made_again_and_tells_where_it_is_from(
+def test_a_psf_built_with_a_mask_can_be_rerun_and_its_lineage_names_the_mask(
     local: LocalService, tmp_path: Path
 ) -> None:
     file, mask = tmp_path / "small.toml", tmp_path / "mask.fits"
@@ -150,7 +150,7 @@ def test_a_psf_built_with_a_mask_is_made_again_and_tells_where_it_is_from(
     ]
 
 
-def test_a_shipped_instrument_that_changed_since_is_made_again_as_it_was(
+def test_a_rerun_uses_the_instrument_file_of_the_first_run(
     local: LocalService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its text is in the PSF's file; that of today is not asked."""
@@ -211,7 +211,7 @@ def test_a_product_s_lineage_goes_back_to_what_was_uploaded(catalogue: Catalogue
     assert top.parents[3].cut and top.parents[3].parents == [], "told above"
 
 
-def test_a_lineage_is_bounded_and_needs_no_end(catalogue: Catalogue) -> None:
+def test_a_circular_lineage_is_cut(catalogue: Catalogue) -> None:
     """Rows that name each other as parents cannot come to be; if they did, telling of them would end."""
     for name, other in (("egg", "hen"), ("hen", "egg")):
         catalogue.add(psf(name, origin="fitted", details={"parents": {"psf": identity(other)}}))
@@ -259,14 +259,14 @@ def test_the_job_that_made_a_psf(catalogue: Catalogue, values: dict[str, Any], k
     )
 
 
-def test_parameters_that_are_taken_no_more_say_so(catalogue: Catalogue) -> None:
+def test_parameters_that_are_no_longer_valid_are_refused(catalogue: Catalogue) -> None:
     row, _ = catalogue.add(product("x", "p", details={"parameters": {"image_id": "no id"}}))
     with pytest.raises(DataError, match="made with others: image_id") as caught:
         made_by(catalogue, row)
     assert caught.value.code == "parameters-outdated"
 
 
-def test_another_owner_s_job_is_not_read(catalogue: Catalogue) -> None:
+def test_the_job_of_another_owner_is_not_read(catalogue: Catalogue) -> None:
     job, _ = catalogue.jobs.submit("deconvolve", {"secret": 1}, "k", "somebody")
     lease = catalogue.jobs.claim(job.id, "w")
     row, _ = catalogue.add(product("x", "p", details={"job_id": job.id}))

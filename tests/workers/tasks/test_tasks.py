@@ -1,4 +1,4 @@
-"""Tasks as functions on a temporary store: what goes in comes out right, and what is wrong says so."""
+"""Tasks as functions on a temporary store: right results and clear errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from workers.settings import Settings
 from workers.tasks import deconvolve as deconvolve_task
 
 
-def test_a_product_names_what_made_it_and_keeps_the_frame(
+def test_a_product_names_its_inputs_and_keeps_the_header(
     local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
 ) -> None:
     psf = local.upload_psf(psf_file)
@@ -53,7 +53,7 @@ def test_progress_comes_step_by_step(local: LocalService, image_file: Path, psf_
     assert [at for at in seen if at[0] == "deconvolving"] == [("deconvolving", n, 4) for n in (1, 2, 3, 4)]
 
 
-def test_an_equal_request_is_not_computed_again(
+def test_an_identical_request_is_not_computed_again(
     local: LocalService, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     psf_id = local.upload_psf(psf_file)["id"]
@@ -63,7 +63,7 @@ def test_an_equal_request_is_not_computed_again(
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_worker_of_one_thread_takes_no_second_one_for_the_picture(
+def test_a_worker_with_one_thread_draws_in_that_thread(
     settings: Settings, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
     """A second would take the time of the worker next to it."""
@@ -78,12 +78,12 @@ def test_a_worker_of_one_thread_takes_no_second_one_for_the_picture(
 
         monkeypatch.setattr(deconvolve_task, name, wrapped)
 
-    noted("_preview")
+    noted("save_preview")
     noted("effects")
     local = LocalService(settings.model_copy(update={"worker_threads": threads}))
     local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"])
     local.close()
-    assert (of_threads["_preview"] == of_threads["effects"]) == (threads == 1)
+    assert (of_threads["save_preview"] == of_threads["effects"]) == (threads == 1)
 
 
 def test_a_job_redelivered_after_its_end_does_nothing(
@@ -120,7 +120,7 @@ def test_a_psf_that_sums_to_three_is_the_users_error(
         local.deconvolve(image_file, psf_id=psf_id)
 
 
-def test_a_built_psf_carries_where_it_came_from(local: LocalService, tmp_path: Path) -> None:
+def test_a_built_psf_carries_its_provenance(local: LocalService, tmp_path: Path) -> None:
     file = tmp_path / "small.toml"
     file.write_text(SMALL_INSTRUMENT)
     psf = local.build_psf(file, tmp_path / "psf.fits", size=256, preview=tmp_path / "psf.png")
@@ -157,7 +157,7 @@ def test_a_cancelled_job_stops_at_its_next_step(
     assert catalogue.page(ProductRow, owner=DEFAULT_OWNER, limit=1) == []
 
 
-def test_a_passing_failure_is_tried_again_and_then_given_up(
+def test_a_transient_failure_is_retried_a_limited_number_of_times(
     local: LocalService, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def away(*_: object) -> str:
@@ -176,7 +176,7 @@ def test_a_passing_failure_is_tried_again_and_then_given_up(
     assert row.error is not None and row.error["fault"] == "transient"
 
 
-def test_our_own_failure_is_internal_and_is_logged(
+def test_an_unexpected_exception_is_an_internal_error_and_is_logged(
     local: LocalService, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken(*_: object) -> str:
@@ -207,7 +207,7 @@ def test_the_contract_holds_the_methods_that_psfcore_has() -> None:
     assert sorted(METHODS) == method_names()
 
 
-def test_errors_are_drawn_where_noise_is_known(
+def test_error_planes_need_known_noise(
     local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
 ) -> None:
     psf_id = local.upload_psf(psf_file)["id"]

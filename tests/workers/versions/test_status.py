@@ -1,4 +1,4 @@
-"""What a PSF may become, how versions are numbered, and ranges of times: the rules, without a database."""
+"""Changes of status, version numbers and ranges of times, without a database."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import product
 import pytest
 
 from psfcore.errors import DataError
-from workers.versions.series import channel_of, line_of, word
+from workers.versions.series import channel_of, series_of, word
 from workers.versions.status import MAY_BECOME, PsfStatus, check_transition, check_version, next_version
 from workers.versions.validity import Validity, iso, seconds
 
@@ -22,11 +22,11 @@ ALLOWED = {
 
 
 @pytest.mark.parametrize(("before", "after"), list(product(PsfStatus, PsfStatus)))
-def test_the_machine(before: PsfStatus, after: PsfStatus) -> None:
+def test_allowed_and_refused_changes_of_status(before: PsfStatus, after: PsfStatus) -> None:
     if (before, after) in ALLOWED:
         check_transition(before, after)
         return
-    with pytest.raises(DataError, match=f"a {before} PSF may become .*; got {after}") as caught:
+    with pytest.raises(DataError, match=f"expected status .* for a {before} PSF; got {after}") as caught:
         check_transition(before, after)
     assert caught.value.code == "wrong-transition"
     assert all(state in caught.value.message for state in MAY_BECOME[before])
@@ -60,8 +60,8 @@ def test_the_next_version_is_after_the_highest_by_number(released: list[str], fo
         ("1.0.0", "version-taken"),
     ],
 )
-def test_versions_that_cannot_be_given_are_refused_with_one_that_can(version: str | None, code: str) -> None:
-    with pytest.raises(DataError, match=r"the next one free is 1\.1\.0") as caught:
+def test_invalid_versions_are_refused_and_a_free_one_is_named(version: str | None, code: str) -> None:
+    with pytest.raises(DataError, match=r"the next free version is 1\.1\.0") as caught:
         check_version(version, ["1.0.0"])
     assert caught.value.code == code
 
@@ -76,7 +76,7 @@ def test_versions_that_cannot_be_given_are_refused_with_one_that_can(version: st
         ("1969-12-31T23:59:59Z", -1.0),
     ],
 )
-def test_times(text: str, at: float) -> None:
+def test_times_are_read_and_written(text: str, at: float) -> None:
     assert seconds(text) == at
     told = iso(at)
     assert told is not None and told.endswith("Z") and seconds(told) == at
@@ -85,8 +85,8 @@ def test_times(text: str, at: float) -> None:
 @pytest.mark.parametrize(
     "text", ["2024", "5", "now", "2024-13-01", "2024-01-01 12:00", "2024-01-01T25:00", "", "1e9"]
 )
-def test_what_is_no_time(text: str) -> None:
-    with pytest.raises(DataError, match="expected a time as") as caught:
+def test_invalid_times_are_refused(text: str) -> None:
+    with pytest.raises(DataError, match="expected a time such as") as caught:
         seconds(text)
     assert caught.value.code == "bad-time"
 
@@ -116,16 +116,16 @@ def test_ranges_are_half_open(
 
 
 @pytest.mark.parametrize(("start", "end"), [(B, A), (A, A)])
-def test_a_range_that_holds_nothing(start: str, end: str) -> None:
+def test_an_empty_range_is_refused(start: str, end: str) -> None:
     with pytest.raises(DataError, match="expected valid_from before valid_to") as caught:
         Validity.of(start, end)
     assert caught.value.code == "empty-range"
 
 
-def test_lines_and_their_names() -> None:
-    assert line_of("hri_euv", "174", "total") == "hri_euv/174/total"
-    assert line_of("mine", None, "total") == "mine/-/total"
-    assert line_of(None, "174", "total") is None
+def test_series_and_their_names() -> None:
+    assert series_of("hri_euv", "174", "total") == "hri_euv/174/total"
+    assert series_of("mine", None, "total") == "mine/-/total"
+    assert series_of(None, "174", "total") is None
     assert (channel_of("aia_3", 193.0), channel_of("hri_euv", None), channel_of("mine", None)) == (
         "193",
         "174",

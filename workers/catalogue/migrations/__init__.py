@@ -1,1 +1,1 @@
-"""Revisions of the catalogue's tables, run by alembic; ``workers.catalogue.schema`` says when."""
+"""Revisions of the catalogue's tables. ``workers.catalogue.schema`` runs them through alembic."""

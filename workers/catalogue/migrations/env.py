@@ -1,4 +1,4 @@
-"""Alembic's environment: revisions run on the connection, and in the transaction, of who asks for them."""
+"""Alembic's environment: revisions run on the connection and in the transaction of the caller."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from workers.catalogue.tables import Base
 context.configure(
     connection=context.config.attributes["connection"],
     target_metadata=Base.metadata,
-    transactional_ddl=True,  # SQLite's is too, where BEGIN is said as workers.catalogue.database says it
+    transactional_ddl=True,  # also on SQLite, because workers.catalogue.database sends BEGIN itself
 )
 with context.begin_transaction():
     context.run_migrations()

@@ -1,4 +1,4 @@
-"""A bulk whose request was sent again, and one that is cancelled while it looks for files."""
+"""A bulk run whose request is sent again, and one that is cancelled while it lists files."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def turns(catalogue: Catalogue, settings: Settings) -> None:
             runner.run(turn.id)
 
 
-def test_what_failed_is_tried_again_once_the_equal_bulk_has_ended(
+def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
     api: TestClient,
     archive: Path,
     psf_file: Path,
@@ -114,7 +114,7 @@ def test_what_failed_is_tried_again_once_the_equal_bulk_has_ended(
     assert line == failed["path-not-utf-8"], "its reason stays: there is no path to try again"
 
 
-def test_a_bulk_that_finds_no_file_is_cancelled_while_it_looks(
+def test_a_run_can_be_cancelled_while_it_lists_and_finds_no_file(
     api: TestClient,
     archive: Path,
     psf_file: Path,
@@ -124,6 +124,8 @@ def test_a_bulk_that_finds_no_file_is_cancelled_while_it_looks(
 ) -> None:
     monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
     monkeypatch.setattr("workers.bulk.task.TELL_EVERY_S", 0.0)
+    monkeypatch.setattr("workers.run.runner.REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr("workers.bulk.listing.TELL_EVERY_S", 0.0)
     psf_id = upload(api, psf_file, "/v1/psfs")
     request = {"files": [{"glob": f"{archive}/**/*.none"}], "psf_id": psf_id, "parameters": FEW}
     bulk = api.post("/v1/bulk", json=request).json()

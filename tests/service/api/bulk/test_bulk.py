@@ -1,4 +1,4 @@
-"""Bulk over HTTP, its turns run in this process: from uploads and from an archive, into the service and into a folder."""
+"""Bulk runs over HTTP, with turns in this process: from uploads and an archive, into the service and a folder."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_uploads_become_products_and_a_manifest(
         file = api.get(line["file"]).content
         assert hashlib.sha256(file).hexdigest() == line["sha256"] and len(file) == line["bytes"]
         product = api.get(f"/v1/products/{line['product_id']}").json()
-        assert line["score"] == product["details"]["effects"]["artefacts"]["score"]
+        assert line["score"] == product["details"]["changes"]["artefacts"]["score"]
         assert line["flux_change_pct"] == product["details"]["flux_change_pct"]
         assert product["details"]["job_id"] == bulk["id"]
         assert line["psf_id"] == psf_id and line["seconds"] >= line["kernel_seconds"] > 0
@@ -156,7 +156,7 @@ def test_files_are_found_by_pattern_and_header(
     assert failed["error"]["fault"] == "user"
 
 
-def test_a_product_that_is_there_is_not_made_again(
+def test_an_existing_product_is_not_made_again(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = [{"glob": f"{archive}/*/image*.fits"}]
@@ -197,7 +197,7 @@ def test_products_in_a_folder_beside_the_service(
     assert [path.name for path in written.parent.iterdir()] == [written.name], "nothing half-written is left"
 
 
-def test_an_output_folder_that_cannot_be_written_to_is_told_before_the_work(
+def test_an_unwritable_output_folder_fails_before_the_deconvolution(
     api: TestClient,
     archive: Path,
     psf_id: str,
@@ -220,10 +220,12 @@ def test_an_output_folder_that_cannot_be_written_to_is_told_before_the_work(
         work()
         (failed,) = api.get(bulk["failures"]).json()["items"]
         assert failed["error"]["code"] == "output-not-written"
-        assert failed["error"]["message"] == f"expected an output folder that can be written to: {reason}"
+        assert failed["error"]["message"].endswith(
+            f"that the service can write to; the system says: {reason}"
+        )
 
 
-def test_products_in_a_folder_alone(
+def test_products_only_in_a_folder(
     api: TestClient,
     archive: Path,
     psf_id: str,
@@ -261,7 +263,7 @@ def test_products_in_a_folder_alone(
 
 
 @pytest.mark.parametrize("job_ends", [True, False])
-def test_an_image_that_a_job_is_at_is_waited_for(
+def test_a_run_waits_for_a_job_that_is_computing_the_image(
     api: TestClient,
     archive: Path,
     psf_id: str,
@@ -304,7 +306,7 @@ def test_an_image_that_a_job_is_at_is_waited_for(
     catalogue.close()
 
 
-def test_what_fails_is_apart_and_tried_again(
+def test_failed_images_are_listed_and_retried(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], tmp_path: Path
 ) -> None:
     good, bad = archive / "2020" / "image 0.fits", archive / "2024" / "image 4.fits"
@@ -322,17 +324,17 @@ def test_what_fails_is_apart_and_tried_again(
     assert (bulk["images"]["done"], bulk["images"]["failed"], bulk["phase"]) == (2, 0, "COMPLETED")
 
 
-def test_an_error_of_ours_stops_one_image_and_not_the_bulk(
+def test_an_internal_error_stops_one_image_and_not_the_run(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = bulk_image.treat
+    real = bulk_image.deconvolve_one
 
     def breaks(context: Any, bulk: Any, request: Any, taken: Any) -> Any:
         if taken.position == 1:
             raise ZeroDivisionError("secret place")
         return real(context, bulk, request, taken)
 
-    monkeypatch.setattr("workers.bulk.task.treat", breaks)
+    monkeypatch.setattr("workers.bulk.task.deconvolve_one", breaks)
     bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
     work()
     bulk = seen(api, bulk)
@@ -341,7 +343,7 @@ def test_an_error_of_ours_stops_one_image_and_not_the_bulk(
     assert failed["error"]["code"] == "internal-error" and "secret" not in json.dumps(failed)
 
 
-def test_the_most_doubtful_first_and_as_a_table(
+def test_results_by_artefact_score_and_as_csv(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None]
 ) -> None:
     bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
@@ -360,7 +362,7 @@ def test_the_most_doubtful_first_and_as_a_table(
     ]
 
 
-def test_paused_it_begins_nothing_and_resumed_it_goes_on(
+def test_a_paused_run_begins_no_image_until_it_is_resumed(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None]
 ) -> None:
     bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
@@ -375,7 +377,7 @@ def test_paused_it_begins_nothing_and_resumed_it_goes_on(
     assert api.post(f"{here}/resume").status_code == api.post(f"{here}/cancel").status_code == 409
 
 
-def test_cancelled_it_stops_at_the_next_step_that_it_tells_of(
+def test_a_cancelled_run_stops_at_the_next_reported_step(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steps: list[int] = []
@@ -409,7 +411,7 @@ def test_cancelled_it_stops_at_the_next_step_that_it_tells_of(
     assert api.post(f"/v1/bulk/{bulk['id']}/retry").status_code == 409
 
 
-def test_files_that_are_nowhere_stop_the_bulk_with_the_reason(
+def test_patterns_without_files_stop_the_run_with_the_reason(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None]
 ) -> None:
     bulk = asked(api, files=[{"glob": f"{archive}/**/*.nothing"}], psf_id=psf_id)
@@ -467,7 +469,7 @@ def test_a_context_pins_the_psf_of_each_image(
         ({"images": ["a" * 64] * 100_001, "psf_id": "{psf}"}, 422, "invalid-request"),
     ],
 )
-def test_what_is_refused(
+def test_invalid_requests_are_refused(
     api: TestClient, archive: Path, psf_id: str, request_: dict[str, Any], status: int, code: str
 ) -> None:
     body = json.dumps(request_).replace("{psf}", psf_id).replace("{root}", str(archive))
@@ -476,7 +478,7 @@ def test_what_is_refused(
     assert api.get("/v1/bulk").json()["items"] == []
 
 
-def test_a_link_that_is_put_there_later_is_not_followed(
+def test_a_link_made_after_the_listing_is_not_followed(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], tmp_path: Path
 ) -> None:
     bulk = asked(api, files=[{"glob": f"{archive}/2020/image*"}], psf_id=psf_id)
@@ -501,7 +503,7 @@ def test_a_link_that_is_put_there_later_is_not_followed(
     assert failed["error"]["code"] == "path-not-allowed"
 
 
-def test_a_bulk_is_its_owner_s_and_takes_a_key_for_bulk(settings: Settings, psf_file: Path) -> None:
+def test_a_run_belongs_to_its_owner_and_needs_the_scope_bulk(settings: Settings, psf_file: Path) -> None:
     with keyed(settings) as service:
         mine, other = service.client("mine"), service.client("other")
         psf_id = upload(mine, psf_file, "/v1/psfs")
@@ -542,12 +544,12 @@ def test_the_turns_of_a_bulk_are_jobs_like_others_while_they_last(
     assert api.get("/v1/jobs").json()["items"] == [], "what ended has nothing to say"
 
 
-def test_a_turn_that_fails_for_a_reason_of_its_own_stops_the_bulk_with_it(
+def test_a_turn_that_fails_itself_stops_the_run(
     api: TestClient, archive: Path, psf_id: str, settings: Settings, work: Callable[[], None]
 ) -> None:
     bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("workers.bulk.task._list", lambda *_: 1 / 0)
+        patched.setattr("workers.bulk.task.list_files", lambda *_: 1 / 0)
         work()
     stopped = seen(api, bulk)
     assert stopped["phase"] == "ERROR" and stopped["error"]["code"] == "internal-error"

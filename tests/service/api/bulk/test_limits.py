@@ -1,4 +1,4 @@
-"""Limits of an operator's before an image of a bulk is worked on: those of single jobs, to the letter."""
+"""The operator's limits hold for each image of a bulk run exactly as for a single job."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from tests.conftest import write_image
 from tests.service.conftest import upload
+from workers.bulk import listing
 from workers.bulk import task as bulk_task
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
@@ -32,7 +33,7 @@ FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
     ("limit", "code"),
     [({"max_job_memory_mib": 420}, "too-much-memory"), ({"max_job_s": 60.0}, "too-much-time")],
 )
-def test_an_image_over_a_limit_is_put_apart_as_a_single_job_is_refused(
+def test_an_image_over_a_limit_fails_like_a_single_job(
     settings: Settings,
     tmp_path: Path,
     psf_file: Path,
@@ -85,7 +86,7 @@ def test_an_image_over_a_limit_is_put_apart_as_a_single_job_is_refused(
         assert worked_on == [(96, 128), (96, 128)]
 
 
-def test_an_image_that_takes_too_long_is_put_apart_and_a_turn_may_last_longer(
+def test_an_image_that_takes_too_long_fails_but_a_turn_may_last_longer(
     settings: Settings, tmp_path: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limited = settings.model_copy(update={"max_job_s": 30.0})
@@ -118,7 +119,7 @@ def test_an_image_that_takes_too_long_is_put_apart_and_a_turn_may_last_longer(
         assert failed["error"]["fault"] == "user" and "30 s" in failed["error"]["message"]
 
 
-def test_looking_for_files_is_stopped_where_it_takes_too_long_though_it_finds_none(
+def test_a_listing_that_takes_too_long_is_stopped_even_if_it_finds_no_file(
     settings: Settings, tmp_path: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     archive = tmp_path / "archive"
@@ -127,7 +128,7 @@ def test_looking_for_files_is_stopped_where_it_takes_too_long_though_it_finds_no
     limited = settings.model_copy(update={"max_job_s": 30.0, "bulk_roots": str(archive)})
     clock = _Clock()
     monkeypatch.setattr(runner, "time", clock)
-    monkeypatch.setattr(bulk_task, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(listing, "TELL_EVERY_S", 0.0)
     looked: list[Any] = []
     real = os.scandir
 

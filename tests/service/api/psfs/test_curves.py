@@ -1,4 +1,4 @@
-"""What a PSF says, over HTTP, in this process and on the command line: from its tables, with its pixels out of reach."""
+"""Curves and weights of a PSF from its tables, over HTTP, in this process and on the command line."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_a_built_psf_answers_without_its_pixels(served: Served, without_pixels: 
     assert len(profile["radius_px"]) == len(profile["pixels"]) == len(profile["azimuthal_rms_over_mean"])
 
 
-def test_answers_have_etags_that_go_with_the_question(served: Served) -> None:
+def test_etags_depend_on_the_question(served: Served) -> None:
     api, built = served.api, served.psf
     here = f"/v1/psfs/{built['id']}"
     asked = [
@@ -165,7 +165,7 @@ def test_an_uploaded_psf_says_which_job_makes_its_tables(
     )
 
 
-def test_tables_of_weights_that_cannot_be_are_a_users_error(
+def test_invalid_weights_are_a_users_error(
     api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
 ) -> None:
     fits.PrimaryHDU(np.zeros((32, 32), "f4")).writeto(tmp_path / "dark.fits")
@@ -270,7 +270,7 @@ BAD = [
 ]
 
 
-def test_bad_questions(served: Served) -> None:
+def test_invalid_parameters_are_refused(served: Served) -> None:
     api, built = served.api, served.psf
     for question, status, code in BAD:
         answer = api.get(f"/v1/psfs/{built['id']}/{question}")
@@ -298,7 +298,7 @@ def test_psfs_on_other_pixels_are_not_compared(
     assert answer.status_code == 409 and answer.json()["type"].endswith("plate-scale-mismatch")
 
 
-def test_the_client_asks_the_same(served: Served, tmp_path: Path) -> None:
+def test_the_client_gets_the_same_answers(served: Served, tmp_path: Path) -> None:
     api, built = served.api, served.psf
     with Heliopsf("http://testserver", transport=api._transport) as sun:
         curve = sun.psf_curve(built["id"], [0.5, 10])
@@ -320,7 +320,7 @@ def local(tmp_path: Path) -> Iterator[LocalService]:
     service.close()
 
 
-def test_in_this_process_missing_tables_are_made_on_the_way(
+def test_in_this_process_missing_tables_are_made_automatically(
     local: LocalService, psf_file: Path, tmp_path: Path
 ) -> None:
     psf_id = local.upload_psf(psf_file)["id"]

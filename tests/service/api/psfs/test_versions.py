@@ -1,4 +1,4 @@
-"""PSFs in versions over HTTP: certified, looked up, pinned, followed by others; what that means for images and products."""
+"""PSF versions over HTTP: certified, searched, pinned, superseded; consequences for images and products."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SEEN = {"TELESCOP": "SOLO/EUI/HRI_EUV", "DETECTOR": "HRI_EUV", "WAVELNTH": 174.0
 
 @pytest.fixture
 def psfs(api: TestClient, tmp_path: Path) -> list[str]:
-    """Ids of three drafts of one line, uploaded, and of one of another."""
+    """Ids of three drafts of one series, uploaded, and of one of another."""
     ids = []
     for size, channel in ((32, "174"), (48, "174"), (64, "174"), (80, "304")):
         write_psf(tmp_path / f"p{size}.fits", size=size)
@@ -47,7 +47,7 @@ def problem(answer: Response, status: int, code: str) -> str:
     return str(answer.json()["detail"])
 
 
-def test_a_psf_s_life(api: TestClient, psfs: list[str]) -> None:
+def test_a_psf_is_certified_and_deprecated(api: TestClient, psfs: list[str]) -> None:
     first, second, *_ = psfs
     before = api.get(f"/v1/psfs/{first}/status").json()
     assert (before["status"], before["may_become"], before["next_version"]) == (
@@ -55,7 +55,7 @@ def test_a_psf_s_life(api: TestClient, psfs: list[str]) -> None:
         ["certified"],
         "1.0.0",
     )
-    assert before["line"] == "hri_euv/174/total" and before["history"] == []
+    assert before["series"] == "hri_euv/174/total" and before["history"] == []
 
     answer = certify(api, first, "1.0.0", 2020, None, reason="the first good one")
     assert answer.status_code == 200, answer.text
@@ -105,7 +105,9 @@ CHANGES = [
 
 
 @pytest.mark.parametrize(("body", "status", "code"), CHANGES, ids=[json.dumps(c[0])[:60] for c in CHANGES])
-def test_changes_that_cannot_be(api: TestClient, psfs: list[str], body: Any, status: int, code: str) -> None:
+def test_invalid_changes_of_status_are_refused(
+    api: TestClient, psfs: list[str], body: Any, status: int, code: str
+) -> None:
     problem(api.post(f"/v1/psfs/{psfs[0]}/status", json=body), status, code)
     now = api.get(f"/v1/psfs/{psfs[0]}/status").json()
     assert now["status"] == "draft" and now["history"] == []
@@ -120,7 +122,7 @@ def test_a_psf_that_is_not_there(api: TestClient) -> None:
     problem(api.get(f"/v1/images/{'0' * 64}/psf"), 404, "no-such-image")
 
 
-def test_lists_by_what_psfs_are_and_when_they_hold(api: TestClient, psfs: list[str]) -> None:
+def test_lists_by_properties_and_validity(api: TestClient, psfs: list[str]) -> None:
     certify(api, psfs[0], "1.0.0", 2020, 2021)
     certify(api, psfs[1], "1.1.0", 2021, 2022)
     certify(api, psfs[3], "1.0.0", 2020, None)
@@ -155,7 +157,7 @@ def test_lists_by_what_psfs_are_and_when_they_hold(api: TestClient, psfs: list[s
     assert [item["id"] for item in api.get(first["next"]).json()["items"]] == [psfs[0]]
 
 
-def test_the_best_is_one_or_says_why_not(api: TestClient, psfs: list[str]) -> None:
+def test_the_best_psf_is_one_or_the_error_says_why_not(api: TestClient, psfs: list[str]) -> None:
     certify(api, psfs[0], "1.0.0", 2020, 2021)
     certify(api, psfs[1], "1.1.0", 2021, 2022)
     line = {"instrument": "hri_euv", "channel": "174", "kind": "total"}
@@ -185,7 +187,7 @@ def test_contexts_and_the_default(api: TestClient, psfs: list[str]) -> None:
     assert made.status_code == 201
     context = made.json()
     assert context["size"] == 1 and context["pins"][0] == {
-        "line": "hri_euv/174/total",
+        "series": "hri_euv/174/total",
         "valid_from": "2020-01-01T00:00:00Z",
         "valid_to": None,
         "psf_id": psfs[0],
@@ -259,7 +261,7 @@ def test_an_image_is_deconvolved_with_the_psf_of_its_time(
     assert named["psf_id"] == psfs[1] and named["picked_for"] is None
 
 
-def test_products_of_a_psf_that_was_followed_by_another_are_told(
+def test_products_of_a_superseded_psf_are_listed(
     api: TestClient, run_jobs: Callable[[], None], psfs: list[str], tmp_path: Path
 ) -> None:
     old, new, *_ = psfs
@@ -295,7 +297,7 @@ def test_products_of_a_psf_that_was_followed_by_another_are_told(
         assert api.get("/v1/affected", params={"cursor": cursor}).status_code == 422, place
 
 
-def test_lineage_and_rerun_of_what_was_built_here(
+def test_lineage_and_rerun_of_a_built_psf(
     api: TestClient, run_jobs: Callable[[], None], image_file: Path
 ) -> None:
     build = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 64}}
@@ -341,7 +343,9 @@ def test_an_upload_is_not_made_again(api: TestClient, psfs: list[str]) -> None:
     assert told["parents"] == [] and told["made"]["origin"] == "uploaded"
 
 
-def test_an_uploaded_psf_says_its_line_or_is_told_it(api: TestClient, tmp_path: Path) -> None:
+def test_the_series_of_an_uploaded_psf_comes_from_its_file_or_the_request(
+    api: TestClient, tmp_path: Path
+) -> None:
     write_psf(tmp_path / "p.fits")
     content = (tmp_path / "p.fits").read_bytes()
     for query in ({"instrument": "A B"}, {"channel": ""}, {"kind": "-"}, {"kind": "x" * 41}):
@@ -355,4 +359,4 @@ def test_an_uploaded_psf_says_its_line_or_is_told_it(api: TestClient, tmp_path: 
     )
     problem(certify(api, psf["id"], "1.0.0"), 409, "no-line")
     said = certify(api, psf["id"], "1.0.0", instrument="aia_3", channel="193", kind="total").json()
-    assert said["line"] == "aia_3/193/total"
+    assert said["series"] == "aia_3/193/total"

@@ -65,7 +65,7 @@ def test_a_later_database_is_one_sentence_for_status_upgrade_and_serve() -> None
     for words in (("database", "upgrade"), ("serve", "--port", str(free_port()))):
         answer = ask(*words)
         assert answer.exit_code == 1 and isinstance(answer.exception, SystemExit), answer.output
-        assert "at revision 9999, which is not known here" in answer.output
+        assert "at revision 9999, which this version does not know" in answer.output
 
 
 def test_a_database_that_is_away_is_one_sentence_without_its_password(

@@ -116,7 +116,7 @@ def test_contexts(sun: Heliopsf, tmp_path: Path) -> None:
     assert ask("context", "use", "--none") == "no default: what is certified\n"
     assert len(sun.default_context()["history"]) == 2
     ask("context", "use", code=2)
-    assert "no context with the id or name 'three'" in ask("context", "use", "three", code=1)
+    assert "expected the id or name of a context; got 'three'" in ask("context", "use", "three", code=1)
 
 
 def test_lineage_and_rerun(sun: Heliopsf, tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_lineage_and_rerun(sun: Heliopsf, tmp_path: Path) -> None:
     assert told[3].startswith("    instrument-file ")
     assert json.loads((tmp_path / "l.json").read_text())["id"] == product["id"]
     again = ask("psf", "rerun", psf["id"], "--json", str(tmp_path / "r.json"))
-    assert again == "The psf made again is the same file, bit for bit.\n"
+    assert again == "The new PSF is the same file, bit for bit.\n"
     assert json.loads((tmp_path / "r.json").read_text())["same_file"] is True
     assert "bit for bit" in ask("psf", "rerun", product["id"], "--product")
     assert [item["product_id"] for item in sun.affected(psf["id"])] == [product["id"]]
@@ -143,15 +143,15 @@ def test_lineage_and_rerun(sun: Heliopsf, tmp_path: Path) -> None:
 def test_a_rerun_that_differs_ends_with_status_1(
     sun: Heliopsf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from workers.tasks import deconvolve as deconvolve_task
+    from workers.tasks import product as product_task
 
     write_image(tmp_path / "i.fits")
     write_psf(tmp_path / "p.fits")
     product = sun.deconvolve(tmp_path / "i.fits", psf_id=sun.upload_psf(tmp_path / "p.fits")["id"], steps=2)
-    real = deconvolve_task.write_image
+    real = product_task.write_image
 
     def off(path: Path, image: Any, **how: Any) -> None:
         real(path, type(image)(**{**vars(image), "pixels": image.pixels * 1.001}), **how)
 
-    monkeypatch.setattr(deconvolve_task, "write_image", off)
+    monkeypatch.setattr(product_task, "write_image", off)
     assert "differs by 0.001" in ask("psf", "rerun", product["id"], "--product", code=1)

@@ -1,5 +1,6 @@
-"""One file a revision, in order. One that was released is never changed: a later one mends it.
+"""One file per revision, in order. A released revision never changes: a later one corrects it.
 
-A revision says in full what it makes and imports nothing of ``workers.catalogue.tables``, which goes on changing. Columns that
-it adds have a default in the database, so that workers of the version before go on until they are started again.
+A revision contains all that it needs and imports nothing from ``workers.catalogue.tables``, which changes later. New
+columns have a default in the database, so that workers of the previous version can go on until they are restarted.
+Revision 0010 renames columns: before it runs, workers of the previous version must be stopped.
 """

@@ -1,7 +1,7 @@
 """The tables as they were when revisions began.
 
-Versions before it made these tables, and those indexes that an earlier one of theirs lacked, at each start; so does
-this revision with a database that they made.
+Versions before it created these tables and missing indexes at each start. This revision does the same with a database
+of such a version.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Keys that let people in."""
+"""API keys."""
 
 from __future__ import annotations
 

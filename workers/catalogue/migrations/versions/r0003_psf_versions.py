@@ -1,6 +1,6 @@
-"""PSFs in lines, with a status, validity and successors; contexts; reruns; and an index for every list.
+"""Lines (now: series) of PSFs, with status, validity and successors; contexts; reruns; an index for every list.
 
-What the rows hold already says which line a PSF belongs to. Every PSF there is becomes a draft: none was certified.
+The line of a PSF follows from its row. Every existing PSF becomes a draft, because none was certified.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ revision = "0003"
 down_revision = "0002"
 
 BATCH = 1000
-# Lists, by table and by the columns that they may be narrowed to.
+# Lists, by table and by the columns that filter them.
 LISTED = {
     "images": ("",),
     "transits": ("",),
@@ -24,7 +24,7 @@ LISTED = {
     "jobs": ("", "phase"),
     "psf_contexts": ("",),
 }
-# They did not begin with the owner, or not go on with the order of a list.
+# Old indexes that do not begin with the owner or do not have the order of a list.
 REPLACED = {
     "images": ("created_at",),
     "transits": ("created_at",),
@@ -48,7 +48,7 @@ _PSFS = sa.table(
 
 
 def upgrade() -> None:
-    """Add what is new, and fill it from what is there."""
+    """Add the new columns, tables and indexes, and fill them from the existing rows."""
     for table, replaced in REPLACED.items():
         for column in replaced:
             op.drop_index(f"ix_{table}_{column}", table)
@@ -80,7 +80,7 @@ def _new_columns() -> None:
     op.add_column("psfs", sa.Column("valid_from", sa.Double))
     op.add_column("psfs", sa.Column("valid_to", sa.Double))
     op.add_column("psfs", sa.Column("successor_id", sa.String(64)))
-    with op.batch_alter_table("reports") as reports:  # SQLite makes such a table anew
+    with op.batch_alter_table("reports") as reports:  # on SQLite this copies the table
         reports.alter_column("transit_id", existing_type=sa.String(64), nullable=True)
         reports.add_column(sa.Column("about_id", sa.String(64)))
 
@@ -142,7 +142,7 @@ def _new_tables() -> None:
 
 
 def _fill(connection: sa.Connection) -> None:
-    """Channel, kind and line of the PSFs that are there, some at a time: their details are long."""
+    """Fill channel, kind and line of the existing PSFs, in batches, because their details are long."""
     key = sa.tuple_(_PSFS.c.owner, _PSFS.c.id)
     columns = (_PSFS.c.owner, _PSFS.c.id, _PSFS.c.instrument, _PSFS.c.origin, _PSFS.c.details)
     after = ("", "")
@@ -163,7 +163,7 @@ def _fill(connection: sa.Connection) -> None:
 def _said(
     owner: str, identity: str, instrument: str | None, origin: str, details: dict[str, Any]
 ) -> dict[str, Any]:
-    """What a row says of its line."""
+    """Channel, kind and line of a row."""
     wavelength = details.get("wavelength_angstrom")
     channel = CHANNELS.get(instrument or "") if wavelength is None else str(round(wavelength))
     parameters = (details.get("provenance") or {}).get("parameters") or {}

@@ -1,4 +1,4 @@
-"""The queue that a job waits in. Those that wait already do so for a person."""
+"""The queue of a job. Jobs that wait already go to the interactive queue."""
 
 from __future__ import annotations
 

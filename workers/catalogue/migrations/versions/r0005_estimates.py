@@ -1,4 +1,4 @@
-"""What a job was expected to need when it was taken. Of those that are there already nothing is known."""
+"""The estimate of a job's needs, made when it was submitted. Existing jobs have none."""
 
 from __future__ import annotations
 

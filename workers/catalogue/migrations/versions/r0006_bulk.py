@@ -1,4 +1,4 @@
-"""Bulk: many images deconvolved alike."""
+"""Bulk runs: many images deconvolved in the same way."""
 
 from __future__ import annotations
 

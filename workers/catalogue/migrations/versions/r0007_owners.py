@@ -1,4 +1,4 @@
-"""How many bytes each owner has kept, counted from what is there, and limits of their own."""
+"""The bytes that each owner keeps, counted from the existing rows, and the owners' own limits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ COUNTED = ("images", "transits", "psfs", "products", "reports")
 
 
 def upgrade() -> None:
-    """Make the table and fill it."""
+    """Create the table and fill it."""
     owners = op.create_table(
         "owners",
         sa.Column("owner", sa.String(64), primary_key=True),

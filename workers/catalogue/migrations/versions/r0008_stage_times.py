@@ -1,4 +1,4 @@
-"""How long jobs spent in each stage, by kind: sums that outlive the jobs."""
+"""The total time that jobs spent in each stage, by kind. The sums stay when the jobs are deleted."""
 
 from __future__ import annotations
 

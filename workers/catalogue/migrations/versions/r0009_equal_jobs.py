@@ -1,4 +1,4 @@
-"""What a job makes, beside the key that it runs under: of two jobs that make the same, one is at work at a time."""
+"""The identity of a job's result, beside its key. Of two jobs with the same result, one executes at a time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ down_revision = "0008"
 
 
 def upgrade() -> None:
-    """Add the column and its index; of jobs that are there already the key says what they make."""
+    """Add the column and its index. For existing jobs the key is the identity of the result."""
     op.add_column("jobs", sa.Column("work_key", sa.String(64), nullable=True))
     jobs = sa.table("jobs", sa.column("work_key"), sa.column("request_key"))
     op.execute(jobs.update().where(jobs.c.request_key != "").values(work_key=jobs.c.request_key))

@@ -1,0 +1,73 @@
+"""Timing the stages of an attempt: which time counts for which stage, and that the names stay few."""
+
+from __future__ import annotations
+
+import pytest
+
+from psfcore.errors import DataError
+from workers.catalogue.stage_times import Spent
+from workers.tasks import stage_timer
+from workers.tasks.stage_timer import MOST_STAGES, OTHERS, STARTING, StageTimer, short
+
+
+class Clock:
+    """A clock that a test moves."""
+
+    now = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(stage_timer, "time", clock)
+    return clock
+
+
+def test_time_before_a_step_counts_for_its_stage_and_time_before_a_beginning_for_the_previous_one(
+    clock: Clock,
+) -> None:
+    times = StageTimer(_since=clock.now)
+    for stage, step, took_s in (
+        ("reading", 0, 1.0),  # the time before the first report
+        ("deconvolving", 0, 2.0),  # still reading
+        ("deconvolving", 1, 4.0),
+        ("deconvolving", 1, 8.0),  # reported twice, counted once
+        ("deconvolving", 2, 16.0),
+        ("saving", 1, 32.0),
+    ):
+        clock.now += took_s
+        with times.step(stage, step):
+            clock.now += 1000.0  # the report itself
+            with times.step("images", 7):  # a report within a report
+                clock.now += 1000.0
+    clock.now += 64.0
+    assert times.end() == {
+        STARTING: Spent(1.0, 0),
+        "reading": Spent(2.0, 0),
+        "deconvolving": Spent(28.0, 2),
+        "saving": Spent(96.0, 1),
+    }
+
+
+def test_a_report_that_raises_is_counted_like_any_other(clock: Clock) -> None:
+    times = StageTimer(_since=clock.now)
+    with pytest.raises(DataError), times.step("reading", 1):
+        raise DataError("x", "y")
+    with times.step("reading", 2):
+        pass
+    assert times.end()["reading"].steps == 2
+
+
+def test_names_stay_few() -> None:
+    assert {short(f"fold {n}: errors of {n}") for n in range(50)} == {"fold n"}
+    assert short("+2.5 DN: round 3") == short("-5 DN") == "n DN"
+    assert len(short("x" * 999)) == 64
+    times = StageTimer()
+    for number in range(500):
+        with times.step("abcdefghij"[number % 10] * (1 + number // 10), 1):
+            pass
+    assert len(times.end()) == MOST_STAGES + 1
+    assert sum(one.steps for one in times.spent.values()) == 500 and times.spent[OTHERS].steps > 400

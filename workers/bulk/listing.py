@@ -1,0 +1,129 @@
+"""Listing the files of a bulk run: from the patterns of its request to its images in the catalogue."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+from psfcore.errors import DataError
+from workers.catalogue.bulk_tables import MOST_LETTERS, BulkRow
+from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
+from workers.catalogue.jobs import Lease
+from workers.contract.bulk import BulkWork, Condition
+from workers.contract.phases import Fault, JobError
+from workers.files import archive as archive_files
+from workers.tasks.context import Context
+
+LIST_AT_ONCE = 200
+MOST_IMAGES = 1_000_000
+TELL_EVERY_S = 1.0  # how often a turn reports its progress and looks whether it must stop
+
+
+def work_of(bulk: BulkRow) -> BulkWork:
+    """The request of a bulk run, without the uploaded images."""
+    return BulkWork.model_validate(bulk.request)
+
+
+def list_files(context: Context, bulk: BulkRow, lease: Lease) -> bool:
+    """Add the files that the patterns of a bulk run match to its images. An error that concerns all files stops the run.
+
+    Returns False if this turn has nothing more to do.
+    """
+    bulks = context.catalogue.bulks
+    if not bulks.begin_listing(bulk.id, lease):
+        return False
+    try:
+        listed = _listed(context, work_of(bulk))
+        while batch := list(islice(listed, LIST_AT_ONCE)):
+            if not bulks.add_listed(bulk.id, lease, batch):
+                return False
+        there = bulks.get(bulk.id)
+        if there is not None and there.total == 0:
+            raise DataError(
+                "no-images",
+                "expected files that match the patterns and the header conditions; found none: check the globs and `where`",
+            )
+    except DataError as error:
+        bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code=error.code, message=error.message))
+        return False
+    return bulks.end_listing(bulk.id, lease)
+
+
+def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
+    """The files that match, each once even if several patterns match it."""
+    allowed = archive_files.roots(context.settings.bulk_roots)
+    seen: set[Path] = set()
+    looked_at, told_at = 0, 0.0
+
+    def tell() -> None:
+        nonlocal told_at
+        told_at = time.monotonic()
+        context.report("listing", len(seen), max(looked_at, len(seen) + 1))
+
+    def tick() -> None:
+        """Report during a long walk that finds nothing, so that it can be stopped like any other work."""
+        if time.monotonic() - told_at >= TELL_EVERY_S:
+            tell()
+
+    for files in request.files:
+        for found in archive_files.find(files.glob, allowed, tick):
+            looked_at += 1
+            tell()
+            if found.path in seen:
+                continue
+            listed = _listed_one(context, found, files.where)
+            if listed is None:
+                continue
+            seen.add(found.path)
+            if len(seen) > MOST_IMAGES:
+                raise DataError(
+                    "too-many-images",
+                    f"expected at most {MOST_IMAGES} images in a bulk run; the patterns match more: split the request",
+                )
+            yield listed
+
+
+def _listed_one(context: Context, found: archive_files.Found, where: dict[str, Condition]) -> Listed | None:
+    """The found file as an image of the run, with the error if it cannot be used; None if its header does not match."""
+    error = None
+    try:
+        if found.error is not None:
+            raise found.error
+        if not archive_files.matches(found.path, where, context.limits):
+            return None
+    except DataError as unreadable:
+        error = JobError(fault=Fault.USER, code=unreadable.code, message=unreadable.message)
+    except OSError as unreadable:
+        error = _unreadable_file(unreadable)
+    source = archive_files.shown(found.path)
+    path_error = _path_error(found.path, source)
+    if len(source) > MOST_LETTERS:
+        source = source[: MOST_LETTERS - 1] + "…"
+    return Listed(source, uploaded=False, error=path_error or error)
+
+
+def _path_error(path: Path, source: str) -> JobError | None:
+    """The error if the catalogue cannot store this path, so that the file could not be found later; None if it can."""
+    if source != str(path):
+        code, message = (
+            NOT_UTF_8,
+            f"expected a path in UTF-8; got one that ends in {source[-100:]}: rename the file",
+        )
+    elif len(source) > MOST_LETTERS:
+        code = TOO_LONG
+        message = f"expected a path of at most {MOST_LETTERS} characters; got {len(source)}, ending in {source[-100:]}"
+    else:
+        return None
+    return JobError(fault=Fault.USER, code=code, message=message)
+
+
+def _unreadable_file(error: OSError) -> JobError:
+    """The error for a file that cannot be read, without its path."""
+    reason = archive_files.reason_of(error)
+    return JobError(
+        fault=Fault.USER,
+        code="unreadable-file",
+        message=f"expected a readable file; the system says: {reason}",
+    )

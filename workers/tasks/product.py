@@ -1,0 +1,192 @@
+"""The product of a deconvolution: its FITS file, its pictures, and its row in the catalogue."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.deconvolve.assess.changes import Changes
+from psfcore.deconvolve.assess.error_planes import ErrorPlanes
+from psfcore.deconvolve.assess.plots import changes_png
+from psfcore.deconvolve.assess.quality import QualityBit
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.drawing import plots
+from psfcore.fits.images import write_image
+from psfcore.image import Image, MaskBit
+from workers.catalogue.tables import ProductRow, PsfRow
+from workers.contract.identities import product_identity
+from workers.contract.resolved import ResolvedDeconvolve
+from workers.settings import library_versions, software_version
+from workers.tasks.context import Context
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a product is made from: the request, the PSF's row, and the image that was read."""
+
+    context: Context
+    request: ResolvedDeconvolve
+    psf_row: PsfRow
+    image: Image
+
+
+@dataclass(frozen=True)
+class Made:
+    """A finished deconvolution that is not yet written. preview_sha256: None if no preview was drawn."""
+
+    inputs: Inputs
+    result: Deconvolved
+    errors: ErrorPlanes | None
+    found: Changes
+    quality: NDArray[np.uint8]
+    details: dict[str, Any]
+    preview_sha256: str | None
+
+    @property
+    def identity(self) -> str:
+        """The product's id."""
+        return product_identity(self.inputs.request)
+
+
+def write(made: Made, path: Path) -> None:
+    """Write the product as a FITS file."""
+    inputs, result, errors = made.inputs, made.result, made.errors
+    planes: dict[str, NDArray[Any]] = {"QUALITY": made.quality}
+    if errors is not None:
+        planes["ERROR"] = errors.error
+        if errors.psf_error is not None:
+            planes["PSF_ERROR"] = errors.psf_error
+    write_image(
+        path,
+        dataclasses.replace(inputs.image, pixels=result.pixels),
+        cards=_cards(inputs, made.identity, result, errors),
+        history=_history(inputs, result),
+        mask=inputs.image.mask,
+        planes=planes,
+        plane_bits={"QUALITY": QualityBit},
+    )
+
+
+def keep(made: Made, path: Path) -> ProductRow:
+    """Move a written product file into the store and add the product to the catalogue."""
+    inputs, context = made.inputs, made.inputs.context
+    size_bytes = path.stat().st_size
+    file_sha256 = context.store.keep(path)
+    picture = _save_changes_picture(made) if inputs.request.changes_picture else None
+    assert made.preview_sha256 is not None
+    row = ProductRow(
+        owner=context.owner,
+        id=made.identity,
+        created_at=time.time(),
+        kind="deconvolved-image",
+        image_id=inputs.request.image_id,
+        psf_id=inputs.psf_row.id,
+        psf_version=inputs.psf_row.version,
+        file_sha256=file_sha256,
+        bytes=size_bytes,
+        preview_sha256=made.preview_sha256,
+        details=made.details | {"changes_picture_sha256": picture},
+    )
+    return context.catalogue.add(row)[0]
+
+
+def save_preview(inputs: Inputs, result: Deconvolved) -> str:
+    """Draw the preview (before, after, change) into the store; returns its SHA-256."""
+    with inputs.context.store.temporary() as picture:
+        plots.preview_png(inputs.image.pixels, result.pixels, picture, title=_title(inputs))
+        return inputs.context.store.keep(picture)
+
+
+def _save_changes_picture(made: Made) -> str:
+    inputs = made.inputs
+    with inputs.context.store.temporary() as picture:
+        changes_png(inputs.image.pixels, made.result.pixels, made.found, picture, title=_title(inputs))
+        return inputs.context.store.keep(picture)
+
+
+def _cards(
+    inputs: Inputs, identity: str, result: Deconvolved, errors: ErrorPlanes | None
+) -> dict[str, tuple[Any, str]]:
+    # A hash fills its card, so these cards have no comment.
+    cards: dict[str, tuple[Any, str]] = {
+        "PRODID": (identity, ""),
+        "PSFID": (inputs.psf_row.id, ""),
+        "PSFVERS": (inputs.psf_row.version, "PSF version"),
+        "PSFNAME": (inputs.psf_row.name, "PSF name"),
+        "PSFSTAT": (inputs.psf_row.status, "PSF status"),
+        "DCNVMETH": (inputs.request.method.name, "deconvolution method"),
+        "DCNVITER": (result.steps_done, "deconvolution steps done"),
+        "DCNVSTOP": (result.stopped_because, "why it stopped"),
+        "DCNVEDGE": (result.edges, "what was taken beyond the edges"),
+        "DCNVBAND": (result.edge_band_px, "[px] edge band that leans on it"),
+        "DCNVALGV": (inputs.request.method.algorithm_version, "algorithm version"),
+        "SWHELIO": (software_version(), "heliopsf version"),
+        "INPSHA": (inputs.request.image_id, ""),
+    }
+    if errors is not None and errors.amplification is not None:
+        cards["DCNVAMPL"] = (errors.amplification, "noise of the result over that of the input")
+    return cards
+
+
+def _history(inputs: Inputs, result: Deconvolved) -> list[str]:
+    psf = inputs.psf_row
+    return [
+        f"heliopsf {software_version()}: {inputs.request.method.name}, {result.steps_done} steps, "
+        f"edges {result.edges}, PSF {psf.name} {psf.version} ({psf.status})"
+    ]
+
+
+def _title(inputs: Inputs) -> str:
+    header = inputs.image.header
+    parts = [header.get("DETECTOR") or header.get("INSTRUME") or "image"]
+    parts += [str(header[key]) for key in ("DATE-BEG", "DATE-OBS") if header.get(key)][:1]
+    return f"{' '.join(map(str, parts))}   PSF {inputs.psf_row.name} {inputs.psf_row.version}"
+
+
+def details_of(
+    inputs: Inputs, result: Deconvolved, errors: ErrorPlanes | None, found: Changes
+) -> dict[str, Any]:
+    """The details of the product's row: how it was made, and what changed in the image.
+
+    Bright pixels are those at or above the 99th percentile of the input; dark pixels are those at or below the first.
+    """
+    image = inputs.image
+    before, after = image.pixels[image.valid], result.pixels[image.valid]
+    low, high = np.percentile(before, [1, 99])
+    dark, bright = before <= low, before >= high
+    details = {
+        "method": inputs.request.method.model_dump(mode="json"),
+        "algorithm_version": inputs.request.method.algorithm_version,
+        "software_version": software_version(),
+        "libraries": library_versions(),
+        "parameters": inputs.request.model_dump(mode="json", exclude_none=True),
+        "job_id": inputs.context.job_id,
+        "steps_done": result.steps_done,
+        "stopped_because": result.stopped_because,
+        "last_step_change": result.last_change,
+        "edges": result.edges,
+        "edge_band_px": result.edge_band_px,
+        "noise_amplification": result.noise_amplification if errors is None else errors.amplification,
+        "chi2_per_pixel": result.chi2_per_pixel,
+        "flux_change_pct": 100 * (result.flux_out / result.flux_in - 1),
+        "bright_change_pct": _change_pct(before[bright], after[bright]),
+        "dark_change_pct": _change_pct(before[dark], after[dark]),
+        "negative_pixels": result.negative_pixels,
+        "masked_pixels": {
+            str(bit.name).lower(): int(np.count_nonzero(image.mask & bit.value)) for bit in MaskBit
+        },
+        "changes": found.as_json(),
+    }
+    return details
+
+
+def _change_pct(before: NDArray[np.float64], after: NDArray[np.float64]) -> float | None:
+    """Change of the summed intensity, in percent; None if the sum of the input is not positive."""
+    total = float(before.sum())
+    return 100 * (float(after.sum()) / total - 1) if total > 0 else None

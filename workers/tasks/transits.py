@@ -1,0 +1,68 @@
+"""Reading uploaded transits, shared by the tasks."""
+
+from __future__ import annotations
+
+from psfcore.errors import DataError
+from psfcore.fits.psfs import read_psf
+from psfcore.noise import Noise
+from psfcore.transit.archive import unpack
+from psfcore.transit.folder import read_prepared
+from psfcore.transit.prepare import Prepared
+from psfcore.transit.transit import Kernel, Transit
+from workers.catalogue.tables import TransitRow
+from workers.contract.resolved import ResolvedOnTransit
+from workers.tasks.context import Context
+from workers.tasks.psf_build import built_psf
+
+
+def load_transit(
+    context: Context,
+    request: ResolvedOnTransit,
+    *,
+    diffraction: Kernel | None = None,
+) -> tuple[Transit, Prepared]:
+    """Unpack, read and prepare the transit that a request names.
+
+    diffraction: the diffraction PSF to use if the transit contains none; None: build it from the request's recipe.
+
+    Raises DataError "no-such-transit", "no-known-psf", and whatever unpacking and preparing raise.
+    """
+    upload = context.catalogue.get(TransitRow, request.transit_id, context.owner)
+    if upload is None:
+        raise DataError(
+            "no-such-transit",
+            f"expected the id of an uploaded transit; got {request.transit_id}, which is not in the catalogue: upload "
+            "the transit first",
+        )
+    images = int(upload.summary["images"])
+    context.report("reading", 0, images)
+    with context.store.temporary_folder() as folder:
+        unpack(context.store.path(request.transit_id), folder, context.settings.archive_limits)
+        return read_prepared(
+            folder,
+            context.limits,
+            progress=lambda done, of: context.report("reading", done, of),
+            diffraction=lambda _instrument, _shape: (
+                _built_diffraction(context, request) if diffraction is None else diffraction
+            ),
+            noise=None if request.noise is None else Noise(**request.noise.model_dump()),
+            saturation_dn=request.saturation_dn,
+        )
+
+
+def _built_diffraction(
+    context: Context,
+    request: ResolvedOnTransit,
+) -> Kernel:
+    """The diffraction PSF of the transit's instrument, from the catalogue or built now.
+
+    It is not cut to the field: its kernel sums to 1 on 2048 px.
+    """
+    if request.diffraction_recipe is None:
+        raise DataError(
+            "no-known-psf",
+            "expected known_psf in transit.json, or an instrument whose diffraction PSF can be built; got neither: add "
+            "the file of the known PSF to the transit",
+        )
+    row = built_psf(context, request.diffraction_recipe)
+    return read_psf(context.store.path(row.file_sha256), context.limits, parts=False).kernel
