@@ -17,7 +17,7 @@ from service.cli import context as cli_context
 from service.cli import diffraction as cli_diffraction
 from service.cli import evaluate as cli_evaluate
 from service.cli import flare as cli_flare
-from service.cli import gap as cli_gap
+from service.cli.gap import diagnose as cli_gap
 from service.cli import report as cli_report
 from service.cli import simulate as cli_simulate
 from service.cli.connection import LOCAL, SERVER, connection, named_psf

@@ -11,7 +11,7 @@ from astropy.io import fits
 from click.testing import CliRunner, Result
 
 from psfcore.errors import DataError
-from service.cli.gap_blind import blind
+from service.cli.gap.blind import blind
 
 SMALL = ["--size", "128", "--images", "9", "--synthetic", "--processes", "1"]
 

@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from service.cli.connection import LOCAL, SERVER, connection, named_psf
-from service.cli.gap_blind import blind
+from service.cli.gap.blind import blind
 from service.cli.options import (
     NOISE,
     OUTPUT,
