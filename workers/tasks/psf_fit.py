@@ -10,7 +10,6 @@ from psfcore.fits.fits_io import read_psf, write_psf
 from psfcore.noise import Noise
 from psfcore.scatter.fit import TransitFit, fit_transit, psf_of, report
 from psfcore.scatter.fit_plot import fit_png
-from psfcore.transit.archive import unpack
 from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
@@ -60,8 +59,7 @@ def load_transit(
         raise DataError("no-such-transit", f"no transit was uploaded with id {request.transit_id}")
     images = int(upload.summary["images"])
     context.report("reading", 0, images)
-    with context.store.temporary_folder() as folder:
-        unpack(context.store.path(request.transit_id), folder, context.settings.archive_limits)
+    with context.store.unpacked(request.transit_id, context.settings.archive_limits) as folder:
         return read_prepared(
             folder,
             context.limits,

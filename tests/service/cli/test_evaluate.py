@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
+from service.cli.evaluate import COMMANDS, _built_diffraction
 
 from psfcore.fits.fits_io import write_psf as write_whole_psf
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.simulate.transit import INSTRUMENT, PLATE_SCALE_ARCSEC
 from psfcore.simulate.transit_files import write
-from service.cli.evaluate import COMMANDS, _built_diffraction
 from tests.conftest import write_psf
 from tests.psfcore.conftest import make_psf
 from tests.psfcore.small_transits import DIFFRACTION, IMAGES, SCATTER, SIZE_PX, observed, sky
