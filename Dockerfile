@@ -2,6 +2,7 @@
 FROM python:3.11-slim AS build
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY heliopsf heliopsf
 COPY psfcore psfcore
 COPY service service
 COPY workers workers
