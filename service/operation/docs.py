@@ -1,7 +1,7 @@
-"""The description of the interface as a page to read: ``/docs``.
+"""The API as a page to read: ``/docs``. The description for programs is at ``/openapi.json``.
 
-A page of our own, and not one of the known viewers: those load their scripts from elsewhere, or want a copy of them
-kept up to date here. This one runs no script at all, and the machine's own description is at ``/openapi.json``.
+This page runs no script. The known viewers load scripts from other hosts, or need a copy of the scripts that is kept up to
+date here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ router = APIRouter(include_in_schema=False)
 
 @router.get("/docs")
 def docs(request: Request) -> Response:
-    """The page."""
+    """The page (HTML)."""
     description = request.app.openapi()
     page = _template().render(info=description["info"], groups=_groups(description))
     headers = {"Content-Security-Policy": PAGE_POLICY}
@@ -43,7 +43,7 @@ def _template() -> Any:
 
 
 def _groups(description: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """The operations by their tag, in the order of the application."""
+    """The operations, grouped by tag, in the order of the application."""
     schemas = description.get("components", {}).get("schemas", {})
     groups: dict[str, list[dict[str, Any]]] = {}
     for path, operations in description["paths"].items():
@@ -82,7 +82,7 @@ def _operation(path: str, method: str, operation: dict[str, Any], schemas: dict[
 
 
 def _fields(schema: dict[str, Any], schemas: dict[str, Any]) -> list[dict[str, str]]:
-    """What a body holds, two levels deep: deeper things are named, and stand in the machine's description."""
+    """The fields of a body, two levels deep; ``/openapi.json`` has the deeper levels."""
     resolved = _resolved(schema, schemas)
     if "oneOf" in resolved:
         return [field for one in resolved["oneOf"] for field in _fields(one, schemas)]
@@ -104,7 +104,7 @@ def _resolved(schema: dict[str, Any], schemas: dict[str, Any]) -> dict[str, Any]
 
 
 def _kind(schema: dict[str, Any], schemas: dict[str, Any]) -> str:
-    """A type as people read it."""
+    """A type in words."""
     if "$ref" in schema:
         return _kind(_resolved(schema, schemas), schemas)
     for several in ("anyOf", "oneOf"):
