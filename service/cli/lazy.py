@@ -65,9 +65,11 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except click.NoSuchOption as error:
-            if error.option_name in self._renamed:
-                error.possibilities = [self._renamed[error.option_name]]
-            raise
+            if error.option_name not in self._renamed:
+                raise
+            meant = self._renamed[error.option_name]
+            said = f"there is no option '{error.option_name}'. Did you mean `{meant}`?"
+            raise click.UsageError(said, error.ctx) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands under their headings, without importing them."""

@@ -25,7 +25,9 @@ class Readiness(BaseModel):
     """All parts that the service needs answer."""
 
     status: str
-    parts: dict[str, str] = Field(description="state of database, storage, and broker or embedded worker; `ok` if it answers")
+    parts: dict[str, str] = Field(
+        description="state of database, storage, and broker or embedded worker; `ok` if it answers"
+    )
 
 
 @router.get("/healthz", summary="Is the service up?", responses=problems.RESPONSES)
@@ -34,7 +36,9 @@ def healthz(state: Shared) -> Health:
     state.catalogue.ping()
     if not state.reconciler.alive:
         raise problems.Problem(
-            503, "reconciler-stopped", "the reconciler stopped, so queued jobs are not submitted; restart the service"
+            503,
+            "reconciler-stopped",
+            "the reconciler stopped, so queued jobs are not submitted; restart the service",
         )
     return Health(status="ok", version=software_version())
 

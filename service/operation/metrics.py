@@ -96,7 +96,9 @@ class _Catalogued(Collector):
             labels=["kind", "stage"],
         )
         steps = CounterMetricFamily(
-            "heliopsf_job_stage_steps", "Steps that ended attempts reported in a stage", labels=["kind", "stage"]
+            "heliopsf_job_stage_steps",
+            "Steps that ended attempts reported in a stage",
+            labels=["kind", "stage"],
         )
         for (kind, stage), spent in self._state.catalogue.stage_times.all().items():
             seconds.add_metric([kind, stage], spent.seconds)
@@ -112,7 +114,9 @@ class _Catalogued(Collector):
             oldest = catalogue.census.oldest_queued_at(queue)
             age.add_metric([queue], 0.0 if oldest is None else max(0.0, time.time() - oldest))
         yield age
-        silent = GaugeMetricFamily("heliopsf_jobs_silent", "Jobs whose worker did not report within its lease")
+        silent = GaugeMetricFamily(
+            "heliopsf_jobs_silent", "Jobs whose worker did not report within its lease"
+        )
         silent.add_metric([], catalogue.census.count_silent(lease_s))
         yield silent
         images = GaugeMetricFamily(

@@ -20,7 +20,18 @@ from psfcore.simulate.transit_files import write
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.psfcore.small_transits import SCATTER, observed, sky
 
-HEAVY = {"astropy", "celery", "fastapi", "httpx", "matplotlib", "numba", "numpy", "pydantic", "scipy", "sqlalchemy"}
+HEAVY = {
+    "astropy",
+    "celery",
+    "fastapi",
+    "httpx",
+    "matplotlib",
+    "numba",
+    "numpy",
+    "pydantic",
+    "scipy",
+    "sqlalchemy",
+}
 
 
 def loaded_by(code: str) -> set[str]:
@@ -100,5 +111,5 @@ def test_a_transit_is_fitted(tmp_path: Path) -> None:
 
 
 def test_a_diffraction_that_is_not_known_is_refused() -> None:
-    with pytest.raises(heliopsf.DataError, match="known_psf.*hri_euv.*got my-telescope"):
+    with pytest.raises(heliopsf.DataError, match=r"known_psf.*hri_euv.*got my-telescope"):
         known_diffraction("my-telescope")

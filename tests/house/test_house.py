@@ -37,7 +37,20 @@ def sources(package: str) -> list[Path]:
 @pytest.mark.parametrize(
     ("package", "forbidden"),
     [
-        ("psfcore", ("heliopsf", "workers", "service", "fastapi", "starlette", "celery", "sqlalchemy", "redis", "httpx")),
+        (
+            "psfcore",
+            (
+                "heliopsf",
+                "workers",
+                "service",
+                "fastapi",
+                "starlette",
+                "celery",
+                "sqlalchemy",
+                "redis",
+                "httpx",
+            ),
+        ),
         ("workers", ("heliopsf", "service", "fastapi", "starlette", "httpx")),
         ("service", ("heliopsf",)),
     ],
@@ -57,7 +70,8 @@ def test_what_people_import_stands_on_the_core_and_the_client_alone() -> None:
         (path.name, name)
         for path in sources("heliopsf")
         for name in imports(path)
-        if name.split(".")[0] not in {"__future__", "collections", "heliopsf", "importlib", "pathlib", "psfcore", "typing"}
+        if name.split(".")[0]
+        not in {"__future__", "collections", "heliopsf", "importlib", "pathlib", "psfcore", "typing"}
         and not name.startswith("service.client")
     ]
     assert wrong == []

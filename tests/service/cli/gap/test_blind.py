@@ -66,7 +66,10 @@ def test_where_no_case_can_be_made_that_is_said(tmp_path: Path, monkeypatch: pyt
     answer = run("--cases", 2, "--clean-only", "-o", tmp_path / "set", *SMALL)
     assert answer.exit_code == 1
     assert "could not make case 0001" in answer.output
-    assert "expected cases that can be made; of 2 none could: bad-scene: expected a scene" in answer.output
+    assert (
+        "none of the 2 cases could be made; the first failed with: bad-scene: expected a scene"
+        in answer.output
+    )
     assert "Traceback" not in answer.output
 
 
