@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from jinja2 import Environment, StrictUndefined
 
 PAGE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'"
 _BOUNDS = {
@@ -36,6 +35,8 @@ def docs(request: Request) -> Response:
 
 @lru_cache(maxsize=1)
 def _template() -> Any:
+    from jinja2 import Environment, StrictUndefined  # only this page needs it
+
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
