@@ -37,6 +37,8 @@ from workers.intake.requests import image_row, resolve, transit_row, uploaded_ps
 from workers.run.runner import Runner
 from workers.settings import Settings
 
+_Seen = dict[Path, tuple[int, int]]
+
 
 class LocalStore(Store):
     """A store that also serves files and folders of the user, read where they are.
@@ -46,62 +48,58 @@ class LocalStore(Store):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self._files: dict[str, Path] = {}
-        self._folders: dict[str, FolderTransit] = {}
-        self._seen: dict[Path, tuple[int, int]] = {}
+        self._files: dict[str, _Seen] = {}
+        self._folders: dict[str, tuple[FolderTransit, _Seen]] = {}
 
     def add_file(self, file: Path) -> str:
         """Serve a file; returns its SHA-256."""
         file = file.resolve()
-        self._look_at(file)
+        seen = _states(file)
         digest = sha256_of(file)
-        self._check(file)
-        self._files.setdefault(digest, file)
+        _check(seen)
+        self._files[digest] = seen
         return digest
 
     def add_folder(self, folder: Path) -> FolderTransit:
         """Serve the transit in a folder. Raises DataError as ``transit_in``."""
-        for path in folder.resolve().iterdir():
-            if path.is_file():
-                self._look_at(path)
+        before = _states(*(path for path in folder.resolve().iterdir() if path.is_file()))
         found = transit_in(folder)
-        self._check(*(found.folder / name for name in found.contents.files))
-        self._folders[found.sha256] = found
+        seen = {path: before[path] for path in (found.folder / name for name in found.contents.files)}
+        _check(seen)
+        self._folders[found.sha256] = found, seen
         return found
 
     def path(self, digest: str) -> Path:
         """Path of a stored file, or of a file of the user."""
-        file = self._files.get(digest)
-        if file is None:
+        seen = self._files.get(digest)
+        if seen is None:
             return super().path(digest)
-        self._check(file)
-        return file
+        _check(seen)
+        return next(iter(seen))
 
     @contextmanager
     def unpacked(self, digest: str, limits: ArchiveLimits) -> Iterator[Path]:
         """A folder with the files of a transit: the user's own folder, or an archive that is unpacked."""
-        found = self._folders.get(digest)
-        if found is None:
+        if digest not in self._folders:
             with super().unpacked(digest, limits) as folder:
                 yield folder
             return
-        files = [found.folder / name for name in found.contents.files]
-        self._check(*files)
+        found, seen = self._folders[digest]
+        _check(seen)
         yield found.folder
-        self._check(*files)
-
-    def _look_at(self, file: Path) -> None:
-        self._seen.setdefault(file, _state(file))
-
-    def _check(self, *files: Path) -> None:
-        for file in files:
-            if _state(file) != self._seen[file]:
-                raise OSError(f"{file} changed while it was read; run the command again")
+        _check(seen)
 
 
-def _state(file: Path) -> tuple[int, int]:
-    found = file.stat()
-    return found.st_mtime_ns, found.st_size
+def _states(*files: Path) -> _Seen:
+    """Time of the last change (ns) and size (bytes) of each file."""
+    return {file: ((found := file.stat()).st_mtime_ns, found.st_size) for file in files}
+
+
+def _check(seen: _Seen) -> None:
+    """Raise OSError if a file changed since."""
+    for file, state in _states(*seen).items():
+        if state != seen[file]:
+            raise OSError(f"{file} changed while it was read; run the command again")
 
 
 class LocalService(Operations):

@@ -19,7 +19,6 @@ from service.cli.options import (
     OUTPUT_FOLDER,
     SATURATION,
     STEPS,
-    check_writable,
     fits_files,
     limits,
     progress_bar,
@@ -73,7 +72,6 @@ def changes(
     from psfcore.deconvolve.assess.contact_sheet import contact_sheet_png, table, treat_many
 
     files = [str(path) for path in _named(images)]
-    check_writable(output.parent if output.parent.exists() else None)
     with user_errors(), connection(server, local) as service, progress_bar() as report:
         parameters = {
             "psf_id": named_psf(service, psf),
@@ -122,7 +120,12 @@ def _one_by_one(
                 if error.code is None or error.status in FOR_ALL:
                     raise
                 raise DataError(error.code, str(error)) from error
-            products[name] = {"id": product["id"], "psf_id": product["psf_id"]}
+            version = product["details"]["software_version"]
+            products[name] = {
+                "id": product["id"],
+                "psf_id": product["psf_id"],
+                "software_version": version,
+            }
             return changes_in_product(name, name, file, product["details"], limits())
 
     return one

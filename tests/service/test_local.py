@@ -71,5 +71,7 @@ def test_a_product_may_replace_the_image_that_it_was_made_from(tmp_path: Path) -
         product = service.deconvolve(
             tmp_path / "image.fits", tmp_path / "image.fits", psf_id=psf["id"], steps=2
         )
-    assert product["image_id"] == before
-    assert sha256_of(tmp_path / "image.fits") == product["sha256"] != before
+        assert product["image_id"] == before
+        assert sha256_of(tmp_path / "image.fits") == product["sha256"] != before
+        again = service.upload_image(tmp_path / "image.fits")
+        assert again["id"] == product["sha256"], "the file is another one now"
