@@ -76,7 +76,7 @@ def query(
 @SERVER
 def cutout(psf: str, size: int, output: Path, server: str | None) -> None:
     """Write the central part of a PSF, not renormalised. For a file, with its components."""
-    from psfcore.psf_cut import central_part
+    from psfcore.central_part import central_part
 
     check_writable(output)
     with user_errors():
