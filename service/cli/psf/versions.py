@@ -123,7 +123,7 @@ def deprecate(psf_id: str, successor: str | None, reason: str, server: str | Non
         count = sum(1 for _ in service.affected(psf_id))
     instead = f", use {said['successor']}" if said["successor"] else ""
     click.echo(f"{said['line']} {said['version']}: {said['status']}{instead}")
-    click.echo(f"products that were made with it: {count}")
+    click.echo(f"products made with it: {count}")
 
 
 @click.command("best")
