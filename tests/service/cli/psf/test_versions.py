@@ -113,7 +113,7 @@ def test_contexts(sun: Client, tmp_path: Path) -> None:
     assert listed[0].startswith("* ") and listed[1].startswith("  ") and "as delivered" in listed[1]
     assert ask("psf", "best", "--channel", "304").startswith(second)
     assert "none has context one" in ask("psf", "best", "--channel", "304", "--context", "one", code=1)
-    assert ask("context", "use", "--none") == "no default: what is certified\n"
+    assert ask("context", "use", "--none") == "no default context: the certified PSFs are used\n"
     assert len(sun.default_context()["history"]) == 2
     ask("context", "use", code=2)
     assert "no context with the id or name 'three'" in ask("context", "use", "three", code=1)
