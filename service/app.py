@@ -1,4 +1,4 @@
-"""The application, put together."""
+"""The application: its routers, middlewares, and what lives as long as it does."""
 
 from __future__ import annotations
 
@@ -19,22 +19,24 @@ from service.http.rates import Rates, Streams
 from service.http.state import State
 from service.operation import docs, health, metrics
 from service.uws import routes as uws
-from workers.broker import app as queue
-from workers.broker.reconciler import Reconciler
 from workers.catalogue.catalogue import Catalogue
 from workers.files.opened import open_store
 from workers.settings import Settings, software_version
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
-    """An application for these settings; its tables are made, and its reconciler runs, while it lives.
+    """An application for these settings. Its start upgrades the database's tables and starts the reconciler.
 
-    bound_to: the address that it is served on, by which it is open or asks for keys where the settings do not say.
+    bound_to: the address that it listens on. If the settings do not say whether requests need a key, this address decides.
     """
     access, rates = Access.of(settings, bound_to), Rates(settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        # Celery takes half a second to import, which the description of the interface does not need.
+        from workers.broker import app as queue
+        from workers.broker.reconciler import Reconciler
+
         settings.data_dir.mkdir(parents=True, exist_ok=True)
         catalogue = Catalogue(settings.catalogue_url)
         catalogue.upgrade()
@@ -51,16 +53,16 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     app = FastAPI(
         title="heliopsf",
         version=software_version(),
-        summary="Point-spread functions of solar EUV telescopes, and images freed of their stray light.",
+        summary="Point-spread functions of solar EUV telescopes, and deconvolved images.",
         lifespan=lifespan,
-        docs_url=None,  # these load scripts from elsewhere; there is a page of our own
+        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.operation.docs serves its own
         redoc_url=None,
     )
     problems.install(app)
     description.install(app)
     guard.install(app, access, settings.max_body_mib * 2**20)
     app.state.requests = observation.install(app)
-    # psf_choice before psfs: "best" is no id.
+    # psf_choice comes before psfs, so that "best" is not taken for an id.
     versions = (psf_choice, psf_status, contexts, affected, lineage)
     for part in (
         *versions,

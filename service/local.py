@@ -1,4 +1,7 @@
-"""The service's work in this process, for ``--local``: the same tasks on a catalogue of its own."""
+"""A service in this process, for ``--local``: the same requests and tasks, on a temporary catalogue.
+
+Images, PSFs and transits are read where they are; nothing is copied.
+"""
 
 from __future__ import annotations
 
@@ -15,32 +18,99 @@ from pydantic import TypeAdapter, ValidationError
 from psfcore.errors import DataError
 from psfcore.fits.cutout import cutout
 from psfcore.fits.header import FitsLimits, read_summary
-from psfcore.tables import lookup as psf_lookup
-from psfcore.transit.archive import list_archive
+from psfcore.tables import lookup
+from psfcore.transit.archive import ArchiveLimits, list_archive
+from psfcore.transit.in_place import FolderTransit, transit_in
 from service.api.jobs import JobView
 from service.api.products import ProductView
 from service.api.psfs.versions import PsfView
 from service.api.reports import ReportView
 from service.api.transits import TransitDetails
-from service.client.http import Operations, Progress, ServiceError, as_archive
+from service.client.errors import ServiceError
+from service.client.operations import Operations
+from service.client.versions import Progress
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
 from workers.contract.kinds import JobRequest
 from workers.contract.phases import Phase
 from workers.contract.suggestions import explained
-from workers.files.store import Store
+from workers.files.store import Store, sha256_of
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 from workers.run.runner import Runner
 from workers.settings import Settings
 
+_Seen = dict[Path, tuple[int, int]]
+
+
+class LocalStore(Store):
+    """A store that also serves files and folders of the user, read where they are.
+
+    Each is found by its SHA-256. If it has changed since, reading it raises OSError.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._files: dict[str, _Seen] = {}
+        self._folders: dict[str, tuple[FolderTransit, _Seen]] = {}
+
+    def add_file(self, file: Path) -> str:
+        """Serve a file; returns its SHA-256."""
+        file = file.resolve()
+        seen = _states(file)
+        digest = sha256_of(file)
+        _check(seen)
+        self._files[digest] = seen
+        return digest
+
+    def add_folder(self, folder: Path) -> FolderTransit:
+        """Serve the transit in a folder. Raises DataError as ``transit_in``."""
+        before = _states(*(path for path in folder.resolve().iterdir() if path.is_file()))
+        found = transit_in(folder)
+        seen = {path: before[path] for path in (found.folder / name for name in found.contents.files)}
+        _check(seen)
+        self._folders[found.sha256] = found, seen
+        return found
+
+    def path(self, digest: str) -> Path:
+        """Path of a stored file, or of a file of the user."""
+        seen = self._files.get(digest)
+        if seen is None:
+            return super().path(digest)
+        _check(seen)
+        return next(iter(seen))
+
+    @contextmanager
+    def unpacked(self, digest: str, limits: ArchiveLimits) -> Iterator[Path]:
+        """A folder with the files of a transit: the user's own folder, or an archive that is unpacked."""
+        if digest not in self._folders:
+            with super().unpacked(digest, limits) as folder:
+                yield folder
+            return
+        found, seen = self._folders[digest]
+        _check(seen)
+        yield found.folder
+        _check(seen)
+
+
+def _states(*files: Path) -> _Seen:
+    """Time of the last change (ns) and size (bytes) of each file."""
+    return {file: ((found := file.stat()).st_mtime_ns, found.st_size) for file in files}
+
+
+def _check(seen: _Seen) -> None:
+    """Raise OSError if a file changed since."""
+    for file, state in _states(*seen).items():
+        if state != seen[file]:
+            raise OSError(f"{file} changed while it was read; run the command again")
+
 
 class LocalService(Operations):
-    """The operations of a service, done here and now."""
+    """The requests to a service, done at once in this process."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._store = Store(settings.data_dir)
+        self._store = LocalStore(settings.data_dir)
         self._catalogue = Catalogue(settings.catalogue_url)
         self._catalogue.upgrade()
         self._runner = Runner(settings, self._catalogue, self._store)
@@ -50,19 +120,27 @@ class LocalService(Operations):
         self._catalogue.close()
 
     def upload_image(self, path: str | Path) -> dict[str, Any]:
-        """Take an image in; its header is checked as a service would."""
+        """Add an image, after the check of its header that a service makes."""
         source = Path(path)
         summary = read_summary(source, FitsLimits(max_pixels=self._settings.max_pixels))
-        sha256 = self._keep(source)
+        sha256 = self._store.add_file(source)
         row = image_row(DEFAULT_OWNER, sha256, source.stat().st_size, source.name, summary)
         self._catalogue.add(row)
         return {"id": row.id, "header": row.summary}
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
-        """Take a transit in; its archive's table of contents is checked as a service would."""
-        with as_archive(Path(path)) as source:
+        """Add a transit, after the check of its table of contents that a service makes."""
+        source = Path(path)
+        if source.is_dir():
+            try:
+                found = self._store.add_folder(source)
+            except DataError as error:
+                raise ServiceError(error.message, code=error.code) from error
+            name = f"{found.folder.name}.tar"
+            row = transit_row(DEFAULT_OWNER, found.sha256, found.bytes, name, found.contents)
+        else:
             contents = list_archive(source, self._settings.archive_limits)
-            sha256 = self._keep(source)
+            sha256 = self._store.add_file(source)
             row = transit_row(DEFAULT_OWNER, sha256, source.stat().st_size, source.name, contents)
         return TransitDetails.of(self._catalogue.add(row)[0]).model_dump(mode="json")
 
@@ -76,10 +154,10 @@ class LocalService(Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Take a PSF in."""
+        """Add a PSF."""
         source = Path(path)
         summary = read_summary(source, FitsLimits(max_pixels=self._settings.max_pixels))
-        sha256 = self._keep(source)
+        sha256 = self._store.add_file(source)
         row = uploaded_psf_row(
             DEFAULT_OWNER,
             sha256,
@@ -95,7 +173,7 @@ class LocalService(Operations):
         return PsfView.of(self._catalogue.add(row)[0]).model_dump(mode="json")
 
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
-        """Write a job down; ``wait`` runs it."""
+        """Add a job; ``wait`` runs it."""
         body = {"kind": kind, "parameters": parameters}
         try:
             request = TypeAdapter[JobRequest](JobRequest).validate_python(body)
@@ -110,8 +188,8 @@ class LocalService(Operations):
         return JobView.of(row).model_dump(mode="json")
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
-        """Run the job here; returns it completed, or raises ``ServiceError``."""
-        while not Phase(job["phase"]).ended:  # a passing failure is tried again, as often as the settings say
+        """Run the job; returns its description. Raises ``ServiceError`` if it fails."""
+        while not Phase(job["phase"]).ended:  # a transient fault is tried again, as often as the settings say
             self._runner.run(job["id"], progress)
             row = self._catalogue.jobs.get(job["id"])
             assert row is not None
@@ -146,16 +224,16 @@ class LocalService(Operations):
         shutil.copyfile(self._store.path(digest), path)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """The answer of the tables that are kept here."""
+        """The answer of the PSF's tables."""
         name, _, other = question.partition("/")
         tables = [self._tables(one) for one in (psf_id, other) if one]
         try:
-            return psf_lookup.compare(*tables) if other else psf_lookup.QUESTIONS[name](*tables, **query)
+            return lookup.compare(*tables) if other else lookup.QUESTIONS[name](*tables, **query)
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
 
     def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
-        """Cut the middle out of a PSF that is kept here."""
+        """Write the central part of a PSF."""
         row = self._psf(psf_id)
         limits = FitsLimits(max_pixels=self._settings.max_pixels)
         try:
@@ -188,15 +266,10 @@ class LocalService(Operations):
         assert row is not None
         return row
 
-    def _keep(self, source: Path) -> str:
-        with self._store.temporary() as copy:
-            shutil.copyfile(source, copy)
-            return self._store.keep(copy)
-
 
 @contextmanager
 def local_service(*, gap_effects: str = "") -> Iterator[LocalService]:
-    """A local service on a folder that is gone afterwards. gap_effects: as the setting of that name."""
+    """A local service on a temporary folder. gap_effects: as the setting of that name."""
     with TemporaryDirectory(prefix="heliopsf-") as folder:
         service = LocalService(Settings.apart(Path(folder), gap_effects=gap_effects))
         try:

@@ -1,4 +1,4 @@
-"""Writes the OpenAPI description: ``python -m service.openapi openapi/openapi.json``."""
+"""Write the OpenAPI description: ``python -m service.openapi openapi/openapi.json``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from workers.settings import Settings
 
 
 def description() -> str:
-    """The OpenAPI document as text, as it is kept in ``openapi/``."""
+    """The OpenAPI document as text, as stored in ``openapi/``."""
     return json.dumps(create_app(Settings()).openapi(), indent=1, sort_keys=True) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""``heliopsf serve``: the web process and, in the embedded mode, its worker beside it."""
+"""``heliopsf serve``: the web process and, in embedded mode, a worker process beside it."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ log = logging.getLogger(__name__)
 
 
 def serve(settings: Settings, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Serve until interrupted. Port 0 takes a free one; ``announce`` is told the address.
+    """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address.
 
-    Told to stop (SIGTERM, Control-C), it takes no more connections, lets requests at work go on for ``stop_s``,
-    and then stops the embedded worker, which takes ``gone_s`` at most.
+    On SIGTERM or Control-C it accepts no more connections, gives running requests ``stop_s`` seconds, and then stops the
+    embedded worker, which takes at most ``gone_s`` seconds.
     """
     logs.configure(settings)
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as listener:
@@ -50,7 +50,7 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
             )
         )
         _prepare(settings, host)
-        # The server passes a signal on once it has shut down; as exceptions they let the worker be stopped too.
+        # The server raises the signal again after its shutdown; as an exception it lets the worker be stopped too.
         signal.signal(signal.SIGTERM, _raise_exit)
         with embedded_worker(settings):
             announce(address)
@@ -61,7 +61,7 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
 
 
 def _prepare(settings: Settings, host: str) -> None:
-    """Bring the database to this version's tables before a worker beside looks at them, and see to it that nobody is let in who should not be.
+    """Upgrade the database before the worker uses it, and check that a public address requires keys.
 
     Raises ``SchemaError``, ``NoKeyYet``.
     """
@@ -75,10 +75,10 @@ def _prepare(settings: Settings, host: str) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Tells the application that it is to stop, so that requests which wait for a job are answered at once."""
+    """Tells the application about a shutdown, so that requests that wait for a job are answered at once."""
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """As the server does on a signal, once the application knows."""
+        """Tell the application, then handle the signal as the server does."""
         assert isinstance(self.config.app, FastAPI)
         self.config.app.state.stopping = True
         super().handle_exit(sig, frame)
@@ -90,9 +90,9 @@ def _raise_exit(_signal: int, _frame: object) -> None:
 
 @contextmanager
 def embedded_worker(settings: Settings) -> Iterator[None]:
-    """A worker process beside this one while the block runs; started again if it dies.
+    """Run a worker process while the block runs; restart it if it ends.
 
-    Does nothing where the broker is a real one: there, workers are started on their own.
+    With an external broker it does nothing, because workers are started separately.
     """
     if not settings.embedded:
         yield
@@ -112,7 +112,7 @@ def _keep_worker(settings: Settings, stopping: threading.Event) -> None:
         try:
             worker = _start_worker(settings)
         except OSError as error:
-            log.error("the worker could not be started, trying again: %s", error)
+            log.error("cannot start the worker, will try again: %s", error)
             stopping.wait(5.0)
             continue
         while worker.poll() is None and not stopping.wait(0.5):
@@ -120,7 +120,7 @@ def _keep_worker(settings: Settings, stopping: threading.Event) -> None:
         if stopping.is_set():
             _stop(worker, settings.gone_s + 3.0)
         else:
-            log.error("the worker ended with code %s; starting it again", worker.returncode)
+            log.error("the worker ended with exit status %s; restarting it", worker.returncode)
             stopping.wait(1.0)
 
 
@@ -132,15 +132,15 @@ def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
             [sys.executable, "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
             env=os.environ | environment(settings),
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # what Celery says beside the logs
+            stdout=subprocess.DEVNULL,  # what Celery prints apart from the logs
             stderr=output,
-            # Control-C goes to this process alone, which then stops the worker in order.
+            # So that Control-C reaches only this process, which then stops the worker.
             start_new_session=True,
         )
 
 
 def environment(settings: Settings) -> dict[str, str]:
-    """Settings as the variables that another process reads them from."""
+    """Settings as environment variables for another process."""
     set_here = settings.model_dump(mode="json", exclude_none=True)
     set_here["data_dir"] = str(Path(settings.data_dir).resolve())
     return {f"HELIOPSF_{name.upper()}": str(value) for name, value in set_here.items()}
@@ -151,6 +151,6 @@ def _stop(worker: subprocess.Popen[bytes], within_s: float) -> None:
     try:
         worker.wait(within_s)
     except subprocess.TimeoutExpired:
-        # It ends itself before; its job is queued again by the next server, so nothing is lost here either.
+        # A worker normally ends before this. The next server queues its job again, so nothing is lost.
         os.killpg(worker.pid, signal.SIGKILL)
         worker.wait()

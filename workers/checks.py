@@ -13,7 +13,6 @@ from tempfile import TemporaryFile
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
 from workers.settings import Settings
@@ -58,6 +57,8 @@ def broker(settings: Settings) -> None:
     """Check that the broker answers."""
     if "://" not in settings.broker_url:  # Celery would use a broker in its own memory
         raise Unusable("the broker's URL cannot be used (expected scheme://...)")
+    from workers.broker import app as queue  # Celery takes half a second to import
+
     try:
         queue.check(settings)
     except queue.AWAY as error:

@@ -13,6 +13,7 @@ import tarfile
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from psfcore.errors import DataError
 from psfcore.transit.admission import ArchiveLimits
@@ -107,9 +108,15 @@ def pack(folder: str | Path, path: str | Path) -> TransitManifest:
 
     Raises DataError "no-manifest", "bad-manifest", "missing-file".
     """
-    folder = Path(folder)
-    manifest = read_manifest(folder)
-    with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as archive:
+    manifest = read_manifest(Path(folder))
+    with Path(path).open("wb") as file:
+        pack_into(Path(folder), manifest, file)
+    return manifest
+
+
+def pack_into(folder: Path, manifest: TransitManifest, target: IO[bytes]) -> None:
+    """Write the .tar that ``pack`` writes to an open file, of which only ``write`` and ``tell`` are called."""
+    with tarfile.open(fileobj=target, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for name in (MANIFEST_NAME, *manifest.files):
             if not (folder / name).is_file():
                 message = f"expected every file that {MANIFEST_NAME} names; missing: {name}"
@@ -119,7 +126,6 @@ def pack(folder: str | Path, path: str | Path) -> TransitManifest:
                 entry.size = file.seek(0, io.SEEK_END)
                 file.seek(0)
                 archive.addfile(entry, file)
-    return manifest
 
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""``heliopsf bulk``: an archive reprocessed."""
+"""``heliopsf bulk``: bulk runs, which deconvolve many images on a service."""
 
 from __future__ import annotations
 
@@ -11,11 +11,22 @@ from typing import Any
 import click
 
 from service.cli.connection import SERVER, named_psf, remote
-from service.cli.options import METHODS, NOISE, OUTPUT, SATURATION, check_writable, progress_bar, user_errors
-from service.client.http import percent
+from service.cli.options import (
+    METHOD,
+    NOISE,
+    OUTPUT,
+    SATURATION,
+    STEPS,
+    check_writable,
+    fits_files,
+    percent,
+    progress_bar,
+    user_errors,
+)
 
 _CONDITION = re.compile(r"([A-Z0-9_-]{1,8})\s*(=|!=|<=|>=|<|>)\s*(.+)")
 BULK_ID = click.argument("bulk_id", metavar="ID")
+WAIT = click.option("--wait", is_flag=True, help="Wait until the bulk run ends")
 
 
 class _Condition(click.ParamType):
@@ -24,35 +35,41 @@ class _Condition(click.ParamType):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, str, Any]:
-        """(keyword, sign, value) of a text such as WAVELNTH=174."""
+        """Split a text such as WAVELNTH=174 into keyword, sign and value."""
         parts = _CONDITION.fullmatch(str(value).strip())
         if parts is None:
-            self.fail(f"expected KEYWORD=VALUE, or one of != < <= > >= between; got {value!r}", param, ctx)
+            self.fail(f"expected KEYWORD=VALUE, or != < <= > >= instead of =; got {value!r}", param, ctx)
         return parts[1], parts[2], _value(parts[3])
 
 
 @click.group()
 def bulk() -> None:
-    """Have many images deconvolved alike: uploads, or files of an archive that the service reads itself."""
+    """Deconvolve many images on a service in the same way: uploads, or files of an archive that the service can read."""
 
 
 @bulk.command("submit")
 @click.argument("patterns", nargs=-1)
-@click.option("--psf", metavar="ID|FILE", help="PSF for all images: an id, or a file of yours")
-@click.option("--context", help="Or the context to find each image's PSF in: its id or name")
+@click.option("--psf", metavar="ID|FILE", help="PSF for all images: its id, or a file")
+@click.option("--context", help="Choose the PSF of each image from this context: its id or name")
 @click.option("--upload", "uploads", multiple=True, type=click.Path(exists=True, path_type=Path),
-              help="A file of this machine, or a folder of FITS files, to send and deconvolve")  # fmt: skip
-@click.option("--image", "images", multiple=True, metavar="ID", help="An image that was uploaded before")
+              help="FITS file, or folder of FITS files, to upload and deconvolve; may be given several times")  # fmt: skip
+@click.option(
+    "--image",
+    "images",
+    multiple=True,
+    metavar="ID",
+    help="Image that was uploaded before; may be given several times",
+)
 @click.option("--where", "conditions", multiple=True, type=_Condition(), metavar="KEYWORD=VALUE",
-              help="What a file's header must say; several must all be met")  # fmt: skip
+              help="Take only files whose header says so; several conditions must all hold")  # fmt: skip
 @click.option("--output", help="Folder on the service's machine to write products to")
-@click.option("--only", is_flag=True, help="There alone: the service keeps no product")
-@click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True)
-@click.option("--steps", type=click.IntRange(1, 200), help="[default: the method's]")
+@click.option("--only", is_flag=True, help="Write products only there; the service keeps no copy")
+@METHOD
+@STEPS
 @NOISE
 @SATURATION
-@click.option("--name", default="", help="A label")
-@click.option("--wait", is_flag=True, help="Stay until it ends")
+@click.option("--name", default="", help="Label of the bulk run")
+@WAIT
 @SERVER
 def submit(
     patterns: tuple[str, ...],
@@ -71,15 +88,16 @@ def submit(
     wait: bool,
     server: str | None,
 ) -> None:
-    """Submit a bulk of the files that PATTERNS name on the service's machine, below a folder that its operator allows.
+    """Start a bulk run of the files that match PATTERNS on the machine of the service.
 
-    A pattern is an absolute path; * ? and [ab] stand for parts of a name, ** for any folders between. Quote it.
+    A pattern is an absolute path in a folder that the operator allows. * ? and [ab] match parts of a name, ** matches any
+    number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context.
     """
     if (psf is None) == (context is None):
-        raise click.UsageError("expected one of --psf and --context")
+        raise click.UsageError("expected either --psf or --context")
     figures = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]} if noise else None
     with user_errors(), remote(server) as service:
-        sent = [service.upload_image(path)["id"] for path in _fits_files(uploads)]
+        sent = [service.upload_image(path)["id"] for path in fits_files(uploads)]
         made = service.submit_bulk(
             images=[*images, *sent],
             files=[{"glob": pattern, "where": _where(conditions)} for pattern in patterns],
@@ -101,10 +119,10 @@ def submit(
 
 @bulk.command("status")
 @click.argument("bulk_id", metavar="[ID]", required=False)
-@click.option("--wait", is_flag=True, help="Stay until it ends")
+@WAIT
 @SERVER
 def status(bulk_id: str | None, wait: bool, server: str | None) -> None:
-    """Say how far a bulk is, how fast, and until when; without an ID, list all."""
+    """Show progress, speed and time left of a bulk run; without an ID, list all bulk runs."""
     with user_errors(), remote(server) as service:
         if bulk_id is None:
             for row in service.bulks():
@@ -123,7 +141,7 @@ def status(bulk_id: str | None, wait: bool, server: str | None) -> None:
 @BULK_ID
 @SERVER
 def retry(bulk_id: str, server: str | None) -> None:
-    """Try again the images that failed."""
+    """Try the failed images of a bulk run again."""
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.retry_bulk(bulk_id))))
 
@@ -132,7 +150,7 @@ def retry(bulk_id: str, server: str | None) -> None:
 @BULK_ID
 @SERVER
 def pause(bulk_id: str, server: str | None) -> None:
-    """Begin no more images; those at work are let end."""
+    """Pause a bulk run: start no more images, but finish those in progress."""
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.pause_bulk(bulk_id))))
 
@@ -141,7 +159,7 @@ def pause(bulk_id: str, server: str | None) -> None:
 @BULK_ID
 @SERVER
 def resume(bulk_id: str, server: str | None) -> None:
-    """Let a bulk that was paused, or could not go on, go on where it was."""
+    """Resume a paused or failed bulk run."""
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.resume_bulk(bulk_id))))
 
@@ -150,19 +168,21 @@ def resume(bulk_id: str, server: str | None) -> None:
 @BULK_ID
 @SERVER
 def cancel(bulk_id: str, server: str | None) -> None:
-    """End a bulk for good; what is done stays."""
+    """End a bulk run for good; products that are done stay."""
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.cancel_bulk(bulk_id))))
 
 
 @bulk.command("report")
 @BULK_ID
-@click.option("-o", "--output", type=OUTPUT, help="Write the manifest of all that is done (.ndjson or .csv)")
-@click.option("--failures", type=OUTPUT, help="Write what failed, with reasons (.ndjson)")
-@click.option("--most", default=20, show_default=True, type=click.IntRange(0, 10_000), help="Images to show")
+@click.option("-o", "--output", type=OUTPUT, help="Write the manifest of all products (.ndjson or .csv)")
+@click.option("--failures", type=OUTPUT, help="Write the failures with their reasons (.ndjson)")
+@click.option(
+    "--most", default=20, show_default=True, type=click.IntRange(0, 10_000), help="Number of images to show"
+)
 @SERVER
 def report(bulk_id: str, output: Path | None, failures: Path | None, most: int, server: str | None) -> None:
-    """Say what a bulk did: the images whose artefacts are most doubtful first, then what failed."""
+    """Show the results of a bulk run: images with the highest artefact score first, then failures."""
     check_writable(output, failures)
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.bulk(bulk_id))))
@@ -172,7 +192,7 @@ def report(bulk_id: str, output: Path | None, failures: Path | None, most: int, 
         for row in failed[:most]:
             click.echo(f"failed: {row['source']}: {row['error']['message']}")
         if len(failed) > most:
-            click.echo(f"... and {len(failed) - most} more that failed")
+            click.echo(f"... and {len(failed) - most} more failures")
         if output is not None:
             is_table = output.suffix.lower() == ".csv"
             service.write_bulk_manifest(bulk_id, output, format="csv" if is_table else "ndjson")
@@ -189,13 +209,13 @@ def _said(found: dict[str, Any]) -> list[str]:
     images = found["images"]
     lines = [
         f"{found['phase']}: {images['done']} of {images['total']} done"
-        + (f" ({images['reused']} there already)" if images["reused"] else "")
-        + f", {images['failed']} failed, {images['at_work']} at work, {images['waiting']} waiting"
+        + (f" ({images['reused']} existed already)" if images["reused"] else "")
+        + f", {images['failed']} failed, {images['at_work']} in progress, {images['waiting']} waiting"
     ]
     if images["to_look_at"]:
         lines.append(f"{images['to_look_at']} to look at: `heliopsf bulk report {found['id']}`")
     if found["images_an_hour"]:
-        lines.append(f"{found['images_an_hour']:.0f} images an hour{_left(found['time_left_s'])}")
+        lines.append(f"{found['images_an_hour']:.0f} images per hour{_left(found['time_left_s'])}")
     if found["error"]:
         lines.append(f"stopped: {found['error']['message']}")
     return lines
@@ -219,20 +239,8 @@ def _line(row: dict[str, Any]) -> str:
     return f"{row['score']:8.2f}  {changes}  {row['source']}"
 
 
-def _fits_files(paths: Sequence[Path]) -> list[Path]:
-    """Files as they were named; of a folder the FITS files in it."""
-    found: list[Path] = []
-    for path in paths:
-        found += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
-    return found
-
-
-def _is_fits(path: Path) -> bool:
-    return path.name.lower().endswith((".fits", ".fits.gz", ".fts", ".fit"))
-
-
 def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
-    """Conditions as the service takes them; several values that a card may equal are one of these."""
+    """Conditions in the form of the request; several values of one keyword mean any of them."""
     where: dict[str, Any] = {}
     for key, sign, value in conditions:
         if sign == "=":
@@ -241,19 +249,23 @@ def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
             continue
         where.setdefault(key, {})
         if not isinstance(where[key], dict):
-            raise click.UsageError(f"--where {key}: expected either values or comparisons; got both")
+            raise click.UsageError(
+                f"--where {key}: use either values (=) or comparisons for one keyword, not both"
+            )
         where[key][sign] = value
     return where
 
 
 def _as_list(before: Any, key: str) -> list[Any]:
     if isinstance(before, dict):
-        raise click.UsageError(f"--where {key}: expected either values or comparisons; got both")
+        raise click.UsageError(
+            f"--where {key}: use either values (=) or comparisons for one keyword, not both"
+        )
     return before if isinstance(before, list) else [before]
 
 
 def _value(text: str) -> bool | int | float | str:
-    """T and F, numbers, or else a text, which may stand in quotation marks to be one."""
+    """A value of T, F, a number, or else a text; quotation marks force a text."""
     if text in ("T", "F"):
         return text == "T"
     for kind in (int, float):

@@ -1,16 +1,19 @@
-"""A service for a command: over HTTP, or in this process."""
+"""Where a command sends its request: to a service over HTTP, or to one inside this process."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from service.client.http import DEFAULT_SERVER, Heliopsf, Operations
+from service.cli.options import is_psf_id
+from service.client.operations import DEFAULT_SERVER, Operations
+
+if TYPE_CHECKING:
+    from service.client.http import Client
 
 _KEY = "heliopsf.key"
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -21,30 +24,37 @@ def _remember(context: click.Context, _parameter: click.Parameter, key: str | No
 
 
 def server_option(what: str) -> Callable[[Command], Command]:
-    """The options of a command that asks a service: which one, and the key that lets it in."""
+    """The options ``--server`` and ``--key`` of a command that needs a service."""
     key = click.option(
         "--key",
         envvar="HELIOPSF_KEY",
         expose_value=False,
         callback=_remember,
-        help="Key for it; HELIOPSF_KEY keeps it out of the list of processes",
+        help="Access key; better set HELIOPSF_KEY: other users can read command lines",
     )
     server = click.option("--server", envvar="HELIOPSF_SERVER", help=f"{what} [default: {DEFAULT_SERVER}]")
     return lambda command: server(key(command))
 
 
-SERVER = server_option("Service to use")
+SERVER = server_option("Address of the service")
 LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
+PSF = click.option(
+    "--psf",
+    metavar="ID|FILE",
+    help="PSF: its id, or a file [default: the certified one for the image, else its instrument's]",
+)
 
 
-def remote(server: str | None) -> Heliopsf:
-    """A service over HTTP, with the key that the command was given."""
-    return Heliopsf(server, key=click.get_current_context().meta.get(_KEY))
+def remote(server: str | None) -> Client:
+    """A client of the service at ``server``, with the key that the command was given."""
+    from service.client.http import Client
+
+    return Client(server, key=click.get_current_context().meta.get(_KEY))
 
 
 @contextmanager
-def connection(server: str | None, local: bool) -> Iterator[Operations]:
-    """A service over HTTP, or one that lives in this process."""
+def connection(server: str | None, local: bool, *, gap_effects: str = "") -> Iterator[Operations]:
+    """A service over HTTP, or one in this process (``local``). gap_effects: further effects of the local one."""
     if not local:
         with remote(server) as service:
             service.health()
@@ -52,13 +62,13 @@ def connection(server: str | None, local: bool) -> Iterator[Operations]:
         return
     from service.local import local_service
 
-    with local_service() as here:
+    with local_service(gap_effects=gap_effects) as here:
         yield here
 
 
 def named_psf(service: Operations, psf: str | None) -> str | None:
-    """The id of the PSF that the user named: a file is uploaded, an id taken as it is. Raises ``ClickException``."""
-    if psf is None or re.fullmatch(r"[0-9a-f]{64}", psf):
+    """The id of the PSF that the user named; a file is uploaded first. Raises ``ClickException``."""
+    if psf is None or is_psf_id(psf):
         return psf
     if not Path(psf).is_file():
         raise click.ClickException(f"--psf: expected a PSF id (64 hexadecimal digits) or a file; got {psf!r}")

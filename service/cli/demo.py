@@ -1,4 +1,4 @@
-"""``heliopsf demo``: the whole way of one image, with everything real and nothing left running."""
+"""The command ``demo``: one image from upload to product, on a service that is started for it and stopped afterwards."""
 
 from __future__ import annotations
 
@@ -7,11 +7,32 @@ import subprocess
 import sys
 from pathlib import Path
 
-from service.client.http import Heliopsf, Progress, percent
+import click
+
+from service.cli.options import FILE, OUTPUT_FOLDER, percent, progress_bar, user_errors
+from service.client.http import Client
+from service.client.versions import Progress
+
+
+@click.command()
+@click.option("--image", type=FILE, help="Your own image (FITS) [default: a simulated one]")
+@click.option(
+    "-o",
+    "--output",
+    default="heliopsf-demo",
+    show_default=True,
+    type=OUTPUT_FOLDER,
+    help="Folder for the results",
+)
+def demo(image: Path | None, output: Path) -> None:
+    """Start a service, upload an image, deconvolve it, download the product, and stop the service."""
+    with user_errors(), progress_bar() as report:
+        lines = run(image, output, report)
+    click.echo("\n".join(lines))
 
 
 def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
-    """Serve on a free port, upload, deconvolve, download, stop; returns what to tell the user."""
+    """Serve on a free port, upload, deconvolve, download, stop. Returns lines to print."""
     output.mkdir(parents=True, exist_ok=True)
     with (output / "server.log").open("w") as log:
         server = subprocess.Popen(
@@ -25,14 +46,14 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
                 "--data",
                 str(output / "data"),
             ],
-            # Whatever service the environment names, the demo keeps to itself.
+            # The demo uses a service of its own, whatever service the environment names.
             env={key: value for key, value in os.environ.items() if not key.startswith("HELIOPSF_")},
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
         )
         try:
-            with Heliopsf(_address(server, output)) as service:
+            with Client(_address(server, output)) as service:
                 if image is None:
                     image = _simulated(service, output, progress)
                 product_file = output / f"{image.stem}-deconvolved.fits"
@@ -53,20 +74,20 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
 
 
 def _address(server: subprocess.Popen[str], output: Path) -> str:
-    """The address that the server announces once it listens."""
+    """The address of the server, which it prints when it listens."""
     assert server.stdout is not None
     line = server.stdout.readline()
     if " serves " not in line:
-        raise OSError(f"the demo's server did not start; see {output / 'server.log'}")
+        raise OSError(f"the server of the demo did not start; read {output / 'server.log'}")
     address = line.split(" serves ")[1].split()[0]
-    with Heliopsf(address) as service:
+    with Client(address) as service:
         service.wait_until_up()
     return address
 
 
-def _simulated(service: Heliopsf, output: Path, progress: Progress) -> Path:
-    """An image seen through the very PSF that the service then takes away again."""
-    # Imported here, so that a demo of an image of your own does not load it.
+def _simulated(service: Client, output: Path, progress: Progress) -> Path:
+    """A simulated image, convolved with the PSF that the service builds."""
+    # Imported here: a demo with the user's own image does not need it.
     from psfcore.fits.header import FitsLimits
     from psfcore.fits.psfs import read_psf
     from psfcore.simulate.observe import demo_image

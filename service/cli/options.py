@@ -1,27 +1,30 @@
-"""What the commands share: options, limits and settings, one-line errors, results written, progress on a terminal.
+"""What commands share: options, settings, errors in one line, checks of output files, and a progress bar.
 
-Nothing numerical is imported here, so that the commands start fast.
+This file imports nothing numerical, so that commands start fast.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
-from service.client.http import ServiceError
+from service.client.errors import ServiceError
 from workers.contract.methods import Method
-from workers.settings import Settings
+
+if TYPE_CHECKING:
+    from psfcore.fits.header import FitsLimits
+    from workers.settings import Settings
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -29,20 +32,39 @@ OUTPUT = click.Path(dir_okay=False, path_type=Path)
 OUTPUT_FOLDER = click.Path(file_okay=False, path_type=Path)
 METHODS = [get_args(kind.model_fields["name"].annotation)[0] for kind in get_args(get_args(Method)[0])]
 
+METHOD = click.option(
+    "--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True, help="Deconvolution method"
+)
+STEPS = click.option(
+    "--steps", type=click.IntRange(1, 200), help="Iterations [default: the method's own; Richardson-Lucy: 20]"
+)
 NOISE = click.option(
-    "--noise", nargs=2, type=float, metavar="GAIN READ", help="DN a photon, DN rms of the readout"
+    "--noise",
+    nargs=2,
+    type=float,
+    metavar="GAIN READ",
+    help="Photon gain (DN per photon) and read noise (DN rms) of the camera",
 )
 SATURATION = click.option(
-    "--saturation", "saturation_dn", type=float, help="DN from which a pixel is not trusted"
+    "--saturation",
+    "saturation_dn",
+    type=float,
+    metavar="DN",
+    help="Level from which pixels are saturated and ignored",
 )
-PLOT = click.option("--plot", type=OUTPUT, help="Write a picture (PNG)")
+SEED = click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Seed of random numbers"
+)
+JSON = click.option("--json", "json_file", type=OUTPUT, help="Write all numbers to this file (JSON)")
+PLOT = click.option("--plot", type=OUTPUT, help="Write a plot to this file (PNG)")
+DATA = click.option("--data", type=OUTPUT_FOLDER, help="Data folder [default: HELIOPSF_DATA_DIR]")
 
 Report = Callable[[str, int, int], None]
 
 
 @contextmanager
 def user_errors() -> Iterator[None]:
-    """What is wrong with the user's data, files or service as one line and an exit status, without a traceback."""
+    """Turn an error of the user's data, files or service into one line and an exit status, without a traceback."""
     try:
         yield
     except DataError as error:
@@ -52,21 +74,21 @@ def user_errors() -> Iterator[None]:
 
 
 def check_writable(*paths: Path | None) -> None:
-    """Say so before the work, not after it, where a result could not be written: ``ClickException``."""
+    """Raise ``ClickException`` before the work starts if the folder of an output file does not exist."""
     for path in paths:
         if path is not None and not path.resolve().parent.is_dir():
             raise click.ClickException(f"cannot write {path}: there is no folder {path.resolve().parent}")
 
 
 def check_fresh_folder(folder: Path, *, force: bool = False) -> None:
-    """Raise ``ClickException`` where a folder to fill cannot be made, or holds something and ``force`` is not said."""
+    """Raise ``ClickException`` if an output folder cannot be made, or holds files and ``force`` is false."""
     if not force and folder.is_dir() and any(folder.iterdir()):
-        raise click.ClickException(f"{folder} is not empty: name another folder, or say --force")
+        raise click.ClickException(f"{folder} is not empty; name another folder, or use --force")
     check_writable(folder)
 
 
 def write_json(path: Path | None, content: dict[str, Any]) -> None:
-    """Write ``content`` where a path is given; ``ClickException`` where that cannot be done."""
+    """Write ``content`` to ``path``, if one is given. Raises ``ClickException`` if the file cannot be written."""
     if path is None:
         return
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
@@ -76,8 +98,32 @@ def write_json(path: Path | None, content: dict[str, Any]) -> None:
         raise click.ClickException(f"cannot write {path}: {error.strerror or error}") from error
 
 
+def fits_files(paths: Sequence[Path]) -> list[Path]:
+    """Files as named, each once; a folder stands for the FITS files in it, by name."""
+    found: list[Path] = []
+    for path in paths:
+        found += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
+    return list(dict.fromkeys(found))
+
+
+def _is_fits(path: Path) -> bool:
+    return path.name.lower().endswith((".fits", ".fits.gz", ".fts", ".fit"))
+
+
+def is_psf_id(psf: str) -> bool:
+    """Whether a text is the id of a PSF; else it names a file."""
+    return re.fullmatch(r"[0-9a-f]{64}", psf) is not None
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A relative change as text; None: the reference has no light."""
+    return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
+
+
 def read_settings(data: Path | None = None) -> Settings:
-    """The operator's settings, on a data folder where one is named; ``ClickException`` says which are wrong."""
+    """The operator's settings; ``data`` replaces the data folder. Raises ``ClickException`` for wrong values."""
+    from workers.settings import Settings
+
     try:
         return Settings() if data is None else Settings(data_dir=data)
     except ValidationError as error:
@@ -88,13 +134,15 @@ def read_settings(data: Path | None = None) -> Settings:
 
 
 def limits() -> FitsLimits:
-    """What is read of FITS files: as much as the settings let a service take."""
+    """The largest FITS file that a command reads, as HELIOPSF_MAX_PIXELS says."""
+    from psfcore.fits.header import FitsLimits
+
     return FitsLimits(max_pixels=read_settings().max_pixels)
 
 
 @contextmanager
 def progress_bar() -> Iterator[Report]:
-    """A bar on a terminal, with the time it will take; nothing where the output is no terminal."""
+    """A progress bar with the estimated time left; silent if standard error is not a terminal."""
     if not sys.stderr.isatty():
         yield lambda stage, step, steps: None
         return

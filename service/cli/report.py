@@ -1,53 +1,104 @@
-"""The command ``report``: a transit and its PSF as one page that can be read, printed and sent."""
+"""The command ``report``: what a transit says about a PSF."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import click
 
 from service.cli.connection import LOCAL, SERVER, connection, named_psf
-from service.cli.options import NOISE, OUTPUT, SATURATION, check_writable, progress_bar, user_errors
+from service.cli.options import (
+    JSON,
+    NOISE,
+    OUTPUT,
+    PLOT,
+    SATURATION,
+    SEED,
+    check_writable,
+    progress_bar,
+    user_errors,
+)
 
 
 @click.command()
 @click.argument("transit", type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", required=True, type=OUTPUT, help="The page (HTML)")
-@click.option("--json", "json_file", type=OUTPUT, help="Write all of its numbers too")
-@click.option("--psf", metavar="ID|FILE", help="A PSF to judge as it is [default: fit the transit]")
-@click.option("--dark-offsets/--no-dark-offsets", default=True, help="Also fit with wrong dark levels (slow)")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Of all draws")
+@click.option("-o", "--output", type=OUTPUT, help="Write a page to read and print (HTML)")
+@JSON
+@PLOT
+@click.option(
+    "--psf", metavar="ID|FILE", help="Test this PSF: its id, or a file [default: fit one to TRANSIT]"
+)
+@click.option(
+    "--dark-offsets/--no-dark-offsets",
+    default=True,
+    help="Also fit with wrong dark levels, +-3 and +-5 DN (slow)",
+)
+@click.option(
+    "--shapes",
+    is_flag=True,
+    help="Also compare shapes of the scatter kernel by held-out errors (slow); without --psf",
+)
+@SEED
 @NOISE
 @SATURATION
 @SERVER
 @LOCAL
 def report(
     transit: Path,
-    output: Path,
+    output: Path | None,
     json_file: Path | None,
+    plot: Path | None,
     psf: str | None,
     dark_offsets: bool,
+    shapes: bool,
     seed: int,
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
     server: str | None,
     local: bool,
 ) -> None:
-    """Show what TRANSIT, a folder (or a .zip or .tar of one) with a transit.json, says of a PSF: one HTML page."""
-    check_writable(output, json_file)
-    with user_errors(), connection(server, local) as service, progress_bar() as say:
-        found = service.evaluate(
+    """Fit a PSF to TRANSIT, or test one on it: compare simulated and observed light in the occulter's disc.
+
+    TRANSIT is a folder with a transit.json, or a .zip or .tar file of one. Without --psf every image is tested with a PSF
+    that was fitted without it. Name at least one output: -o, --json or --plot.
+    """
+    if output is None and json_file is None and plot is None:
+        raise click.UsageError(
+            "expected an output: -o PAGE.html, --json FILE or --plot FILE; got none of them"
+        )
+    if shapes and psf is not None:
+        raise click.UsageError(
+            "--shapes fits every shape itself, so it cannot be used with --psf; leave one out"
+        )
+    check_writable(output, json_file, plot)
+    with (
+        user_errors(),
+        TemporaryDirectory(prefix="heliopsf-") as folder,
+        connection(server, local) as service,
+        progress_bar() as say,
+    ):
+        numbers = json_file or Path(folder) / "report.json"
+        found = service.report(
             transit,
-            json_file,
+            numbers,
             page=output,
+            preview=plot,
             progress=say,
             noise=noise or None,
             psf_id=named_psf(service, psf),
             seed=seed,
             dark_offsets=dark_offsets,
+            shapes=shapes or None,
             saturation_dn=saturation_dn,
         )
-    click.echo(f"{output}: {found['details']['sentence']}")
+        told = json.loads(numbers.read_text("utf-8"))
+    from psfcore.evaluation.summary_lines import summary_lines
+
+    written = ", ".join(str(path) for path in (output, json_file, plot) if path is not None)
+    click.echo(f"{written}: {found['details']['sentence']}")
+    click.echo("\n".join(summary_lines(told["evaluation"], told.get("shapes"))))
     for limit in found["details"]["limits"]:
         click.echo(f"  note: {limit}")
     for missing in found["details"]["not_shown"]:

@@ -1,4 +1,4 @@
-"""What a client asks of bulk, many images deconvolved alike, and how it follows what goes on."""
+"""The requests of a client about bulk runs, and how it follows jobs and bulk runs by their events."""
 
 from __future__ import annotations
 
@@ -8,23 +8,24 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
-
-import httpx
+from typing import TYPE_CHECKING, Any
 
 from service.client.errors import ServiceError
 from service.client.versions import Progress
 
+if TYPE_CHECKING:
+    import httpx
+
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0
 PATIENCE_S = 600.0
-PASSING = (None, 429, 502, 503)  # no answer at all, or one that says to come again
-QUIET_S = 60.0  # a stream says at least every 15 s that it is there
+PASSING = (None, 429, 502, 503)  # no answer, or an answer that asks to try again later
+QUIET_S = 60.0  # a stream sends at least one line in 15 s
 
 
 class BulkClient(ABC):
-    """The part of a service's client that is about bulk and events.
+    """The requests about bulk runs and events.
 
-    Every method raises ``ServiceError``, whose ``code`` says why ("path-not-allowed", "no-such-bulk", ...).
+    Every method raises ``ServiceError``; its ``code`` is the reason ("path-not-allowed", "no-such-bulk", ...).
     """
 
     @abstractmethod
@@ -45,7 +46,7 @@ class BulkClient(ABC):
 
     @abstractmethod
     def _streamed(self, address: str, **options: Any) -> AbstractContextManager[httpx.Response]:
-        """The answer at an address, while it comes."""
+        """The answer at an address, read while it arrives."""
 
     def submit_bulk(
         self,
@@ -59,11 +60,12 @@ class BulkClient(ABC):
         name: str = "",
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Have many images deconvolved; returns the bulk, which is the open one of an equal request if there is one.
+        """Start a bulk run and return its description. If an equal bulk run is open, return that one.
 
-        ``images``: ids of uploads. ``files``: patterns on the service's machine, or {"glob": ..., "where": {...}} with
-        what headers must say. ``psf_id`` or ``context`` (id or name). ``output``: folder there; ``only`` there.
-        ``parameters``: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``, ``error_draws``.
+        images: ids of uploaded images. files: patterns of paths on the machine of the service, or {"glob": pattern,
+        "where": conditions on the header}. Give either psf_id or context (id or name). output: folder on that machine;
+        only: write products only there. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
+        ``error_draws``.
         """
         return self._json(
             "POST",
@@ -80,48 +82,48 @@ class BulkClient(ABC):
         )
 
     def bulk(self, bulk_id: str) -> dict[str, Any]:
-        """A bulk as it is now."""
+        """The current description of a bulk run."""
         return self.get(f"/v1/bulk/{bulk_id}")
 
     def bulks(self, **filters: str) -> Iterator[dict[str, Any]]:
-        """All bulks, newest first."""
+        """All bulk runs, newest first."""
         return self._all("/v1/bulk", filters)
 
     def pause_bulk(self, bulk_id: str) -> dict[str, Any]:
-        """Begin no more of its images."""
+        """Pause a bulk run: it starts no more images."""
         return self._json("POST", f"/v1/bulk/{bulk_id}/pause")
 
     def resume_bulk(self, bulk_id: str) -> dict[str, Any]:
-        """Let a bulk that was paused, or could not go on, go on."""
+        """Resume a paused or failed bulk run."""
         return self._json("POST", f"/v1/bulk/{bulk_id}/resume")
 
     def cancel_bulk(self, bulk_id: str) -> dict[str, Any]:
-        """End a bulk; what is done stays."""
+        """End a bulk run for good; products that are done stay."""
         return self._json("POST", f"/v1/bulk/{bulk_id}/cancel")
 
     def retry_bulk(self, bulk_id: str) -> dict[str, Any]:
-        """Try again what failed; "equal-bulk-open" where the same request is at work as another bulk."""
+        """Try the failed images again. ``ServiceError`` "equal-bulk-open": another bulk run of the same request is open."""
         return self._json("POST", f"/v1/bulk/{bulk_id}/retry")
 
     def bulk_failures(self, bulk_id: str) -> Iterator[dict[str, Any]]:
-        """Images that failed, with reasons."""
+        """The failed images, with reasons."""
         return self._all(f"/v1/bulk/{bulk_id}/failures", {})
 
     def bulk_results(
         self, bulk_id: str, *, order: str = "bulk", limit: int | None = None
     ) -> Iterator[dict[str, Any]]:
-        """Images that are done, with checksums and what changed; ``order="worst"``: the most doubtful first."""
+        """The images that are done, with checksums and changes; ``order="worst"``: highest artefact score first."""
         query = {"order": order} | ({} if limit is None else {"limit": str(limit)})
         with self._streamed(f"/v1/bulk/{bulk_id}/results", params=query) as answer:
             for line in answer.iter_lines():
                 yield json.loads(line)
 
     def write_bulk_manifest(self, bulk_id: str, path: str | Path, *, format: str = "ndjson") -> None:
-        """Write the manifest of what is done, as lines of JSON ("ndjson") or as a table ("csv")."""
+        """Write the manifest of all products, as lines of JSON ("ndjson") or as a table ("csv")."""
         self.download(f"/v1/bulk/{bulk_id}/results?format={format}", path)
 
     def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> dict[str, Any]:
-        """Follow a bulk to its end, or to where it cannot go on by itself; returns it as it is then."""
+        """Wait until a bulk run ends, is paused or has failed; returns its description."""
         for bulk in self.follow(f"/v1/bulk/{bulk_id}"):
             images = bulk["images"]
             if progress is not None and images["total"]:
@@ -131,9 +133,9 @@ class BulkClient(ABC):
         return bulk
 
     def follow(self, address: str) -> Iterator[dict[str, Any]]:
-        """A job or a bulk, by its address (``/v1/jobs/...``, ``/v1/bulk/...``): now, and each time it has changed.
+        """Yield the description of a job or bulk run (address ``/v1/jobs/...``, ``/v1/bulk/...``) now and after each change.
 
-        Ends with it. A service that is away for some minutes (a restart) does not end it.
+        Ends when the job or bulk run ends. Survives an absence of the service for some minutes, such as a restart.
         """
         last_id: str | None = None
         wait_s, heard_at = FIRST_WAIT_S, time.monotonic()
@@ -159,7 +161,7 @@ class BulkClient(ABC):
 
 
 def _events(lines: Iterator[str]) -> Iterator[dict[str, str]]:
-    """Events of a stream; what stands before a blank line is one, if it has data."""
+    """The events of a stream. A blank line ends an event; an event without data is dropped."""
     event: dict[str, str] = {}
     for line in lines:
         if line:

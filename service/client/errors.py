@@ -1,10 +1,14 @@
-"""What a client says when a request was refused."""
+"""The error that a client raises."""
 
 from __future__ import annotations
 
 
 class ServiceError(Exception):
-    """The service refused a request, a job failed, or no service is there; the message says why."""
+    """A request was refused, a job failed, or no service answered. The message says why.
+
+    status: HTTP status; None if there was no answer. code: the reason as a word, such as "no-such-psf".
+    retry_after_s: when the service asks to try again.
+    """
 
     def __init__(
         self,

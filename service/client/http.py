@@ -1,4 +1,4 @@
-"""A client for scripts: ``with Heliopsf("http://127.0.0.1:8765") as sun: sun.deconvolve("in.fits", "out.fits")``."""
+"""A client for scripts: ``with Client("http://127.0.0.1:8765") as client: client.deconvolve("in.fits", "out.fits")``."""
 
 from __future__ import annotations
 
@@ -17,14 +17,13 @@ from psfcore.errors import DataError
 from psfcore.transit.archive import pack
 from service.client.bulk import BulkClient
 from service.client.errors import ServiceError
-from service.client.operations import Operations
+from service.client.operations import DEFAULT_SERVER, Operations
 from service.client.versions import Progress, VersionedPsfs
 
-DEFAULT_SERVER = "http://127.0.0.1:8765"
 PATIENCE_S = 30.0
 
 
-class Heliopsf(VersionedPsfs, BulkClient, Operations):
+class Client(VersionedPsfs, BulkClient, Operations):
     """A heliopsf service, over HTTP."""
 
     def __init__(
@@ -34,18 +33,21 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
         key: str | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        """``server``, ``key``: by default what HELIOPSF_SERVER and HELIOPSF_KEY say."""
+        """server: its address; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY.
+
+        Raises ``ServiceError`` "bad-key" if the key cannot be sent.
+        """
         self.server = server or os.environ.get("HELIOPSF_SERVER", DEFAULT_SERVER)
         key = (key or os.environ.get("HELIOPSF_KEY", "")).strip()
         if not (key.isascii() and key.isprintable()) or " " in key:
-            # Said here, since what a library says of a header that it cannot send shows the header.
+            # Checked here, because the HTTP library's message about a header that it cannot send shows the header.
             raise ServiceError(
                 "expected a key of the form hpsf_ID_SECRET; got something else", code="bad-key"
             )
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._http = httpx.Client(base_url=self.server, timeout=60, transport=transport, headers=headers)
 
-    def __enter__(self) -> Heliopsf:
+    def __enter__(self) -> Client:
         return self
 
     def __exit__(
@@ -58,11 +60,11 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
         self._http.close()
 
     def health(self) -> dict[str, Any]:
-        """What ``/healthz`` says."""
+        """The answer of ``/healthz``."""
         return self._json("GET", "/healthz")
 
     def wait_until_up(self, timeout_s: float = 60.0) -> None:
-        """Wait until a service that was just started answers; ``ServiceError`` where it does not in time."""
+        """Wait until the service answers. Raises ``ServiceError`` after ``timeout_s``."""
         deadline = time.monotonic() + timeout_s
         while True:
             try:
@@ -78,7 +80,7 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
         return self._upload("/v1/images", Path(path), {})
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
-        """Upload a transit, a folder or an archive of one; returns its description, with its ``id``."""
+        """Upload a transit: a folder, or an archive of one. Returns its description, with its ``id``."""
         with as_archive(Path(path)) as archive:
             return self._upload("/v1/transits", archive, {}, media_type="application/octet-stream")
 
@@ -92,20 +94,20 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Upload a PSF of your own; returns its description, with its ``id``."""
-        line = {"instrument": instrument, "channel": channel, "kind": kind}
-        return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **line})
+        """Upload a PSF (FITS); returns its description, with its ``id``."""
+        series = {"instrument": instrument, "channel": channel, "kind": kind}
+        return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
 
     def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """Ask for a job; returns it as it is then, which is ended where an equal one was done before.
+        """Submit a job; returns its description. If an equal job was done before, it has ended already.
 
-        ``queue``: "bulk" lets all that people wait for go before.
+        queue: "bulk" runs it after all jobs that people wait for; default: the queue of its kind.
         """
         body = {"kind": kind, "queue": queue, "parameters": parameters}
         return self._json("POST", "/v1/jobs", json=body)
 
     def job(self, job_id: str) -> dict[str, Any]:
-        """A job as it is now."""
+        """The current description of a job."""
         return self._json("GET", f"/v1/jobs/{job_id}")
 
     def cancel(self, job_id: str) -> dict[str, Any]:
@@ -115,9 +117,9 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
     def wait(
         self, job: dict[str, Any], *, progress: Progress | None = None, timeout_s: float | None = None
     ) -> dict[str, Any]:
-        """Wait for a job's end; returns it completed.
+        """Wait until a job is completed; returns its description.
 
-        Raises ``ServiceError`` where it failed or was cancelled, ``TimeoutError`` after ``timeout_s``.
+        Raises ``ServiceError`` if it failed or was cancelled, ``TimeoutError`` after ``timeout_s``.
         """
         started = time.monotonic()
         while job["phase"] in ("QUEUED", "EXECUTING"):
@@ -130,7 +132,7 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
         return self._ended(job)
 
     def _job_patiently(self, job_id: str) -> dict[str, Any]:
-        """The job; a service that is away for a moment (a restart) does not end the wait for it."""
+        """The description of a job; tries again if the service does not answer for a moment, as in a restart."""
         deadline = time.monotonic() + PATIENCE_S
         while True:
             try:
@@ -161,7 +163,7 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
         return self._all("/v1/products", filters)
 
     def download(self, address: str, path: str | Path) -> None:
-        """Download a file of the service; ``path`` is written only once it is whole."""
+        """Download a file of the service. ``path`` appears only when it is complete."""
         target = Path(path)
         partial = target.with_name(target.name + ".part")
         try:
@@ -173,12 +175,12 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
             partial.unlink(missing_ok=True)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """The service's answer to a question about a PSF."""
-        told = {
+        """The answer of the service to a question about a PSF."""
+        parameters = {
             name: ",".join(f"{number!r}" for number in value) if isinstance(value, list) else value
             for name, value in query.items()
         }
-        return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=told)
+        return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=parameters)
 
     def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
         """Download the central (size, size) px of a PSF."""
@@ -232,7 +234,7 @@ class Heliopsf(VersionedPsfs, BulkClient, Operations):
 
 @contextmanager
 def as_archive(path: Path) -> Iterator[Path]:
-    """The archive at ``path``, or one made of the folder there, which is gone afterwards."""
+    """The archive at ``path``; for a folder, a temporary archive of it."""
     if not path.is_dir():
         yield path
         return
@@ -243,11 +245,6 @@ def as_archive(path: Path) -> Iterator[Path]:
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
         yield archive
-
-
-def percent(value: float | None, digits: int = 1) -> str:
-    """A change as people read it; None is a change of nothing."""
-    return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
 
 
 def _refused(response: httpx.Response) -> ServiceError:

@@ -1,4 +1,4 @@
-"""What can be asked of a service, told from a few operations that differ between one over HTTP and one in this process."""
+"""The requests to a service, built on a few operations that differ between HTTP and a service in this process."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from typing import Any
 from service.client.errors import ServiceError
 from service.client.versions import Progress
 
+DEFAULT_SERVER = "http://127.0.0.1:8765"
+
 
 class Operations(ABC):
-    """What can be asked of a service, whether it is reached over HTTP or lives in this process."""
+    """The requests to a service, over HTTP or in this process. Every method raises ``ServiceError``."""
 
     @abstractmethod
     def upload_image(self, path: str | Path) -> dict[str, Any]:
@@ -20,9 +22,9 @@ class Operations(ABC):
 
     @abstractmethod
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
-        """Upload a transit, a folder or an archive of one; returns its description, with its ``id``.
+        """Upload a transit: a folder, or an archive of one. Returns its description, with its ``id``.
 
-        Of a folder what its transit.json names is sent, as the same bytes each time. Raises ``ServiceError``.
+        Of a folder, transit.json and the files that it names are sent, always as the same bytes.
         """
 
     @abstractmethod
@@ -36,22 +38,22 @@ class Operations(ABC):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Upload a PSF of your own; returns its description, with its ``id``.
+        """Upload a PSF (FITS); returns its description, with its ``id``.
 
-        ``instrument``, ``channel``, ``kind``: what its file does not say; ``kind="total"`` is a whole PSF.
+        instrument, channel, kind: needed if the file does not say them; ``kind="total"`` is a total PSF.
         """
 
     @abstractmethod
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
-        """Ask for a job; returns it as it is then, which is ended where an equal one was done before."""
+        """Submit a job; returns its description. If an equal job was done before, it has ended already."""
 
     @abstractmethod
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
-        """Wait for a job's end; returns it completed. Raises ``ServiceError`` where it ended otherwise."""
+        """Wait until a job is completed; returns its description. Raises ``ServiceError`` if it ends otherwise."""
 
     @abstractmethod
     def get(self, address: str) -> dict[str, Any]:
-        """The description at an address of the service, as ``/v1/products/...``."""
+        """The description at an address of the service, such as ``/v1/products/...``."""
 
     @abstractmethod
     def download(self, address: str, path: str | Path) -> None:
@@ -59,9 +61,9 @@ class Operations(ABC):
 
     @abstractmethod
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """What a PSF's tables say to "curve", "profile", "encircled", "annulus" or "compare/ID".
+        """The answer of a PSF's tables to "curve", "profile", "encircled", "annulus" or "compare/ID".
 
-        Raises ``ServiceError`` with code "no-tables" where they have not been made.
+        Raises ``ServiceError`` "no-tables" if the tables have not been made.
         """
 
     @abstractmethod
@@ -80,28 +82,32 @@ class Operations(ABC):
         noise: tuple[float, float] | None = None,
         saturation_dn: float | None = None,
         error_draws: int = 0,
-        effects: str | Path | None = None,
+        changes: str | Path | None = None,
+        context: str | None = None,
         **method_parameters: Any,
     ) -> dict[str, Any]:
-        """Upload an image, have it deconvolved and download the product; returns its description.
+        """Upload an image, deconvolve it and download the product to ``output``; returns the description of the product.
 
-        ``noise``: (DN a detected photon, DN rms of the readout). ``error_draws``: 2 or more add an ERROR plane, and need ``noise``.
-        ``effects``: where to write the picture of difference, ratio and histogram.
-        ``method_parameters``: what the method takes, as ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
+        psf_id: default: the certified PSF for the image in ``context`` (id or name; default: the default context), else
+        that of its instrument. noise: photon gain (DN per photon) and read noise (DN rms). error_draws: number of noise
+        realisations for an ERROR plane, 0 or at least 2. preview, changes: where to write the pictures of before and
+        after, and of difference, ratio and histograms (PNG). method_parameters: as ``steps=20``,
+        ``stop="discrepancy"``, ``edges="zero"``.
         """
         wanted = {
             "psf_id": psf_id,
             "method": {"name": method, **_given(method_parameters)},
             "saturation_dn": saturation_dn,
             "error_draws": error_draws,
-            "changes_picture": effects is not None,
+            "changes_picture": changes is not None,
+            **({} if context is None else {"context": context}),
         }
         image_id = self.upload_image(image)["id"]
         job = self.submit("deconvolve", image_id=image_id, **wanted, **_noise(noise))
         product = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(product, output, preview)
-        if effects is not None:
-            self.download(product["changes"], effects)
+        if changes is not None:
+            self.download(product["changes"], changes)
         return product
 
     def build_psf(
@@ -115,10 +121,11 @@ class Operations(ABC):
         preview: str | Path | None = None,
         progress: Progress | None = None,
     ) -> dict[str, Any]:
-        """Have the PSF of an instrument built and download it; returns its description.
+        """Compute the PSF of an instrument and download it to ``output``; returns its description.
 
-        ``instrument`` is the name of a shipped one, or the path of an instrument file (TOML); ``mask`` the FITS
-        image that such a file's mount names; ``component`` one part alone, as ``diffraction``.
+        instrument: the name of a known instrument, or the path of an instrument file (TOML). size: width and height, px.
+        component: one component alone, such as "diffraction". mask: the mask image (FITS) that the mount in an
+        instrument file names.
         """
         wanted: dict[str, Any] = {"size": size, "component": component}
         if isinstance(instrument, Path) or instrument.endswith(".toml"):
@@ -143,10 +150,10 @@ class Operations(ABC):
         noise: tuple[float, float] | None = None,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Upload a transit (a folder or an archive), have its scatter fitted and download the PSF; its description.
+        """Upload a transit (folder or archive), fit its scatter kernel and download the PSF; returns its description.
 
-        ``report``, ``preview``: where to write the report (JSON) and the picture. ``noise``: as for ``deconvolve``.
-        ``parameters``: what the fit takes, as ``shape="stretched"``, ``as_published=True``.
+        report, preview: where to write the report (JSON) and the plot (PNG). noise: as for ``deconvolve``. parameters: as
+        ``shape="stretched"``, ``as_published=True``.
         """
         psf = self._on_transit("psf-fit", transit, progress, noise, parameters)
         self._fetch(psf, output, preview)
@@ -164,15 +171,15 @@ class Operations(ABC):
         noise: tuple[float, float] | None = None,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, have its fit cross-validated and download the report (JSON); its description.
+        """Upload a transit, cross-validate its fit and download the report (JSON); returns its description.
 
-        ``parameters``: as for ``fit_psf``, and ``scheme="exact"``, ``runs=10``.
+        parameters: as for ``fit_psf``, and ``scheme="exact"``, ``runs=10``.
         """
         found = self._on_transit("cross-validate", transit, progress, noise, parameters)
         self._fetch(found, report, preview)
         return found
 
-    def evaluate(
+    def report(
         self,
         transit: str | Path,
         report: str | Path | None = None,
@@ -183,10 +190,10 @@ class Operations(ABC):
         noise: tuple[float, float] | None = None,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, have a report made on it and its PSF, and download that; its description.
+        """Upload a transit, make a report on its PSF and download it; returns its description.
 
-        ``report``, ``page``, ``preview``: where to write it as JSON, as HTML, as a picture. ``noise``: as for
-        ``deconvolve``. ``parameters``: ``psf_id`` of a PSF to judge instead of fitting one, ``seed``, ``dark_offsets``.
+        report, page, preview: where to write the report as JSON, as HTML, and its plot (PNG). noise: as for
+        ``deconvolve``. parameters: ``psf_id`` of a PSF to test (default: fit one), ``seed``, ``dark_offsets``, ``shapes``.
         """
         found = self._on_transit("report", transit, progress, noise, parameters)
         self._fetch(found, report, preview)
@@ -205,10 +212,10 @@ class Operations(ABC):
         noise: tuple[float, float] | None = None,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, have the gap between it and its model diagnosed and download the report; its description.
+        """Upload a transit, diagnose the gap between it and the fitted model, and download the report; its description.
 
-        ``report``, ``page``, ``preview``, ``noise``: as for ``evaluate``. ``parameters``: ``psf_id`` of a fitted PSF to
-        start from, ``seed``, ``correct``. Where there is an answer, ``details.corrected_psf_id`` names the PSF with it.
+        report, page, preview, noise: as for ``report``. parameters: ``psf_id`` of a fitted PSF to start from, ``seed``,
+        ``correct``. If an effect was found, ``details.corrected_psf_id`` is the id of the PSF that includes it.
         """
         found = self._on_transit("gap-diagnose", transit, progress, noise, parameters)
         self._fetch(found, report, preview)
@@ -224,13 +231,13 @@ class Operations(ABC):
         noise: tuple[float, float] | None,
         parameters: dict[str, Any],
     ) -> dict[str, Any]:
-        """Upload a transit and have a job of this kind done on it; the description of what it made."""
+        """Upload a transit and run a job of this kind on it; returns the description of the result."""
         transit_id = self.upload_transit(transit)["id"]
         job = self.submit(kind, transit_id=transit_id, **_given(parameters), **_noise(noise))
         return self.get(self.wait(job, progress=progress)["result"])
 
     def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
-        """Light beyond radii (px) in percent by component, with errors; without radii the whole table."""
+        """Light beyond radii (px) in percent, by component, with errors; without radii the whole table."""
         return self.answer([psf_id], "curve", {} if radii is None else {"radii": list(radii)})
 
     def psf_profile(self, psf_id: str) -> dict[str, Any]:
@@ -246,11 +253,11 @@ class Operations(ABC):
         return self.answer([psf_id], "annulus", {"inner": inner, "outer": outer})
 
     def compare_psfs(self, psf_id: str, other_id: str) -> dict[str, Any]:
-        """Differences of two PSFs' curves (points) and totals, the second less the first."""
+        """Differences of the curves (percentage points) and sums of two PSFs, the second minus the first."""
         return self.answer([psf_id, other_id], f"compare/{other_id}", {})
 
     def answer(self, psf_ids: list[str], question: str, query: dict[str, Any]) -> dict[str, Any]:
-        """The answer; tables that are not there yet, as of a PSF that was uploaded, are made first."""
+        """The answer to a question; missing tables, as those of an uploaded PSF, are made first."""
         try:
             return self.ask(psf_ids[0], question, **query)
         except ServiceError as error:
@@ -268,9 +275,9 @@ class Operations(ABC):
 
     @staticmethod
     def _ended(job: dict[str, Any]) -> dict[str, Any]:
-        """The job, where it is completed; else what it died of, or that nobody started it."""
+        """The job, if it is completed. Raises ``ServiceError`` if it failed, was cancelled or was never started."""
         if job["phase"] == "PENDING":
-            raise ServiceError(f"job {job['id']} was set up and not started", code="pending")
+            raise ServiceError(f"job {job['id']} was created but not started", code="pending")
         if job["phase"] == "ERROR":
             raise ServiceError(job["error"]["message"], code=job["error"]["code"])
         if job["phase"] == "ABORTED":
@@ -279,10 +286,10 @@ class Operations(ABC):
 
 
 def _given(parameters: dict[str, Any]) -> dict[str, Any]:
-    """Of a job's parameters those that were given; the service has defaults for the others."""
+    """The parameters that were given; the service has defaults for the others."""
     return {name: value for name, value in parameters.items() if value is not None}
 
 
 def _noise(noise: tuple[float, float] | None) -> dict[str, Any]:
-    """A job's parameter for (DN a photon, DN rms of the readout), where they are known."""
+    """The parameter of a job for photon gain (DN per photon) and read noise (DN rms), if given."""
     return {} if noise is None else {"noise": {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}}

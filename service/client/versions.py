@@ -1,4 +1,4 @@
-"""What a client asks of PSFs in versions: statuses, the one that fits, contexts, lineage, reruns."""
+"""The requests of a client about PSF versions: status, best PSF, contexts, lineage, reruns."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ Progress = Callable[[str, int, int], None]
 
 
 class VersionedPsfs(ABC):
-    """The part of a service's client that is about versions. Times are ISO 8601, UTC without a zone.
+    """The requests about PSF versions. Times are ISO 8601, UTC without a zone.
 
-    Every method raises ``service.client.http.ServiceError``, whose ``code`` says why ("ranges-overlap", "no-psf-fits", ...).
+    Every method raises ``service.client.errors.ServiceError``; its ``code`` is the reason ("ranges-overlap", "no-psf-fits", ...).
     """
 
     @abstractmethod
@@ -21,11 +21,11 @@ class VersionedPsfs(ABC):
 
     @abstractmethod
     def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """Ask for a job."""
+        """Submit a job."""
 
     @abstractmethod
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
-        """Wait for a job's end."""
+        """Wait until a job ends."""
 
     @abstractmethod
     def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
@@ -36,7 +36,7 @@ class VersionedPsfs(ABC):
         """All items of a list."""
 
     def psf_status(self, psf_id: str) -> dict[str, Any]:
-        """A PSF's status, what it may become, the next version of its line, and its history."""
+        """The status of a PSF, the statuses that may follow, the next version of its series, and its history."""
         return self.get(f"/v1/psfs/{psf_id}/status")
 
     def certify_psf(
@@ -48,12 +48,12 @@ class VersionedPsfs(ABC):
         valid_to: str | None = None,
         supersedes: Sequence[str] = (),
         reason: str = "",
-        **line: str | None,
+        **series: str | None,
     ) -> dict[str, Any]:
-        """Certify a draft under a version, or give a certified PSF another range; its status then.
+        """Certify a draft under a version, or change the time range of a certified PSF. Returns its new status.
 
-        ``supersedes``: certified PSFs that are deprecated in the same step. ``line``: ``instrument``, ``channel``,
-        ``kind`` of an uploaded PSF whose file does not say them.
+        supersedes: certified PSFs to deprecate in the same step. series: ``instrument``, ``channel`` and ``kind`` of an
+        uploaded PSF, if its file does not say them.
         """
         body = {
             "status": "certified",
@@ -62,28 +62,31 @@ class VersionedPsfs(ABC):
             "valid_to": valid_to,
             "supersedes": list(supersedes),
             "reason": reason,
-            **line,
+            **series,
         }
         return self._json("POST", f"/v1/psfs/{psf_id}/status", json=body)
 
     def deprecate_psf(self, psf_id: str, successor: str | None = None, *, reason: str = "") -> dict[str, Any]:
-        """Deprecate a certified PSF, or name a deprecated one's successor; its status then."""
+        """Deprecate a certified PSF, or name the successor of a deprecated one. Returns its new status."""
         body = {"status": "deprecated", "successor": successor, "reason": reason}
         return self._json("POST", f"/v1/psfs/{psf_id}/status", json=body)
 
     def best_psf(self, **filters: str | None) -> dict[str, Any]:
         """The one PSF that fits ``instrument``, ``channel``, ``kind``, ``version``, ``valid_at``, ``context``, ...
 
-        The answer's ``psf`` is its description. ``ServiceError`` "no-psf-fits" or "several-psfs-fit" says why not.
+        Its description is under "psf". Raises ``ServiceError`` "no-psf-fits" or "several-psfs-fit".
         """
         return self._json("GET", "/v1/psfs/best", params=_given(filters))
 
     def psf_for_image(self, image_id: str, **where: str | None) -> dict[str, Any]:
-        """The PSF for an uploaded image, by its header; ``context`` and ``kind`` as for ``best_psf``."""
+        """The PSF that fits the header of an uploaded image; ``context`` and ``kind`` as for ``best_psf``."""
         return self._json("GET", f"/v1/images/{image_id}/psf", params=_given(where))
 
     def affected(self, psf_id: str | None = None, *, superseded: bool = False) -> Iterator[dict[str, Any]]:
-        """Products made with a PSF; without one, those made with any that is deprecated (and has a successor)."""
+        """Products made with a PSF; without ``psf_id``, those made with any deprecated PSF.
+
+        superseded: of those, only products whose PSF has a successor.
+        """
         if psf_id is not None:
             return self._all(f"/v1/psfs/{psf_id}/affected", {})
         return self._all("/v1/affected", {"superseded": "true" if superseded else "false"})
@@ -99,26 +102,26 @@ class VersionedPsfs(ABC):
     def create_context(
         self, name: str, pins: Sequence[dict[str, Any]] | None = None, *, reason: str = ""
     ) -> dict[str, Any]:
-        """Pin PSFs under a name: all that are certified now, or ``{"psf_id", "valid_from", "valid_to"}`` each."""
+        """Make a context. pins: ``{"psf_id", "valid_from", "valid_to"}`` for each PSF; default: all certified PSFs."""
         body = {"name": name, "reason": reason, "pins": None if pins is None else list(pins)}
         return self._json("POST", "/v1/contexts", json=body)
 
     def default_context(self) -> dict[str, Any]:
-        """The context that images are looked up in where a request names none, and where it was before."""
+        """The default context, which chooses the PSF if a request names no context, and its history."""
         return self.get("/v1/contexts/default")
 
     def use_context(self, id_or_name: str | None, *, reason: str = "") -> dict[str, Any]:
-        """Make a context the default; none: what is certified at the moment."""
+        """Make a context the default; None: use the PSFs that are certified at the moment."""
         return self._json("PUT", "/v1/contexts/default", json={"context": id_or_name, "reason": reason})
 
     def lineage(self, of: Literal["psf", "product"], identity: str) -> dict[str, Any]:
-        """Where a PSF or a product came from, back to what was uploaded."""
+        """What a PSF or a product was made from, back to the uploads."""
         return self.get(f"/v1/{of}s/{identity}/lineage")
 
     def rerun(
         self, of: Literal["psf", "product"], identity: str, *, progress: Progress | None = None
     ) -> dict[str, Any]:
-        """Have a PSF or a product made again; the report on what differs from the first."""
+        """Make a PSF or a product again; returns the report on the differences."""
         job = self.submit("rerun", of=of, id=identity)
         return self.get(self.wait(job, progress=progress)["result"])
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Depends, Request
 
 from psfcore.fits.header import FitsLimits
 from service.http.access import Access
 from service.http.rates import Rates, Streams
-from workers.broker.reconciler import Reconciler
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
 from workers.settings import Settings
+
+if TYPE_CHECKING:
+    from workers.broker.reconciler import Reconciler
 
 
 @dataclass(frozen=True)

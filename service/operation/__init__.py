@@ -1,0 +1,1 @@
+"""Routes for operation: health, metrics, and the API page."""

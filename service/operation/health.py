@@ -1,4 +1,4 @@
-"""Is the service up, and can it do its work? ``/healthz`` and ``/readyz``."""
+"""``/healthz`` (is the service up?) and ``/readyz`` (can it do its work?)."""
 
 from __future__ import annotations
 
@@ -11,37 +11,41 @@ from workers import checks
 from workers.settings import software_version
 
 router = APIRouter(tags=["operation"])
-NOT_READY = {"model": problems.ProblemDocument, "description": "Something is away; `parts` says what."}
+NOT_READY = {"model": problems.ProblemDocument, "description": "A part does not answer; `parts` says which."}
 
 
 class Health(BaseModel):
-    """The process answers, and so does its database."""
+    """The process and its database answer."""
 
     status: str
     version: str
 
 
 class Readiness(BaseModel):
-    """All that the service stands on answers."""
+    """All parts that the service needs answer."""
 
     status: str
-    parts: dict[str, str] = Field(description="database, storage, and broker or embedded worker: `ok` each")
+    parts: dict[str, str] = Field(
+        description="state of database, storage, and broker or embedded worker; `ok` if it answers"
+    )
 
 
 @router.get("/healthz", summary="Is the service up?", responses=problems.RESPONSES)
 def healthz(state: Shared) -> Health:
-    """200 where the process, its reconciler and its database are up; 503 where one is not."""
+    """200: process, reconciler and database work. 503: one of them does not."""
     state.catalogue.ping()
     if not state.reconciler.alive:
         raise problems.Problem(
-            503, "reconciler-stopped", "queued jobs are not submitted; restart the service"
+            503,
+            "reconciler-stopped",
+            "the reconciler stopped, so queued jobs are not submitted; restart the service",
         )
     return Health(status="ok", version=software_version())
 
 
 @router.get("/readyz", summary="Can the service do its work?", responses={503: NOT_READY})
 def readyz(state: Shared) -> Readiness:
-    """200 where database, storage, and broker (or the embedded worker) answer; else 503 that says which does not."""
+    """200: database, storage, and broker (or embedded worker) answer. 503: `parts` says which does not."""
     parts = {}
     for name, check in checks.needed(state.settings, state.catalogue, state.store).items():
         try:
@@ -50,7 +54,7 @@ def readyz(state: Shared) -> Readiness:
         except checks.Unusable as fault:
             parts[name] = str(fault)
     if not state.reconciler.alive:
-        parts["reconciler"] = "queued jobs are not submitted; restart the service"
+        parts["reconciler"] = "the reconciler stopped, so queued jobs are not submitted; restart the service"
     away = {name: found for name, found in parts.items() if found != "ok"}
     if away:
         raise problems.Problem(503, "not-ready", "; ".join(away.values()), parts=parts)

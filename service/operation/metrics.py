@@ -1,8 +1,8 @@
 """Metrics for Prometheus: ``/metrics``.
 
-What concerns all processes (jobs, files, workers) is asked of the database at each scrape, by queries that read
-indexes alone; what concerns this process (its requests) is counted in it. Jobs and files are gauges: a job that is
-destroyed takes its numbers along. What jobs spent in their stages stays, and is counted.
+Numbers about all processes (jobs, files, workers) are read from the database at each scrape, by queries that use only
+indexes. Numbers about this process (its requests) are counted in it. Jobs and files are gauges, because a destroyed job
+no longer counts. The time that jobs spent in their stages is a counter, which never decreases.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ router = APIRouter(tags=["operation"])
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
 def metrics(request: Request, _caller: Administering, state: Shared) -> Response:
-    """Jobs, files and workers of the whole service; requests of this process."""
+    """Jobs, files and workers of the whole service, and requests to this process."""
     shared = CollectorRegistry()
     shared.register(_Catalogued(state))
     text = generate_latest(shared) + generate_latest(request.app.state.requests.registry)
@@ -47,16 +47,16 @@ class _Catalogued(Collector):
         self._state = state
 
     def describe(self) -> list[Metric]:
-        """Nothing: what would be asked for here is asked for at the scrape itself."""
+        """Nothing: the metrics are collected only at the scrape."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """All that the database and the storage say; where the database is away, that alone."""
+        """The metrics of database and storage; if the database does not answer, only that and the free space."""
         yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
-        room = GaugeMetricFamily("heliopsf_storage_free_bytes", "Room left where the files are")
+        room = GaugeMetricFamily("heliopsf_storage_free_bytes", "Free space where files are stored")
         room.add_metric([], checks.free_bytes(self._state.settings.data_dir))
         yield room
-        up = GaugeMetricFamily("heliopsf_database_up", "1 where the database answers")
+        up = GaugeMetricFamily("heliopsf_database_up", "1 if the database answers, else 0")
         try:
             found = [*self._jobs(), *self._stages(), *self._waiting(), *self._files()]
         except SQLAlchemyError:
@@ -75,7 +75,7 @@ class _Catalogued(Collector):
         retries = GaugeMetricFamily("heliopsf_job_retries", "Starts of jobs after the first", labels=["kind"])
         seconds = GaugeMetricFamily(
             "heliopsf_job_run_seconds",
-            "Time that all jobs counted as COMPLETED took, from the last start",
+            "Time from the last start to the end, of all jobs that are COMPLETED",
             labels=["kind"],
         )
         for kind in kinds:
@@ -92,11 +92,13 @@ class _Catalogued(Collector):
     def _stages(self) -> Iterator[Metric]:
         seconds = CounterMetricFamily(
             "heliopsf_job_stage_seconds",
-            "Time of attempts that ended, by what they were at; without reporting it",
+            "Time that ended attempts spent in a stage",
             labels=["kind", "stage"],
         )
         steps = CounterMetricFamily(
-            "heliopsf_job_stage_steps", "Steps that these attempts reported", labels=["kind", "stage"]
+            "heliopsf_job_stage_steps",
+            "Steps that ended attempts reported in a stage",
+            labels=["kind", "stage"],
         )
         for (kind, stage), spent in self._state.catalogue.stage_times.all().items():
             seconds.add_metric([kind, stage], spent.seconds)
@@ -106,28 +108,30 @@ class _Catalogued(Collector):
     def _waiting(self) -> Iterator[Metric]:
         catalogue, lease_s = self._state.catalogue, self._state.settings.lease_s
         age = GaugeMetricFamily(
-            "heliopsf_oldest_queued_seconds", "Age of the job that has waited longest", labels=["queue"]
+            "heliopsf_oldest_queued_seconds", "Waiting time of the oldest queued job", labels=["queue"]
         )
         for queue in Queue:
             oldest = catalogue.census.oldest_queued_at(queue)
             age.add_metric([queue], 0.0 if oldest is None else max(0.0, time.time() - oldest))
         yield age
-        silent = GaugeMetricFamily("heliopsf_jobs_silent", "Jobs whose worker has been silent for its lease")
+        silent = GaugeMetricFamily(
+            "heliopsf_jobs_silent", "Jobs whose worker did not report within its lease"
+        )
         silent.add_metric([], catalogue.census.count_silent(lease_s))
         yield silent
         images = GaugeMetricFamily(
-            "heliopsf_bulk_images", "Images of bulks that have not ended", labels=["state"]
+            "heliopsf_bulk_images", "Images of bulk runs that have not ended", labels=["state"]
         )
         for state, count in catalogue.bulks.progress.open_images().items():
             images.add_metric([state], count)
         yield images
-        workers = GaugeMetricFamily("heliopsf_workers", "Worker processes that are there")
+        workers = GaugeMetricFamily("heliopsf_workers", "Worker processes that report")
         workers.add_metric([], len(catalogue.census.workers(lease_s)))
         yield workers
 
     def _files(self) -> Iterator[Metric]:
-        files = GaugeMetricFamily("heliopsf_files", "Files kept", labels=["kind", "origin"])
-        size = GaugeMetricFamily("heliopsf_file_bytes", "Bytes of files kept", labels=["kind", "origin"])
+        files = GaugeMetricFamily("heliopsf_files", "Stored files", labels=["kind", "origin"])
+        size = GaugeMetricFamily("heliopsf_file_bytes", "Bytes of stored files", labels=["kind", "origin"])
         for tally in self._state.catalogue.census.tally_files():
             files.add_metric([tally.kind, tally.origin], tally.files)
             size.add_metric([tally.kind, tally.origin], tally.bytes)

@@ -37,8 +37,22 @@ def sources(package: str) -> list[Path]:
 @pytest.mark.parametrize(
     ("package", "forbidden"),
     [
-        ("psfcore", ("workers", "service", "fastapi", "starlette", "celery", "sqlalchemy", "redis", "httpx")),
-        ("workers", ("service", "fastapi", "starlette", "httpx")),
+        (
+            "psfcore",
+            (
+                "heliopsf",
+                "workers",
+                "service",
+                "fastapi",
+                "starlette",
+                "celery",
+                "sqlalchemy",
+                "redis",
+                "httpx",
+            ),
+        ),
+        ("workers", ("heliopsf", "service", "fastapi", "starlette", "httpx")),
+        ("service", ("heliopsf",)),
     ],
 )
 def test_imports_run_one_way(package: str, forbidden: tuple[str, ...]) -> None:
@@ -47,6 +61,18 @@ def test_imports_run_one_way(package: str, forbidden: tuple[str, ...]) -> None:
         for path in sources(package)
         for name in imports(path)
         if name.split(".")[0] in forbidden
+    ]
+    assert wrong == []
+
+
+def test_what_people_import_stands_on_the_core_and_the_client_alone() -> None:
+    wrong = [
+        (path.name, name)
+        for path in sources("heliopsf")
+        for name in imports(path)
+        if name.split(".")[0]
+        not in {"__future__", "collections", "heliopsf", "importlib", "pathlib", "psfcore", "typing"}
+        and not name.startswith("service.client")
     ]
     assert wrong == []
 
@@ -60,6 +86,7 @@ LIGHT = (
     "psfcore.errors",
     "psfcore.noise_figures",
     "psfcore.transit.archive",
+    "psfcore.transit.in_place",
     "psfcore.transit.manifest",
 )
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parents[2]
-PACKAGES = ("psfcore", "workers", "service", "benchmarks", "studies")
+PACKAGES = ("heliopsf", "psfcore", "workers", "service", "benchmarks", "studies")
 MOST_FILES = 15
 # Folders that hold one thing of many equal parts: each catalogue table has its file there, as each command has.
 LARGER = {"workers/catalogue": 18}

@@ -19,7 +19,7 @@ import pytest
 from sqlalchemy import create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 
-from service.client.http import Heliopsf
+from service.client.http import Client
 
 POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
 # A lost worker is noticed soon, so that tests need not wait as long as an operator would.
@@ -44,7 +44,7 @@ class Stack:
         self.server: subprocess.Popen[str] | None = None
         self.workers: list[subprocess.Popen[str]] = []
         self.redis: Redis | None = None
-        self.client = Heliopsf()
+        self.client = Client()
 
     def start_server(self) -> None:
         self.server = subprocess.Popen(
@@ -58,7 +58,7 @@ class Stack:
         assert self.server.stdout is not None
         line = self.server.stdout.readline()
         assert " serves " in line, (self.data.parent / "server.log").read_text()
-        self.client = Heliopsf(line.split(" serves ")[1].split()[0])
+        self.client = Client(line.split(" serves ")[1].split()[0])
         self.client.wait_until_up()
 
     def start_worker(self) -> subprocess.Popen[str]:

@@ -13,7 +13,7 @@ from pyvo.dal import DALServiceError
 from pyvo.dal.tap import AsyncTAPJob
 from pyvo.io.uws import parse_job_list
 
-from service.client.http import Heliopsf
+from service.client.http import Client
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.whole import stack as stacks
 from tests.whole.stack import Stack, wait_for
@@ -82,7 +82,7 @@ def test_abort_at_work_with_a_key(stack: Stack, tmp_path: Path) -> None:
     session = session_with(key)
     write_image(tmp_path / "image.fits", shape=(1024, 1024))
     write_psf(tmp_path / "psf.fits")
-    with Heliopsf(stack.client.server, key=key) as client:
+    with Client(stack.client.server, key=key) as client:
         image_id = client.upload_image(tmp_path / "image.fits")["id"]
         psf_id = client.upload_psf(tmp_path / "psf.fits")["id"]
         method = '{"name": "richardson-lucy", "steps": 200}'

@@ -16,6 +16,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from psfcore.transit.archive import ArchiveLimits, unpack
+
 
 class StoreAway(ConnectionError):
     """The storage does not answer now; a later attempt may succeed."""
@@ -77,6 +79,13 @@ class Store:
             yield folder
         finally:
             shutil.rmtree(folder)
+
+    @contextmanager
+    def unpacked(self, digest: str, limits: ArchiveLimits) -> Iterator[Path]:
+        """The files of a stored archive, in a folder that is removed at the end. Raises DataError as ``unpack``."""
+        with self.temporary_folder() as folder:
+            unpack(self.path(digest), folder, limits)
+            yield folder
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
         """Move a finished file into the store and force it to disk; returns its SHA-256, computed if not given."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf
-from psfcore.noise import Noise
-from psfcore.transit.archive import unpack
 from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
@@ -36,8 +34,7 @@ def load_transit(
         )
     images = int(upload.summary["images"])
     context.report("reading", 0, images)
-    with context.store.temporary_folder() as folder:
-        unpack(context.store.path(request.transit_id), folder, context.settings.archive_limits)
+    with context.store.unpacked(request.transit_id, context.settings.archive_limits) as folder:
         return read_prepared(
             folder,
             context.limits,
@@ -45,7 +42,7 @@ def load_transit(
             diffraction=lambda _instrument, _shape: (
                 _built_diffraction(context, request) if diffraction is None else diffraction
             ),
-            noise=None if request.noise is None else Noise(**request.noise.model_dump()),
+            noise=None if request.noise is None else request.noise.noise(),
             saturation_dn=request.saturation_dn,
         )
 

@@ -1,4 +1,4 @@
-"""``heliopsf database``: the revision of the catalogue's tables, and the way to this version's."""
+"""``heliopsf database``: show the revision of the database's tables, and upgrade them."""
 
 from __future__ import annotations
 
@@ -9,31 +9,29 @@ from pathlib import Path
 import click
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
-from service.cli.options import OUTPUT_FOLDER, read_settings
+from service.cli.options import DATA, read_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.schema import SchemaError, SchemaStatus
 
 SENTENCES = {
-    "empty": "the database is empty; its tables are made at revision {wanted}",
-    "unversioned": "the database says no revision: its tables are from before there were any; wanted {wanted}",
-    "older": "the database is at revision {revision}; this version works with {wanted}",
-    "current": "the database is at revision {revision}, which this version works with",
-    "newer": "the database is at revision {revision}, made by a later version; this one knows up to {wanted}",
+    "empty": "the database is empty; the first start makes its tables at revision {wanted}",
+    "unversioned": "the database has tables without a revision, from before revisions existed; this version needs {wanted}",
+    "older": "the database is at revision {revision}; this version needs {wanted}",
+    "current": "the database is at revision {revision}, as this version needs it",
+    "newer": "the database is at revision {revision}, of a later version; this version knows revisions up to {wanted}",
 }
-
-DATA = click.option("--data", type=OUTPUT_FOLDER, help="Folder for everything kept")
 
 
 @click.group()
 def database() -> None:
-    """The revision of the database's tables."""
+    """Show or upgrade the revision of the database's tables."""
 
 
 @database.command("status")
 @DATA
 def status(data: Path | None) -> None:
-    """Say which revision the database is at, and which this version works with. Status 1: they differ."""
+    """Show the revision of the database and the revision that this version needs. Exit status 1: they differ."""
     with opened_catalogue(data) as catalogue:
         found = catalogue.schema.status()
     click.echo(sentence(found))
@@ -44,9 +42,9 @@ def status(data: Path | None) -> None:
 @database.command("upgrade")
 @DATA
 def upgrade(data: Path | None) -> None:
-    """Bring the database to this version's tables, as the next `heliopsf serve` would.
+    """Upgrade the tables to the revision of this version, as the next `heliopsf serve` would.
 
-    Tables and indexes that somebody removed are made again. Keep a copy of the database before.
+    It also restores missing tables and indexes. Make a copy of the database first.
     """
     with opened_catalogue(data) as catalogue:
         before = catalogue.schema.status()
@@ -59,13 +57,13 @@ def upgrade(data: Path | None) -> None:
 
 
 def sentence(found: SchemaStatus) -> str:
-    """Which revision a database is at, in words."""
+    """The revision of a database as a sentence."""
     return SENTENCES[found.state].format(revision=found.revision, wanted=found.wanted)
 
 
 @contextmanager
 def opened_catalogue(data: Path | None) -> Iterator[Catalogue]:
-    """The catalogue of a data folder, as it is; what is wrong with its database as one line (``ClickException``)."""
+    """The catalogue of a data folder, not upgraded. An error of its database becomes a ``ClickException``."""
     settings = read_settings(data)
     if settings.database_url is None:
         settings.data_dir.mkdir(parents=True, exist_ok=True)
@@ -73,7 +71,7 @@ def opened_catalogue(data: Path | None) -> Iterator[Catalogue]:
         catalogue = Catalogue(settings.catalogue_url)
     except (ArgumentError, ImportError, ValueError) as error:
         raise click.ClickException(
-            f"HELIOPSF_DATABASE_URL cannot be used ({type(error).__name__}): expected postgresql://... or none"
+            f"HELIOPSF_DATABASE_URL cannot be used ({type(error).__name__}); set it to postgresql://..., or unset it"
         ) from error
     try:
         yield catalogue

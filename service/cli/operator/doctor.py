@@ -1,6 +1,6 @@
-"""``heliopsf doctor``: what an operator would look at first, looked at in one command.
+"""``heliopsf doctor``: check everything that an operator would check first, in one command.
 
-Nothing is made and nothing is changed by it, and it needs nothing that runs: what is not there is what it finds.
+It makes and changes nothing, and works if nothing runs: what is missing is a finding.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from service.cli.operator.database import sentence
-from service.cli.options import OUTPUT_FOLDER, read_settings
+from service.cli.options import DATA, read_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.files.opened import open_store
@@ -41,7 +41,7 @@ LITTLE_ROOM_BYTES = 5 * 2**30
 
 @dataclass(frozen=True)
 class Finding:
-    """What was looked at, how it is, what was found, and what to do where something is to be done."""
+    """One check: its subject, its state, what was found, and what to do (empty: nothing)."""
 
     what: str
     state: State
@@ -50,10 +50,10 @@ class Finding:
 
 
 @click.command()
-@click.option("--data", type=OUTPUT_FOLDER, help="Folder for everything kept")
-@click.option("--json", "as_json", is_flag=True, help="Say it as JSON")
+@DATA
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def doctor(data: Path | None, as_json: bool) -> None:
-    """Say what of the service's surroundings is well and what is not, and what to do. Status 1: something is broken."""
+    """Check versions, settings, disk, database, broker and workers, and say what to do. Exit status 1: something is broken."""
     findings = examine(read_settings(data))
     broken = any(finding.state == "broken" for finding in findings)
     if as_json:
@@ -65,7 +65,7 @@ def doctor(data: Path | None, as_json: bool) -> None:
 
 
 def examine(settings: Settings) -> list[Finding]:
-    """Everything, in the order in which one would mend it."""
+    """All findings, in the order in which one would repair them."""
     findings = [versions(), threads(settings), storage(settings)]
     findings += [object_store(settings)] if settings.store_url else []
     findings.append(broker(settings))
@@ -79,13 +79,13 @@ def examine(settings: Settings) -> list[Finding]:
                 except SQLAlchemyError as error:
                     name = look.__name__.replace("_", " ")
                     findings.append(
-                        Finding(name, "broken", f"the database does not say: {checks.database_said(error)}")
+                        Finding(name, "broken", f"the database did not answer: {checks.database_said(error)}")
                     )
     return findings
 
 
 def table(findings: list[Finding], width: int) -> Iterator[str]:
-    """The findings as lines: what, state, what was found, and below it what to do."""
+    """The findings as lines: subject, state and what was found; below it what to do."""
     names = max(len(finding.what) for finding in findings)
     indent = " " * (names + 11)
     for finding in findings:
@@ -99,11 +99,11 @@ def table(findings: list[Finding], width: int) -> Iterator[str]:
     yield ", ".join(f"{number} {state}" for state, number in count.items() if number)
 
 
-# What is looked at ----------------------------------------------------------------------------------
+# The checks ----------------------------------------------------------------------------------
 
 
 def versions(pins: Path = PINS) -> Finding:
-    """The libraries that are installed: as declared, and where the sources are at hand, as tested."""
+    """Are the installed libraries as declared, and (if constraints.txt is here) as tested?"""
     wrong, other, count = [], [], 0
     tested = _pinned(pins)
     for requirement in map(Requirement, requires("heliopsf") or []):
@@ -117,16 +117,16 @@ def versions(pins: Path = PINS) -> Finding:
             continue
         pin = tested.get(canonicalize_name(requirement.name), found)
         if not requirement.specifier.contains(found, prereleases=True):
-            wrong.append(f"{requirement.name} {found}, needed {requirement.specifier}")
+            wrong.append(f"{requirement.name} {found}, but {requirement.specifier} is needed")
         elif pin != found:
             other.append(f"{requirement.name} {found}, tested with {pin}")
     about = f"heliopsf {software_version()}, Python {sys.version.split()[0]}"
     if wrong:
         return Finding("versions", "broken", f"{about}; {'; '.join(wrong)}", "install heliopsf again")
     if other:
-        advice = "install with `-c constraints.txt` for the versions that it was tested with"
+        advice = "install with `-c constraints.txt` to get the tested versions"
         return Finding("versions", "warning", f"{about}; {'; '.join(other)}", advice)
-    as_what = "as tested" if tested else "as declared (no constraints.txt here to compare with)"
+    as_what = "as tested" if tested else "as declared (no constraints.txt here to compare them with)"
     return Finding("versions", "ok", f"{about}; {count} libraries {as_what}")
 
 
@@ -145,52 +145,56 @@ def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
         if value is None:
             continue
         found += f"; {name}={value}"
-        if name == "NUMBA_NUM_THREADS":  # a worker sets its own
+        if name == "NUMBA_NUM_THREADS":  # a worker sets this variable itself
             continue
         first = value.split(",")[0].strip()
         if not first.isdecimal() or int(first) < 1:
-            more.append(f"{name} is no number of threads")
+            more.append(f"set {name} to a number of threads")
         elif int(first) * settings.worker_processes > may_use:
             more.append(f"set {name} to {max(1, int(may_use // settings.worker_processes))} or less")
     if wanted > may_use:
         fit = max(1, int(may_use // settings.worker_processes))
-        more.append(f"threads wait for one another: set HELIOPSF_WORKER_THREADS={fit}, or fewer processes")
+        more.append(
+            f"more threads than cores slow each other down: set HELIOPSF_WORKER_THREADS={fit}, or start fewer processes"
+        )
     return Finding("threads", "warning" if more else "ok", found, "; ".join(more))
 
 
 def storage(settings: Settings) -> Finding:
-    """Can files be kept, and is there room?"""
+    """Can files be written, and is there room for them?"""
     folder = settings.data_dir.resolve()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir() or (there != folder and not os.access(there, os.W_OK | os.X_OK)):
-        found = f"{folder} is not there and cannot be made"
-        return Finding("storage", "broken", found, "set HELIOPSF_DATA_DIR to a folder that can be written to")
+        found = f"{folder} does not exist and cannot be made"
+        return Finding(
+            "storage", "broken", found, "set HELIOPSF_DATA_DIR to a folder that this user can write to"
+        )
     if there == folder:
         try:
             checks.storage(folder)
         except checks.Unusable as fault:
             found = f"{folder}: {fault}"
-            return Finding("storage", "broken", found, "let this user write there, or free the disk")
+            return Finding("storage", "broken", found, "give this user write access, or free disk space")
     free = checks.free_bytes(there)
     found = f"{folder}{'' if there == folder else ' (not made yet)'}, {_gib(free)} free"
     largest = max(settings.max_upload_bytes, settings.max_transit_bytes)
     if free < settings.max_upload_bytes:
-        return Finding("storage", "broken", f"{found}: no room for one upload", "free the disk")
+        return Finding("storage", "broken", f"{found}: no room for one upload", "free disk space")
     if free < max(LITTLE_ROOM_BYTES, largest):
-        advice = f"free the disk: one transit may take {_gib(settings.max_transit_bytes)}"
+        advice = f"free disk space: one transit may take {_gib(settings.max_transit_bytes)}"
         return Finding("storage", "warning", found, advice)
     return Finding("storage", "ok", found)
 
 
 def object_store(settings: Settings) -> Finding:
-    """Does what keeps the files elsewhere take them?"""
+    """Does the object store accept files?"""
     try:
         checks.object_store(open_store(settings))
     except checks.Unusable as fault:
-        advice = "look at HELIOPSF_STORE_URL and at the AWS_* variables: endpoint, region, credentials"
+        advice = "check HELIOPSF_STORE_URL and the AWS_* variables (endpoint, region, credentials)"
         return Finding("object store", "broken", f"{settings.store_url}: {fault}", advice)
     except ImportError:
-        advice = "install heliopsf with its extra: pip install 'heliopsf[s3]'"
+        advice = "install heliopsf with the extra s3: pip install 'heliopsf[s3]'"
         return Finding("object store", "broken", "the library for S3 is not installed", advice)
     return Finding("object store", "ok", str(settings.store_url))
 
@@ -198,18 +202,20 @@ def object_store(settings: Settings) -> Finding:
 def broker(settings: Settings) -> Finding:
     """Does the broker answer?"""
     if settings.embedded:
-        return Finding("broker", "ok", "embedded: a folder in the data folder")
+        return Finding("broker", "ok", "embedded: a folder inside the data folder")
     where = address(settings.broker_url)
     try:
         checks.broker(settings)
     except checks.Unusable as fault:
-        advice = "start it, or mend HELIOPSF_BROKER_URL; jobs wait in the database until it is back"
+        advice = (
+            "start it, or correct HELIOPSF_BROKER_URL; jobs wait in the database until the broker answers"
+        )
         return Finding("broker", "broken", f"{where}: {fault}", advice)
     return Finding("broker", "ok", f"{where} answers")
 
 
 def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
-    """Is the database at the revision that this version works with, and is everything there?"""
+    """Is the database at the revision that this version needs, and complete?"""
     status = catalogue.schema.status()
     said = sentence(status)
     match status.state:
@@ -218,42 +224,42 @@ def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
         case "newer":
             return Finding("schema", "broken", said, "run the version of heliopsf that upgraded it")
         case "unversioned" | "older":
-            advice = (
-                "keep a copy of it, then `heliopsf database upgrade`; the next `heliopsf serve` does it too"
-            )
+            advice = "copy the database, then run `heliopsf database upgrade` (the next `heliopsf serve` upgrades it too)"
             return Finding("schema", "warning", said, advice)
         case "current":
             faults = catalogue.schema.faults()
     if faults.columns:
         found = f"{said}, but columns are missing: {', '.join(faults.columns)}"
-        return Finding("schema", "broken", found, "somebody changed the tables: take a copy from before")
+        return Finding(
+            "schema", "broken", found, "the tables were changed by hand: restore a copy of the database"
+        )
     if faults.tables or faults.indexes:
         found = f"{said}, but these are missing: {', '.join((*faults.tables, *faults.indexes))}"
-        return Finding("schema", "warning", found, "`heliopsf database upgrade` makes them again")
-    return Finding("schema", "ok", f"{said}: tables, columns and indexes are there")
+        return Finding("schema", "warning", found, "run `heliopsf database upgrade` to restore them")
+    return Finding("schema", "ok", f"{said}: tables, columns and indexes are complete")
 
 
 def clock(_settings: Settings, catalogue: Catalogue) -> Finding:
-    """Do this machine and the database's agree about the time? Leases go by the database's alone."""
+    """Do the clocks of this machine and of the database agree? Leases use the clock of the database."""
     before = time.time()
     theirs = catalogue.census.clock()
     after = time.time()
     apart = theirs - (before + after) / 2
     found = f"the database's clock is {abs(apart):.2f} s {'ahead' if apart > 0 else 'behind'}"
     if abs(apart) > 1.0 + (after - before):
-        advice = "set both clocks by NTP: when things were made, and when keys expire, goes by this machine's"
+        advice = "set both clocks by NTP: creation times and the expiry of keys use the clock of this machine"
         return Finding("clock", "warning", found, advice)
-    return Finding("clock", "ok", f"within {max(0.01, abs(apart)):.2f} s of the database's")
+    return Finding("clock", "ok", f"within {max(0.01, abs(apart)):.2f} s of the database's clock")
 
 
 def workers(settings: Settings, catalogue: Catalogue) -> Finding:
-    """Is anybody there to do the work, and of this version?"""
+    """Are there workers, and do they run this version?"""
     if "workers" in catalogue.schema.faults().tables:
-        return Finding("workers", "warning", "none has ever been here", _start(settings))
+        return Finding("workers", "warning", "no worker was ever started", _start(settings))
     there = catalogue.census.workers(settings.lease_s)
     waiting = catalogue.census.oldest_queued_at()
     if not there:
-        found = f"none was heard of for {settings.lease_s:g} s"
+        found = f"no worker has reported for {settings.lease_s:g} s"
         if waiting is not None:
             found += f"; a job has waited for {_span(time.time() - waiting)}"
         state: State = "broken" if waiting is not None and not settings.embedded else "warning"
@@ -264,39 +270,39 @@ def workers(settings: Settings, catalogue: Catalogue) -> Finding:
     )
     found += ", ..." if len(there) > 5 else ""
     if others:
-        advice = f"start them again with {software_version()}"
+        advice = f"restart them with version {software_version()}"
         return Finding("workers", "warning", f"{found}; some run version {', '.join(others)}", advice)
     return Finding("workers", "ok", found)
 
 
 def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
-    """Jobs that a running service would have taken care of by now."""
+    """Are there jobs that a running service would have handled by now?"""
     if "jobs" in catalogue.schema.faults().tables:
         return Finding("stuck jobs", "ok", "no jobs yet")
     silent = catalogue.census.count_silent(settings.lease_s + 5 * settings.reconcile_s)
     left = catalogue.census.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))
     if not silent and not left:
         return Finding("stuck jobs", "ok", "none")
-    found = f"{silent} at work without a sign of life, {left} queued that no server gave to the broker"
+    found = f"{silent} in progress without a sign of life, {left} queued but not submitted to the broker"
     return Finding(
         "stuck jobs",
         "warning" if settings.embedded else "broken",
         found,
-        "start `heliopsf serve`: it queues them again; if it runs, its log says what hinders it",
+        "start `heliopsf serve`, which queues them again; if it is running, read its log",
     )
 
 
-# How it is said -------------------------------------------------------------------------------------
+# Texts -------------------------------------------------------------------------------------
 
 
 def address(url: str) -> str:
-    """A URL's scheme, host, port and path: what an operator knows it by, without user, password and options."""
+    """Scheme, host, port and path of a URL, without user, password and options."""
     try:
         parts = urlsplit(url)
         where = f"{parts.hostname}:{parts.port}" if parts.port else parts.hostname or ""
     except ValueError:
         return "the URL that is set"
-    # What does not read as a URL may be a password in any of its parts; one with / in it ends the host early.
+    # A text that is not a URL may hold a password in any part; a password with / in it ends the host early.
     beyond = parts.path + parts.query + parts.fragment
     if "@" in beyond or not (parts.hostname or parts.scheme.startswith("sqlite")):
         return "the URL that is set"
@@ -305,19 +311,21 @@ def address(url: str) -> str:
 
 @contextmanager
 def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]:
-    """The catalogue, where there is one that answers; and what is to be said of the database."""
+    """The catalogue (None if the database does not answer), and the finding about the database."""
     where, own = _database(settings)
-    if own and not Path(where).exists():  # looking at it would make it
-        yield None, Finding("database", "warning", f"{where} is not there yet", "`heliopsf serve` makes it")
+    if own and not Path(where).exists():  # opening it would create it
+        yield None, Finding("database", "warning", f"{where} does not exist yet", "`heliopsf serve` makes it")
         return
-    advice = "mend the file's permissions" if own else "start it, or mend HELIOPSF_DATABASE_URL"
+    advice = "correct the permissions of the file" if own else "start it, or correct HELIOPSF_DATABASE_URL"
     try:
         catalogue = Catalogue(settings.catalogue_url)
     except (ArgumentError, ImportError, ValueError) as error:
         found = f"{where} cannot be used ({type(error).__name__})"
         yield (
             None,
-            Finding("database", "broken", found, "mend HELIOPSF_DATABASE_URL: postgresql://... or none"),
+            Finding(
+                "database", "broken", found, "set HELIOPSF_DATABASE_URL to postgresql://..., or unset it"
+            ),
         )
         return
     try:
@@ -333,7 +341,7 @@ def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]
 
 
 def _database(settings: Settings) -> tuple[str, bool]:
-    """Where the database is, and whether that is a file of SQLite's."""
+    """Address of the database, and whether it is a file of SQLite."""
     try:
         url = make_url(settings.catalogue_url)
     except (ArgumentError, ValueError):
@@ -348,7 +356,7 @@ def _start(settings: Settings) -> str:
 
 
 def _pinned(file: Path) -> dict[str, str]:
-    """Name -> version of a file of pins; nothing where it is not there."""
+    """Name -> version of a file of pins; empty if there is no such file."""
     if not file.is_file():
         return {}
     pairs = (line.split("==", 1) for line in file.read_text().splitlines() if "==" in line and line[0] != "#")
@@ -356,7 +364,7 @@ def _pinned(file: Path) -> dict[str, str]:
 
 
 def _quota(file: Path) -> float | None:
-    """Cores that a container may use, as Linux says; None without a limit."""
+    """Number of cores that the container may use, from the cgroup; None: no limit."""
     try:
         quota, period = file.read_text().split()
         return int(quota) / int(period)

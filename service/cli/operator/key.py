@@ -1,4 +1,4 @@
-"""``heliopsf key``: the keys that let people and programs in."""
+"""``heliopsf key``: access keys for people and programs."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from pathlib import Path
 import click
 from sqlalchemy import make_url
 
-from service.cli.operator.database import DATA, opened_catalogue
-from service.cli.options import read_settings
+from service.cli.operator.database import opened_catalogue
+from service.cli.options import DATA, read_settings
 from workers.catalogue.keys import OWNER, Scope
 from workers.catalogue.tables import KeyRow
 
 UNITS_S = {"h": 3600, "d": 86_400, "w": 604_800}
 DEFAULT_SCOPES = (Scope.READ, Scope.SUBMIT)
 MEANINGS = {
-    Scope.READ: "see and download what is the owner's",
-    Scope.SUBMIT: "upload, ask for jobs, cancel them",
-    Scope.CERTIFY: "change what PSFs are said to be worth, and the sets that pin them",
-    Scope.BULK: "have an archive reprocessed",
-    Scope.ADMIN: "the metrics, and (header X-Owner) all owners' things",
+    Scope.READ: "see and download the files of the owner",
+    Scope.SUBMIT: "upload files, submit jobs, cancel them",
+    Scope.CERTIFY: "certify and deprecate PSFs, and change contexts",
+    Scope.BULK: "start bulk runs",
+    Scope.ADMIN: "read the metrics, and act for any owner (header X-Owner)",
 }
 
 
 class Duration(click.ParamType):
-    """Seconds, as a text such as 12h, 30d or 8w."""
+    """A duration in seconds, written as 12h, 30d or 8w."""
 
     name = "duration"
 
@@ -36,34 +36,34 @@ class Duration(click.ParamType):
         """Seconds of a text such as 30d."""
         parts = re.fullmatch(r"([0-9]{1,5})([hdw])", str(value))
         if parts is None or not int(parts[1]):
-            self.fail(f"expected a duration as 12h, 30d or 8w; got {value!r}", param, ctx)
+            self.fail(f"expected a duration such as 12h, 30d or 8w; got {value!r}", param, ctx)
         return int(parts[1]) * UNITS_S[parts[2]]
 
 
 @click.group()
 def key() -> None:
-    """Keys that let people and programs in."""
+    """Create, list and revoke access keys for people and programs."""
 
 
 @key.command("create", epilog="Scopes: " + "; ".join(f"{name}: {text}" for name, text in MEANINGS.items()))
 @click.option(
-    "--owner", required=True, help="Whose all is that is made with it; several keys may be one owner's"
+    "--owner", required=True, help="Owner of all that is made with the key; an owner may have several keys"
 )
 @click.option(
     "--scope",
     "scopes",
     multiple=True,
     type=click.Choice([scope.value for scope in Scope]),
-    help=f"What it is good for; give several [default: {', '.join(DEFAULT_SCOPES)}]",
+    help=f"What the key allows; may be given several times [default: {', '.join(DEFAULT_SCOPES)}]",
 )
-@click.option("--expires", type=Duration(), metavar="30d", help="When it ends [default: when it is revoked]")
-@click.option("--label", default="", help="What it is for, to know it again in a list")
+@click.option("--expires", type=Duration(), metavar="30d", help="Lifetime [default: until it is revoked]")
+@click.option("--label", default="", help="Note that the list shows, such as what the key is for")
 @DATA
 def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: str, data: Path | None) -> None:
-    """Make a key, and show it: this once, since only a hash of it is kept."""
+    """Make a key and show it once; only its hash is stored, so it cannot be shown again."""
     if not OWNER.fullmatch(owner):
         raise click.BadParameter(
-            "expected small letters, digits, '.', '_' and '-', 64 at most", param_hint="--owner"
+            "expected lower-case letters, digits, '.', '_' and '-', at most 64", param_hint="--owner"
         )
     wanted = {Scope(scope) for scope in scopes} or set(DEFAULT_SCOPES)
     expires_at = None if expires is None else time.time() + expires
@@ -75,23 +75,23 @@ def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: st
     ends = "until it is revoked" if expires_at is None else f"until {_day(expires_at)}"
     click.echo(
         f"for {owner}: {', '.join(sorted(wanted))}; {ends}. It cannot be shown again. Clients read it from "
-        f"HELIOPSF_KEY. Servers on {url} let it in.",
+        f"HELIOPSF_KEY. Servers that use the database {url} accept it.",
         err=True,
     )
 
 
 @key.command("list")
-@click.option("--json", "as_json", is_flag=True, help="Say it as JSON")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 @DATA
 def list_keys(as_json: bool, data: Path | None) -> None:
-    """List keys by their ids, those that are no longer good too."""
+    """List all keys by their ids, also expired and revoked ones."""
     with opened_catalogue(data) as catalogue:
         rows = catalogue.keys.all()
     if as_json:
         click.echo(json.dumps([_described(row) for row in rows], indent=1))
         return
     if not rows:
-        click.echo("no key yet: `heliopsf key create --owner NAME` makes one")
+        click.echo("no key yet; `heliopsf key create --owner NAME` makes one")
     for row in rows:
         used = "never used" if row.last_used_at is None else f"used {_day(row.last_used_at)}"
         click.echo(
@@ -104,13 +104,15 @@ def list_keys(as_json: bool, data: Path | None) -> None:
 @click.argument("identity", metavar="ID")
 @DATA
 def revoke(identity: str, data: Path | None) -> None:
-    """Let the key with this id in no more, from its next request on. Jobs that it asked for go on."""
-    # Whoever has only the key itself at hand may give that.
+    """Revoke the key with this id: its next request is refused. Jobs that it submitted continue."""
+    # Also accepts the key itself.
     identity = identity.removeprefix("hpsf_").partition("_")[0]
     with opened_catalogue(data) as catalogue:
         if not catalogue.keys.revoke(identity):
-            raise click.ClickException(f"there is no key {identity[:16]!r}; `heliopsf key list` lists them")
-    click.echo(f"{identity} lets nobody in any more")
+            raise click.ClickException(
+                f"there is no key {identity[:16]!r}; `heliopsf key list` shows all keys"
+            )
+    click.echo(f"{identity} is revoked")
 
 
 def _state(row: KeyRow) -> str:
@@ -120,7 +122,7 @@ def _state(row: KeyRow) -> str:
 
 
 def _described(row: KeyRow) -> dict[str, object]:
-    """A key as JSON; its hash is nobody's business."""
+    """A key as JSON, without its hash."""
     shown = ("id", "owner", "scopes", "label", "created_at", "expires_at", "revoked_at", "last_used_at")
     return {name: getattr(row, name) for name in shown} | {"state": _state(row)}
 

@@ -1,4 +1,4 @@
-"""``heliopsf store``: what is kept, by whom, and what nobody needs any more."""
+"""``heliopsf store``: remove files that nothing refers to, show what each owner stores, and set quotas."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from service.cli.operator.database import DATA, opened_catalogue
+from service.cli.operator.database import opened_catalogue
 from service.cli.operator.key import Duration
-from service.cli.options import read_settings, user_errors
+from service.cli.options import DATA, read_settings, user_errors
 from workers.catalogue.keys import OWNER
 from workers.catalogue.owners import MIB, Usage
 from workers.files.collection import collect
@@ -19,33 +19,38 @@ DAY_S = 86_400
 
 @click.group()
 def store() -> None:
-    """Look after the files that a service keeps. Runs where the service runs, on its settings."""
+    """Clean up the files of a service. Run it on the machine of the service, with its settings."""
 
 
 @store.command("collect")
-@click.option("--dry-run", is_flag=True, help="Say what would be removed, and remove nothing")
+@click.option("--dry-run", is_flag=True, help="Show what would be removed, but remove nothing")
 @click.option(
-    "--older-than", "older_than_s", type=Duration(), default="30d", show_default=True, help="Kept last before"
+    "--older-than",
+    "older_than_s",
+    type=Duration(),
+    default="30d",
+    show_default=True,
+    help="Remove only files older than this",
 )
-@click.option("--even-most", is_flag=True, help="Also where more than half of all files would go")
+@click.option("--even-most", is_flag=True, help="Remove even more than half of all files")
 @DATA
 def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: Path | None) -> None:
-    """Remove files that no upload, PSF, product, report or job names: left by what was killed half-way.
+    """Remove files that no upload, PSF, product, report or job refers to; killed processes leave such files behind.
 
-    Young files are left alone, since uploads and jobs at work keep files before they write them down. Another
-    database's files are named by nothing in this one: a store is to have one database.
+    Young files stay: uploads and running jobs store a file before the database refers to it. If two databases share one
+    store, this removes the files of the other database; use one store for one database.
     """
     settings = read_settings(data)
     if older_than_s < settings.max_job_s:
         days = -(-settings.max_job_s // DAY_S)
         raise click.BadParameter(
-            f"expected {days:.0f}d or more: a job may be at work for so long (HELIOPSF_MAX_JOB_S)",
+            f"expected {days:.0f}d or more, because a job may run for that long (HELIOPSF_MAX_JOB_S)",
             param_hint="--older-than",
         )
     with user_errors(), opened_catalogue(data) as catalogue:
         if catalogue.schema.status().state != "current":
             raise click.ClickException(
-                "the database is not at this version's revision, so what it names may not be known here: "
+                "the database is not at the revision of this version, so its references may not be known here; see "
                 "`heliopsf database status`"
             )
         found = collect(catalogue, open_store(settings), older_than_s, dry_run=dry_run, even_most=even_most)
@@ -58,13 +63,13 @@ def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: P
         f"{found.removed_bytes / MIB:.1f} of {found.bytes / MIB:.1f} MiB"
     )
     if recounted:
-        click.echo(f"bytes counted anew for {', '.join(recounted)}")
+        click.echo(f"corrected the byte count of {', '.join(recounted)}")
 
 
 @store.command("usage")
 @DATA
 def usage(data: Path | None) -> None:
-    """Say how much each owner has kept, and may keep."""
+    """Show how much each owner stores, and may store."""
     settings = read_settings(data)
     with opened_catalogue(data) as catalogue:
         for one in catalogue.owners.all(settings.quota_mib):
@@ -74,14 +79,14 @@ def usage(data: Path | None) -> None:
 @store.command("quota")
 @click.argument("owner")
 @click.argument("mib", type=click.IntRange(0), required=False)
-@click.option("--default", "as_all", is_flag=True, help="The limit of all again (HELIOPSF_QUOTA_MIB)")
+@click.option("--default", "as_all", is_flag=True, help="Back to the default limit (HELIOPSF_QUOTA_MIB)")
 @DATA
 def quota(owner: str, mib: int | None, as_all: bool, data: Path | None) -> None:
-    """Set how many MIB an OWNER may have kept; 0 is no limit."""
+    """Set how many MIB an OWNER may store; 0: unlimited."""
     if (mib is None) != as_all:
-        raise click.UsageError("expected a number of MiB, or --default")
+        raise click.UsageError("expected either a number of MiB or --default")
     if not OWNER.fullmatch(owner):
-        raise click.BadParameter("expected an owner of small letters, digits, '.', '_' and '-'")
+        raise click.BadParameter("OWNER: expected lower-case letters, digits, '.', '_' and '-'")
     with opened_catalogue(data) as catalogue:
         catalogue.owners.set_quota(owner, mib)
         click.echo(_line(catalogue.owners.usage(owner, read_settings(data).quota_mib)))

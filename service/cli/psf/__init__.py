@@ -1,0 +1,1 @@
+"""The commands `heliopsf psf`: make, read and version PSFs."""

@@ -1,11 +1,10 @@
-"""Commands about what a PSF says: ``psf query``, ``psf cutout``, ``psf rebin``; of a file, or of a service's PSF.
+"""The commands ``psf query``, ``psf cutout`` and ``psf rebin``, for a PSF in a file or on a service.
 
-A file is read here and asked the same questions as the service's tables are.
+The tables of a file are computed here; a service keeps the tables of its PSFs. Both answer the same questions.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,24 +13,30 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psfcore.tables import lookup as psf_lookup
+from psfcore.tables import lookup
 from service.cli.connection import remote, server_option
-from service.cli.options import OUTPUT, check_writable, limits, user_errors, write_json
+from service.cli.options import JSON, OUTPUT, check_writable, is_psf_id, limits, user_errors, write_json
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
 
-SERVER = server_option("Service to ask for an ID")
+SERVER = server_option("Address of the service that knows an ID")
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @click.command("query")
 @click.argument("psf", metavar="PSF_ID|FILE")
-@click.option("--radius", "radii", multiple=True, type=float, help="px; may be given many times")
-@click.option("--annulus", nargs=2, type=float, metavar="INNER OUTER", help="Light between two radii, px")
-@click.option("--profile", is_flag=True, help="Mean weight by radius too")
-@click.option("--compare", metavar="PSF_ID|FILE", help="Differences of this one, less PSF")
-@click.option("--json", "json_file", type=OUTPUT, help="Write the answers")
+@click.option("--radius", "radii", multiple=True, type=float, help="Radius, px; may be given several times")
+@click.option(
+    "--annulus", nargs=2, type=float, metavar="INNER OUTER", help="Show the light between two radii, px"
+)
+@click.option("--profile", is_flag=True, help="Also show the mean weight by radius")
+@click.option(
+    "--compare",
+    metavar="PSF_ID|FILE",
+    help="Show the difference of this PSF from the first (this minus first)",
+)
+@JSON
 @SERVER
 def query(
     psf: str,
@@ -42,7 +47,7 @@ def query(
     json_file: Path | None,
     server: str | None,
 ) -> None:
-    """Say how far the light of a PSF goes: by radius, in an annulus, beside another PSF."""
+    """Show how much light of a PSF lies beyond radii or in an annulus, and how it differs from another PSF."""
     check_writable(json_file)
     answers: dict[str, Any] = {}
     with user_errors(), _asking(server, psf, compare) as ask:
@@ -64,28 +69,32 @@ def query(
 
 @click.command("cutout")
 @click.argument("psf", metavar="PSF_ID|FILE")
-@click.option("--size", required=True, type=click.IntRange(1), help="Edge of the middle to cut out, px")
-@click.option("-o", "--output", required=True, type=OUTPUT)
+@click.option(
+    "--size", required=True, type=click.IntRange(1), help="Width and height of the part to write, px"
+)
+@click.option("-o", "--output", required=True, type=OUTPUT, help="Write the part (FITS)")
 @SERVER
 def cutout(psf: str, size: int, output: Path, server: str | None) -> None:
-    """Write the middle of a PSF, not renormalised. Of a file, its components too."""
+    """Write the central part of a PSF, not renormalised. For a file, with its components."""
+    from psfcore.central_part import central_part
+
     check_writable(output)
     with user_errors():
         if _is_id(psf):
             with remote(server) as service:
                 service.psf_cutout(psf, size, output)
         else:
-            _write(output, _cut(_read(psf), size))
+            _write(output, central_part(_read(psf), size))
     click.echo(f"{output}: central {size} x {size} px")
 
 
 @click.command("rebin")
 @click.argument("psf", metavar="PSF_ID|FILE")
-@click.option("--factor", required=True, type=click.IntRange(2), help="Pixels a binned pixel, on each axis")
-@click.option("-o", "--output", required=True, type=OUTPUT)
+@click.option("--factor", required=True, type=click.IntRange(2), help="Pixels per binned pixel, on each axis")
+@click.option("-o", "--output", required=True, type=OUTPUT, help="Write the binned PSF (FITS)")
 @SERVER
 def rebin(psf: str, factor: int, output: Path, server: str | None) -> None:
-    """Write the PSF that an image of FACTOR x FACTOR binned pixels is seen through."""
+    """Write the PSF for images that are binned by FACTOR x FACTOR pixels."""
     from psfcore.psf_sampling import rebinned
 
     check_writable(output)
@@ -101,17 +110,17 @@ def rebin(psf: str, factor: int, output: Path, server: str | None) -> None:
     click.echo(f"{output}: {binned.name} {binned.version}, {nx} x {ny} px of {factor} x {factor}")
 
 
-COMMANDS = (query, cutout, rebin)  # of the group `psf`
+COMMANDS = (query, cutout, rebin)
 
 
 @contextmanager
 def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
-    """What answers a question about a PSF that the user named: of ids the service, of files their own tables."""
+    """A function that answers questions about the named PSFs: the service answers for ids, tables made here for files."""
     ids = [psf for psf in psfs if psf is not None and _is_id(psf)]
     files = [psf for psf in psfs if psf is not None and not _is_id(psf)]
     if ids and files:
         raise click.UsageError(
-            "expected two ids of a service or two files to compare; got one of each: upload the file"
+            "expected two PSF ids or two files; got one of each. Upload the file first: heliopsf psf upload FILE"
         )
     if not ids:
         tables = {file: _tables(file) for file in files}
@@ -119,8 +128,8 @@ def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dic
         def ask_files(psf: str, question: str, **wanted: Any) -> dict[str, Any]:
             name, _, other = question.partition("/")
             if other:
-                return psf_lookup.compare(tables[psf], tables[other])
-            return psf_lookup.QUESTIONS[name](tables[psf], **wanted)
+                return lookup.compare(tables[psf], tables[other])
+            return lookup.QUESTIONS[name](tables[psf], **wanted)
 
         yield ask_files
         return
@@ -131,7 +140,7 @@ def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dic
 
 
 def _is_id(psf: str) -> bool:
-    if re.fullmatch(r"[0-9a-f]{64}", psf):
+    if is_psf_id(psf):
         return True
     if not Path(psf).is_file():
         raise click.UsageError(f"expected a PSF id (64 hexadecimal digits) or a file; got {psf!r}")
@@ -150,23 +159,6 @@ def _read(file: str) -> Psf:
     return read_psf(file, limits())
 
 
-def _cut(psf: Psf, size: int) -> Psf:
-    from dataclasses import replace
-
-    from psfcore.errors import DataError
-    from psfcore.psf import crop_centred
-
-    smallest = min(psf.kernel.shape)
-    if size > smallest:
-        raise DataError("cutout-too-large", f"expected a size of 1 to {smallest} px; got {size}")
-    shape = (size, size)
-    return replace(
-        psf,
-        kernel=crop_centred(psf.kernel, shape),
-        components={name: crop_centred(part, shape) for name, part in psf.components.items()},
-    )
-
-
 def _write(output: Path, psf: Psf) -> None:
     from psfcore.fits.psfs import write_psf
 
@@ -179,7 +171,7 @@ def _curve_lines(answer: dict[str, Any]) -> list[str]:
     lines = [
         f"{answer['name']} {answer['version']}, sum {answer['sum_on_array']:.6f} on {answer['shape'][1]} x "
         f"{answer['shape'][0]} px, central pixel {answer['central_weight']:.4f}",
-        "light farther than R, or off the array, in percent:",
+        "light beyond R, or outside the array, in percent:",
         f"{'R (px)':>10}" + "".join(f"{name:>{_width(name, sigma)}}" for name in curves),
     ]
     for n, radius in enumerate(answer["radii_px"]):
@@ -200,7 +192,7 @@ def _with_sigma(value: float, sigma: float | None) -> str:
 
 
 def _annulus_lines(answer: dict[str, Any]) -> list[str]:
-    lines = [f"light between {answer['inner_px']:g} and {answer['outer_px']:g} px, percent of all:"]
+    lines = [f"light between {answer['inner_px']:g} and {answer['outer_px']:g} px, in percent of all light:"]
     for name, light in answer["light"].items():
         sigma = answer["sigma"].get(name)
         lines.append(f"  {name:<14} {_with_sigma(100 * light, None if sigma is None else 100 * sigma)}")
@@ -219,8 +211,8 @@ def _profile_lines(answer: dict[str, Any]) -> list[str]:
 def _compare_lines(answer: dict[str, Any]) -> list[str]:
     one, other = answer["one"], answer["other"]
     lines = [
-        f"{other['name']} {other['version']} less {one['name']} {one['version']}: sum {answer['difference_of_sums']:+.6f}, "
-        f"central pixel {answer['difference_of_central_weights']:+.5f}; light beyond R, points:"
+        f"{other['name']} {other['version']} minus {one['name']} {one['version']}: sum {answer['difference_of_sums']:+.6f}, "
+        f"central pixel {answer['difference_of_central_weights']:+.5f}; light beyond R in percentage points:"
     ]
     points = answer["difference_points"]
     lines.append(f"{'R (px)':>10}" + "".join(f"{name:>15}" for name in points))

@@ -1,4 +1,4 @@
-"""Commands about PSFs in versions: ``psf list``, ``upload``, ``certify``, ``deprecate``, ``best``, ``lineage``, ``rerun``."""
+"""Commands about PSF versions: ``psf list``, ``upload``, ``certify``, ``deprecate``, ``best``, ``lineage``, ``rerun``."""
 
 from __future__ import annotations
 
@@ -10,33 +10,35 @@ from typing import Any, TypeVar
 import click
 
 from service.cli.connection import SERVER, remote
-from service.cli.options import FILE, OUTPUT, check_writable, progress_bar, user_errors, write_json
+from service.cli.options import FILE, JSON, check_writable, progress_bar, user_errors, write_json
 from workers.versions.status import PsfStatus
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-REASON = click.option("--reason", default="", help="Why, for those who ask later")
+REASON = click.option("--reason", default="", help="Reason, kept in the history")
 FROM = click.option(
-    "--from", "valid_from", metavar="TIME", help="First time of observation [default: from ever]"
+    "--from", "valid_from", metavar="TIME", help="Start of its time range (included) [default: no start]"
 )
-TO = click.option("--to", "valid_to", metavar="TIME", help="The time before which it ends [default: open]")
-CONTEXT = click.option("--context", help="Id or name of a context; now: what is certified now")
-JSON = click.option("--json", "json_file", type=OUTPUT, help="Write the answer")
+TO = click.option("--to", "valid_to", metavar="TIME", help="End of its time range (excluded) [default: open]")
+CONTEXT = click.option("--context", help="Context: its id or name; now: the PSFs certified at the moment")
+PRODUCT = click.option("--product", is_flag=True, help="The id is that of a product, not of a PSF")
 
 
 def _line_options(command: Command) -> Command:
     for name, what in (
-        ("kind", "total, uploaded, or a component's name, as diffraction"),
-        ("channel", "Wavelength in whole angstrom, as 174"),
-        ("instrument", "As hri_euv"),
+        ("kind", "Kind: total, uploaded, or a component such as diffraction"),
+        ("channel", "Channel: wavelength in whole angstrom, such as 174"),
+        ("instrument", "Instrument, such as hri_euv"),
     ):
         command = click.option(f"--{name}", help=what)(command)
     return command
 
 
 def _filter_options(command: Command) -> Command:
-    at = click.option("--valid-at", metavar="TIME", help="Time of observation, as 2024-03-01T12:00:00")
-    status = click.option("--status", type=click.Choice([str(status) for status in PsfStatus]))
-    version = click.option("--version")
+    at = click.option("--valid-at", metavar="TIME", help="Time of observation, such as 2024-03-01T12:00:00")
+    status = click.option(
+        "--status", type=click.Choice([str(status) for status in PsfStatus]), help="Status of the PSF"
+    )
+    version = click.option("--version", help="Version of the PSF")
     return _line_options(version(status(at(CONTEXT(command)))))
 
 
@@ -48,7 +50,7 @@ def list_psfs(server: str | None, **filters: str | None) -> None:
     with user_errors(), remote(server) as service:
         rows = list(service.psfs(**_given(filters)))
     if not rows and not _given(filters):
-        click.echo("no PSF yet: `heliopsf psf build` makes one, and so does the first deconvolution")
+        click.echo("no PSF yet; `heliopsf psf build` makes one, and so does the first deconvolution")
     elif not rows:
         click.echo("no PSF with " + ", ".join(f"{name} {value}" for name, value in _given(filters).items()))
     for row in rows:
@@ -59,12 +61,12 @@ def list_psfs(server: str | None, **filters: str | None) -> None:
 
 @click.command("upload")
 @click.argument("file", type=FILE)
-@click.option("--name", help="[default: PSFNAME, or the file's name]")
-@click.option("--version", help="[default: PSFVERS]")
+@click.option("--name", help="Name [default: PSFNAME in the header, or the file name]")
+@click.option("--version", help="Version [default: PSFVERS in the header]")
 @_line_options
 @SERVER
 def upload_psf(file: Path, server: str | None, **said: str | None) -> None:
-    """Upload a PSF of your own. KIND total lets images be deconvolved with it once it is certified."""
+    """Upload a PSF from FILE (FITS). Once certified, a PSF of kind total serves for images of its instrument."""
     with user_errors(), remote(server) as service:
         row = service.upload_psf(file, **said)
     line = f"{row['instrument'] or 'unknown instrument'} {row['channel'] or '-'} {row['kind']}"
@@ -73,11 +75,14 @@ def upload_psf(file: Path, server: str | None, **said: str | None) -> None:
 
 @click.command("certify")
 @click.argument("psf_id", metavar="PSF_ID")
-@click.option("--version", help="Three numbers that its line has not had; a certified PSF keeps its own")
+@click.option("--version", help="Version such as 1.2.0, new in its series; a certified PSF keeps its version")
 @FROM
 @TO
 @click.option(
-    "--supersedes", multiple=True, metavar="PSF_ID", help="A certified one to deprecate in the same step"
+    "--supersedes",
+    multiple=True,
+    metavar="PSF_ID",
+    help="Also deprecate this certified PSF; may be given several times",
 )
 @REASON
 @_line_options
@@ -92,7 +97,7 @@ def certify(
     server: str | None,
     **line: str | None,
 ) -> None:
-    """Certify a PSF for a range of times of observation, or give a certified one another range."""
+    """Certify a PSF for a range of times of observation, or change the range of a certified PSF."""
     with user_errors(), remote(server) as service:
         said = service.certify_psf(
             psf_id,
@@ -108,11 +113,11 @@ def certify(
 
 @click.command("deprecate")
 @click.argument("psf_id", metavar="PSF_ID")
-@click.option("--successor", metavar="PSF_ID", help="The certified one to use instead")
+@click.option("--successor", metavar="PSF_ID", help="Certified PSF to use instead")
 @REASON
 @SERVER
 def deprecate(psf_id: str, successor: str | None, reason: str, server: str | None) -> None:
-    """Say that a certified PSF is no longer to be used; or name a deprecated one's successor."""
+    """Withdraw a certified PSF from use, or name the successor of a deprecated PSF."""
     with user_errors(), remote(server) as service:
         said = service.deprecate_psf(psf_id, successor, reason=reason)
         count = sum(1 for _ in service.affected(psf_id))
@@ -122,16 +127,18 @@ def deprecate(psf_id: str, successor: str | None, reason: str, server: str | Non
 
 
 @click.command("best")
-@click.option("--image", type=FILE, help="An image, by whose header it is found")
+@click.option("--image", type=FILE, help="Image (FITS) that the PSF is for")
 @_filter_options
 @JSON
 @SERVER
 def best(image: Path | None, json_file: Path | None, server: str | None, **filters: str | None) -> None:
-    """Say which PSF fits an image, or these properties."""
+    """Find the PSF that fits an image, or the one with the given properties."""
     check_writable(json_file)
     given = _given(filters)
     if image is not None and set(given) - {"context", "kind"}:
-        raise click.UsageError("--image: expected --context and --kind alone beside it")
+        raise click.UsageError(
+            "--image can only be combined with --context and --kind; leave out the other filters"
+        )
     with user_errors(), remote(server) as service:
         if image is None:
             found = service.best_psf(**given)
@@ -143,12 +150,12 @@ def best(image: Path | None, json_file: Path | None, server: str | None, **filte
 
 
 @click.command("lineage")
-@click.argument("identity", metavar="PSF_ID")
-@click.option("--product", is_flag=True, help="PSF_ID is a product's id")
+@click.argument("identity", metavar="ID")
+@PRODUCT
 @JSON
 @SERVER
 def lineage(identity: str, product: bool, json_file: Path | None, server: str | None) -> None:
-    """Say where a PSF, or a product, came from."""
+    """Show what a PSF or a product was made from, back to the uploads."""
     check_writable(json_file)
     with user_errors(), remote(server) as service:
         told = service.lineage("product" if product else "psf", identity)
@@ -158,12 +165,12 @@ def lineage(identity: str, product: bool, json_file: Path | None, server: str | 
 
 
 @click.command("rerun")
-@click.argument("identity", metavar="PSF_ID")
-@click.option("--product", is_flag=True, help="PSF_ID is a product's id")
+@click.argument("identity", metavar="ID")
+@PRODUCT
 @JSON
 @SERVER
 def rerun(identity: str, product: bool, json_file: Path | None, server: str | None) -> None:
-    """Make a PSF, or a product, again and compare. Status 1: it came out otherwise."""
+    """Make a PSF or a product again and compare. Exit status 1: the result differs."""
     check_writable(json_file)
     with user_errors(), remote(server) as service, progress_bar() as report:
         found = service.rerun("product" if product else "psf", identity, progress=report)
@@ -173,7 +180,7 @@ def rerun(identity: str, product: bool, json_file: Path | None, server: str | No
     sys.exit(0 if found["details"]["same"] else 1)
 
 
-COMMANDS = (list_psfs, upload_psf, certify, deprecate, best, lineage, rerun)  # of the group `psf`
+COMMANDS = (list_psfs, upload_psf, certify, deprecate, best, lineage, rerun)
 
 
 def _given(filters: dict[str, str | None]) -> dict[str, str]:
@@ -181,20 +188,20 @@ def _given(filters: dict[str, str | None]) -> dict[str, str]:
 
 
 def _validity(row: dict[str, Any]) -> str:
-    """The range of a PSF that has one; a draft has none."""
+    """The time range of a PSF; empty for a draft, which has no range."""
     if row["status"] == PsfStatus.DRAFT:
         return ""
-    return f"  [{row['valid_from'] or 'from ever'}, {row['valid_to'] or 'open'})"
+    return f"  [{row['valid_from'] or 'always'}, {row['valid_to'] or 'open'})"
 
 
 def _tree(told: dict[str, Any], depth: int) -> Iterator[str]:
-    """A lineage as lines, each thing below what was made from it."""
+    """A lineage as lines; inputs are indented below what was made from them."""
     made = told["made"] or {}
     named = " ".join(str(made[key]) for key in ("name", "version", "status") if made.get(key))
     by = [f"heliopsf {made['software_version']}"] if made.get("software_version") else []
     by += [f"job {made['job_id']}"] if made.get("job_id") else []
-    gone = "" if told["there"] or told["type"] == "instrument-file" else "no longer here"
-    cut = "told above" if told["cut"] else ""
+    gone = "" if told["there"] or told["type"] == "instrument-file" else "deleted since"
+    cut = "shown above" if told["cut"] else ""
     said = "; ".join(part for part in (named, ", ".join(by), gone, cut) if part)
     yield "  " * depth + f"{told['type']} {told['id']}" + (f"  ({said})" if said else "")
     for parent in told["parents"]:

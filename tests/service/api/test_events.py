@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 
 from service.api import events
 from service.app import create_app
-from service.client.http import Heliopsf, ServiceError
+from service.client.http import Client, ServiceError
 from tests.whole.stack import free_port, wait_for
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
@@ -34,7 +34,7 @@ class Live:
 
     url: str
     app: FastAPI
-    client: Heliopsf
+    client: Client
 
     @property
     def catalogue(self) -> Catalogue:
@@ -62,7 +62,7 @@ def live(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
     thread = threading.Thread(target=server.run)
     thread.start()
     url = f"http://127.0.0.1:{port}"
-    with Heliopsf(url) as client:
+    with Client(url) as client:
         client.wait_until_up()
         yield Live(url, app, client)
     server.should_exit = True

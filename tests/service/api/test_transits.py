@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 from psfcore.errors import DataError
 from psfcore.transit.archive import ArchiveLimits, pack, unpack
 from service.app import create_app
-from service.client.http import Heliopsf, ServiceError
+from service.client.http import Client, ServiceError
 from service.local import LocalService
 from tests.service.conftest import upload
 from tests.transit_files import READ_NOISE, write_transit
@@ -261,7 +261,7 @@ def test_images_are_still_images(api: TestClient, image_file: Path) -> None:
 
 
 def test_a_client_sends_a_folder_or_an_archive(api: TestClient, folder: Path, tmp_path: Path) -> None:
-    with Heliopsf("http://testserver", transport=api._transport) as sun:
+    with Client("http://testserver", transport=api._transport) as sun:
         transit = sun.upload_transit(folder)
         assert transit["images"] == 4 and transit["filename"] == "mercury.tar"
         assert sun.upload_transit(str(folder))["id"] == transit["id"], "the same bytes each time"
@@ -279,7 +279,7 @@ def test_a_client_sends_a_folder_or_an_archive(api: TestClient, folder: Path, tm
 
 
 def test_the_local_service_takes_the_same(settings: Settings, api: TestClient, folder: Path) -> None:
-    with Heliopsf("http://testserver", transport=api._transport) as sun:
+    with Client("http://testserver", transport=api._transport) as sun:
         there = sun.upload_transit(folder)
     local = LocalService(Settings.apart(folder.parent / "local"))
     try:

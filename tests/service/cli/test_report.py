@@ -81,8 +81,29 @@ def test_the_command_writes_the_page_and_its_numbers(folder: Path, psf: Path, tm
     done = CliRunner().invoke(main, [str(one) for one in arguments])
     assert done.exit_code == 0, done.output
     check_stands_alone(page.read_text("utf-8"))
-    assert json.loads(numbers.read_text())["sentence"] in done.output
+    told = json.loads(numbers.read_text())
+    assert told["sentence"] in done.output
+    whole = told["evaluation"]["all"]
+    assert f"all pointings: {whole['images']} images, mean {whole['mean_pct']:+.2f} %" in done.output
+    pointings = [
+        line for line in done.output.splitlines() if line.startswith("pointing ") and "images" in line
+    ]
+    assert len(pointings) == len(told["evaluation"]["pointings"])
     assert "not shown: other shapes of scatter (a PSF was given, and nothing was fitted)" in done.output
+
+
+def test_a_plot_alone_is_enough_and_noise_may_come_with_the_command(
+    folder: Path, psf: Path, tmp_path: Path
+) -> None:
+    plots = [tmp_path / name for name in ("quiet.png", "loud.png")]
+    said = []
+    for plot, noise in zip(plots, ((), ("--noise", "24", "8")), strict=True):
+        arguments = ["report", folder, "--plot", plot, "--psf", psf, "--no-dark-offsets", "--local", *noise]
+        done = CliRunner().invoke(main, [str(one) for one in arguments])
+        assert done.exit_code == 0, done.output
+        assert plot.read_bytes().startswith(b"\x89PNG")
+        said.append(next(line for line in done.output.splitlines() if line.startswith("all pointings")))
+    assert said[0] != said[1]
 
 
 @pytest.mark.parametrize(
@@ -92,7 +113,8 @@ def test_the_command_writes_the_page_and_its_numbers(folder: Path, psf: Path, tm
         (["-o", "R.html", "--psf", "missing.fits"], "expected a PSF id"),
         (["-o", "R.html", "--noise", "-1", "2"], "greater than or equal to 0"),
         (["-o", "R.html", "--seed", "-1"], "not in the range"),
-        ([], "Missing option '-o'"),
+        ([], "expected an output: -o PAGE.html, --json FILE or --plot FILE"),
+        (["-o", "R.html", "--shapes", "--psf", "x.fits"], "--shapes fits every shape itself"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(

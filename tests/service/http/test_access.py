@@ -18,7 +18,7 @@ from sqlalchemy import inspect
 
 from service.app import create_app
 from service.cli.main import main
-from service.client.http import Heliopsf, ServiceError
+from service.client.http import Client, ServiceError
 from service.http.access import check_can_serve
 from tests.service.conftest import upload
 from tests.service.keyed import Keyed, bearer, keyed
@@ -285,21 +285,21 @@ def test_client_and_commands_take_a_key_and_never_show_it(
 ) -> None:
     key = service.key("ann")
     transport = service.api._transport
-    with Heliopsf("http://testserver", key=key, transport=transport) as client:
+    with Client("http://testserver", key=key, transport=transport) as client:
         assert list(client.psfs()) == []
     monkeypatch.setenv("HELIOPSF_KEY", f" {key}\n")
-    with Heliopsf("http://testserver", transport=transport) as client:
+    with Client("http://testserver", transport=transport) as client:
         assert list(client.psfs()) == []
     monkeypatch.delenv("HELIOPSF_KEY")
-    with Heliopsf("http://testserver", transport=transport) as client, pytest.raises(ServiceError) as refused:
+    with Client("http://testserver", transport=transport) as client, pytest.raises(ServiceError) as refused:
         list(client.psfs())
     assert (refused.value.status, refused.value.code) == (401, "no-key")
     with pytest.raises(ServiceError) as malformed:
-        Heliopsf("http://testserver", key="hpsf_s3cret\nX-Owner: bob")
+        Client("http://testserver", key="hpsf_s3cret\nX-Owner: bob")
     assert "s3cret" not in str(malformed.value)
     seen: list[str | None] = []
     monkeypatch.setattr(
-        "service.client.http.Heliopsf.__init__", lambda self, server, key=None: seen.append(key) or 1 / 0
+        "service.client.http.Client.__init__", lambda self, server, key=None: seen.append(key) or 1 / 0
     )
     CliRunner().invoke(main, ["psf", "list", "--key", key])
     monkeypatch.setenv("HELIOPSF_KEY", "from-the-environment")

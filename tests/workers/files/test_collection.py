@@ -328,5 +328,5 @@ def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert not store.path(orphan).exists()
     with catalogue._engine.begin() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
-    assert "not at this version's revision" in said(status=1)
+    assert "not at the revision of this version" in said(status=1)
     catalogue.close()

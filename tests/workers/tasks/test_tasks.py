@@ -13,7 +13,7 @@ from astropy.io import fits
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.fits.images import read_planes
 from psfcore.instruments.model import parse_instrument
-from service.cli.main import METHODS
+from service.cli.options import METHODS
 from service.client.http import ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf

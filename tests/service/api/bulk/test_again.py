@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from service.cli import bulk as cli_bulk
 from service.cli.main import main
-from service.client.http import Heliopsf
+from service.client.http import Client
 from tests.conftest import write_image
 from tests.service.conftest import upload
 from workers.bulk.turns import keep_turns
@@ -92,7 +92,7 @@ def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
     assert f"bulk {second['id']} is LISTING" in refused.json()["detail"]
     assert api.get(f"/v1/bulk/{first['id']}").json() == ended
 
-    class Here(Heliopsf):
+    class Here(Client):
         def close(self) -> None:
             """The transport is the application's: it goes on."""
 

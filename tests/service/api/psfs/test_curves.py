@@ -24,7 +24,7 @@ from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from service.app import create_app
 from service.cli.psf.query import COMMANDS
-from service.client.http import Heliopsf, ServiceError
+from service.client.http import Client, ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
 from tests.conftest import write_psf as write_plain_psf
@@ -300,7 +300,7 @@ def test_psfs_on_other_pixels_are_not_compared(
 
 def test_the_client_gets_the_same_answers(served: Served, tmp_path: Path) -> None:
     api, built = served.api, served.psf
-    with Heliopsf("http://testserver", transport=api._transport) as sun:
+    with Client("http://testserver", transport=api._transport) as sun:
         curve = sun.psf_curve(built["id"], [0.5, 10])
         assert curve == api.get(f"/v1/psfs/{built['id']}/curve?radii=0.5,10").json()
         assert sun.psf_profile(built["id"])["radius_px"][:3] == [0, 1, 2]

@@ -56,7 +56,7 @@ def test_with_nothing_there_it_says_so_and_makes_nothing(tmp_path: Path) -> None
     answer = ask()
     assert answer.exit_code == 0, answer.output
     said = " ".join(answer.output.split())
-    assert "is not there yet -> `heliopsf serve` makes it" in said
+    assert "does not exist yet -> `heliopsf serve` makes it" in said
     assert list(tmp_path.iterdir()) == []
 
 
@@ -134,9 +134,9 @@ def test_a_database_of_another_version(catalogue: Catalogue, statement: str, sta
 @pytest.mark.parametrize(
     ("statement", "state", "says"),
     [
-        ("DROP TABLE alembic_version", "warning", "no revision"),
+        ("DROP TABLE alembic_version", "warning", "without a revision"),
         ("UPDATE alembic_version SET version_num = '0001'", "warning", "at revision 0001"),
-        ("UPDATE alembic_version SET version_num = '9999'", "broken", "made by a later version"),
+        ("UPDATE alembic_version SET version_num = '9999'", "broken", "of a later version"),
     ],
 )
 def test_a_database_at_another_revision(catalogue: Catalogue, statement: str, state: str, says: str) -> None:
@@ -179,14 +179,14 @@ def test_a_job_whose_worker_is_gone(catalogue: Catalogue) -> None:
     assert states()["stuck jobs"] == "ok"
     with catalogue._engine.begin() as connection:
         connection.execute(text("UPDATE jobs SET heartbeat_at = heartbeat_at - 7200"))
-    assert "1 at work" in findings()["stuck jobs"]["found"]
+    assert "1 in progress" in findings()["stuck jobs"]["found"]
 
 
 @pytest.mark.parametrize(
     ("environment", "says"),
     [
         ({"OMP_NUM_THREADS": "4096"}, "OMP_NUM_THREADS"),
-        ({"OMP_NUM_THREADS": "many"}, "OMP_NUM_THREADS is no number"),
+        ({"OMP_NUM_THREADS": "many"}, "set OMP_NUM_THREADS to a number"),
         ({"HELIOPSF_WORKER_THREADS": "4096"}, "HELIOPSF_WORKER_THREADS=2"),
         ({"HELIOPSF_WORKER_PROCESSES": "4096"}, "fewer processes"),
         ({}, ""),

@@ -14,15 +14,15 @@ from fastapi.testclient import TestClient
 from service.cli import context as cli_context
 from service.cli.main import main
 from service.cli.psf import versions as cli_psf_versions
-from service.client.http import Heliopsf, ServiceError
+from service.client.http import Client, ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 
 
 @pytest.fixture
-def sun(api: TestClient, run_jobs: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> Heliopsf:
+def sun(api: TestClient, run_jobs: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> Client:
     """A client of the application in this process, whose jobs are run as soon as they are asked for."""
 
-    class AtOnce(Heliopsf):
+    class AtOnce(Client):
         def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
             job = super().submit(kind, queue=queue, **parameters)
             run_jobs()
@@ -57,7 +57,7 @@ def uploaded(tmp_path: Path, size: int, **line: str) -> str:
     return ask("psf", "upload", str(file), "--name", f"p{size}", *options).split()[0]
 
 
-def test_psfs_from_draft_to_deprecated(sun: Heliopsf, tmp_path: Path) -> None:
+def test_psfs_from_draft_to_deprecated(sun: Client, tmp_path: Path) -> None:
     assert "no PSF yet" in ask("psf", "list")
     first, second = uploaded(tmp_path, 32), uploaded(tmp_path, 48)
     assert "no-such" not in ask("psf", "list") and first in ask("psf", "list", "--status", "draft")
@@ -78,7 +78,7 @@ def test_psfs_from_draft_to_deprecated(sun: Heliopsf, tmp_path: Path) -> None:
     assert [one["reason"] for one in sun.psf_status(second)["history"]] == ["", "wrong", ""]
 
 
-def test_the_best_by_properties_and_by_an_image(sun: Heliopsf, tmp_path: Path) -> None:
+def test_the_best_by_properties_and_by_an_image(sun: Client, tmp_path: Path) -> None:
     first, second = uploaded(tmp_path, 32), uploaded(tmp_path, 48)
     ask("psf", "certify", first, "--version", "1.0.0", "--to", "2021-01-01")
     ask("psf", "certify", second, "--version", "1.1.0", "--from", "2021-01-01")
@@ -99,7 +99,7 @@ def test_the_best_by_properties_and_by_an_image(sun: Heliopsf, tmp_path: Path) -
     assert (caught.value.code, caught.value.status) == ("no-psf-fits", 404)
 
 
-def test_contexts(sun: Heliopsf, tmp_path: Path) -> None:
+def test_contexts(sun: Client, tmp_path: Path) -> None:
     assert "no context yet" in ask("context", "list")
     assert "there is none yet" in ask("context", "create", "one", code=1)
     first, second = uploaded(tmp_path, 32), uploaded(tmp_path, 48, channel="304")
@@ -113,13 +113,13 @@ def test_contexts(sun: Heliopsf, tmp_path: Path) -> None:
     assert listed[0].startswith("* ") and listed[1].startswith("  ") and "as delivered" in listed[1]
     assert ask("psf", "best", "--channel", "304").startswith(second)
     assert " has context one" in ask("psf", "best", "--channel", "304", "--context", "one", code=1)
-    assert ask("context", "use", "--none") == "no default: what is certified\n"
+    assert ask("context", "use", "--none") == "no default context: the certified PSFs are used\n"
     assert len(sun.default_context()["history"]) == 2
     ask("context", "use", code=2)
     assert "expected the id or name of a context; got 'three'" in ask("context", "use", "three", code=1)
 
 
-def test_lineage_and_rerun(sun: Heliopsf, tmp_path: Path) -> None:
+def test_lineage_and_rerun(sun: Client, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
     write_image(tmp_path / "i.fits")
     psf = sun.build_psf(tmp_path / "small.toml", size=64)
@@ -141,7 +141,7 @@ def test_lineage_and_rerun(sun: Heliopsf, tmp_path: Path) -> None:
 
 
 def test_a_rerun_that_differs_ends_with_status_1(
-    sun: Heliopsf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sun: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from workers.tasks import product as product_task
 

@@ -46,7 +46,7 @@ def test_an_effect_of_one_s_own_is_found_with_its_size(folder: Path, tmp_path: P
     corrected = tmp_path / "psf.fits"
     with quick_diagnosis():
         done = run(
-            folder, "--local", "--effects", tmp_path / "mine.py", "--json", numbers, "--html", page,
+            folder, "--local", "--effects", tmp_path / "mine.py", "--json", numbers, "-o", page,
             "--plot", picture, "--corrected", corrected,
         )  # fmt: skip
     assert done.exit_code == 0, done.output
@@ -156,7 +156,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     done = run(folder, "--local", "--corrected", psf, "--json", numbers)
     assert done.exit_code == 1 and not psf.exists()
     assert done.output.splitlines()[1] == "verdict: none"
-    assert "was not written: no effect was found that could be added (verdict none)" in done.output
+    assert "was not written: no effect was found that a PSF can include (verdict none)" in done.output
     assert json.loads(numbers.read_text())["verdict"] == "none"
 
 

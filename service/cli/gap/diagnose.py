@@ -1,13 +1,8 @@
-"""``heliopsf gap``: where the fitted model and the images of a transit part, and which effect explains it.
-
-Everything numerical is imported by the command, so that the others start fast.
-"""
+"""``heliopsf gap``: where fitted model and images of a transit differ, and which effect explains the difference."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,23 +10,24 @@ from typing import Any
 import click
 
 from service.cli.connection import LOCAL, SERVER, connection, named_psf
-from service.cli.gap_blind import blind
+from service.cli.gap.blind import blind
 from service.cli.options import (
+    JSON,
     NOISE,
     OUTPUT,
     PLOT,
     SATURATION,
+    SEED,
     check_writable,
     progress_bar,
     user_errors,
 )
-from service.client.http import Operations
 
 SHOWN = 6
 
 
 class _DiagnosisByDefault(click.Group):
-    """A group whose first word may also be a transit: ``heliopsf gap DIR`` is ``heliopsf gap diagnose DIR``."""
+    """A group whose default command is ``diagnose``: ``heliopsf gap DIR`` means ``heliopsf gap diagnose DIR``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
@@ -41,40 +37,39 @@ class _DiagnosisByDefault(click.Group):
 
 @click.group(
     cls=_DiagnosisByDefault,
-    help="Diagnose a transit (heliopsf gap TRANSIT ...; its options: heliopsf gap diagnose -h), or judge the diagnosis.",
+    help="Find out why a fitted PSF and a transit differ. `heliopsf gap TRANSIT` is short for `heliopsf gap diagnose TRANSIT`; "
+    "its options: `heliopsf gap diagnose -h`.",
 )
 def gap() -> None:
-    """The gap between a fitted model and the images."""
+    """The gap between a fitted model and the images of a transit."""
 
 
 @gap.command()
 @click.argument("transit", type=click.Path(exists=True, path_type=Path))
-@click.option("--json", "report_file", type=OUTPUT, help="Write the report (schema gap/1)")
-@click.option("--html", "page_file", type=OUTPUT, help="Write it as a page to read")
+@click.option("-o", "--output", type=OUTPUT, help="Write a page to read and print (HTML)")
+@JSON
 @PLOT
-@click.option(
-    "--psf", metavar="ID|FILE", help="A PSF fitted to a transit: its shape is fitted, from its values"
-)
+@click.option("--psf", metavar="ID|FILE", help="Start from this fitted PSF: refit its shape from its values")
 @click.option(
     "--corrected",
     "corrected_file",
     type=OUTPUT,
-    help="Write the PSF with the answer in the model, of a tie with the best of those tied (FITS)",
+    help="Write the PSF fitted with the effect found in the model (FITS); in a tie, with the best effect",
 )
 @click.option(
     "--effects",
     metavar="FILE.py|MODULE[,...]",
-    help="Try effects of your own too; their code is run. With --local: a service has HELIOPSF_GAP_EFFECTS",
+    help="Also test effects of your own; this runs their code. Needs --local (a service has HELIOPSF_GAP_EFFECTS)",
 )
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Of all draws")
+@SEED
 @NOISE
 @SATURATION
 @SERVER
 @LOCAL
 def diagnose(
     transit: Path,
-    report_file: Path | None,
-    page_file: Path | None,
+    output: Path | None,
+    json_file: Path | None,
     plot: Path | None,
     psf: str | None,
     corrected_file: Path | None,
@@ -85,30 +80,33 @@ def diagnose(
     server: str | None,
     local: bool,
 ) -> None:
-    """Diagnose the gap between TRANSIT, a folder (or a .zip or .tar of one), and the model fitted to it."""
-    check_writable(report_file, page_file, plot, corrected_file)
+    """Diagnose the gap between TRANSIT and the model fitted to it: which effect explains the residuals.
+
+    TRANSIT is a folder with a transit.json, or a .zip or .tar file of one.
+    """
+    check_writable(output, json_file, plot, corrected_file)
     if effects is not None and not local:
         raise click.UsageError(
-            "--effects: expected --local with it; a service runs those of HELIOPSF_GAP_EFFECTS"
+            "--effects: expected --local with it; a service tests the effects in HELIOPSF_GAP_EFFECTS"
         )
     with (
         user_errors(),
         TemporaryDirectory(prefix="heliopsf-") as folder,
-        _service(server, local, effects) as service,
+        connection(server, local, gap_effects=effects or "") as service,
         progress_bar() as say,
     ):
-        numbers = report_file or Path(folder) / "report.json"
+        numbers = json_file or Path(folder) / "report.json"
         found = service.diagnose_gap(
             transit,
             numbers,
-            page=page_file,
+            page=output,
             preview=plot,
             progress=say,
             noise=noise or None,
             psf_id=named_psf(service, psf),
             saturation_dn=saturation_dn,
             seed=seed,
-            # A service keeps it for whoever asks next.
+            # A service keeps the corrected PSF for the next request.
             correct=corrected_file is not None or not local,
         )
         report = json.loads(numbers.read_text("utf-8"))
@@ -118,29 +116,16 @@ def diagnose(
     click.echo("\n".join(_lines(report)))
     if corrected_file is not None and corrected is None:
         raise click.ClickException(
-            f"{corrected_file} was not written: no effect was found that could be added (verdict {report['verdict']})"
+            f"{corrected_file} was not written: no effect was found that a PSF can include (verdict {report['verdict']})"
         )
 
 
-@contextmanager
-def _service(server: str | None, local: bool, effects: str | None) -> Iterator[Operations]:
-    """A service; one in this process, where effects are named, that tries these too."""
-    if effects is None:
-        with connection(server, local) as service:
-            yield service
-        return
-    from service.local import local_service
-
-    with local_service(gap_effects=effects) as own:
-        yield own
-
-
 def _lines(report: dict[str, Any]) -> list[str]:
-    """What is said of a report on a terminal."""
+    """A report as lines to print."""
     so_far = "best so far: " if report["verdict"] == "inconclusive" else ""
     answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
     out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
-    together = report.get("together", ())  # reports of earlier versions have none
+    together = report.get("together", ())  # reports of earlier versions lack this key
     for effect in [*together, *report["effects"]][:SHOWN]:
         closure = effect["closure"]
         closed = "" if closure is None else f", held-out closure {100 * closure['value']:.0f} %"

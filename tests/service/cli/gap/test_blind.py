@@ -11,7 +11,7 @@ from astropy.io import fits
 from click.testing import CliRunner, Result
 
 from psfcore.errors import DataError
-from service.cli.gap_blind import blind
+from service.cli.gap.blind import blind
 
 SMALL = ["--size", "128", "--images", "9", "--synthetic", "--processes", "1"]
 
@@ -66,7 +66,10 @@ def test_where_no_case_can_be_made_that_is_said(tmp_path: Path, monkeypatch: pyt
     answer = run("--cases", 2, "--clean-only", "-o", tmp_path / "set", *SMALL)
     assert answer.exit_code == 1
     assert "could not make case 0001" in answer.output
-    assert "expected cases that can be made; of 2 none could: bad-scene: expected a scene" in answer.output
+    assert (
+        "none of the 2 cases could be made; the first failed with: bad-scene: expected a scene"
+        in answer.output
+    )
     assert "Traceback" not in answer.output
 
 

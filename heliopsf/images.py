@@ -1,0 +1,52 @@
+"""Deconvolve an image in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from heliopsf.psfs import LIMITS, read_psf
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.fits.images import read_image
+from psfcore.image import Image
+from psfcore.noise import Noise
+from psfcore.psf import Psf
+from psfcore.psf_sampling import psf_for_image
+
+
+def deconvolve(
+    image: str | Path | Image,
+    psf: str | Path | Psf,
+    *,
+    method: str = "richardson-lucy",
+    noise: tuple[float, float] | None = None,
+    saturation_dn: float | None = None,
+    edges: Edges | None = None,
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    **parameters: Any,
+) -> Deconvolved:
+    """Deconvolve an image with a PSF. The result's ``pixels`` [y, x] have the shape and the unit of the image.
+
+    image: a FITS file, or an ``Image`` (pixels [y, x] in its unit, and a mask). psf: a FITS file, or a ``Psf``; it is
+    rebinned if the image is binned. noise: photon gain (DN per photon) and read noise (DN rms). saturation_dn: pixels from
+    this level (DN) are ignored; used if ``image`` is a file. edges: "zero", "symmetric" or "extended"; default: the best for
+    the method. progress(step, steps) is called after each step. parameters: of the method, such as ``steps=20``.
+
+    Raises ``DataError``; its ``code`` is the reason, such as "not-fits", "plate-scale-mismatch" or "unknown-method".
+    """
+    if not isinstance(image, Image):
+        image = read_image(image, LIMITS, saturation_dn=saturation_dn)
+    if not isinstance(psf, Psf):
+        psf = read_psf(psf)
+    conditions = Conditions(
+        edges=edges,
+        noise=None if noise is None else Noise(*noise),
+        threads=threads,
+        progress=progress,
+    )
+    return method_named(method)(image, psf_for_image(psf, image.header), conditions, **parameters)

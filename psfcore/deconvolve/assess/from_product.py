@@ -1,0 +1,61 @@
+"""A row of the contact sheet, read from a product: what a deconvolution by the service changed in an image.
+
+The task ``deconvolve`` computes the figures and keeps them in the product's details; the product's QUALITY plane marks
+the suspected pixels. Nothing is deconvolved or computed again here; the thumbnails are binned from both files.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.deconvolve.assess.artefacts import Artefacts
+from psfcore.deconvolve.assess.changes import Changes, Range, Structure
+from psfcore.deconvolve.assess.contact_sheet import THUMBNAIL_PX, Treated
+from psfcore.deconvolve.assess.quality import QualityBit
+from psfcore.drawing.plots import binned
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_image, read_planes
+
+DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
+
+
+def changes_in_product(
+    name: str, before: str | Path, product: str | Path, details: dict[str, Any], limits: FitsLimits
+) -> Treated:
+    """The row of one image. ``before``, ``product``: the FITS files of the image and of its product.
+
+    details: the product's details, with "changes", "steps_done" and "stopped_because". Raises DataError as
+    ``read_image``.
+    """
+    image, after = read_image(before, limits), read_image(product, limits)
+    suspected = (read_planes(product)["QUALITY"] & QualityBit.ARTEFACT) > 0
+    step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
+    dates = (image.header.get(key) for key in DATE_KEYS)
+    return Treated(
+        name=name,
+        taken=next((date.strip() for date in dates if isinstance(date, str) and date.strip()), None),
+        psf=f"{after.header.get('PSFNAME')} {after.header.get('PSFVERS')}",
+        found=changes_from_json(details["changes"], suspected),
+        steps_done=details["steps_done"],
+        stopped_because=details["stopped_because"],
+        before=binned(image.pixels, step),
+        after=binned(after.pixels, step),
+        suspected=np.unique(np.argwhere(suspected) // step, axis=0),
+    )
+
+
+def changes_from_json(figures: dict[str, Any], suspected: NDArray[np.bool_]) -> Changes:
+    """The figures that ``Changes.as_json`` wrote, with the plane of suspected pixels [y, x]."""
+    artefacts = figures["artefacts"]
+    return Changes(
+        **figures
+        | {
+            "structures": tuple(Structure(**row) for row in figures["structures"]),
+            "ranges": tuple(Range(**row) for row in figures["ranges"]),
+            "artefacts": Artefacts(suspected, artefacts["signs"], artefacts["sources"], artefacts["score"]),
+        }
+    )

@@ -1,0 +1,158 @@
+"""Test a PSF on the stray light of a flare, from an image during the flare and one before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.flare.arm_profile import BOX_PX, FlareComparison, compare_on_flare, flare_centre
+from psfcore.flare.arms import measure_arms
+from psfcore.image import Image
+from psfcore.noise import Noise
+from psfcore.psf import Psf
+from psfcore.psf_sampling import check_compatible
+
+ENOUGH_EXPLAINED = 0.5
+WELL_MATCHED_PCT = 3.0
+
+Plane = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FlareTest:
+    """A PSF compared with a flare, and the planes [y, x] that it was compared on.
+
+    difference: the flare's light, in ``unit``. usable: pixels that both images trust.
+    """
+
+    comparison: FlareComparison
+    difference: Plane
+    usable: NDArray[np.bool_]
+    unit: str
+
+
+def judge_on_flare(
+    flaring: Image,
+    before: Image,
+    psf: Psf,
+    *,
+    centre_xy: tuple[int, int] | None = None,
+    arm_deg: float | None = None,
+    distances_px: tuple[float, float] = (10.0, 80.0),
+    noise: Noise | None = None,
+) -> FlareTest:
+    """Simulate the flare's stray light with ``psf`` and compare it along a diffraction arm.
+
+    centre_xy: the flare, px; default: found. arm_deg: direction from +x towards +y; default: the measured arm nearest
+    to +x. noise: of the camera, for chi2. Raises DataError "plate-scale-mismatch", "flare-shapes", "flare-units", and
+    as ``compare_on_flare`` and ``measure_arms`` do.
+    """
+    check_compatible(flaring, psf)
+    light, quiet, unit = _same_unit(flaring, before)
+    difference, usable = light - quiet, flaring.valid & before.valid
+    found_at = centre_xy or flare_centre(difference, flaring.valid, before.valid)
+    if arm_deg is None:
+        arm_deg = _measured_arm(light, quiet, usable, found_at, distances_px[1])
+    found = compare_on_flare(
+        difference,
+        usable,
+        psf,
+        found_at,
+        arm_deg,
+        variance=None if noise is None else _variance(noise, flaring) + _variance(noise, before),
+        distances_px=distances_px,
+    )
+    return FlareTest(found, difference, usable, unit)
+
+
+def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
+    """Both images [y, x], 0 where a pixel has no value, and their unit: DN/s if the exposures are known."""
+    if flaring.pixels.shape != before.pixels.shape:
+        shapes = f"{flaring.pixels.shape} and {before.pixels.shape}"
+        raise DataError("flare-shapes", f"expected two images of the same frame; got {shapes}")
+    rates = [_rate(image) for image in (flaring, before)]
+    if flaring.exposure_s is None and before.exposure_s is None and flaring.unit == before.unit:
+        rates, unit = [flaring.pixels, before.pixels], flaring.unit or "image unit"
+    elif rates[0] is None or rates[1] is None:
+        exposures = f"{flaring.exposure_s} and {before.exposure_s} s"
+        raise DataError(
+            "flare-units", f"expected the exposure time of both images or of neither; got {exposures}"
+        )
+    else:
+        unit = "DN/s"
+    light, quiet = (np.nan_to_num(rate, posinf=0.0, neginf=0.0) for rate in rates if rate is not None)
+    return light, quiet, unit
+
+
+def _rate(image: Image) -> Plane | None:
+    """Pixels in DN/s; None if the exposure time is unknown."""
+    if (image.unit or "").replace(" ", "").lower() == "dn/s":
+        return image.pixels
+    return None if image.exposure_s is None else image.pixels / image.exposure_s
+
+
+def _variance(noise: Noise, image: Image) -> Plane:
+    """Variance of each pixel, in the square of the unit that the images are compared in."""
+    rate = _rate(image)
+    exposure_s = 1.0 if image.exposure_s is None else image.exposure_s
+    values = np.nan_to_num(image.pixels if rate is None else rate, posinf=0.0, neginf=0.0)
+    return noise.variance(values, exposure_s)
+
+
+def _measured_arm(
+    light: Plane, quiet: Plane, usable: NDArray[np.bool_], centre_xy: tuple[int, int], reach_px: float
+) -> float:
+    """Direction of the arm nearest to +x, measured as far out as it is used."""
+    try:
+        found = measure_arms(
+            light,
+            centre_xy,
+            reference=quiet,
+            saturated=~usable,
+            source_radius_px=BOX_PX / 2,
+            reach_px=reach_px,
+        )
+    except DataError as error:
+        raise DataError(error.code, f"{error.message}; or give the direction with --arm") from error
+    return min(found.angles_deg, key=abs)
+
+
+def summary_lines(found: FlareComparison) -> list[str]:
+    """What the comparison says, as lines to print."""
+    profile = found.profile
+    lines = [
+        f"flare at x, y = {profile.centre_xy[0]}, {profile.centre_xy[1]}; arm at {profile.arm_deg:.2f} degrees; "
+        f"{profile.distance_px.size} distances from {profile.distance_px[0]:g} to {profile.distance_px[-1]:g} px"
+    ]
+    for name, fit in (("total PSF", found.total), ("diffraction alone", found.diffraction)):
+        if fit is not None:
+            chi2 = "" if fit.chi2_per_distance is None else f", chi2 {fit.chi2_per_distance:.2f} per distance"
+            lines.append(
+                f"{name:<18} {fit.rms_pct:7.1f} % rms{chi2}; flare of {fit.box.sum():.3g} in {fit.used_pixels} px"
+            )
+    if found.rms_factor is not None:
+        chi2 = "" if found.chi2_factor is None else f", {found.chi2_factor:.0f} times the chi2"
+        lines.append(f"diffraction alone: {found.rms_factor:.1f} times the error{chi2}")
+    else:
+        lines.append(
+            "note: the PSF file does not separate DIFFRACTION from SCATTER, so they are not compared"
+        )
+    return lines + _cautions(found)
+
+
+def _cautions(found: FlareComparison) -> list[str]:
+    lines = []
+    if found.explained < ENOUGH_EXPLAINED:
+        lines.append(
+            f"note: outside the arm the flare's box explains {100 * max(found.explained, 0):.0f} % of the change "
+            "between the images. The change is not the stray light of a compact flare alone, and says little about the PSF"
+        )
+    noise_pct = found.total.matched_noise_pct
+    if noise_pct is not None and noise_pct > WELL_MATCHED_PCT:
+        lines.append(
+            f"note: the fit is matched to the light at 60 to 70 px, which is known only to {noise_pct:.0f} %"
+        )
+    return lines

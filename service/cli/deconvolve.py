@@ -1,0 +1,95 @@
+"""The command ``deconvolve``: one image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
+from service.cli.options import (
+    FILE,
+    METHOD,
+    NOISE,
+    OUTPUT,
+    SATURATION,
+    STEPS,
+    check_writable,
+    percent,
+    progress_bar,
+    user_errors,
+)
+
+CONTEXT = click.option("--context", help="Choose the PSF from this context: its id or name")
+
+
+@click.command()
+@click.argument("image", type=FILE)
+@click.option("-o", "--output", required=True, type=OUTPUT, help="Write the deconvolved image (FITS)")
+@PSF
+@CONTEXT
+@METHOD
+@STEPS
+@click.option("--stop", type=click.Choice(["fixed", "discrepancy"]), help="When to stop [default: fixed]")
+@click.option(
+    "--edges",
+    type=click.Choice(["zero", "symmetric", "extended"]),
+    help="What lies outside the image [default: the best for the method]",
+)
+@NOISE
+@SATURATION
+@click.option(
+    "--errors",
+    "error_draws",
+    type=click.IntRange(0, 64),
+    default=0,
+    metavar="N",
+    help="Add a plane of errors from N >= 2 noise realisations; each costs one deconvolution",
+)
+@click.option("--plot", type=OUTPUT, help="Write the image before and after (PNG)")
+@click.option("--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG)")
+@SERVER
+@LOCAL
+def deconvolve(
+    image: Path,
+    output: Path,
+    psf: str | None,
+    context: str | None,
+    method: str,
+    steps: int | None,
+    stop: str | None,
+    edges: str | None,
+    noise: tuple[float, float] | None,
+    saturation_dn: float | None,
+    error_draws: int,
+    plot: Path | None,
+    changes: Path | None,
+    server: str | None,
+    local: bool,
+) -> None:
+    """Deconvolve IMAGE (FITS) with the PSF of its instrument, or with the PSF that you name."""
+    check_writable(output, plot, changes)
+    with user_errors(), connection(server, local) as service, progress_bar() as report:
+        product = service.deconvolve(
+            image,
+            output,
+            psf_id=named_psf(service, psf),
+            context=context,
+            method=method,
+            preview=plot,
+            progress=report,
+            noise=noise or None,
+            saturation_dn=saturation_dn,
+            error_draws=error_draws,
+            changes=changes,
+            steps=steps,
+            stop=stop,
+            edges=edges,
+        )
+    details = product["details"]
+    click.echo(f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}")
+    click.echo(f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}")
+    click.echo(
+        f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
+        f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}"
+    )

@@ -1,0 +1,111 @@
+"""``heliopsf gap blind``: make transits with a withheld effect, seal the effects, diagnose the transits, score the answers.
+
+The command imports what is numerical when it is called, so that the others start fast.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from psfcore.errors import DataError
+from service.cli.options import FILE, OUTPUT_FOLDER, limits, user_errors
+
+# The diagnosis runs as a command in another process, which knows nothing about the set.
+DIAGNOSE = (
+    sys.executable,
+    "-c",
+    "from service.cli.main import main; main()",
+    "gap",
+    "{transit}",
+    "--json",
+    "{report}",
+    "--local",
+)
+
+
+@click.command()
+@click.option("--cases", default=24, show_default=True, type=click.IntRange(1, 9999), help="Number of cases")
+@click.option("--seed", default=1, show_default=True, type=click.IntRange(0), help="Seed of random numbers")
+@click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder of the set")
+@click.option(
+    "--size", default=256, show_default=True, type=click.IntRange(128, 1024), help="Width and height, px"
+)
+@click.option(
+    "--images", default=18, show_default=True, type=click.IntRange(6, 200), help="Images per transit"
+)
+@click.option(
+    "--processes", default=2, show_default=True, type=click.IntRange(1, 64), help="Diagnoses at the same time"
+)
+@click.option("--keep", is_flag=True, help="Keep each transit after its diagnosis")
+@click.option("--scenes", multiple=True, type=FILE, help="Take scenes from these images (FITS), in turn")
+@click.option(
+    "--only", multiple=True, metavar="EFFECT", help="Withhold only these effects, one per case, in turn"
+)
+@click.option(
+    "--left",
+    "left_pct",
+    multiple=True,
+    type=click.FloatRange(0.05, 50),
+    metavar="PCT",
+    help="Residual that an effect leaves in the discs after a refit, in turn [default: random, 0.5 to 10]",
+)
+@click.option("--clean-only", is_flag=True, help="Make only cases without an effect, to count false alarms")
+@click.option(
+    "--synthetic",
+    is_flag=True,
+    help="Use a synthetic diffraction PSF instead of the instrument's; starts faster",
+)
+@click.option(
+    "--make-only", is_flag=True, help="Make and seal the cases, but diagnose nothing; keeps the transits"
+)
+def blind(
+    cases: int,
+    seed: int,
+    output: Path,
+    size: int,
+    images: int,
+    processes: int,
+    keep: bool,
+    scenes: tuple[Path, ...],
+    only: tuple[str, ...],
+    left_pct: tuple[float, ...],
+    clean_only: bool,
+    synthetic: bool,
+    make_only: bool,
+) -> None:
+    """Test the diagnosis on simulated cases whose effect it does not know. Resumes a run that was stopped."""
+    from psfcore.blind.case_set import SetPlan, alone_in, make_set
+    from psfcore.blind.run_set import run_set
+    from psfcore.blind.score_set import write_score
+    from psfcore.simulate.from_files import image_rate
+
+    def say(line: str) -> None:
+        click.echo(line, err=True)
+
+    if clean_only and only:
+        raise click.UsageError("expected one of --clean-only and --only; got both")
+    with user_errors(), alone_in(output):
+        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct)
+        planes = [image_rate(file, limits()) for file in scenes]
+        made, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
+        numbers = [number for number in plan.numbers if number not in not_made]
+        if not numbers:
+            why = next(iter(not_made.values()))
+            raise DataError(
+                "no-case-made", f"none of the {cases} cases could be made; the first failed with: {why}"
+            )
+        if make_only:
+            click.echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
+            return
+        run_set(made, numbers, DIAGNOSE, processes=processes, keep=keep, progress=say)
+        click.echo(write_score(made, numbers, not_made))
+
+
+COMMANDS = (blind,)
+
+
+if __name__ == "__main__":
+    blind()

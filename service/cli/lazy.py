@@ -1,0 +1,79 @@
+"""A group of commands that are imported when they are called, so that ``heliopsf --version`` is fast."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import click
+
+
+class Lazy(NamedTuple):
+    """A command that is not imported yet: the file and the name in it, and the line that ``--help`` shows."""
+
+    module: str
+    name: str
+    summary: str
+
+
+class LazyGroup(click.Group):
+    """Commands under headings. A command's file is imported when the command is called.
+
+    sections: the rows of each heading by command name. renamed: old names of commands and options, with the new
+    names; whoever types an old one is told the new one.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        sections: Mapping[str, Mapping[str, Lazy]],
+        renamed: Mapping[str, str] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(*args, **options)
+        self.sections = sections
+        self.rows = {name: row for rows in sections.values() for name, row in rows.items()}
+        self._renamed = renamed or {}
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of the headings."""
+        return list(self.rows)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command; None if the group has no command of this name."""
+        row = self.rows.get(cmd_name)
+        if row is None:
+            return None
+        command: click.Command = getattr(import_module(row.module), row.name)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that the arguments call. Raises ``UsageError`` that names the command the user may mean."""
+        wanted = args[0]
+        if wanted not in self.rows and not wanted.startswith("-"):
+            meant = self._renamed.get(wanted) or next(iter(get_close_matches(wanted, self.rows, n=1)), None)
+            hint = "" if meant is None else f" Did you mean `{meant}`?"
+            ctx.fail(f"there is no command '{wanted}'.{hint}")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command. For an option that was renamed, the error names the new option."""
+        try:
+            return super().invoke(ctx)
+        except click.NoSuchOption as error:
+            if error.option_name not in self._renamed:
+                raise
+            meant = self._renamed[error.option_name]
+            said = f"there is no option '{error.option_name}'. Did you mean `{meant}`?"
+            raise click.UsageError(said, error.ctx) from error
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands under their headings, without importing them."""
+        width = max(map(len, self.rows))
+        for heading, rows in self.sections.items():
+            with formatter.section(heading):
+                formatter.write_dl([(f"{name:<{width}}", row.summary) for name, row in rows.items()])

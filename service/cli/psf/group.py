@@ -1,0 +1,35 @@
+"""The group ``heliopsf psf``: which commands it has, and in which file each is."""
+
+from __future__ import annotations
+
+import click
+
+from service.cli.lazy import Lazy, LazyGroup
+
+SECTIONS = {
+    "Make": {
+        "build": Lazy("service.cli.psf.make", "build", "Compute the PSF of an instrument."),
+        "fit": Lazy("service.cli.psf.make", "fit", "Fit the scattered light of a transit."),
+        "crossval": Lazy("service.cli.psf.make", "crossval", "Estimate the uncertainty of such a fit."),
+    },
+    "Read": {
+        "show": Lazy("service.cli.psf.make", "show", "Show what a PSF file contains."),
+        "query": Lazy("service.cli.psf.query", "query", "Show how much light lies beyond which radius."),
+        "cutout": Lazy("service.cli.psf.query", "cutout", "Write the central part of a PSF."),
+        "rebin": Lazy("service.cli.psf.query", "rebin", "Write the PSF for binned images."),
+    },
+    "Versions on a service": {
+        "list": Lazy("service.cli.psf.versions", "list_psfs", "List PSFs."),
+        "upload": Lazy("service.cli.psf.versions", "upload_psf", "Upload a PSF."),
+        "certify": Lazy("service.cli.psf.versions", "certify", "Certify a PSF for a range of times."),
+        "deprecate": Lazy("service.cli.psf.versions", "deprecate", "Withdraw a certified PSF."),
+        "best": Lazy("service.cli.psf.versions", "best", "Find the PSF for an image."),
+        "lineage": Lazy("service.cli.psf.versions", "lineage", "Show what a PSF or product was made from."),
+        "rerun": Lazy("service.cli.psf.versions", "rerun", "Make a PSF or product again and compare."),
+    },
+}
+
+
+@click.group(cls=LazyGroup, sections=SECTIONS, renamed={"--preview": "--plot"})
+def psf() -> None:
+    """Build, fit, inspect, certify and list PSFs."""

@@ -1,0 +1,218 @@
+"""The commands ``psf build``, ``psf fit``, ``psf crossval`` and ``psf show``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import get_args
+
+import click
+
+from service.cli.connection import LOCAL, SERVER, connection
+from service.cli.options import (
+    FILE,
+    JSON,
+    NOISE,
+    OUTPUT,
+    PLOT,
+    SATURATION,
+    check_writable,
+    limits,
+    progress_bar,
+    user_errors,
+)
+from workers.contract.requests import Component, ShapeName
+
+SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 11.5, 20, 50, 100, 200, 500, 1000)
+TRANSIT = click.argument("transit", type=click.Path(exists=True, path_type=Path))
+SHAPE = click.option(
+    "--shape",
+    type=click.Choice(get_args(ShapeName)),
+    help="Shape of the scatter kernel [default: softened-power-law]",
+)
+
+
+@click.command("build")
+@click.option(
+    "--instrument", required=True, metavar="NAME|FILE", help="hri_euv, or an instrument file (TOML)"
+)
+@click.option("--size", default=2048, show_default=True, help="Width and height of the array, px")
+@click.option(
+    "--component", type=click.Choice(get_args(Component)), help="One component alone [default: the total PSF]"
+)
+@click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
+@PLOT
+@SERVER
+@LOCAL
+def build(
+    instrument: str,
+    size: int,
+    component: str | None,
+    output: Path,
+    plot: Path | None,
+    server: str | None,
+    local: bool,
+) -> None:
+    """Compute the PSF of an instrument."""
+    check_writable(output, plot)
+    with (
+        user_errors(),
+        _mask_of(instrument) as mask,
+        connection(server, local) as service,
+        progress_bar() as report,
+    ):
+        built = service.build_psf(
+            instrument, output, size=size, component=component, mask=mask, preview=plot, progress=report
+        )
+    click.echo(f"{output}: {built['name']} {built['version']} ({built['status']})")
+    for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
+        click.echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
+
+
+@click.command("fit")
+@TRANSIT
+@click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
+@JSON
+@PLOT
+@SHAPE
+@click.option("--as-published", is_flag=True, help="Also run the published recipe and show its biases (slow)")
+@NOISE
+@SATURATION
+@SERVER
+@LOCAL
+def fit(
+    transit: Path,
+    output: Path,
+    json_file: Path | None,
+    plot: Path | None,
+    shape: str | None,
+    as_published: bool,
+    noise: tuple[float, float] | None,
+    saturation_dn: float | None,
+    server: str | None,
+    local: bool,
+) -> None:
+    """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of one."""
+    check_writable(output, json_file, plot)
+    with user_errors(), connection(server, local) as service, progress_bar() as say:
+        fitted = service.fit_psf(
+            transit,
+            output,
+            report=json_file,
+            preview=plot,
+            progress=say,
+            noise=noise or None,
+            shape=shape,
+            as_published=as_published,
+            saturation_dn=saturation_dn,
+        )
+    found = fitted["details"]["fit"]
+    click.echo(f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']})")
+    click.echo(found["sentence"])
+    for name, parameter in found["parameters"].items():
+        click.echo(f"  {name:<12} {parameter['value']:10.4f} +- {parameter['sigma']:.4f} {parameter['unit']}")
+    curve = found["curve"]
+    for radius, beyond, sigma in zip(
+        curve["radii_px"], curve["light_beyond_pct"], curve["sigma"], strict=True
+    ):
+        click.echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} +- {sigma:.2f} %")
+    for limit in found["limits"]:
+        click.echo(f"  note: {limit}")
+
+
+@click.command("crossval")
+@TRANSIT
+@click.option("--json", "json_file", required=True, type=OUTPUT, help="Write all numbers to this file (JSON)")
+@PLOT
+@click.option(
+    "--scheme",
+    type=click.Choice(["shared", "exact"]),
+    help="exact: fit every fold to the end (slow) [default: shared]",
+)
+@click.option(
+    "--runs", type=click.IntRange(1, 50), help="Runs; each holds out every block once [default: 10]"
+)
+@SHAPE
+@NOISE
+@SERVER
+@LOCAL
+def crossval(
+    transit: Path,
+    json_file: Path,
+    plot: Path | None,
+    scheme: str | None,
+    runs: int | None,
+    shape: str | None,
+    noise: tuple[float, float] | None,
+    server: str | None,
+    local: bool,
+) -> None:
+    """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the rest, in many runs."""
+    check_writable(json_file, plot)
+    with user_errors(), connection(server, local) as service, progress_bar() as report:
+        found = service.cross_validate(
+            transit,
+            json_file,
+            preview=plot,
+            progress=report,
+            noise=noise or None,
+            scheme=scheme,
+            runs=runs,
+            shape=shape,
+        )
+    click.echo(f"{json_file}: {found['details']['sentence']}")
+
+
+@click.command("show")
+@click.argument("file", type=FILE)
+@PLOT
+def show(file: Path, plot: Path | None) -> None:
+    """Show what the PSF in FILE (FITS) contains: its size, sum, and the light beyond a number of radii."""
+    import numpy as np
+
+    from psfcore.fits.psfs import read_psf
+    from psfcore.psf import cumulative_curve
+
+    check_writable(plot)
+    with user_errors():
+        psf = read_psf(file, limits())
+        if plot is not None:
+            from psfcore.drawing.plots import psf_png
+
+            psf_png(psf, plot)
+    radii = np.array([r for r in SHOWN_RADII_PX if r < psf.reach_px])
+    kernels = {"TOTAL": psf.kernel, **psf.components}
+    curves = {name: cumulative_curve(kernel, radii) for name, kernel in kernels.items()}
+    click.echo(f"{psf.name} {psf.version} ({psf.status}), instrument {psf.instrument or 'unnamed'}")
+    click.echo(
+        f"{psf.kernel.shape[1]} x {psf.kernel.shape[0]} px, reach {psf.reach_px:.0f} px, sum {psf.kernel.sum():.6f}, "
+        f"central pixel {psf.kernel.max():.4f}, plate scale {psf.plate_scale_arcsec or 'unknown'} arcsec/px"
+    )
+    click.echo("\nlight beyond R, or outside the array, in percent:")
+    click.echo(f"{'R (px)':>8}" + "".join(f"{name:>15}" for name in kernels))
+    for n, radius in enumerate(radii):
+        click.echo(f"{radius:>8g}" + "".join(f"{curve[n]:>15.3f}" for curve in curves.values()))
+
+
+@contextmanager
+def _mask_of(instrument: str) -> Iterator[Path | None]:
+    """The mask image that the user's instrument file names, as a FITS file; None if it names no mask image."""
+    if not instrument.endswith(".toml"):
+        yield None
+        return
+    from astropy.io import fits
+
+    from psfcore.fits.mask_file import read_mask_image
+    from psfcore.instruments.model import load_instrument
+
+    mount = load_instrument(instrument).mount
+    if mount is None or mount.mask_image is None:
+        yield None
+        return
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "mask.fits"
+        mask = read_mask_image(Path(instrument).parent / mount.mask_image.file)
+        fits.PrimaryHDU(mask).writeto(path)
+        yield path

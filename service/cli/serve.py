@@ -1,0 +1,77 @@
+"""The commands ``serve`` and ``worker``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+import click
+
+from service.cli.options import DATA, read_settings
+from workers.contract.queues import Queue, queues_named
+
+
+@click.command()
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on")
+@click.option("--port", default=8765, show_default=True, help="Port to listen on; 0: any free port")
+@DATA
+def serve(host: str, port: int, data: Path | None) -> None:
+    """Start a service over HTTP, and keep it running until it is interrupted.
+
+    Without a broker (HELIOPSF_BROKER_URL) it also starts a worker. If other machines can reach the address, every
+    request needs a key: `heliopsf key create`.
+    """
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from service.http.access import NoKeyYet
+    from service.server import serve as run
+    from workers import checks
+    from workers.catalogue.schema import SchemaError
+
+    settings = read_settings(data)
+    where = settings.data_dir.resolve()
+    try:
+        where.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=where):
+            pass
+    except OSError as error:
+        raise click.ClickException(f"cannot keep data in {where}: {error.strerror or error}") from error
+    try:
+        run(settings, host, port, lambda url: click.echo(f"heliopsf serves {url} (data in {where})"))
+    except (SchemaError, NoKeyYet) as error:
+        raise click.ClickException(str(error)) from error
+    except SQLAlchemyError as error:
+        raise click.ClickException(f"the database: {checks.database_said(error)}") from error
+    except OSError as error:
+        raise click.ClickException(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+
+
+@click.command()
+@click.option("--processes", type=click.IntRange(1), help="Number of worker processes [default: 1]")
+@click.option("--queues", help=f"Queues to serve, from {', '.join(Queue)}, with commas [default: all]")
+@DATA
+@click.option("--stop-with-parent", type=int, metavar="PID", hidden=True)
+def worker(
+    processes: int | None, queues: str | None, data: Path | None, stop_with_parent: int | None
+) -> None:
+    """Run jobs from the broker until interrupted. Start one worker on each machine.
+
+    Jobs that people wait for (queue interactive) run first, then cross-validations (crossval), then bulk runs (bulk),
+    in whatever order you name the queues.
+    """
+    from service.server import environment
+
+    # Celery imports the worker's module, which reads its settings from the environment.
+    update: dict[str, Any] = {"worker_processes": processes, "worker_queues": queues}
+    given = {name: value for name, value in update.items() if value is not None}
+    if queues is not None:
+        try:
+            queues_named(queues)
+        except ValueError as error:
+            raise click.BadParameter(str(error), param_hint="--queues") from error
+    os.environ |= environment(read_settings(data).model_copy(update=given))
+    from workers.run.worker import main as run
+
+    run(stop_with_parent)

@@ -1,0 +1,115 @@
+"""The package that people import, as they use it: light to import, typed, and equal to what it is made of."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import heliopsf
+from heliopsf.psfs import LIMITS
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.fits.images import read_image
+from psfcore.known_diffraction import known_diffraction
+from psfcore.simulate.transit_files import write
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.psfcore.small_transits import SCATTER, observed, sky
+
+HEAVY = {
+    "astropy",
+    "celery",
+    "fastapi",
+    "httpx",
+    "matplotlib",
+    "numba",
+    "numpy",
+    "pydantic",
+    "scipy",
+    "sqlalchemy",
+}
+
+
+def loaded_by(code: str) -> set[str]:
+    """Top-level modules that a new process has loaded after running ``code``."""
+    script = f"{code}\nimport sys, json; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_the_import_loads_nothing_heavy() -> None:
+    loaded = loaded_by("import heliopsf; dir(heliopsf)")
+    assert loaded & HEAVY == set()
+    assert {name for name in loaded if name.split(".")[0] in ("psfcore", "service", "workers")} == set()
+
+
+def test_the_client_loads_no_numerics_and_no_server() -> None:
+    loaded = loaded_by("from heliopsf import Client; Client('http://127.0.0.1:1').close()")
+    assert "httpx" in loaded
+    assert loaded & {"numba", "scipy", "numpy", "astropy", "fastapi", "sqlalchemy", "celery"} == set()
+
+
+def test_the_functions_load_no_server() -> None:
+    loaded = loaded_by("from heliopsf import deconvolve, build_psf, read_psf, fit_scatter, diagnose_gap")
+    assert "psfcore.scatter.fit" in loaded
+    assert loaded & {"fastapi", "sqlalchemy", "celery", "httpx", "service", "workers"} == set()
+
+
+def test_every_name_is_there_with_a_docstring_and_no_other() -> None:
+    for name in heliopsf.__all__:
+        assert getattr(heliopsf, name).__doc__, name
+    assert sorted(dir(heliopsf)) == sorted(heliopsf.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'evaluate'"):
+        heliopsf.evaluate  # noqa: B018
+    assert (Path(heliopsf.__file__).parent / "py.typed").is_file()
+
+
+def test_an_image_is_deconvolved_as_the_core_does(tmp_path: Path) -> None:
+    write_image(tmp_path / "image.fits")
+    write_psf(tmp_path / "psf.fits")
+    steps: list[tuple[int, int]] = []
+    found = heliopsf.deconvolve(
+        tmp_path / "image.fits",
+        tmp_path / "psf.fits",
+        steps=3,
+        progress=lambda step, of: steps.append((step, of)),
+    )
+    psf = heliopsf.read_psf(tmp_path / "psf.fits")
+    image = read_image(tmp_path / "image.fits", LIMITS)
+    again = heliopsf.deconvolve(image, psf, steps=3)
+    np.testing.assert_array_equal(found.pixels, again.pixels)
+    core = method_named("richardson-lucy")(image, psf, Conditions(), steps=3)
+    np.testing.assert_array_equal(found.pixels, core.pixels)
+    assert steps[-1] == (3, 3) and found.steps_done == 3
+
+
+def test_errors_have_a_code(tmp_path: Path) -> None:
+    (tmp_path / "text.fits").write_text("no FITS" * 1000)
+    with pytest.raises(heliopsf.DataError) as caught:
+        heliopsf.read_psf(tmp_path / "text.fits")
+    assert caught.value.code == "not-fits"
+    with pytest.raises(heliopsf.ServiceError):
+        heliopsf.Client("http://127.0.0.1:1").health()
+
+
+def test_a_psf_is_built_from_an_instrument_file(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
+    psf = heliopsf.build_psf(tmp_path / "small.toml", size=128)
+    assert psf.kernel.shape == (128, 128) and 0.9 < psf.total <= 1.0
+
+
+def test_a_transit_is_fitted(tmp_path: Path) -> None:
+    write(observed(sky()), tmp_path / "transit")
+    fit = heliopsf.fit_scatter(tmp_path / "transit", threads=2)
+    assert abs(fit.inversion.values["total"] - SCATTER.total) < 0.03
+    with pytest.raises(heliopsf.DataError, match="transit"):
+        heliopsf.diagnose_gap(tmp_path)
+
+
+def test_a_diffraction_that_is_not_known_is_refused() -> None:
+    with pytest.raises(heliopsf.DataError, match=r"known_psf.*hri_euv.*got my-telescope"):
+        known_diffraction("my-telescope")

@@ -1,0 +1,120 @@
+"""The command line as a whole: its headings, its length, old names, and what starting it loads."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from service.cli.lazy import LazyGroup
+from service.cli.main import main
+
+HEAVY = {
+    "astropy",
+    "celery",
+    "fastapi",
+    "httpx",
+    "matplotlib",
+    "numba",
+    "numpy",
+    "pydantic",
+    "scipy",
+    "sqlalchemy",
+}
+MOST_LINES = 60
+
+
+def commands(group: click.Group, *path: str) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
+        yield (*path, name), command
+        if isinstance(command, click.Group):
+            yield from commands(command, *path, name)
+
+
+ALL = list(commands(main))
+
+
+@pytest.mark.parametrize("path", [path for path, _ in ALL], ids=" ".join)
+def test_the_help_of_a_command_fits_a_screen_and_explains_every_option(path: tuple[str, ...]) -> None:
+    helped = CliRunner().invoke(main, [*path, "-h"])
+    assert helped.exit_code == 0 and len(helped.output.splitlines()) < MOST_LINES
+    command = dict(ALL)[path]
+    assert command.help
+    unexplained = [
+        option.name
+        for option in command.params
+        if isinstance(option, click.Option) and not option.hidden and not option.help
+    ]
+    assert unexplained == []
+
+
+def test_the_help_is_grouped() -> None:
+    lines = CliRunner().invoke(main, ["--help"]).output.splitlines()
+    assert len(lines) < MOST_LINES
+    headings = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
+    assert headings[1:] == [
+        "Images:", "PSFs:", "Transits:", "Archives:", "Service and operation:", "Studies:",
+    ]  # fmt: skip
+
+
+def test_options_have_the_same_name_everywhere() -> None:
+    """A picture is --plot, numbers are --json, a result is -o/--output."""
+    for path, command in ALL:
+        names = {name for option in command.params for name in option.opts}
+        assert names & {"--preview", "--html", "--page", "--picture", "--out"} == set(), path
+        if "-o" in names:
+            assert "--output" in names, path
+        if "--local" in names:
+            assert "--server" in names, path
+
+
+def test_a_row_of_the_table_is_the_command_of_that_name() -> None:
+    for path, command in ALL:
+        assert command.name == path[-1], path
+    groups = [main, *(group for _, group in ALL if isinstance(group, LazyGroup))]
+    for group in groups:
+        assert all(row.summary.endswith(".") for row in group.rows.values())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["evaluate", "T"], "`report`"),
+        (["effects", "I"], "`changes`"),
+        (["deconvolv"], "`deconvolve`"),
+        (["psf", "sho"], "`show`"),
+        (["deconvolve", "x", "--preview", "y"], "`--plot`"),
+        (["deconvolve", "x", "--effects", "y"], "`--changes`"),
+    ],
+)
+def test_an_old_name_is_answered_with_the_new_one(arguments: list[str], meant: str) -> None:
+    refused = CliRunner().invoke(main, arguments)
+    assert refused.exit_code == 2 and f"Did you mean {meant}" in refused.output
+
+
+def test_an_unknown_name_is_refused() -> None:
+    refused = CliRunner().invoke(main, ["xyzzy"])
+    assert refused.exit_code == 2 and "there is no command 'xyzzy'" in refused.output
+    assert "Did you mean" not in refused.output
+
+
+@pytest.mark.parametrize("option", ["--version", "--help"])
+def test_version_and_help_load_nothing_heavy(option: str) -> None:
+    script = (
+        "import sys, json, atexit\n"
+        "atexit.register(lambda: print(json.dumps(sorted(sys.modules))))\n"
+        f"sys.argv = ['heliopsf', {option!r}]\n"
+        "from service.cli.main import main\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    loaded = set(json.loads(done.stdout.splitlines()[-1]))
+    assert "service.cli.main" in loaded and loaded & HEAVY == set()
