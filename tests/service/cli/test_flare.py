@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
-from service.cli.flare import COMMANDS
+from service.cli.main import main
 from tests.simulated_flare import CENTRE, SATURATION, flare_psf, write_flare
 
 NOISE = ("--noise", 6, 2)
@@ -25,7 +25,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def run(files: dict[str, Path], *options: object, **other: Path) -> Result:
     used = files | other
     fixed = (used["flare"], "--background", used["before"], "--psf", used["psf"])
-    return CliRunner().invoke(COMMANDS[0], [str(argument) for argument in (*fixed, *options)])
+    return CliRunner().invoke(main, ["flare", *[str(argument) for argument in (*fixed, *options)]])
 
 
 def test_a_psf_is_judged_along_an_arm(files: dict[str, Path], tmp_path: Path) -> None:

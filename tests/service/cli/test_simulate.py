@@ -11,14 +11,14 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
-from service.cli.simulate import COMMANDS
+from service.cli.main import main
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 
 SMALL = ("--size", "64", "--images", "3")
 
 
 def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(COMMANDS[0], [str(argument) for argument in arguments])
+    return CliRunner().invoke(main, ["simulate", *[str(argument) for argument in arguments]])
 
 
 @pytest.fixture(scope="module")

@@ -125,8 +125,12 @@ def test_a_silent_worker_of_a_cancelled_job_aborts_it(catalogue: Catalogue) -> N
     assert phase(catalogue, job) == Phase.ABORTED
 
 
+# Long enough that a busy machine does not oversleep the second wait, which is twice the first.
+WAIT_S = 0.4
+
+
 def waiting(catalogue: Catalogue) -> list[str]:
-    return [job.id for job in catalogue.jobs.unsubmitted(0.05)]
+    return [job.id for job in catalogue.jobs.unsubmitted(WAIT_S)]
 
 
 def test_a_lost_message_is_submitted_again_after_a_wait(catalogue: Catalogue) -> None:
@@ -134,12 +138,12 @@ def test_a_lost_message_is_submitted_again_after_a_wait(catalogue: Catalogue) ->
     assert waiting(catalogue) == [job.id]
     catalogue.jobs.mark_submitted(job.id)
     assert waiting(catalogue) == []
-    time.sleep(0.06)
+    time.sleep(1.1 * WAIT_S)
     assert waiting(catalogue) == [job.id]
     catalogue.jobs.mark_submitted(job.id)
-    time.sleep(0.06)
+    time.sleep(1.1 * WAIT_S)
     assert waiting(catalogue) == [], "the wait doubles"
-    time.sleep(0.06)
+    time.sleep(1.1 * WAIT_S)
     assert waiting(catalogue) == [job.id]
 
 

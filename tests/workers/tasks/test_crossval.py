@@ -15,7 +15,6 @@ from tests.transit_files import write_simulated
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.parts import Part, Parts
 from workers.contract.phases import Phase
-from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
 from workers.tasks import crossval as crossval_task
@@ -131,7 +130,7 @@ def test_a_killed_worker_loses_no_fold_and_no_fold_counts_twice(
     monkeypatch.setattr(Parts, "release", lambda self, part: None)
     job_id = submit(service, transit, seed=11)
     catalogue = Catalogue(settings.catalogue_url)
-    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    runner = Runner(settings, catalogue, service._store)
     with pytest.raises(Killed):
         runner.run(job_id)
     threading.Event().wait(settings.lease_s + 0.2)
@@ -166,14 +165,14 @@ def test_another_worker_shares_the_folds(
 
         def help_out() -> None:
             helping.set()
-            Runner(settings, Catalogue(settings.catalogue_url), Store(settings.data_dir)).assist(job_id)
+            Runner(settings, Catalogue(settings.catalogue_url), service._store).assist(job_id)
 
         helpers.append(threading.Thread(target=help_out, name="helper"))
         helpers[-1].start()
 
     job_id = submit(service, transit, seed=12)
     catalogue = Catalogue(settings.catalogue_url)
-    Runner(settings, catalogue, Store(settings.data_dir), call_for_help).run(job_id)
+    Runner(settings, catalogue, service._store, call_for_help).run(job_id)
     helpers[0].join()
     row = catalogue.jobs.get(job_id)
     assert row is not None and row.phase == Phase.COMPLETED
@@ -181,7 +180,7 @@ def test_another_worker_shares_the_folds(
     assert sorted(fold for folds in by_thread.values() for fold in folds) == [
         (run, fold) for run in range(3) for fold in range(3)
     ]
-    Runner(settings, catalogue, Store(settings.data_dir)).assist(job_id)  # too late: nothing to do
+    Runner(settings, catalogue, service._store).assist(job_id)  # too late: nothing to do
     catalogue.close()
 
 

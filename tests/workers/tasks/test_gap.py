@@ -235,7 +235,7 @@ def test_changed_effect_files_make_another_diagnosis_and_an_earlier_job_refuses_
         local.wait(waiting)
     assert caught.value.code == "effects-changed" and len(asked) == 2
     mine.unlink()
-    with pytest.raises(DataError, match="expected a Python file") as gone:
+    with pytest.raises(DataError, match="expected a readable Python file") as gone:
         local.submit("gap-diagnose", transit_id=local.upload_transit(transit)["id"])
     assert gone.value.code == "bad-effects"
     local.close()

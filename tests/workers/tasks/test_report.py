@@ -52,7 +52,7 @@ def true_psf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(service: LocalService, transit: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """One report of a fit, without the slow dark offsets, and all of its files."""
     out = tmp_path_factory.mktemp("made")
-    row = service.evaluate(
+    row = service.report(
         transit, out / "r.json", page=out / "r.html", preview=out / "r.png", seed=3, dark_offsets=False
     )
     return {"row": row, "json": json.loads((out / "r.json").read_text()), "folder": out}
@@ -98,7 +98,7 @@ def test_its_page_stands_alone_and_shows_every_image(made: dict[str, Any]) -> No
 def test_an_identical_request_gets_the_existing_report(
     service: LocalService, made: dict[str, Any], transit: Path
 ) -> None:
-    again = service.evaluate(transit, seed=3, dark_offsets=False)
+    again = service.report(transit, seed=3, dark_offsets=False)
     assert again["id"] == made["row"]["id"] and again["created_at"] == made["row"]["created_at"]
 
 
@@ -106,7 +106,7 @@ def test_a_given_psf_is_evaluated_without_a_fit(
     service: LocalService, transit: Path, true_psf: Path, tmp_path: Path
 ) -> None:
     psf_id = service.upload_psf(true_psf)["id"]
-    row = service.evaluate(transit, tmp_path / "r.json", page=tmp_path / "r.html", psf_id=psf_id)
+    row = service.report(transit, tmp_path / "r.json", page=tmp_path / "r.html", psf_id=psf_id)
     report = json.loads((tmp_path / "r.json").read_text())
     assert "fit" not in report and report["psf"]["given"] and row["details"]["psf_id"] == psf_id
     whole = report["evaluation"]["all"]
@@ -114,7 +114,7 @@ def test_a_given_psf_is_evaluated_without_a_fit(
     assert any("nothing was fitted" in missing["why"] for missing in report["not_shown"])
     check_stands_alone((tmp_path / "r.html").read_text("utf-8"))
     # Dark offsets are of fits: asking for them or not is the same request here.
-    again = service.evaluate(transit, psf_id=psf_id, dark_offsets=False)
+    again = service.report(transit, psf_id=psf_id, dark_offsets=False)
     assert again["created_at"] == row["created_at"]
 
 
@@ -127,27 +127,27 @@ def test_a_given_psf_needs_no_diffraction(
     manifest = json.loads((folder / "transit.json").read_text())
     (folder / "transit.json").write_text(json.dumps(manifest | {"known_psf": None, "instrument": None}))
     psf_id = service.upload_psf(true_psf)["id"]
-    with_it = service.evaluate(transit, psf_id=psf_id)
-    without = service.evaluate(folder, psf_id=psf_id)
+    with_it = service.report(transit, psf_id=psf_id)
+    without = service.report(folder, psf_id=psf_id)
     assert without["details"]["residuals"] == pytest.approx(with_it["details"]["residuals"])
     with pytest.raises(Exception) as caught:
-        service.evaluate(folder)
+        service.report(folder)
     assert getattr(caught.value, "code", None) == "no-known-psf"
 
 
 def test_invalid_requests_are_refused(service: LocalService, transit: Path, tmp_path: Path) -> None:
     with pytest.raises(Exception) as caught:
-        service.evaluate(transit, psf_id="0" * 64)
+        service.report(transit, psf_id="0" * 64)
     assert getattr(caught.value, "code", None) == "no-such-psf"
     with pytest.raises(ServiceError, match="seed"):
-        service.evaluate(transit, seed=-1)
+        service.report(transit, seed=-1)
     # A PSF file whose scale is not that of the images.
     kernel = np.zeros((33, 33))
     kernel[16, 16] = 1.0
     header = fits.Header({"CDELT1": 5.0, "CDELT2": 5.0, "CUNIT1": "arcsec", "CUNIT2": "arcsec"})
     fits.PrimaryHDU(kernel, header).writeto(tmp_path / "coarse.fits")
     with pytest.raises(ServiceError) as refused:
-        service.evaluate(transit, psf_id=service.upload_psf(tmp_path / "coarse.fits")["id"])
+        service.report(transit, psf_id=service.upload_psf(tmp_path / "coarse.fits")["id"])
     assert refused.value.code == "plate-scale-mismatch"
 
 

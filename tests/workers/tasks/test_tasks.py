@@ -66,7 +66,7 @@ def test_an_identical_request_is_not_computed_again(
 def test_a_worker_with_one_thread_draws_in_that_thread(
     settings: Settings, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    """A second would take the time of the worker next to it."""
+    """A second thread would slow down the worker beside it."""
     of_threads: dict[str, int] = {}
 
     def noted(name: str) -> None:
@@ -79,11 +79,11 @@ def test_a_worker_with_one_thread_draws_in_that_thread(
         monkeypatch.setattr(deconvolve_task, name, wrapped)
 
     noted("save_preview")
-    noted("effects")
+    noted("measure_changes")
     local = LocalService(settings.model_copy(update={"worker_threads": threads}))
     local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"])
     local.close()
-    assert (of_threads["save_preview"] == of_threads["effects"]) == (threads == 1)
+    assert (of_threads["save_preview"] == of_threads["measure_changes"]) == (threads == 1)
 
 
 def test_a_job_redelivered_after_its_end_does_nothing(

@@ -89,7 +89,7 @@ def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
     second = api.post("/v1/bulk", json=request).json()
     refused = api.post(f"/v1/bulk/{first['id']}/retry")
     assert (refused.status_code, refused.json()["type"]) == (409, "urn:heliopsf:equal-bulk-open")
-    assert f"bulk {second['id']} is LISTING" in refused.json()["detail"]
+    assert f"run {second['id']} is LISTING" in refused.json()["detail"]
     assert api.get(f"/v1/bulk/{first['id']}").json() == ended
 
     class Here(Client):
@@ -101,7 +101,7 @@ def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
     answer = CliRunner().invoke(main, ["bulk", "retry", first["id"]])
     assert answer.exit_code == 1
     (line,) = answer.output.splitlines()
-    assert line.startswith("Error: ") and f"bulk {second['id']} is LISTING" in line
+    assert line.startswith("Error: ") and f"run {second['id']} is LISTING" in line
 
     turns(catalogue, settings)
     (archive / "letter.fits").unlink()
@@ -123,8 +123,6 @@ def test_a_run_can_be_cancelled_while_it_lists_and_finds_no_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
-    monkeypatch.setattr("workers.bulk.task.TELL_EVERY_S", 0.0)
-    monkeypatch.setattr("workers.run.runner.REPORT_EVERY_S", 0.0)
     monkeypatch.setattr("workers.bulk.listing.TELL_EVERY_S", 0.0)
     psf_id = upload(api, psf_file, "/v1/psfs")
     request = {"files": [{"glob": f"{archive}/**/*.none"}], "psf_id": psf_id, "parameters": FEW}

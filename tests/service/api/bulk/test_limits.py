@@ -20,7 +20,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.files import archive as archive_files
 from workers.files.store import Store
 from workers.intake import estimates
-from workers.run import runner
+from workers.run import attempt
 from workers.run.runner import Runner
 from workers.settings import Settings
 from workers.tasks import deconvolve as deconvolve_task
@@ -43,7 +43,9 @@ def test_an_image_over_a_limit_fails_like_a_single_job(
     code: str,
 ) -> None:
     # So slow a machine that the limit parts the images, and no clock does.
-    monkeypatch.setattr(estimates, "ONCE_NS", 1e6)
+    slow_reading = estimates.COSTS.kinds.deconvolve.model_copy(update={"image_ns": 1e6})
+    slow_kinds = estimates.COSTS.kinds.model_copy(update={"deconvolve": slow_reading})
+    monkeypatch.setattr(estimates, "COSTS", estimates.COSTS.model_copy(update={"kinds": slow_kinds}))
     shapes = {"a": (96, 128), "b": (512, 512), "c": (96, 128)}
     archive = tmp_path / "archive"
     archive.mkdir()
@@ -91,7 +93,7 @@ def test_an_image_that_takes_too_long_fails_but_a_turn_may_last_longer(
 ) -> None:
     limited = settings.model_copy(update={"max_job_s": 30.0})
     clock = _Clock()
-    monkeypatch.setattr(runner, "time", clock)
+    monkeypatch.setattr(attempt, "time", clock)
     monkeypatch.setattr(bulk_task, "TELL_EVERY_S", 0.0)
     make = deconvolve_task.make
 
@@ -127,7 +129,7 @@ def test_a_listing_that_takes_too_long_is_stopped_even_if_it_finds_no_file(
         (archive / f"{number:02}").mkdir(parents=True)
     limited = settings.model_copy(update={"max_job_s": 30.0, "bulk_roots": str(archive)})
     clock = _Clock()
-    monkeypatch.setattr(runner, "time", clock)
+    monkeypatch.setattr(attempt, "time", clock)
     monkeypatch.setattr(listing, "TELL_EVERY_S", 0.0)
     looked: list[Any] = []
     real = os.scandir

@@ -248,7 +248,7 @@ def test_an_image_is_deconvolved_with_the_psf_of_its_time(
     assert (found["psf"]["id"], found["valid_at"]) == (psfs[0], "2020-06-01T00:00:00Z")
     now = asked(image).json()["parameters"]
     assert (now["psf_id"], now["psf_recipe"], now["picked_for"]) == (psfs[0], None, "hri_euv")
-    detail = problem(asked(far), 409, "no-psf-fits")
+    detail = problem(asked(far), 404, "no-psf-fits")
     assert "2030-06-01" in detail and "hri_euv" in detail
 
     api.post("/v1/contexts", json={"name": "c", "pins": [{"psf_id": psfs[2]}]})

@@ -11,13 +11,13 @@ from astropy.io import fits
 from click.testing import CliRunner, Result
 
 from psfcore.errors import DataError
-from service.cli.gap.blind import blind
+from service.cli.main import main
 
 SMALL = ["--size", "128", "--images", "9", "--synthetic", "--processes", "1"]
 
 
 def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(blind, [str(argument) for argument in arguments])
+    return CliRunner().invoke(main, ["gap", "blind", *[str(argument) for argument in arguments]])
 
 
 def test_a_set_is_made_and_sealed_and_another_is_not_mixed_in(tmp_path: Path) -> None:

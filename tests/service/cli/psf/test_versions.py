@@ -65,7 +65,7 @@ def test_psfs_from_draft_to_deprecated(sun: Client, tmp_path: Path) -> None:
     told = ask("psf", "certify", first, "--version", "1.0.0", "--from", "2020-01-01", "--reason", "good")
     assert told == "hri_euv/174/total 1.0.0: certified  [2020-01-01T00:00:00Z, open)\n"
     refused = ask("psf", "certify", second, "--version", "1.1.0", code=1)
-    assert first in refused and "deprecate it" in refused and "Traceback" not in refused
+    assert first in refused and "deprecate that PSF" in refused and "Traceback" not in refused
     told = ask("psf", "certify", second, "--version", "1.1.0", "--from", "2020-01-01", "--supersedes", first)
     assert "1.1.0: certified" in told
     listed = ask("psf", "list", "--instrument", "hri_euv")
@@ -101,7 +101,7 @@ def test_the_best_by_properties_and_by_an_image(sun: Client, tmp_path: Path) -> 
 
 def test_contexts(sun: Client, tmp_path: Path) -> None:
     assert "no context yet" in ask("context", "list")
-    assert "there is none yet" in ask("context", "create", "one", code=1)
+    assert "no PSF is certified yet" in ask("context", "create", "one", code=1)
     first, second = uploaded(tmp_path, 32), uploaded(tmp_path, 48, channel="304")
     ask("psf", "certify", first, "--version", "1.0.0", "--from", "2020-01-01")
     assert "one  1 pinned" in ask("context", "create", "one", "--reason", "as delivered")
@@ -154,4 +154,4 @@ def test_a_rerun_that_differs_ends_with_status_1(
         real(path, type(image)(**{**vars(image), "pixels": image.pixels * 1.001}), **how)
 
     monkeypatch.setattr(product_task, "write_image", off)
-    assert "differs by 0.001" in ask("psf", "rerun", product["id"], "--product", code=1)
+    assert "differs by at most 0.001" in ask("psf", "rerun", product["id"], "--product", code=1)
