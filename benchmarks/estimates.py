@@ -21,19 +21,13 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-METHODS = (
-    "richardson-lucy",
-    "richardson-lucy-accelerated",
-    "richardson-lucy-extended",
-    "richardson-lucy-total-variation",
-    "basic-iterative",
-    "linear",
-)
+from psfcore.deconvolve.methods.registry import method_names
+
 # psf: edge length of a PSF with little scattered light, or "hri" for the PSF of HRI_EUV, which has most.
 QUICK: list[dict[str, Any]] = [
     *(
         {"kind": "deconvolve", "px": 1024, "psf": "hri", "method": {"name": name, "steps": 20}}
-        for name in METHODS
+        for name in method_names()
     ),
     {"kind": "deconvolve", "px": 512, "psf": 512, "method": {"name": "richardson-lucy", "steps": 20}},
     {"kind": "deconvolve", "px": 2048, "psf": 2048, "method": {"name": "richardson-lucy", "steps": 20}},
@@ -92,7 +86,8 @@ def write(measured: list[dict[str, Any]]) -> None:
     for (kind, method), found in ratios.items():
         times = content["kinds"][kind]
         if method:
-            times["step_ns"][method] = round(times["step_ns"][method] * median(found), 3)
+            before = times["step_ns"].get(method, max(times["step_ns"].values()))
+            times["step_ns"][method] = round(before * median(found), 3)
             continue
         for name, value in times.items():
             if name.endswith(("_s", "_ns")):

@@ -133,7 +133,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     fitted = psf is not None and "fit" in psf.details
     runs = 1 + draws + (cost.psf_draws if draws and fitted else 0)
     cpu_s = built_s + cost.base_s + cost.image_ns * 1e-9 * ny * nx
-    cpu_s += runs * method["steps"] * cost.step_ns[method["name"]] * 1e-9 * plane
+    cpu_s += runs * method["steps"] * _of_method(cost.step_ns, method) * 1e-9 * plane
     image_bytes = cost.image_bytes + (cost.errors_bytes if draws else 0.0)
     working = cost.plane_bytes * plane + image_bytes * ny * nx + cost.psf_bytes * math.prod(psf_shape)
     return cpu_s, max(built_mib, working / MIB)
@@ -144,8 +144,13 @@ def _margin_px(method: Mapping[str, Any], field: tuple[int, int], psf_px: int) -
         return 0
     if method["margin_px"] is not None:
         return int(method["margin_px"])
-    share = COSTS.kinds.deconvolve.margin_share[method["name"]]
+    share = _of_method(COSTS.kinds.deconvolve.margin_share, method)
     return int(min(share * psf_px / 2, min(field) / 2))
+
+
+def _of_method(figures: Mapping[str, float], method: Mapping[str, Any]) -> float:
+    """The figure of a method; the largest of all methods if this one has not been measured yet."""
+    return figures.get(method["name"], max(figures.values()))
 
 
 def _build(parameters: Mapping[str, Any]) -> tuple[float, float]:

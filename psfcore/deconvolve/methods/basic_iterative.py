@@ -37,6 +37,7 @@ from psfcore.psf import Psf
 
 METHOD = "basic-iterative"
 EDGES: Edges = "symmetric"
+MAY_BE_NEGATIVE = True
 MARGIN_SHARE = 0.015
 
 

@@ -38,6 +38,7 @@ from psfcore.psf import Psf
 
 METHOD = "linear"
 EDGES: Edges = "symmetric"
+MAY_BE_NEGATIVE = True
 MARGIN_SHARE = 0.015
 LEAST_TRANSFER = 0.1
 

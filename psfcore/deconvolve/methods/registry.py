@@ -34,6 +34,11 @@ def method_names() -> list[str]:
     return sorted(name for name in map(_name_of, _files()) if name is not None)
 
 
+def may_be_negative(name: str) -> bool:
+    """Whether results of a method may be negative: its module says MAY_BE_NEGATIVE = True."""
+    return getattr(_module(name.replace("-", "_")), "MAY_BE_NEGATIVE", False)
+
+
 def _files() -> list[str]:
     return [module.name for module in pkgutil.iter_modules(psfcore.deconvolve.methods.__path__)]
 
