@@ -28,6 +28,8 @@ test-full: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests
 
 bench: $(DEV)
+	$(BIN)/python -m benchmarks.start_up
+	$(BIN)/python -m benchmarks.quick_calls
 	$(BIN)/python -m benchmarks.deconvolution
 	$(BIN)/python -m benchmarks.ring_sums --quick
 	$(BIN)/python -m benchmarks.fit

@@ -1,10 +1,10 @@
 """The same Richardson-Lucy loop by heliopsf's engine, SciPy's transforms and ducc0's, timed side by side.
 
-The comparison decides whether the 876 lines of `psfcore.convolution.engine`, `psfcore.convolution.fft_kernels` and
-`psfcore.compiled` pay. All three do the published method: 20 steps, float32, a scene that is zero beyond the field, the
-same padded lengths, the same number of threads. The two references also transform only the field's rows along x, as a
-version of heliopsf without its own engine would. Each runs in a process of its own, in turn, and the shortest of
-three times counts.
+The comparison decides whether the 876 lines of `psfcore.convolution.engine`,
+`psfcore.convolution.fft_kernels` and `psfcore.compiled` pay. All three do the published method: 20 steps,
+float32, a scene that is zero beyond the field, the same padded lengths, the same number of threads. The two
+references also transform only the field's rows along x, as a version of heliopsf without its own engine
+would. Each runs in a process of its own, in turn, and the shortest of three times counts.
 """
 
 from __future__ import annotations

@@ -19,13 +19,14 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import BinaryIO, Protocol
-
-from astropy.io.fits import Header
-from astropy.io.fits.verify import VerifyError
+from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 from psfcore.errors import HeaderError
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
 
 BLOCK_BYTES = 2880
 CARD_BYTES = 80
@@ -34,8 +35,6 @@ _BITPIX = (8, 16, 32, 64, -32, -64)
 _LARGEST_COUNT = 2**63 - 1
 _SKIP_BYTES = 1 << 20
 END_CARD = b"END" + b" " * 77
-# Exceptions that astropy raises for a damaged card. Which one depends on the damage.
-CARD_TROUBLE = (VerifyError, ValueError, TypeError, IndexError, OverflowError)
 _KNOWN_STARTS = (
     (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),
     (b"\xff\x4f\xff\x51", "a JPEG 2000 codestream"),
@@ -226,10 +225,21 @@ def _check_start(block: bytes) -> None:
     raise HeaderError("not-fits", f"expected a FITS file, which starts with 'SIMPLE  ='; got {got}")
 
 
+@cache
+def card_trouble() -> tuple[type[Exception], ...]:
+    """Exceptions that astropy raises for a damaged card. Which one depends on the damage."""
+    from astropy.io.fits.verify import VerifyError
+
+    return VerifyError, ValueError, TypeError, IndexError, OverflowError
+
+
 def _parse(raw: bytes, hdu: int) -> Header:
+    # astropy.io.fits takes half a second to import; the web process loads it when the first FITS file arrives.
+    from astropy.io.fits import Header
+
     try:
         return Header.fromstring(raw)
-    except CARD_TROUBLE as error:
+    except card_trouble() as error:
         raise HeaderError("bad-card", f"expected readable cards in HDU {hdu}; got: {error!s:.100}") from None
 
 
@@ -327,7 +337,7 @@ def _value(header: Header, key: str) -> object:
         return None
     except HeaderError:
         raise
-    except CARD_TROUBLE:
+    except card_trouble():
         raise HeaderError("bad-card", f"expected a readable card {key}; its value cannot be read") from None
 
 

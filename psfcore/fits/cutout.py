@@ -10,13 +10,14 @@ import math
 import sys
 from array import array
 from pathlib import Path
-from typing import BinaryIO
-
-from astropy.io.fits import Header
+from typing import TYPE_CHECKING, BinaryIO
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import BLOCK_BYTES, CARD_BYTES, END_CARD
 from psfcore.fits.header import FitsLimits, read_summary
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
 
 _FLOATS = {-32: "f", -64: "d"}
 # Cards of the whole image that are wrong for a cut-out. The cards that it needs are written again.
@@ -56,6 +57,8 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
 
 def _header(file: BinaryIO) -> Header:
     """Read the first header; the file is then at the first byte of its data."""
+    from astropy.io.fits import Header  # see psfcore.fits.blocks: slow to import
+
     raw = bytearray()
     block = b""
     while not any(block[at : at + CARD_BYTES] == END_CARD for at in range(0, len(block), CARD_BYTES)):

@@ -9,20 +9,22 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-
-from astropy.io.fits import Header
+from typing import TYPE_CHECKING
 
 from psfcore.fits.blocks import (
-    CARD_TROUBLE,
     FitsLimits,
     card_count,
     card_flag,
     card_text,
+    card_trouble,
     first_image,
     open_source,
     walk,
 )
 from psfcore.instruments.files import match_instrument
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
 
 # FitsLimits is exported here too: every caller of `read_summary` needs it.
 __all__ = [
@@ -142,7 +144,7 @@ def _lenient(header: Header, key: str) -> object:
         return header[key]
     except KeyError:
         return None
-    except CARD_TROUBLE:
+    except card_trouble():
         return None
 
 

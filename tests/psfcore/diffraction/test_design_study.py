@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -68,10 +67,8 @@ def test_without_scatter_there_is_no_ratio_to_it() -> None:
     assert design_study(hri, [1270.0], [40.0]).rows[0].peak_over_scatter is None
 
 
-def test_the_study_is_quick_and_is_plotted_and_written_as_json(study: DesignStudy, tmp_path: Path) -> None:
-    start = time.perf_counter()
+def test_the_study_is_plotted_and_written_as_json(study: DesignStudy, tmp_path: Path) -> None:
     larger = design_study(load_instrument("hri_euv"), [300.0 + 300 * i for i in range(8)], [20, 30, 40, 50])
-    assert time.perf_counter() - start < 20
     assert len(larger.rows) == 32
     content = json.loads(study.as_json())
     assert content["flown"]["pitch_um"] == 1270

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -92,13 +91,6 @@ def test_the_pattern_rotates_from_x_towards_y() -> None:
         along = order * spacing
         x, y = along * np.cos(np.deg2rad(20)), along * np.sin(np.deg2rad(20))
         assert kernel[64 + round(y), 64 + round(x)] > 100 * kernel[64 - round(y), 64 + round(x)]
-
-
-def test_a_full_array_is_quick() -> None:
-    rotated("hri entrance", 1.3, 64)  # compiles
-    start = time.perf_counter()
-    rotated("hri entrance", 45.0, 2048)
-    assert time.perf_counter() - start < 4.0  # 1 s on a quiet machine; the limit allows for a busy one
 
 
 # --- AIA 171 against aiapy --------------------------------------------------------------------------------

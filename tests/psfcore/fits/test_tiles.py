@@ -56,7 +56,7 @@ def test_a_long_empty_stream_shared_by_many_tiles_takes_no_time(tmp_path: Path) 
     (tmp_path / "bomb.fits").write_bytes(lying_tiles(nothing))
     started = time.monotonic()
     peak_mib_of_refusal(tmp_path / "bomb.fits", "tile-too-large")
-    assert time.monotonic() - started < 5
+    assert time.monotonic() - started < 10  # guards against a hang; about 0.3 s normally
 
 
 WHOLE, FLOATS = ("u1", "i2", "i4"), ("f4", "f8")

