@@ -1,4 +1,4 @@
-"""The evaluation in a report's JSON as a short table to print: by pointing, by pixel of the disc, and by shape."""
+"""Print the evaluation in a report's JSON as a short table: errors by pointing, by pixel of the disc, and by shape."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Json = dict[str, Any]
 
 
 def summary_lines(evaluation: Json, shapes: Json | None = None) -> list[str]:
-    """Lines of an evaluation (schema "evaluation/1", as ``psfcore.evaluation.report.report`` makes it).
+    """The lines of the table. evaluation: result of ``psfcore.evaluation.report.report`` (schema "evaluation/1").
 
-    shapes: the comparison of shapes, as ``psfcore.evaluation.shapes.ShapesByErrors.to_json`` makes it.
+    shapes: the comparison of shapes, a result of ``psfcore.evaluation.shapes.ShapesByErrors.to_json``.
     """
     maps = evaluation["superposed"]
     lines = ["simulated minus observed light in the occulter's disc, in percent of the observed light:"]
@@ -75,5 +75,5 @@ def _figures(figures: Json, sign: str = "") -> str:
 
 
 def _number(value: float | None, sign: str = "") -> str:
-    """Two decimals; JSON has null for a value that is not finite."""
+    """The value with two decimals. JSON has null in place of a value that is not finite; it is printed as "n/a"."""
     return NO_NUMBER if value is None else f"{value:{sign}.2f}"

@@ -1,15 +1,16 @@
 """Fit a transit completely: the total PSF with its errors and limits, and alternative fits for comparison.
 
 Hofmeister et al., The point-spread function of HRI_EUV, sections "The inversion algorithm" and "Inversion results".
-The default is `psfcore.scatter.inversion`, which corrects the four biases of the published fit. Beside it stand:
+The default is `psfcore.scatter.inversion`, which corrects the four biases of the published fit. The result also contains:
 - a free fit of shells without a formula,
 - other shapes, tested on held-out images,
 - the first guess,
-- on request, the published recipe unchanged, and with each of its four biases corrected alone (`published`).
+- on request, the unchanged published recipe, and four variants that each correct one of its biases (`published`).
 
-Errors come from the photon and read noise of every pixel, propagated through the fit. If the disc means scatter from
-image to image by more than this noise, by a factor f in chi2 that chance does not explain, all errors are multiplied
-by sqrt(f) and the report says so. The excess shows an effect that the model lacks, and averaging does not remove it.
+The errors follow from the photon and read noise of every pixel, propagated through the fit. A disc mean is the mean of the
+fully dark pixels of one image. The disc means can vary from image to image by more than this noise. Then chi2 divided by
+its degrees of freedom is a factor f > 1. If chance does not explain f, all errors are multiplied by sqrt(f), and the
+report says so. Such an excess shows that the model lacks an effect, and averaging more images does not remove it.
 
 | symbol | name | unit |
 |---|---|---|

@@ -3,7 +3,7 @@
     inverse:     x <- x + G (y - H x)                       Eq. (1)
     derivative:  d x / d q = -G (dH / dq) x                 Eq. (2)
 
-G is the inverse of the convolution on a periodic plane. The central pixel of HRI_EUV's PSF holds 0.43 of the light, so
+G is the inverse of the convolution on a periodic plane. The core of HRI_EUV's PSF contains 0.43 of the light, so
 Eq. (1) converges in about five steps. Eq. (1) is linear and does not bias faint pixels, unlike Richardson-Lucy. Between
 steps, fields stay in the memory order of the convolution engine (its "lanes"). Functions below read and write single
 pixels in this order.

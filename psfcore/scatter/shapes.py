@@ -13,10 +13,11 @@ is scaled so that its weights outside the central pixel sum to `total` on the fu
     two power laws                Eq. (2) + a second power law, (b_2 + r)^-c           Eq. (6)
     core                          Eq. (2) + a Gaussian                                 Eq. (7)
 
-In Eq. (3) a stretch by 1 + s along the angle t has ln(1 + s) = hypot(p, q) and 2 t = atan2(q, p). The two numbers p
-and q are smooth at zero stretch, where an angle is not defined. The shares in Eq. (6) and (7) are fractions of `total`.
+For Eq. (3), a stretch by the factor 1 + s along the angle t corresponds to ln(1 + s) = hypot(p, q) and 2 t = atan2(q, p).
+At zero stretch the angle is not defined, but the kernel is a smooth function of p and q. In Eq. (4), t is the direction of
+d. In Eq. (6) and (7), the second term contains a fraction of `total` (halo_share, core_share).
 
-A fit works in unbounded coordinates: the logarithm of a positive number, the logit of a fraction.
+The fit uses unbounded coordinates instead of the parameters: the logarithm of a positive number, the logit of a fraction.
 
 | symbol | name | unit |
 |---|---|---|

@@ -27,7 +27,9 @@ DARK, ON = "dark", "on"
 COMBINED, HIGH = "combined", "high-only"
 CAMERA = Noise(photon_gain_dn=6.0, read_noise_dn=2.0)
 
-_THIRDS_UP_TO = 60  # up to this number of images, each pointing gets a third; more are divided as in the paper
+_THIRDS_UP_TO = (
+    60  # up to this number of images, each pointing gets a third; more are divided as in the paper
+)
 _PAPER_LIMB_SHARE = 24 / 126
 _PAPER_FAR_SHARE = 10 / 24
 _MARGIN_PX = 6.0  # smallest distance between the edge of the occulter and the edge of the field
