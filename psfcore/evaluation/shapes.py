@@ -73,7 +73,7 @@ class ShapeErrors:
 
 @dataclass(frozen=True)
 class ShapesByErrors:
-    """The errors of all shapes on the same images; the softened power law comes first."""
+    """The errors of all compared shapes; each shape is evaluated on the same images. The power law comes first."""
 
     images: int
     folds: int

@@ -5,13 +5,12 @@ photon noise and read noise.
 
     F_jk = sum over pixels of (dm / dp_j) (dm / dp_k) / var(m)       Eq. (1)
     var(m) = (g m t + r^2) / t^2                                      Eq. (2)
-    dm / dp_j = (ds / dp_j) * d * (S - h)                             Eq. (3)
+    dm / dp_j = (ds / dp_j) * d * (S - h),  dm / dq = -s * d * (dh / dq)   Eq. (3)
     sigma^2(f) = (df / dp)^T F^-1 (df / dp)                           Eq. (4)
 
 The information that one pixel contains about m is taken as 1 / var(m). An estimator that is linear in the pixel values
-cannot use more. An estimator that uses the full likelihood can use slightly more. Its information has the upper limit
-t / (g m), which is the information of the photon count without read noise. This limit exceeds 1 / var(m) by the
-factor 1 + r^2 / (g m t). For g = 6 DN, r = 2 DN and 2.5 photons (m t = 15 DN) the factor is 94 / 90, about 4 % more.
+cannot use more. An estimator that uses the full likelihood can use slightly more: at most t / (g m), which is the
+information of the photon count without read noise. This limit exceeds 1 / var(m) by the factor 1 + r^2 / (g m t). For g = 6 DN, r = 2 DN and 2.5 photons (m t = 15 DN) the factor is 94 / 90, about 4 % more.
 
 The data for the scatter are the fully dark pixels of every image: their four corners lie within the occulter's radius.
 The pixels around the disc are not used, neither here nor by the fit. They serve to estimate the scene, which is given
@@ -22,6 +21,7 @@ is given. In high-only images, pixels that clip are left out.
 |---|---|---|
 | m | expected pixel | DN/s |
 | p | b, c, total; the stretch is fitted together with these three | px, -, -, - |
+| q | x or y of the occulter's centre | px |
 | f | any function of the parameters, for example a point of a curve | - |
 | s, d | scatter kernel, diffraction PSF; * is linear convolution | - |
 | S, h | scene, light that the disc hides | DN/s |
@@ -59,7 +59,7 @@ Window = tuple[slice, slice]
 
 CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 PLACE_MARGIN_PX = 5.0
-_LAW = 3  # the first of PARAMETERS: b, c, total
+_LAW = 3  # number of parameters of the power law: b, c and total are the first three of PARAMETERS
 
 
 @dataclass(frozen=True)

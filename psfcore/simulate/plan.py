@@ -2,8 +2,9 @@
 
 The default plan follows Hofmeister et al., The point-spread function of HRI_EUV, section "The observations". There are
 three pointings. In the first, the planet approaches the Sun's east limb. In the second, it crosses the solar disc. In the
-third, it moves away from the west limb. The exposures last 5 s in combined gain while the planet is far from the limb,
-0.9 s in high gain while it is near the limb, and 1.8 s in high gain while it is in front of the solar disc.
+third, it moves away from the west limb. While the planet is far from the limb, exposures
+last 5 s in combined gain. Near the limb they last 0.9 s in high gain. In front of the solar disc they last 1.8 s in high
+gain.
 """
 
 from __future__ import annotations
@@ -27,9 +28,8 @@ DARK, ON = "dark", "on"
 COMBINED, HIGH = "combined", "high-only"
 CAMERA = Noise(photon_gain_dn=6.0, read_noise_dn=2.0)
 
-_THIRDS_UP_TO = (
-    60  # up to this number of images, each pointing gets a third; more are divided as in the paper
-)
+# Up to this number of images, each pointing gets a third of them. More images are divided as in the paper.
+_THIRDS_UP_TO = 60
 _PAPER_LIMB_SHARE = 24 / 126
 _PAPER_FAR_SHARE = 10 / 24
 _MARGIN_PX = 6.0  # smallest distance between the edge of the occulter and the edge of the field
@@ -108,7 +108,7 @@ class Plan:
         return tuple(sorted({shot.pointing for shot in self.shots}))
 
     def place(self, index: int) -> Place:
-        """The exact place of the occulter in an image."""
+        """The exact position and the radius of the occulter in an image."""
         return Place(self.shots[index].x_px, self.shots[index].y_px, self.radius_px)
 
     def as_json(self) -> dict[str, Any]:

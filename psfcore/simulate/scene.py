@@ -1,9 +1,9 @@
 """A synthetic EUV scene of the Sun, with realistic contrasts and spatial scales.
 
-All lengths are in units of the field's longer edge ("field edges" below), so that a scene looks the same at any size. It
-consists of quiet Sun, two active regions with bright moss and thin loops, a dark coronal hole, a filament, a limb, and a
-corona whose brightness decreases with height. The quiet Sun is lognormal and has structure on many scales. A layout
-chooses the limb, the corona, the active regions and the filament, and their positions. A margin extends the scene
+All lengths are in units of the field's longer edge ("field edges" below), so that a scene looks the same at any size. The
+default scene shows quiet Sun, two active regions with bright moss and thin loops, a dark coronal hole, a filament and a
+limb. The quiet Sun is lognormal and has structure on many scales. The brightness of the corona decreases with height. A
+layout chooses the limb, the corona, the active regions and the filament, and their positions. A margin extends the scene
 beyond the field.
 """
 
@@ -38,7 +38,7 @@ class _Bundle:
     """Parallel loops. All lengths are in field edges.
 
     x, y: middle between the footpoints. span: half the distance between the footpoints. rise: height. lean: tilt in
-    radians. light: brightness divided by the brightness of the region's moss.
+    radians. light: brightness relative to the region's moss.
     """
 
     x: float
@@ -121,7 +121,7 @@ def _octaves(canvas: _Canvas, rng: np.random.Generator, *, slope: float, coarses
     """Gaussian noise with structure on many scales: mean 0, rms 1.
 
     The noise is a sum of smooth random planes. Each plane has half the scale of the previous one, down to one pixel. The
-    amplitude of a plane is its scale to the power `slope`. coarsest: largest scale, in field edges.
+    amplitude of a plane is proportional to its scale to the power `slope`. coarsest: largest scale, in field edges.
     """
     shape, edge = canvas.shape, canvas.edge
     total = np.zeros(shape)

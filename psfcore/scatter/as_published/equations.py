@@ -43,9 +43,8 @@ OCCULTED_EQUATIONS = 1000
 UNOCCULTED_EQUATIONS = 100
 UNOCCULTED = -1
 LEAST_LIGHT = 1e-5
-PRIOR_WEIGHT = (
-    10.0  # a shell with all light has as much misfit as one equation that is wrong by 10 times its scale
-)
+# With this weight, a shell that contains all light has as much misfit as one equation that is wrong by 10 times its scale.
+PRIOR_WEIGHT = 10.0
 PIVOT_PX = 15.0
 
 

@@ -159,9 +159,9 @@ class Segments:
         """psf_S of Eq. (2) for a smooth kernel, array (size,). It is 0 for empty segments.
 
         kernel_function: returns the weights at the offsets (dx, dy), which are two arrays in px of the same shape. Beyond
-        32 px, pixels are grouped into cells; the side of a cell is about a sixteenth of its radius. Four points represent
-        a cell. Their mean and covariance are those of the cell's pixels. For power laws, also stretched ones, the result
-        differs by at most 1e-5 from the mean over all pixels, which `mean_of_map` computes (tested).
+        32 px, pixels are grouped into cells; the side of a cell is about a sixteenth of its distance from the
+        centre. Four points represent a cell. Their mean and covariance are those of the cell's pixels. For power laws, also stretched ones, the result
+        has a relative error of at most 1e-5, compared with the mean over all pixels that `mean_of_map` computes (tested).
         """
         nodes = self._nodes
         return self._mean(nodes, kernel_function(nodes.dx, nodes.dy))
@@ -170,8 +170,8 @@ class Segments:
         """psf_S of Eq. (2) for an isotropic kernel, array (size,). It is 0 for empty segments.
 
         radial_function: returns the weights at an array of distances in px. The mean is exact up to 64 px. Beyond 64 px,
-        the kernel is evaluated once in each ring of width r / 2048; the result differs by at most 1e-6 from the mean over
-        all pixels (tested).
+        the kernel is evaluated once in each ring of width r / 2048; the relative error is then at most 1e-6, compared with
+        the mean over all pixels (tested).
         """
         nodes = self._ring_nodes
         return self._mean(nodes, radial_function(nodes.dx))

@@ -24,9 +24,8 @@ ONE_SIGMA: tuple[float, float] = (100 * float(ndtr(-1)), 100 * float(ndtr(1)))
 TWO_SIGMA: tuple[float, float] = (100 * float(ndtr(-2)), 100 * float(ndtr(2)))
 LIMITS = (TWO_SIGMA[0], ONE_SIGMA[0], 50.0, ONE_SIGMA[1], TWO_SIGMA[1])
 LIMIT_NAMES = ("minus_2_sigma", "minus_1_sigma", "median", "plus_1_sigma", "plus_2_sigma")
-NEAR_CENTRE_PX = (
-    3.0  # within this distance, the free fit of the paper differs from the power law of the paper
-)
+# Within this distance, the free fit of the paper differs from the power law of the paper.
+NEAR_CENTRE_PX = 3.0
 PARTING_SIGMAS = 3.0
 
 

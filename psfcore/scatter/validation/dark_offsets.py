@@ -1,8 +1,8 @@
 """Effect of a wrong dark level on a fitted PSF: repeat the fit with an offset added to every readout.
 
 Source: the last experiment in Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness".
-An offset of o DN adds o / t DN/s to an image with exposure time t, Eq. (1). The effect is largest for short exposures while
-the occulter is far from the limb, because the disc then contains only a few tens of DN.
+An offset of o DN adds o / t DN/s to an image with exposure time t, Eq. (1). The effect is largest for short exposures
+while the occulter is far from the limb. A pixel of the disc then contains only a few tens of DN.
 
 Two quantities are compared with the fit without an offset. The first is the diffuse weight: the weight of the scatter
 kernel per pixel, averaged over rings one pixel wide. It is compared only within the field, because the PSF farther out is
