@@ -1,20 +1,24 @@
 """Evaluate a PSF: simulate the light that it scatters into the occulter, and compare it with the observed light.
 
-Hofmeister et al., The point-spread function of HRI_EUV, sections "Accuracy and robustness" and "Evaluation". With H
-a total PSF on the field, y an image and D its pixels that are fully dark:
+Source: Hofmeister et al., The point-spread function of HRI_EUV, sections "Accuracy and robustness" and "Evaluation".
+H is the convolution with a total PSF on the field, y is an image, and D selects the fully dark pixels of this image:
 
     x = H^-1 y,   s = H (1 - D) x                              Eq. (1)
     PE = (s - y) / mean over D of y, for each pixel of D       Eq. (2)
     residual = mean over D of PE                               Eq. (3)
 
-Differences from the paper: its formula of the PE divides by the sum over the occulted pixels, but its text and figures
-require the mean, which is used here. Only fully dark pixels are set to zero. The scene is reconstructed by a linear
-method. The residual at the centre is the mean PE within CENTRE_PX, so its denominator is the mean of the whole disc: a
-mean of a dozen pixels with a dozen photons each would be too noisy as a denominator and would bias the residual high.
+PE is the percentage error of a pixel. Differences from the paper:
 
-Errors contain the photon and read noise of the image, propagated through Eq. (1). For means they are exact
-(`noise_transfer`). For single pixels they come from noise realisations at the observed intensity, and in D at the
-simulated intensity. They do not contain the error of the PSF.
+- In the paper's formula, the PE is divided by the sum over the occulted pixels. The paper's text and figures require the
+  mean, so the mean is used here.
+- Only fully dark pixels are set to zero. The scene is reconstructed by a linear method.
+- The residual at the centre is the mean PE within CENTRE_PX, so it is also divided by the mean of the whole disc. The mean
+  of the centre alone is the mean of a dozen pixels with a dozen photons each. This mean would be too noisy as a
+  denominator and would bias the residual high.
+
+Errors contain the photon and read noise of the image, propagated through Eq. (1). They do not contain the error of the
+PSF. Errors of means are exact (`noise_transfer`). Errors of single pixels come from noise realisations; their noise
+follows from the observed intensity, but for the pixels of D from the simulated intensity.
 
 | symbol | name | unit |
 |---|---|---|
@@ -44,7 +48,9 @@ from psfcore.transit.transit import Frame, Kernel, Transit
 Vector = NDArray[np.float64]
 Plane = NDArray[np.float64]
 
-# Lower than the limit of the inversion, because a PSF without scatter predicts a much darker disc than observed.
+# Smallest depth of an occulter: the missing light divided by the light that a disc would hide according to the PSF. The
+# limit of the inversion is higher. Here a given PSF may lack scatter. The disc is then much brighter than this PSF
+# predicts, and the depth is smaller.
 LEAST_DEPTH = 0.2
 SLICE_HALF_PX = 20
 SLICES_A_POINTING = 3
@@ -55,7 +61,10 @@ _SCENES_KEPT = 24
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """One PSF, or one per fold, evaluated on all images of a transit. left_out: images not evaluated, with reasons."""
+    """The evaluation of one PSF, or of one PSF for each fold, on all images of a transit.
+
+    left_out: files that could not be evaluated, with the reasons.
+    """
 
     transit: Transit
     frames: tuple[FrameEvaluation, ...]
@@ -74,10 +83,11 @@ def evaluate(
 ) -> Evaluation:
     """Simulate the light in every occulter of a transit, and compare it with the observed light.
 
-    psf_for_frame: the total PSF [y, x] for the index of a frame, centre at [n // 2, n // 2]. Frames with the same array
-    object share its preparation. The neighbours in time of an image, which help to locate its occulter, are
-    reconstructed with the PSF of that image. So an image of one fold never depends on the PSF of another fold.
-    noise_realisations: how many show the effect of noise alone on the superposed maps. seed: of these.
+    psf_for_frame: returns the total PSF [y, x] for the index of an image, centre at [n // 2, n // 2]. A PSF is prepared
+    only once for all images for which this function returns the same array object. The neighbours in time of an image
+    help to locate its occulter. They are reconstructed with the PSF of that image, so that an image of one fold never
+    depends on the PSF of another fold. noise_realisations: number of noise realisations for each image; they give the
+    superposed maps of noise alone. seed: random seed of these realisations.
 
     Raises DataError "no-occulter" if no image can be evaluated.
     """
@@ -112,7 +122,7 @@ def evaluate(
 
 
 def _sharing(kernels: Sequence[Kernel]) -> list[list[int]]:
-    """Groups of frame indices with the same kernel, ordered by their first frame."""
+    """Groups of indices of the images that share a kernel, ordered by the first image of each group."""
     groups: dict[int, list[int]] = {}
     for n, kernel in enumerate(kernels):
         groups.setdefault(id(kernel), []).append(n)
@@ -120,7 +130,7 @@ def _sharing(kernels: Sequence[Kernel]) -> list[list[int]]:
 
 
 def _sliced(frames: Sequence[Frame]) -> set[int]:
-    """Frames whose slices are kept: SLICES_A_POINTING per pointing, evenly spaced in its images."""
+    """Indices of the images whose slices are kept: SLICES_A_POINTING for each pointing, at equal intervals."""
     chosen: set[int] = set()
     for pointing in {frame.pointing for frame in frames}:
         here = [n for n, frame in enumerate(frames) if frame.pointing == pointing]
@@ -130,7 +140,7 @@ def _sliced(frames: Sequence[Frame]) -> set[int]:
 
 
 class _FrameSimulator:
-    """Simulates the frames of a transit with one PSF."""
+    """Simulates the images of a transit with one PSF."""
 
     def __init__(self, transit: Transit, kernel: Kernel, threads: int) -> None:
         self.transit, self.kernel = transit, kernel
@@ -153,7 +163,7 @@ class _FrameSimulator:
     def noise_alone(
         self, n: int, dark: Pixels, simulated: NDArray[np.float32], rng: np.random.Generator
     ) -> Vector:
-        """s - y in D, DN/s, for one realisation of a frame's noise and a perfect PSF, by Eq. (1)."""
+        """s - y of the pixels in D, DN/s, from Eq. (1), if the PSF is perfect and the image has one noise realisation."""
         frame, optics = self.transit.frames[n], self.optics
         expected = frame.pixels.astype(np.float64)
         expected[dark] = simulated[dark]
@@ -165,7 +175,7 @@ class _FrameSimulator:
 
 
 class _Scenes(Sequence[NDArray[np.float32]]):
-    """Reconstructed frames [y, x]. Each is computed on access, and the most recent ones are cached."""
+    """Reconstructed scenes [y, x]. A scene is computed when it is needed; the most recently used scenes are cached."""
 
     def __init__(self, transit: Transit, optics: Optics) -> None:
         self._transit, self._optics = transit, optics
@@ -181,12 +191,12 @@ class _Scenes(Sequence[NDArray[np.float32]]):
             scene = self._optics.field(self._optics.invert(observed, steps=INVERSION_STEPS))
             if len(self._kept) >= _SCENES_KEPT:
                 self._kept.pop(next(iter(self._kept)))
-        self._kept[index] = scene  # the most recent scene is dropped last
+        self._kept[index] = scene  # at the end of the dict, so that this scene is removed last
         return scene
 
 
 def _reason(frame: Frame, found: FoundPlace, dark: Pixels) -> str | None:
-    """Why an image cannot be evaluated; None if it can."""
+    """The reason why an image cannot be evaluated; None if it can be evaluated."""
     where = f"({frame.place.x_px:g}, {frame.place.y_px:g}) px"
     if not found.within_reach or found.depth + DOUBT_SIGMAS * found.depth_sigma < LEAST_DEPTH:
         return f"expected an occulter at {where}; found no occulter there"
@@ -229,7 +239,10 @@ def _compared(
 def _standard_errors(
     optics: Optics, frame: Frame, dark: Pixels, found: FoundPlace, noise: Noise
 ) -> tuple[float, float]:
-    """Standard errors of the mean of s - y: over the dark pixels, and over those at the centre (nan without any)."""
+    """Standard errors of two means of s - y: over all dark pixels, and over the dark pixels at the centre.
+
+    The second is nan if there are no dark pixels at the centre.
+    """
     at = at_centre(dark, found)
     templates = [np.full(at.size, 1 / at.size), at / max(int(np.count_nonzero(at)), 1)]
     disc, centre = np.sqrt(np.diag(noise_covariance(optics, frame, dark, templates, noise)))

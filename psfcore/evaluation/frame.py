@@ -27,9 +27,10 @@ CENTRE_PX = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """A row or a column through the centre of an occulter: offsets from the centre (px), intensities (DN/s).
+    """A row or a column of pixels through the centre of an occulter.
 
-    dark: mask of its fully dark pixels.
+    offset_px: distance of each pixel from the centre, with sign. observed, simulated: intensities, DN/s. dark: True for
+    fully dark pixels.
     """
 
     offset_px: Vector
@@ -42,9 +43,9 @@ class Slice:
 class FrameEvaluation:
     """Observed and simulated light in the occulter of one image, DN/s.
 
-    observed, simulated: of the dark pixels, in the order of `dark`. noise_dn_s, centre_noise_dn_s: standard errors of
-    the mean difference, over all dark pixels and over those at the centre; nan if none is at the centre. along_x,
-    along_y: slices; None for most images.
+    observed, simulated: intensities of the dark pixels, in the order of `dark`. noise_dn_s: standard error of the mean
+    difference of the dark pixels. centre_noise_dn_s: this error for the dark pixels at the centre; nan if there are no such
+    pixels. along_x, along_y: slices; None for most images.
     """
 
     index: int
@@ -92,7 +93,7 @@ class FrameEvaluation:
 
     @property
     def centre_dn_s(self) -> tuple[float, float]:
-        """Mean observed and mean simulated intensity at the centre; nan if no dark pixel is there."""
+        """Mean observed and mean simulated intensity at the centre; nan if there are no dark pixels at the centre."""
         at = at_centre(self.dark, self.found)
         if not at.any():
             return float("nan"), float("nan")
@@ -110,7 +111,7 @@ class FrameEvaluation:
         return 100 * self.centre_noise_dn_s / self.observed_dn_s
 
     def residual_against_pct(self, plane: NDArray[np.floating]) -> float:
-        """The residual relative to another image [y, x], for example a simulated image without noise, percent."""
+        """The residual, in percent, with another image [y, x] in place of the observation, for example one without noise."""
         wanted = float(np.mean(plane[self.dark], dtype=np.float64))
         return 100 * (self.simulated_dn_s - wanted) / wanted
 

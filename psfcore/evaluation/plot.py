@@ -1,4 +1,4 @@
-"""Plot an evaluation: slices through discs, and errors by position in the disc, by time and by detector position."""
+"""Plot an evaluation: slices through discs, and errors by position in the disc, time and position on the detector."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ _TITLE_LETTERS = 190
 def evaluation_png(
     evaluation: Evaluation, path: str | Path, *, title: str, study: DarkOffsetStudy | None = None
 ) -> None:
-    """Three rows of panels, and a fourth with the dark offsets of `study`. title: names what was evaluated."""
+    """Write a PNG with three rows of panels. If `study` is given, a fourth row shows the dark offsets.
+
+    title: the name of the evaluated PSF or fit.
+    """
     rows = 3 if study is None else 4
     figure = Figure(
         figsize=(16.0, 3.7 * rows + 0.9),
@@ -96,7 +99,7 @@ def sentence(evaluation: Evaluation) -> str:
 
 
 def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
-    """One image per pointing, the middle one of those with slices; at most `most` images."""
+    """One image for each pointing: the middle one of the images with slices. At most `most` images."""
     kept = [f for f in evaluation.frames if f.along_x is not None]
     fovs = sorted({f.pointing for f in kept})
     by_fov = [[f for f in kept if f.pointing == fov] for fov in fovs]
@@ -104,7 +107,7 @@ def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:
 
 
 def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
-    """Observed and simulated intensity along x (circles, solid line) and along y (squares, dashed line)."""
+    """Draw the observed and simulated intensity along x (circles, solid line) and along y (squares, dashed line)."""
     assert frame.along_x is not None and frame.along_y is not None
     dark = frame.along_x.dark
     if dark.any():
@@ -112,7 +115,7 @@ def draw_slices(axes: Any, frame: FrameEvaluation) -> None:
         axes.axvspan(inside.min() - 0.5, inside.max() + 0.5, color="#eeeeee", linewidth=0, zorder=0)
     _draw_slice(axes, frame.along_x, "along x", "o", _OBSERVED, "-", _SIMULATED)
     _draw_slice(axes, frame.along_y, "along y", "s", "#7d9cc0", (0, (4, 2)), "#1b4f8a")
-    # The axis is scaled to the disc, because light outside may be a hundred times brighter.
+    # The axis is scaled to the light in the disc, because the light outside may be a hundred times brighter.
     middle = np.concatenate([s.observed[np.abs(s.offset_px) <= 14] for s in (frame.along_x, frame.along_y)])
     inner = np.concatenate([s.simulated[s.dark] for s in (frame.along_x, frame.along_y)])
     top = min(float(middle.max()), 4 * float(inner.max(initial=1e-9)))
@@ -148,7 +151,7 @@ def _draw_slice(axes: Any, along: Slice, name: str, marker: str, face: str, dash
 
 
 def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
-    """Observed and simulated light at the centre, by time."""
+    """Draw the observed and simulated light at the centre, by time."""
     minutes = minutes_of(frames)
     observed, simulated = np.array([f.centre_dn_s for f in frames]).T
     error = np.array([f.centre_noise_dn_s for f in frames])
@@ -162,7 +165,7 @@ def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
 
 
 def draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
-    """Maps of the MPE and the MAPE, each beside the map of noise alone on the same scale."""
+    """Draw maps of the MPE and the MAPE. Beside each map is the map of noise alone, on the same scale."""
     mpe_top = max(maps.mpe_largest_pct, 1e-3)
     mape_top = max(float(np.nanmax([maps.mape_pct, maps.noise_mape_pct])), 1e-3)
     half = maps.half_px + 0.5
@@ -189,7 +192,10 @@ def draw_maps(band: Any, panels: Sequence[Any], maps: Superposed) -> None:
 def draw_residuals(
     axes: Any, frames: Sequence[FrameEvaluation], where: Vector, label: str, title: str
 ) -> None:
-    """Residuals with their noise, coloured by pointing. where: abscissa of each image; label: of that axis."""
+    """Draw residuals with their noise; the colour shows the pointing.
+
+    where: abscissa of each image. label: label of the horizontal axis.
+    """
     values = np.array([f.residual_pct for f in frames])
     noise = np.array([f.noise_pct for f in frames])
     draw_errors(axes, frames, where, values, noise)
@@ -197,7 +203,10 @@ def draw_residuals(
 
 
 def draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
-    """Absolute errors by detector x. The scale is linear near 0 and logarithmic beyond, for bright and faint discs."""
+    """Draw the absolute errors by detector x.
+
+    The vertical scale is linear near 0 and logarithmic beyond, so that it shows bright and faint discs.
+    """
     values = np.array([f.error_dn_s for f in frames])
     noise = np.array([f.noise_dn_s for f in frames])
     where = np.array([f.found.place.x_px for f in frames])
@@ -205,7 +214,7 @@ def draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     span = np.abs(values) + noise
     linear = 10.0 ** np.ceil(
         np.log10(max(float(np.median(span)), 1e-6))
-    )  # a power of ten, so that its end has a tick label
+    )  # a power of ten, so that the end of the linear range has a tick label
     top = 4 * max(float(span.max()), linear)
     axes.set_yscale("symlog", linthresh=linear, linscale=1.0)
     axes.set(
@@ -219,7 +228,7 @@ def draw_absolute(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
 def draw_errors(
     axes: Any, frames: Sequence[FrameEvaluation], where: Vector, values: Vector, noise: Vector
 ) -> None:
-    """Errors of images with their noise, coloured by pointing. Values of nan are not drawn."""
+    """Draw the errors of images with their noise; the colour shows the pointing. Values of nan are not drawn."""
     fovs = np.array([f.pointing for f in frames])
     axes.axhline(0, color="#555555", linewidth=1.0)
     for n, fov in enumerate(sorted(set(fovs.tolist()))):
@@ -242,7 +251,7 @@ def draw_errors(
 
 
 def draw_offsets(panels: Sequence[Any], study: DarkOffsetStudy) -> None:
-    """Relative change of the weights by dark offsets, and change of the cumulative curves in percentage points."""
+    """Draw the effect of dark offsets: relative change of the weights, and change of C(R) in percentage points."""
     weights, curve = panels
     for axes in panels:
         axes.axhline(0, color="#555555", linewidth=1.0)

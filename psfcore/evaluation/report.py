@@ -1,13 +1,13 @@
-"""Summarise an evaluation: errors per pointing with the expected noise, and trends over the detector.
+"""Summarise an evaluation: errors of each pointing with the expected noise, and trends across the detector.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Evaluation".
 
     slope = sum w (u - <u>) e / sum w (u - <u>)^2,   <u> = sum w u / sum w,   w = 1 / noise^2    Eq. (1)
-    its error = (sum w (u - <u>)^2)^(-1/2) max(1, chi2 / (N - 2))^(1/2)                          Eq. (2)
+    error of the slope = (sum w (u - <u>)^2)^(-1/2) max(1, chi2 / (N - 2))^(1/2)                 Eq. (2)
 
-If the errors scatter about the fitted line by more than noise, Eq. (2) increases the error of the slope accordingly.
-The occulter's x and y change together along its track. Slopes along x and y come from the same images and are not
-independent.
+The sums run over the N images of a pointing. If e varies about the fitted line by more than noise explains, Eq. (2)
+increases the error of the slope accordingly. The occulter's x and y change together along its track. Therefore the slopes
+along x and along y, which come from the same images, are not independent.
 
 | symbol | name | unit |
 |---|---|---|
@@ -33,17 +33,17 @@ from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 Vector = NDArray[np.float64]
 
 SCHEMA = "evaluation/1"
-TREND_PX = 100.0  # slopes are given per this number of pixels
+TREND_PX = 100.0  # the unit of a slope is the change over this number of pixels
 LEAST_TREND_FRAMES = 3
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Errors of the images of one pointing, percent of the observed mean unless the name has another unit.
+    """Errors of the images of one pointing, in percent of the observed mean unless the name contains another unit.
 
-    fov: the pointing; None: all pointings. mean_noise_pct: standard error of the mean from image noise. noise_pct: rms
-    that image noise alone gives. gap_pct: rms with the noise subtracted in quadrature. centre_...: of the mean PE at the
-    centre.
+    fov: the pointing; None: all pointings. mean_noise_pct: standard error of the mean from image noise. noise_pct: the rms
+    that image noise alone would cause. gap_pct: the rms with the noise subtracted in quadrature. centre_...: the same
+    quantities for the mean PE at the centre of the disc.
     """
 
     fov: int | None
@@ -63,7 +63,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Slope:
-    """Change per TREND_PX pixels, and its standard error."""
+    """A change over TREND_PX pixels, and the standard error of this change."""
 
     per_100_px: float
     sigma: float
@@ -71,7 +71,7 @@ class Slope:
 
 @dataclass(frozen=True)
 class Trend:
-    """Trend of the errors of one pointing with the position of the occulter on the detector."""
+    """The change of the errors of one pointing with the position of the occulter on the detector."""
 
     fov: int
     against: Literal["x", "y"]
@@ -81,7 +81,7 @@ class Trend:
 
 
 def summaries(evaluation: Evaluation) -> tuple[Summary, ...]:
-    """One summary per pointing, in order, and a last one for all images."""
+    """One summary for each pointing, in the order of the pointings; the last summary is for all images."""
     fovs = sorted({frame.pointing for frame in evaluation.frames})
     parts = [summary_of([f for f in evaluation.frames if f.pointing == fov], fov) for fov in fovs]
     return (*parts, summary_of(evaluation.frames, None))
@@ -128,7 +128,7 @@ def trends(evaluation: Evaluation) -> tuple[Trend, ...]:
 
 
 def slope_of(where_px: Vector, error: Vector, noise: Vector) -> Slope:
-    """Eq. (1) and (2), per TREND_PX pixels."""
+    """The slope of Eq. (1) and its error from Eq. (2), both multiplied by TREND_PX."""
     weight = noise**-2.0
     u = where_px - np.sum(weight * where_px) / weight.sum()
     spread = float(np.sum(weight * u**2))
@@ -257,7 +257,7 @@ def _rows(values: Vector) -> list[list[float | None]]:
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Replace nan and infinity, which JSON lacks, by None."""
+    """Replace nan and infinity by None, because JSON cannot express them."""
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
 

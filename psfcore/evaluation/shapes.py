@@ -1,13 +1,13 @@
 """Compare shapes of scatter by their errors on held-out images.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", compares three shapes by the
-MPE and MAPE of all superposed occulters: isotropic, stretched along x, and stretched along any direction. Free shells
-are added here. Each shape is fitted to all images. The PSF of a fold is one step from that fit (Eq. (1) of
-`psfcore.scatter.validation.cross_validation`), and every image is simulated with the PSF of the fold that holds it out.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". The paper compares three
+shapes by the MPE and MAPE of all superposed occulters: isotropic, stretched along x, and stretched along any direction.
+Free shells are added here. Each shape is fitted to all images. The PSF of a fold differs from this fit by one step (Eq.
+(1) of `psfcore.scatter.validation.cross_validation`). Every image is simulated with the PSF of the fold that holds it out.
 
-Errors come from a bootstrap of the images. All shapes use the same images, so their differences are much better known
-than the figures themselves. Consecutive images share a fold. If an error persists over several images, the bootstrap
-errors are too small.
+The errors of the figures below come from a bootstrap of the images. All shapes use the same images, so the differences
+between shapes have much smaller errors than the figures themselves. If the residuals of consecutive images are
+correlated, the bootstrap errors are too small.
 
     MPE rms = rms over the disc of (mean over images of PE)                     Eq. (1)
     MAPE mean = mean over the disc of (mean over images of |PE|)                Eq. (2)
@@ -15,6 +15,7 @@ errors are too small.
 | symbol | name | unit |
 |---|---|---|
 | MPE rms, MAPE mean | mpe_rms_pct, mape_mean_pct | % of the observed mean |
+| PE | FrameEvaluation.pe_pct: percentage error of a pixel | % of the observed mean |
 """
 
 from __future__ import annotations
@@ -48,10 +49,11 @@ KernelOf = Callable[[int], Kernel]
 
 @dataclass(frozen=True)
 class ShapeErrors:
-    """Held-out errors of one shape: FIGURES by name, each with its value and error, percent of the observed mean.
+    """Errors of one shape on held-out images, in percent of the observed mean.
 
-    minus_first: the same for the difference from the softened power law. parameters: of the fit to all images, value
-    and error; empty for free shells.
+    figures: value and standard error of each of FIGURES. minus_first: figures of this shape minus those of the softened
+    power law, with standard errors. parameters: value and standard error of each parameter in the fit to all images;
+    empty for free shells.
     """
 
     name: str
@@ -71,7 +73,7 @@ class ShapeErrors:
 
 @dataclass(frozen=True)
 class ShapesByErrors:
-    """All shapes on the same images; the softened power law is first."""
+    """The errors of all compared shapes; each shape is evaluated on the same images. The power law comes first."""
 
     images: int
     folds: int
@@ -111,8 +113,8 @@ def compare_shapes_by_errors(
 ) -> ShapesByErrors:
     """Compare the softened power law of `solution` with both stretched shapes and with free shells.
 
-    seed: of the bootstrap. Raises DataError "unknown-shape" if `solution` has another shape, "too-few-frames" if there
-    are too few images for two folds, and as `invert` and `evaluate` do.
+    seed: random seed of the bootstrap. Raises DataError "unknown-shape" if `solution` has another shape, "too-few-frames"
+    if there are too few images for two folds, and the errors of `invert` and `evaluate`.
     """
     if solution.inversion.shape.name != SOFTENED_POWER_LAW.name:
         raise DataError(
@@ -152,7 +154,7 @@ def compare_shapes_by_errors(
 
 
 def _fit_of(solution: Solution, name: str, progress: Progress) -> Solution:
-    """Another shape fitted to all images, starting from the fit of the power law."""
+    """Fit another shape to all images, starting from the fit of the power law."""
     shape = SHAPES[name]
 
     def said(stage: str, step: int, steps: int) -> None:
@@ -168,7 +170,7 @@ def _parameters(solution: Solution) -> dict[str, tuple[float, float]]:
 
 
 def _fold_samples(images: int) -> tuple[FoldSample, ...]:
-    """One sample per fold without bootstrap: each fitted image counts once."""
+    """One sample for each fold, without bootstrap: each fitted image counts once."""
     parts = folds(images)
     if not parts:
         raise DataError("too-few-frames", f"expected at least 6 images for held-out folds; got {images}")
@@ -186,7 +188,7 @@ def _fold_kernels(solution: Solution, samples: tuple[FoldSample, ...]) -> Kernel
 
 
 def _free_fold_kernels(solution: Solution, samples: tuple[FoldSample, ...], progress: Progress) -> KernelOf:
-    """The same for free shells."""
+    """For each image, the total PSF [y, x] with free shells, of the fold that holds the image out."""
     shape, diffraction = solution.inversion.shape, solution.transit.diffraction
     shares = free_shares(solution, solution.inversion.coordinates, progress=progress)
     kernels = []
@@ -207,7 +209,7 @@ def _by_image(samples: tuple[FoldSample, ...], kernels: list[Kernel]) -> KernelO
 def _evaluated(
     solution: Solution, kernel_of: KernelOf, name: str, progress: Progress
 ) -> dict[int, FrameEvaluation]:
-    """The evaluation of every usable image with the PSF of its fold, by index."""
+    """The evaluation of every usable image with the PSF of its fold; the keys are the images' indices."""
 
     def said(stage: str, step: int, steps: int) -> None:
         progress(f"{name}: {stage}", step, steps)
@@ -219,19 +221,22 @@ def _evaluated(
 
 
 def _bootstrap_counts(images: int, seed: int) -> Floats:
-    """How often each image counts, (1 + BOOTSTRAP_SAMPLES, images). In the first row, each image counts once."""
+    """The number of times that each image counts, (1 + BOOTSTRAP_SAMPLES, images).
+
+    In the first row, each image counts once.
+    """
     rng = np.random.default_rng(seed)
     counts = rng.multinomial(images, np.full(images, 1 / images), BOOTSTRAP_SAMPLES)
     return np.concatenate((np.ones((1, images)), counts))
 
 
 def _figures(frames: list[FrameEvaluation], counts: Floats) -> Floats:
-    """FIGURES of all images and of each bootstrap sample: (FIGURES, 1 + BOOTSTRAP_SAMPLES)."""
+    """FIGURES for all images (first column) and for each bootstrap sample, (FIGURES, 1 + BOOTSTRAP_SAMPLES)."""
     maps = _maps(frames)
     dark = np.isfinite(maps)
     shown = dark.sum(axis=0) >= LEAST_SHARE * len(frames)
     pe, dark = np.nan_to_num(maps[:, shown]), dark[:, shown]
-    # In rare samples no image shows a position. Its error then counts as 0.
+    # In rare samples, a position in the disc is not dark in any image. The error at this position then counts as 0.
     count = np.maximum(counts @ dark, 1)
     mpe, mape = counts @ pe / count, counts @ np.abs(pe) / count
     residual = np.array([frame.residual_pct for frame in frames])
@@ -247,7 +252,7 @@ def _figures(frames: list[FrameEvaluation], counts: Floats) -> Floats:
 
 
 def _maps(frames: list[FrameEvaluation]) -> Floats:
-    """PE of each image by offset from the centre of the occulter, to the nearest pixel; nan where it is not dark."""
+    """PE of each image at each whole-pixel offset from the centre of the occulter; nan for pixels that are not dark."""
     half = int(np.ceil(max(frame.found.place.radius_px for frame in frames))) + 1
     maps = np.full((len(frames), 2 * half + 1, 2 * half + 1), np.nan)
     for of, frame in zip(maps, frames, strict=True):

@@ -1,4 +1,4 @@
-"""The evaluation in a report's JSON as a short table to print: by pointing, by pixel of the disc, and by shape."""
+"""Print the evaluation in a report's JSON as a short table: errors by pointing, by pixel of the disc, and by shape."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Json = dict[str, Any]
 
 
 def summary_lines(evaluation: Json, shapes: Json | None = None) -> list[str]:
-    """Lines of an evaluation (schema "evaluation/1", as ``psfcore.evaluation.report.report`` makes it).
+    """The lines of the table. evaluation: result of ``psfcore.evaluation.report.report`` (schema "evaluation/1").
 
-    shapes: the comparison of shapes, as ``psfcore.evaluation.shapes.ShapesByErrors.to_json`` makes it.
+    shapes: the comparison of shapes, a result of ``psfcore.evaluation.shapes.ShapesByErrors.to_json``.
     """
     maps = evaluation["superposed"]
     lines = ["simulated minus observed light in the occulter's disc, in percent of the observed light:"]
     lines += [_pointing(of) for of in (*evaluation["pointings"], evaluation["all"])]
     lines.append(
-        f"by pixel of the disc: MPE {_number(maps['mpe_rms_pct'])} % rms, {_number(maps['mpe_largest_pct'])} % at most "
+        f"errors per pixel of the disc: MPE {_number(maps['mpe_rms_pct'])} % rms, largest {_number(maps['mpe_largest_pct'])} % "
         f"(noise alone {_number(maps['mpe_noise_rms_pct'])} % rms); MAPE {_number(maps['mape_mean_pct'])} % "
         f"(noise alone {_number(maps['mape_noise_mean_pct'])} %)"
     )
@@ -38,7 +38,7 @@ def _pointing(of: Json) -> str:
     centre = "" if of["centre_mean_pct"] is None else f"; centre {of['centre_mean_pct']:+.2f} %"
     return (
         f"{name}: {of['images']} images, mean {_number(of['mean_pct'], '+')} % (noise {_number(of['mean_noise_pct'])}), "
-        f"rms {_number(of['rms_pct'])} % (noise {_number(of['noise_pct'])}), at most {_number(of['largest_pct'])} %{centre}"
+        f"rms {_number(of['rms_pct'])} % (noise {_number(of['noise_pct'])}), largest {_number(of['largest_pct'])} %{centre}"
     )
 
 
@@ -75,5 +75,5 @@ def _figures(figures: Json, sign: str = "") -> str:
 
 
 def _number(value: float | None, sign: str = "") -> str:
-    """Two decimals; JSON has null for a value that is not finite."""
+    """The value with two decimals. JSON has null in place of a value that is not finite; it is printed as "n/a"."""
     return NO_NUMBER if value is None else f"{value:{sign}.2f}"

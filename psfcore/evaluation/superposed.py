@@ -1,12 +1,13 @@
 """Maps of the errors of simulated scatter by position in the occulter, with all discs superposed.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". Discs are aligned to the
-nearest whole pixel. No interpolation changes the noise, and positions are blurred by up to half a pixel per axis.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". The discs are aligned to
+the nearest whole pixel. The alignment does not interpolate, so it does not change the noise. It blurs positions by up to
+half a pixel along each axis.
 
     MPE = mean over images of PE,   MAPE = mean over images of |PE|         Eq. (1)
 
-The same maps are computed from noise realisations, for comparison. |noise| does not average out, so the MAPE can only
-be interpreted relative to the MAPE of noise alone.
+PE is the percentage error of a pixel. The same maps are computed from noise realisations, for comparison. The absolute
+value of noise does not average to zero, so the MAPE can only be interpreted relative to the MAPE of noise alone.
 
 | symbol | name | unit |
 |---|---|---|
@@ -35,8 +36,8 @@ LEAST_SHARE = 0.5  # a position is on the maps if it is dark in at least this fr
 class Superposed:
     """Maps [y, x] by offset from the centre of the occulter, which is at [half_px, half_px]; nan outside the disc.
 
-    images: number of superposed discs. count: number of discs that are dark at a position. noise_mpe_pct: standard
-    error of the MPE from noise alone. noise_mape_pct: MAPE of noise alone.
+    images: number of superposed discs. count: for each position, the number of images in which this pixel is dark.
+    noise_mpe_pct: standard error of the MPE from noise alone. noise_mape_pct: MAPE of noise alone.
     """
 
     images: int
@@ -83,7 +84,7 @@ class Superposed:
 
 
 class Superposition:
-    """Running sums over superposed images. noise_realisations: their number for every image."""
+    """Running sums over superposed images. noise_realisations: number of noise realisations for each image."""
 
     def __init__(self, radius_px: float, noise_realisations: int) -> None:
         self._half = math.ceil(radius_px) + 1

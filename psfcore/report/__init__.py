@@ -1,1 +1,1 @@
-"""The report on a transit and its PSF: numbers, figures and one HTML page, as in a publication."""
+"""The report on a transit and its PSF: the numbers and figures that a publication shows, on one HTML page."""

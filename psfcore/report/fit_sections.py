@@ -29,7 +29,7 @@ from psfcore.transit.blocks import folds
 
 
 def found_sections(report: PsfReport) -> list[Part]:
-    """The fitted parameters or the given PSF, and a table of 1 - encircled energy."""
+    """A description of the fit or of the given PSF, and a table of 1 - encircled energy."""
     parts = _given(report.psf) if report.fit is None else _fitted(report.fit)
     return [*parts, _curve_table(report)]
 
@@ -37,7 +37,7 @@ def found_sections(report: PsfReport) -> list[Part]:
 def _fitted(fit: TransitFit) -> list[Part]:
     values, sigma = fit.inversion.values, fit.value_sigma
     enlarged = (
-        f" and multiplied by {math.sqrt(fit.overdispersion):.2f}, because the disc means scatter by that factor more "
+        f" and multiplied by {math.sqrt(fit.overdispersion):.2f}, because the disc means vary by that factor more "
         "than noise explains"
         if fit.overdispersion > 1
         else ""
@@ -49,8 +49,8 @@ def _fitted(fit: TransitFit) -> list[Part]:
     return [
         f"The diffuse scatter was fitted with the shape “{fit.inversion.shape.name}”: its weight at a distance of r px "
         "from the source is proportional to (b + r)^-c. The total PSF is this scatter convolved with the known "
-        "diffraction PSF. Errors are one standard deviation, from the noise of every pixel, propagated through the whole "
-        f"fit{enlarged}.",
+        "diffraction PSF. Errors are standard deviations. They follow from the noise of every pixel, propagated through "
+        f"the whole fit{enlarged}.",
         Values(
             [
                 *parameters,
@@ -58,13 +58,13 @@ def _fitted(fit: TransitFit) -> list[Part]:
                     "chi2 per pixel",
                     fit.inversion.chi2_per_pixel,
                     _chi2_error(fit),
-                    meaning="1 is expected if only noise is left; the error is the expected statistical scatter",
+                    meaning="1 is expected if only noise remains; the error is the expected statistical variation",
                 ),
                 Value(
                     "overdispersion",
                     fit.overdispersion,
-                    meaning="chi2 of the disc means over its expected value, or 1 if chance explains the excess; all "
-                    "errors contain its square root as a factor",
+                    meaning="chi2 of the disc means divided by its expected value, or 1 if chance explains the excess; "
+                    "all errors are multiplied by the square root of the overdispersion",
                 ),
             ]
         ),
@@ -80,7 +80,7 @@ def _given(psf: Psf) -> list[Part]:
                 Value("name", psf.name),
                 Value("version", psf.version),
                 Value("status", psf.status),
-                Value("sum", psf.total, meaning=f"of all weights on {size} px"),
+                Value("sum", psf.total, meaning=f"sum of all weights on {size} px"),
             ]
         ),
     ]
@@ -92,7 +92,7 @@ def _chi2_error(fit: TransitFit) -> float:
 
 
 def _curve_table(report: PsfReport) -> Table:
-    """1 - encircled energy at some radii, by component, with the bands of the folds at the radii that these cover."""
+    """A table of 1 - encircled energy of each component at some radii, and of the bands of the folds."""
     names = [name for name in (TOTAL, SCATTER) if name in report.tables["encircled"]]
     header = ["R (px)", *(f"{'total PSF' if name == TOTAL else 'diffuse scatter'} (%)" for name in names)]
     if report.cross is not None:
@@ -128,7 +128,7 @@ def _bands_at(cross: CrossValidated, radius: float) -> list[str]:
 
 
 def light_sections(report: PsfReport) -> list[Part]:
-    """Figures of 1 - encircled energy and of the radial profile, and the comparison with free shells."""
+    """Figures of 1 - encircled energy and of the radial profile, and the comparison of the fit with free shells."""
     field = max(report.transit.shape)
     beyond = (
         f" Shaded: distances beyond the field of {field} px, where the PSF is an extrapolation of its shape."
@@ -142,9 +142,9 @@ def light_sections(report: PsfReport) -> list[Part]:
             "the total PSF (left) and for its diffuse scatter alone (right). Bottom: difference from the fit to all "
             "images, in percentage points. Lines at the top and bars at the bottom show the fit to all images with its "
             "error. Blue bands show the fits of the cross-validation at the radii where they were computed. Blue points "
-            "show free shells, a fit of one weight per shell without a formula. Their bars are the spread over the "
-            "folds. This spread is smaller than the error, because no weight can be negative; the values below Figure 3 "
-            f"have the full errors.{beyond}"
+            "show free shells: a fit of one weight for each shell, without a formula. The bars of the blue points show "
+            "the spread over the folds. This spread is smaller than the error, because a weight cannot be negative. The "
+            f"values below Figure 3 have the full errors.{beyond}"
         )
         alt = (
             "Two charts of 1 - encircled energy by distance with error bands, falling from about half to zero"
@@ -166,8 +166,8 @@ def light_sections(report: PsfReport) -> list[Part]:
         Figure(
             profile_png(report),
             "Radial profile: mean weight per pixel in rings one pixel wide, by distance, on logarithmic axes. "
-            f"{components} The value at half a pixel is that of the central pixel. Shading about a line: its standard "
-            "error, if known.",
+            f"{components} The value at half a pixel belongs to the central pixel. Shading shows the standard error of a "
+            "line, if it is known.",
             "Radial profile of the PSF and its components over many powers of ten",
         )
     )
@@ -183,9 +183,10 @@ def _free_shells(report: PsfReport, shells: ShellBands) -> list[Part]:
 
     caption = (
         "Weight of the diffuse scatter per pixel, by distance. Orange: the fitted shape. Blue: free shells, median and "
-        "spread over the folds. Each free shell has its own weight, zero or more, with a weak prior at the fitted shape. "
-        "The weights of adjacent shells are anticorrelated, so they scatter much more than 1 - encircled energy in "
-        "Figure 1. Several adjacent shells on the same side of the line would indicate that the formula is wrong there."
+        "spread over the folds. The weight of a free shell is fitted without a formula, with a weak prior at the fitted "
+        "shape; it cannot be negative. The weights of adjacent shells are anticorrelated, so they vary much more than "
+        "1 - encircled energy in Figure 1. If several adjacent shells lie on the same side of the line, the formula is "
+        "probably wrong there."
     )
     return [
         Figure(
@@ -229,8 +230,8 @@ def _cross_validation(cross: CrossValidated, fit: TransitFit, blocks: int) -> li
     return [
         f"Cross-validation: each of {blocks} sequential blocks of images was held out, with a guard on both sides, and "
         f"the images of the other blocks were resampled with replacement (bootstrap). {RUNS} such runs give "
-        f"{len(cross.fits)} fits. They share the reconstructed scenes of the fit to all images, and their differences "
-        "from it are computed to first order.",
+        f"{len(cross.fits)} fits. These fits use the reconstructed scenes of the fit to all images. Their differences "
+        "from the fit to all images are computed to first order.",
         Table(
             ["parameter", "fit, with its error", "folds: median", "1 sigma", "2 sigma"],
             rows,
@@ -239,8 +240,8 @@ def _cross_validation(cross: CrossValidated, fit: TransitFit, blocks: int) -> li
         ),
         Figure(
             totals_png(cross, fit),
-            "Distribution of the total diffuse scatter over the folds. A wider distribution means less agreement between "
-            "the images. Orange: the fit to all images, with its error.",
+            "Distribution of the total diffuse scatter over the folds. The wider it is, the less the images agree with "
+            "each other. Orange: the fit to all images, with its error.",
             "Histogram of the total diffuse scatter over the folds",
         ),
     ]
@@ -259,8 +260,8 @@ def _shapes(fit: TransitFit) -> list[Part]:
             ["shape", "additional parameters", "delta chi2", "number added", "delta chi2, held out"],
             rows,
             "Other shapes of scatter, to first order. Each one is the fitted shape with additional parameters. Delta chi2: "
-            "the decrease of chi2 over all images. If the additional parameters fit only noise, its expected value is "
-            "their number n, with a standard deviation of sqrt(2 n). Held out: the decrease on held-out images; a "
+            "the decrease of chi2 for all images. If n additional parameters fit only noise, delta chi2 has the expected "
+            "value n and the standard deviation sqrt(2 n). Held out: the decrease of chi2 for held-out images. A "
             "negative value indicates that the additional parameters fit noise.",
         )
     ]
@@ -291,8 +292,9 @@ def _dark_offsets(study: DarkOffsetStudy, fit: TransitFit) -> list[Part]:
             ],
             rows,
             "Effect of a wrong dark level: the fit was repeated with an offset added to every readout. For comparison, "
-            f"the errors of the fit are {errors}. Weights are diffuse weights within the field. The light beyond a "
-            "distance is 1 - encircled energy of the total PSF, and its change is in percentage points.",
+            f"the errors of the fit are {errors}. The changes of weights are those of the diffuse weights within the "
+            "field. The light beyond a distance is 1 - encircled energy of the total PSF; the table gives its change in "
+            "percentage points.",
         ),
         Figure(
             offsets_png(study),

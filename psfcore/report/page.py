@@ -1,4 +1,4 @@
-"""The HTML page of a report on a PSF: every number with its error, every figure with a guide to reading it."""
+"""The HTML page of a report on a PSF. Every number has an error, and every caption explains how to read the figure."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from psfcore.scatter.inversion import CONVERGED_POINTS, DARK_MARGIN_PX, DARK_MAR
 
 
 def page_of(report: PsfReport, provenance: dict[str, Any]) -> Page:
-    """The page of a report. provenance: software and request, as nested names and values."""
+    """The page of a report. provenance: names and values, possibly nested, that describe software and request."""
     of = report.transit.instrument or "an unnamed instrument"
     title = f"PSF of {of}" if report.fit is not None else f"PSF {report.psf.name} on a transit of {of}"
     sections = [
@@ -59,9 +59,10 @@ def page_of(report: PsfReport, provenance: dict[str, Any]) -> Page:
 
 def _observed(evaluation: Evaluation, how: str) -> list[Part]:
     parts: list[Part] = [
-        f"{how}. The residual of an image is the mean light that the PSF scatters into the occulter, minus the mean "
-        "observed light, divided by the mean observed light, over all fully dark pixels. The centre consists of the "
-        f"pixels within {CENTRE_PX:g} px of the occulter's centre. Noise is photon and read noise.",
+        f"{how}. The residual of an image compares two means over all fully dark pixels: the light that the PSF scatters "
+        "into the occulter, and the observed light. The residual is the first mean minus the second, divided by the "
+        f"second. The centre consists of the pixels within {CENTRE_PX:g} px of the occulter's centre. Noise is photon and "
+        "read noise.",
         Table(
             [
                 "pointing",
@@ -74,22 +75,22 @@ def _observed(evaluation: Evaluation, how: str) -> list[Part]:
                 "mean (DN/s)",
             ],
             [_summary_row(s, evaluation) for s in summaries(evaluation)],
-            "Residuals by pointing; the last row is for all images. Mean: with its error from image noise. Rms: with its "
-            "sampling error for this number of images. Noise: the rms expected from noise alone. Largest: the residual "
-            "of the image with the largest absolute value.",
+            "Residuals by pointing; the last row is for all images. The error of the mean comes from image noise. The "
+            "error of the rms is its sampling error for this number of images. Noise: the rms expected from noise alone. "
+            "Largest: the residual with the largest absolute value of any image.",
         ),
         Figure(
             slices_png(evaluation),
             "Intensity along a row (circles, solid line) and a column (squares, dashed line) through the centre of an "
-            "occulter, for one image per pointing. Points are observed, lines are simulated. Grey: fully dark pixels. "
+            "occulter, for one image of each pointing. Points: observed. Lines: simulated. Grey: fully dark pixels. "
             "Outside the grey area, sunlight reaches the pixels directly.",
             "Observed and simulated intensity along slices through occulters",
         ),
         Figure(
             residuals_png(evaluation),
             "Residuals of disc means (top) and of disc centres (bottom) by time, detector x and detector y, coloured by "
-            "pointing. Bars show one standard deviation of the noise. If noise alone causes the residuals, about one "
-            "bar in three does not include zero.",
+            "pointing. Bars show one standard deviation of the noise. If noise alone causes the residuals, about one third "
+            "of the bars do not include zero.",
             "Six charts of residuals about zero, by time and detector position",
         ),
     ]
@@ -112,9 +113,9 @@ def _observed(evaluation: Evaluation, how: str) -> list[Part]:
 
 
 _MAPS_CAPTION = (
-    "All discs superposed, aligned to the nearest pixel. MPE: mean over the images of the percentage error of a pixel. "
-    "MAPE: mean of its absolute value. Beside each map is the same map for noise alone, on the same scale. If a map "
-    "resembles its noise map, noise explains the errors."
+    "All discs superposed, aligned to the nearest pixel. MPE: the percentage error of a pixel, averaged over the images. "
+    "MAPE: the absolute value of the percentage error, averaged over the images. Beside each map is the same map for "
+    "noise alone, on the same scale. If both maps look similar, noise explains the errors."
 )
 
 
@@ -150,7 +151,7 @@ def _trends(evaluation: Evaluation) -> list[Part]:
     ]
     caption = (
         f"Slopes of the residuals along the detector axes, per {TREND_PX:g} px. The occulter's x and y change together "
-        "along its track. Slopes along x and y come from the same images and are not independent."
+        "along its track. Therefore the slopes along x and along y are not independent."
     )
     return [
         Table(
@@ -221,7 +222,7 @@ def _images(report: PsfReport) -> list[Part]:
         header,
         [_image_row(frame, exposure_s[frame.file]) for frame in frames],
         "Every evaluated image: its time and exposure, the fitted position of its occulter, the number of fully dark "
-        "pixels, and the mean observed and simulated intensity there. Errors are from noise.",
+        "pixels, and the mean observed and simulated intensity of these pixels. The errors come from noise.",
     )
     parts: list[Part] = [Details(f"All {len(frames)} images", (table,))]
     left_out = report.evaluation.left_out
@@ -267,7 +268,7 @@ def _made_of(report: PsfReport, provenance: dict[str, Any]) -> list[Part]:
                 f"{len(prepared['frames'])}",
                 meaning="the pixels were saturated or had no value",
             ),
-            Value("seed", f"{report.seed}", meaning="of all random samples"),
+            Value("seed", f"{report.seed}", meaning="random seed of all random samples"),
         ]
     )
     files = Table(

@@ -44,7 +44,7 @@ _FREE, _BAND = "#1f6fb4", "#4f8cc4"
 
 
 def curves_png(report: PsfReport) -> bytes:
-    """1 - encircled energy of the total PSF and, for a fit, of its diffuse scatter, with the uncertainties below."""
+    """1 - encircled energy of the total PSF. For a fit, also of its diffuse scatter, with the uncertainties below."""
     if report.fit is None:
         figure, (total,) = _figure(5.6, 3.9, 1)
         _draw_curve(total, report, TOTAL)
@@ -70,7 +70,7 @@ def curves_png(report: PsfReport) -> bytes:
 
 
 def _draw_curve(axes: Any, report: PsfReport, name: str) -> None:
-    """The cumulative curve of a component, with its error."""
+    """Draw 1 - encircled energy of a component, with its error."""
     radii, beyond, sigma = beyond_of(report.tables, name)
     axes.fill_between(radii, beyond - sigma, beyond + sigma, color=_COLOURS[name], alpha=0.3, linewidth=0)
     axes.plot(radii, beyond, color=_COLOURS[name], linewidth=1.5, label=_NAMES[name])
@@ -80,7 +80,7 @@ def _draw_curve(axes: Any, report: PsfReport, name: str) -> None:
 
 
 def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
-    """Differences from the fitted curve of a component: bands of the folds, and the error of the fit as bars."""
+    """Draw differences from the fitted curve of a component: bands of the folds, and bars for the error of the fit."""
     radii, _, sigma = beyond_of(report.tables, name)
     found = _folds_of(report, name)
     if found is not None:
@@ -104,7 +104,7 @@ def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
 
 
 def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]] | None:
-    """Radii, and the limits of the folds minus the fitted curve of a component; None if there are no folds."""
+    """Radii, and the bands of the folds minus the fitted curve of a component; None if there are no folds."""
     if report.cross is None:
         return None
     bands = report.cross.bands
@@ -119,16 +119,16 @@ def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]
 
 
 def _from(report: PsfReport, name: str, edges: Vector) -> Vector:
-    """The light of a component at each distance and beyond. Pixels exactly at the distance are included."""
+    """The percentage of light beyond each distance. Pixels exactly at the distance are included."""
     radii, beyond, _ = beyond_of(report.tables, name)
     just_below = edges * (1 - 1e-9)
     within = np.maximum(np.searchsorted(radii, just_below) - 1, 0)
-    exact = just_below <= report.tables["exact_to_px"]  # there the curve is a step function
+    exact = just_below <= report.tables["exact_to_px"]  # up to this radius, the curve is a step function
     return np.asarray(np.where(exact, beyond[within], np.interp(just_below, radii, beyond)))
 
 
 def _draw_free(curve: Any, spread: Any, report: PsfReport, shells: ShellBands) -> None:
-    """Diffuse light of the free shells beyond their inner edges, within the field: median and spread over the folds."""
+    """Draw the diffuse light beyond the inner edge of each free shell within the field: median and spread of the folds."""
     edges = shells.edges_px[:-1]
     shown = (edges >= 1) & (edges < max(report.transit.shape))
     low_2, low_1, median, high_1, high_2 = shells.free_beyond_pct[:, shown]
@@ -148,12 +148,12 @@ def _title(name: str) -> str:
 
 
 def beyond_of(tables: dict[str, Any], name: str) -> tuple[Vector, Vector, Vector]:
-    """Radii from half a pixel, 100 (1 - encircled energy) of a component, and its standard error (0: not known)."""
+    """Radii (px), 100 (1 - encircled energy) of a component at these radii, and its standard error (0: not known)."""
     radii = np.array(tables["radii_px"])
     encircled = np.array(tables["encircled"][name])
     changes = np.array(tables["encircled_changes"].get(name, np.zeros((1, radii.size))))
     near = radii < _NEAREST_PX
-    # The curve begins at half a pixel, which encloses the central pixel alone.
+    # The curve begins at half a pixel. This radius encloses only the central pixel.
     shown = np.concatenate(([np.flatnonzero(near)[-1]], np.flatnonzero(~near)))
     r = np.where(near[shown], _NEAREST_PX, radii[shown])
     beyond = 100 * np.maximum(1 - encircled[shown], 0.0)
@@ -168,7 +168,7 @@ def _mark_field(axes: Any, report: PsfReport) -> None:
 
 
 def profile_png(report: PsfReport) -> bytes:
-    """Mean weight per pixel by radius: diffraction, diffuse scatter and total PSF, with known errors."""
+    """Mean weight per pixel by radius: diffraction, diffuse scatter and total PSF, with errors if they are known."""
     figure, (axes,) = _figure(7.2, 4.4, 1)
     profile = report.tables["profile"]
     radius = np.array(profile["radius_px"])
@@ -241,7 +241,7 @@ def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
 
 
 def slices_png(evaluation: Evaluation) -> bytes:
-    """Slices through the centres of occulters: one image per pointing, at most six."""
+    """Slices through the centres of occulters: one image for each pointing, at most six images."""
     shown = shown_slices(evaluation, MOST_SLICES)
     across = min(len(shown), 3)
     rows = -(-len(shown) // across)
@@ -301,7 +301,7 @@ def intensities_png(evaluation: Evaluation) -> bytes:
 
 
 def offsets_png(study: DarkOffsetStudy) -> bytes:
-    """Effect of wrong dark levels on diffuse weights and on cumulative curves."""
+    """Effect of wrong dark levels on diffuse weights and on 1 - encircled energy."""
     figure, charts = _figure(WIDTH_IN, 4.2, 2)
     draw_offsets(charts, study)
     charts[0].set_title("Diffuse weights")

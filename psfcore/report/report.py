@@ -1,13 +1,13 @@
-"""Make a report on a PSF and its transit, with the results that a publication shows, from one inversion.
+"""Make a report on a PSF and its transit from one inversion. It contains the results that a publication shows.
 
-Hofmeister et al., The point-spread function of HRI_EUV, sections "Inversion results", "Accuracy and robustness" and
-"Evaluation". All images are inverted once. Every fold differs from this solution by a small step, which the
-contributions of the images to the normal equations give (the shared scheme, Eq. (1) of
-`psfcore.scatter.validation.cross_validation`). This holds for the folds of the cross-validation, whose images are
-bootstrap samples, and for the folds that hold out each image for its evaluation, whose images count once each. Only the
-fits with dark offsets are new fits, and they start from the solution.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, sections "Inversion results", "Accuracy and robustness"
+and "Evaluation". The PSF is fitted to all images once. The fit of every fold differs from this fit by a small step. The
+step follows from the contributions of the images to the normal equations (the shared scheme, Eq. (1) of
+`psfcore.scatter.validation.cross_validation`). There are two kinds of folds. In the cross-validation, the images of a fold
+are a bootstrap sample. In the evaluation, the fitted images of a fold count once each, and the PSF of the fold is
+evaluated on the held-out images. Only the dark offsets need new fits; these start from the fit to all images.
 
-A given PSF is evaluated without a fit. The report then lists the results that only a fit can provide as missing.
+A given PSF is evaluated without a fit. The report then lists the missing results: those that need a fit.
 
 | symbol | name |
 |---|---|
@@ -51,12 +51,12 @@ STAGES = {
     "dark offsets": 63.0,
     "tables": 6.0,
 }  # relative costs
-OFFSET_VISITS = 8.5  # typical number of passes over each frame in a fit with a dark offset
+OFFSET_VISITS = 8.5  # in a fit with a dark offset, each image is typically processed this number of times
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidated:
-    """All fits of a cross-validation, and the bands over them."""
+    """All fits of a cross-validation, and their medians and bands."""
 
     fits: tuple[FoldFit, ...]
     bands: Bands
@@ -74,9 +74,10 @@ class Missing:
 class PsfReport:
     """A transit, a PSF and all results about them.
 
-    tables: of the PSF (`psfcore.tables.make`). fit, cross, study: None if the PSF was given, or if `missing` has the
-    reason. held_out: whether every image was evaluated with a PSF fitted without it. fitted_to_these: the PSF was
-    fitted to these images, here or according to its history.
+    tables: the tables of the PSF (`psfcore.tables.make`). fit, cross, study: None if the PSF was given; cross and study can
+    also be None for a reason that `missing` contains. held_out: whether every image was evaluated with a PSF that was
+    fitted without it. fitted_to_these: whether the PSF used in the evaluation was fitted to the same images, here or
+    according to its history.
     """
 
     transit: Transit
@@ -107,7 +108,7 @@ class PsfReport:
 
     @property
     def how_judged(self) -> str:
-        """Which PSF each image was evaluated with, and whether that is an independent test."""
+        """A sentence: with which PSF each image was evaluated, and whether this is an independent test."""
         if self.held_out:
             return "Each image was evaluated with a PSF that was fitted without this image and its neighbours"
         if self.given and self.fitted_to_these:
@@ -181,7 +182,7 @@ def make_report(
 def _on_a_given(
     transit: Transit, prepared: Prepared, psf: Psf, seed: int, threads: int, stages: _ReportProgress
 ) -> PsfReport:
-    """The report on a given PSF, without a fit."""
+    """The report on a given PSF. No fit is made."""
     evaluation = evaluate(
         transit, lambda _index: psf.kernel, seed=seed, threads=threads, progress=stages.of("evaluating")
     )
@@ -194,7 +195,7 @@ def _on_a_given(
     )
     missing = [Missing(what, why) for what in lacking]
     if psf.fitted is None:
-        missing.append(Missing("errors of the PSF's curve and profile", "the PSF file contains none"))
+        missing.append(Missing("errors of the PSF's curve and profile", "the PSF file contains no errors"))
     return PsfReport(
         transit=transit,
         prepared=prepared,
@@ -212,7 +213,7 @@ def _on_a_given(
 
 
 def _check_scale(transit: Transit, psf: Psf) -> None:
-    """Raise DataError "plate-scale-mismatch" if both scales are known and differ by more than 1 %."""
+    """Raise DataError "plate-scale-mismatch" if both plate scales are known and differ by more than 1 %."""
     seen, wanted = transit.plate_scale_arcsec, psf.plate_scale_arcsec
     if seen is not None and wanted is not None and abs(seen / wanted - 1) > PLATE_SCALE_TOLERANCE:
         raise DataError(
@@ -223,7 +224,10 @@ def _check_scale(transit: Transit, psf: Psf) -> None:
 
 
 def _names_images(psf: Psf, transit: Transit) -> bool:
-    """Whether a PSF's history contains the SHA-256 of an image of a transit. FITS may break its lines anywhere."""
+    """Whether a PSF's history contains the SHA-256 of an image of a transit.
+
+    The lines of the history are joined first, because FITS can break them anywhere.
+    """
     history = "".join(str(line) for line in psf.provenance.get("history", ()))
     return any(transit.sha256.get(frame.file, "-") in history for frame in transit.frames)
 
@@ -236,7 +240,10 @@ def _tables(psf: Psf, threads: int, stages: _ReportProgress) -> dict[str, Any]:
 def _cross_validated(
     fit: TransitFit, seed: int, missing: list[Missing], progress: Progress
 ) -> CrossValidated | None:
-    """The cross-validation by the shared scheme. If the images do not suffice: None, with the reason in `missing`."""
+    """The cross-validation by the shared scheme.
+
+    If the images do not suffice, the result is None, and the reason is appended to `missing`.
+    """
     try:
         fits = shared_fits(
             fit.solution, bootstrap_samples(len(fit.transit.frames), seed=seed), progress=progress
@@ -249,7 +256,10 @@ def _cross_validated(
 
 
 def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[int], Kernel] | None:
-    """For each image, the total PSF of the fold that holds it out; the guard also excludes its neighbours."""
+    """For each image, the total PSF of the fold that holds it out. The fold's guard also excludes its neighbours.
+
+    If the images do not suffice, the result is None, and the reason is appended to `missing`.
+    """
     images = len(solution.transit.frames)
     parts = folds(images)
     kernels = []
@@ -293,7 +303,7 @@ class _ReportProgress:
         self._furthest = 0
 
     def of(self, name: str) -> Progress:
-        """Progress of a stage that reports its own step and number of steps."""
+        """The progress function of a stage that reports its step and its number of steps."""
 
         def report(stage: str, step: int, steps: int) -> None:
             self._say(name, stage, step / max(steps, 1))
@@ -301,7 +311,10 @@ class _ReportProgress:
         return report
 
     def counted(self, name: str, visits: float) -> Progress:
-        """Progress of a stage with several fits, each of which starts at 0: calls are counted instead."""
+        """The progress function of a stage with several fits.
+
+        The steps of each fit begin at 0 again. Therefore the calls are counted instead. visits: expected number of calls.
+        """
         calls = 0
 
         def report(stage: str, _step: int, _steps: int) -> None:
@@ -326,7 +339,7 @@ class _ReportProgress:
 
 
 def report_json(report: PsfReport, provenance: dict[str, Any]) -> dict[str, Any]:
-    """All numbers of a report as JSON. provenance: software and request, as the caller knows them."""
+    """All numbers of a report as JSON. provenance: the caller's description of software and request."""
     out: dict[str, Any] = {
         "schema": SCHEMA,
         "sentence": report.sentence,
@@ -356,7 +369,7 @@ def report_json(report: PsfReport, provenance: dict[str, Any]) -> dict[str, Any]
 
 
 def inputs_of(report: PsfReport) -> dict[str, Any]:
-    """The inputs of a report: files with their SHA-256, noise figures, and counts of filled pixels."""
+    """The inputs of a report: files with their SHA-256, noise figures, and numbers of filled pixels."""
     transit = report.transit
     return {
         "instrument": transit.instrument,

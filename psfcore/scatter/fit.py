@@ -1,19 +1,20 @@
-"""Fit a transit completely: the total PSF with its errors, its limits and the alternatives beside it.
+"""Fit a transit completely: the total PSF with its errors and limits, and alternative fits for comparison.
 
 Hofmeister et al., The point-spread function of HRI_EUV, sections "The inversion algorithm" and "Inversion results".
-The default is `psfcore.scatter.inversion`, which corrects the four biases of the published fit. Beside it stand:
+The default is `psfcore.scatter.inversion`, which corrects the four biases of the published fit. The result also contains:
 - a free fit of shells without a formula,
 - other shapes, tested on held-out images,
 - the first guess,
-- on request, the published recipe unchanged, and with each of its four biases corrected alone (`published`).
+- on request, the unchanged published recipe, and four variants that each correct one of its biases (`published`).
 
-Errors come from the photon and read noise of every pixel, propagated through the fit. If the disc means scatter from
-image to image by more than this noise, by a factor f in chi2 that chance does not explain, all errors are multiplied
-by sqrt(f) and the report says so. The excess shows an effect that the model lacks, and averaging does not remove it.
+The errors follow from the photon and read noise of every pixel, propagated through the fit. A disc mean is the mean of the
+fully dark pixels of one image. The disc means can vary from image to image by more than this noise. Then chi2 divided by
+its degrees of freedom is a factor f > 1. If chance does not explain f, all errors are multiplied by sqrt(f), and the
+report says so. Such an excess shows that the model lacks an effect, and averaging more images does not remove it.
 
 | symbol | name | unit |
 |---|---|---|
-| f | TransitFit.overdispersion | - |
+| f | TransitFit.overdispersion; 1 if chance explains the excess | - |
 | C(R) | Curve.pct: 100 (1 - encircled energy) at radius R | % |
 """
 
@@ -56,10 +57,10 @@ from psfcore.transit.transit import Transit
 Kernel = NDArray[np.float64]
 
 RADII_PX = (*CURVE_RADII_PX, 500.0, 1000.0)
-# Recipes with one bias corrected share their subsets with the published one, so few subsets show the difference.
+# A recipe with one corrected bias uses the same subsets as the published recipe, so few subsets show the difference.
 ALONE_SUBSETS = 30
-WORST_CHI2 = 1.5  # per pixel; for 10,000 pixels chi2 per pixel is known to 0.014
-OPEN_POINTS = 3.0  # a larger error of the curve at a radius is reported as a limit
+WORST_CHI2 = 1.5  # largest acceptable chi2 per pixel; with 10,000 pixels, its standard error is 0.014
+OPEN_POINTS = 3.0  # percentage points; a larger error of the curve is reported as a limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +79,24 @@ class Curve:
 class ShellWeightFits:
     """Scatter fitted shell by shell, without a formula, to subsets of equations.
 
-    segments: the shells. fits: their subset fits, with weights (subsets kept, shells). A shell that no pixel constrains stays
-    at the fitted shape, so its spread there contains no information. `psfcore.scatter.validation.free_shells` has
-    another free fit: one linear least-squares problem of all dark pixels, about the fitted shape.
+    segments: the shells. fits: the fits to the subsets; their weights have shape (subsets kept, shells). A shell that no
+    pixel constrains stays at the fitted shape, so the spread of its weights contains no information.
+    `psfcore.scatter.validation.free_shells` has another free fit: it fits deviations from the fitted shape to all
+    dark pixels, as one linear least-squares problem.
     """
 
     segments: Segments
     fits: SubsetFits
 
     def weights_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
-        """Percentiles over the subsets of the weight per pixel in each shell, (percentiles, shells)."""
+        """The weight per pixel of each shell: percentiles of the fits to the subsets, (percentiles, shells)."""
         return np.asarray(np.percentile(self.fits.fits, percentiles, axis=0))
 
     def beyond_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
-        """Percentiles over the subsets of the diffuse light beyond the inner edge of each shell, percent."""
+        """The percentage of the light that is scattered beyond the inner edge of each shell.
+
+        The result holds percentiles of the fits to the subsets, (percentiles, shells).
+        """
         light = self.fits.fits * self.segments.counts
         beyond = 100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1]
         return np.asarray(np.percentile(beyond, percentiles, axis=0))
@@ -101,10 +106,11 @@ class ShellWeightFits:
 class TransitFit:
     """The complete fit of a transit.
 
-    kernel, scatter: total PSF and scatter kernel [y, x] on the full reach. curve, diffuse_curve: their cumulative
-    curves. free: None for shapes that are not isotropic. shapes: empty unless the softened power law was fitted.
-    published, published_alone: the published recipe and its corrected variants, if requested. limits: sentences about
-    what these data do not determine.
+    kernel, scatter: total PSF and scatter kernel [y, x] on the full reach. curve, diffuse_curve: C(R) of the total PSF
+    and of the scatter kernel. free: the free fit of shells; None for shapes that are not isotropic. shapes: the compared
+    shapes; empty unless the softened power law was fitted. published, published_alone: the published recipe and its
+    variants with one corrected bias, if requested. limits: sentences about quantities that these data do not determine,
+    and about signs that the fit is unreliable.
     """
 
     transit: Transit
@@ -123,7 +129,7 @@ class TransitFit:
 
     @property
     def inversion(self) -> Inversion:
-        """The fit of the shape, without overdispersion in its errors."""
+        """The fit of the shape. Its errors do not include overdispersion."""
         return self.solution.inversion
 
     @property
@@ -191,9 +197,9 @@ def fit_transit(
 
 
 class _FitProgress:
-    """Progress of the whole fit, computed from the progress of its stages. Each call of a stage is one frame.
+    """Progress of the whole fit, computed from the progress of its stages.
 
-    The number of rounds is an estimate. The total grows if a fit needs more.
+    A stage reports once for each image. The number of rounds is estimated; the total grows if a fit needs more rounds.
     """
 
     _COST: ClassVar[dict[str, float]] = {"reconstructing": 1.0, "errors": 1.2, "comparing": 2.5, "free": 1.0}
@@ -217,9 +223,10 @@ class _FitProgress:
 
 
 def overdispersion(inversion: Inversion) -> float:
-    """Scatter of the disc means relative to noise, as a factor on chi2; 1 if chance explains the scatter.
+    """f: chi2 of the disc means divided by its degrees of freedom; 1 if chance explains the excess.
 
-    Chance means two standard deviations of chi2, whose degrees of freedom are images minus parameters.
+    The degrees of freedom are the number of images minus the number of parameters. Chance explains an excess of at most
+    two standard deviations of chi2.
     """
     freedom = len(inversion.frames) - inversion.coordinates.size
     if freedom < 1:
@@ -230,7 +237,7 @@ def overdispersion(inversion: Inversion) -> float:
 
 
 def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Kernel, Kernel, Curve, Curve]:
-    """Total PSF and scatter [y, x] on the full reach, and their cumulative curves with errors."""
+    """Total PSF and scatter kernel [y, x] on the full reach, and C(R) of both with errors."""
     inversion = solution.inversion
     shape, at = inversion.shape, inversion.coordinates
     radii = np.array(RADII_PX)
@@ -238,7 +245,7 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
     diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float64, threads=threads)
     scatter = shape.kernel(at, REACH_GRID_PX)
     kernel = np.maximum(diffract.apply(scatter), 0.0)
-    # Single precision is sufficient for slopes and takes half the time.
+    # Single precision is sufficient for the derivatives and takes half the time.
     diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float32, threads=threads)
     total_slopes, diffuse_slopes = [], []
     for k in range(at.size):
@@ -255,7 +262,10 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
 
 
 def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeightFits:
-    """Free fit to the reconstructed scenes, biases corrected; unconstrained shells stay at the fitted shape."""
+    """Fit free shells to the reconstructed scenes, with the biases of the published fit corrected.
+
+    Shells that no pixel constrains stay at the fitted shape.
+    """
     segments = Segments(tuple(shells_as_published()))
     diffract = Blur(solution.transit.diffraction, solution.transit.shape, threads=solution.threads)
     parts = []
@@ -284,7 +294,7 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeig
 
 
 def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
-    """Sentences about what these data do not determine, and about signs that the fit is unreliable."""
+    """Sentences about quantities that these data do not determine, and about signs that the fit is unreliable."""
     inversion, out = solution.inversion, []
     if not inversion.converged:
         out.append(f"the fit did not converge in {len(inversion.rounds)} rounds")
@@ -307,7 +317,7 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
         )
     if factor > 1:
         out.append(
-            f"the disc means scatter {math.sqrt(factor):.1f} times as much as noise explains: the model lacks an "
+            f"the disc means vary {math.sqrt(factor):.1f} times as much as noise explains: the model lacks an "
             "effect, and all errors are multiplied by that factor"
         )
     if inversion.chi2_per_pixel > WORST_CHI2:

@@ -34,7 +34,11 @@ _TITLE_LETTERS = 175
 
 
 def fit_png(fit: TransitFit, path: str | Path) -> None:
-    """Six panels: weight and light by distance, residuals by time and position, convergence, first guess."""
+    """Write a PNG with six panels.
+
+    They show the diffuse weight and the light beyond each distance, the first guess, the residuals by time and by
+    position, and the convergence.
+    """
     figure = Figure(
         figsize=(15.6, 10.2),
         dpi=100,
@@ -63,7 +67,7 @@ def fit_png(fit: TransitFit, path: str | Path) -> None:
 
 
 def _draw_weights(axes: Any, fit: TransitFit) -> None:
-    """Weight per pixel by distance: the fitted shape with its error, free shells, the published power law."""
+    """Draw the weight per pixel by distance: the fitted shape with its error, the free shells, the published power law."""
     radius, weight, sigma_of_log = _fitted_weights(fit)
     if fit.free is not None:
         _draw_free_weights(axes, fit.free, max(fit.transit.shape))
@@ -100,7 +104,7 @@ def _draw_weights(axes: Any, fit: TransitFit) -> None:
 
 
 def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
-    """Distance (px), mean weight over rings, and the first-order standard error of its logarithm."""
+    """Distance (px), mean weight in a ring at that distance, and the first-order standard error of its logarithm."""
     shape, at = fit.inversion.shape, fit.inversion.coordinates
 
     def rings(kernel: Vector) -> tuple[Vector, Vector]:
@@ -116,7 +120,7 @@ def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
 
 
 def _draw_free_weights(axes: Any, free: ShellWeightFits, field_px: int) -> None:
-    """Median and spread of the shells that begin within the field. No pixel constrains those farther out."""
+    """Draw the median and spread of the shells that begin within the field. No pixel constrains the other shells."""
     edges, shown = _shells_within(free, field_px)
     for percentiles, alpha, label in (
         (TWO_SIGMA, 0.14, "free shells, ±2 σ"),
@@ -138,12 +142,12 @@ def _shells_within(free: ShellWeightFits, field_px: int) -> tuple[Vector, NDArra
 
 
 def _stepped(low: Vector, high: Vector) -> tuple[Vector, Vector]:
-    """Repeat the last value, which steps from edge to edge need, and keep values above 0 for the logarithmic axis."""
+    """Prepare both bounds for steps on a logarithmic axis: repeat the last value, and keep all values above 0."""
     return np.maximum(np.append(low, low[-1]), 1e-30), np.maximum(np.append(high, high[-1]), 1e-30)
 
 
 def _draw_light(axes: Any, fit: TransitFit) -> None:
-    """Light beyond each distance: total and diffuse, with errors, and the published recipe's."""
+    """Draw C(R) of the total PSF and of the scatter kernel with errors, and both curves of the published recipe."""
     radii = np.geomspace(_NEAREST_PX, _FARTHEST_PX, 300)
     for kernel, curve, colour, name in (
         (fit.kernel, fit.curve, _TOTAL, "total"),
@@ -185,7 +189,7 @@ def _draw_published_light(axes: Any, published: Published) -> None:
 
 
 def _draw_residuals(axes: Any, fit: TransitFit, where: Vector, label: str, title: str) -> None:
-    """Residual of every image with its noise, coloured by pointing."""
+    """Draw the residual of every image with its noise; the colour shows the pointing."""
     frames = fit.inversion.frames
     residual = np.array([f.residual_pct for f in frames])
     noise = np.array([100 * f.noise / abs(f.observed) for f in frames])
@@ -208,7 +212,7 @@ def _minutes(fit: TransitFit) -> Vector:
 
 
 def _draw_rounds(axes: Any, fit: TransitFit) -> None:
-    """Largest change of the curve in each round. Markers are filled for rounds with all images."""
+    """Draw the largest change of the curve in each round. Markers are filled for rounds that use all images."""
     rounds = fit.inversion.rounds
     number = np.arange(1, len(rounds) + 1)
     moved = np.array([max(r.moved_points, 1e-6) for r in rounds])
@@ -238,9 +242,9 @@ def _whole_ticks(number: NDArray[np.intp]) -> Sequence[int]:
 
 
 def _draw_first_guess(axes: Any, fit: TransitFit) -> None:
-    """First guess of the light beyond the disc's radius, by estimator and pointing, and the value of the fit.
+    """Draw the first guess of the light beyond the disc's radius, by estimator and pointing, and the fitted value.
 
-    A logarithmic axis cannot show ratios of 0 or less, so they are omitted.
+    The logarithmic axis cannot show ratios of 0 or less, so they are omitted.
     """
     guess = fit.first_guess
     time_min = np.array([f.time_s for f in guess.frames]) / 60

@@ -1,12 +1,14 @@
 """Propagate the noise of all pixels of a frame into the residuals of its dark pixels.
 
-For a frame y = H x + n with fully dark pixels D, and G the inverse of H, the residual in the disc is
-r = D [y - H (1 - D) G y]. The sum of the residual weighted by a template t is
+A frame y = H x + n has fully dark pixels D. G is the inverse of H. The scene is estimated as G y, and its fully dark
+pixels are set to 0. The residual in the disc is then r = D [y - H (1 - D) G y]. The sum of the residual weighted by a
+template t is
 
     t . r = b . n + (t . r without noise),   b = t - G^T (1 - D) H^T t                Eq. (1)
     cov(t_1 . r, t_2 . r) = sum over all pixels of b_1 b_2 var(n)                     Eq. (2)
 
-The two terms of b are the noise of the disc itself, and the noise of the scene that scatters into the disc.
+The first term of b describes the noise of the disc's pixels. The second term describes the noise of the estimated scene,
+which the model scatters into the disc.
 
 | symbol | name | unit |
 |---|---|---|
@@ -41,6 +43,7 @@ def noise_covariance(
         here -= optics.invert_once(scattered, adjoint=True)  # Eq. (1)
         spread.append(optics.field(here).ravel())
     b = np.array(spread, dtype=np.float32)
-    # The variance is linear in the observed value, so the noise of that value averages out.
+    # The variance is a linear function of the expected pixel value. The observed value can replace the expected value
+    # here, because the noise of the observed values averages out in the sum over the pixels.
     variance = noise.variance(frame.pixels.astype(np.float64), frame.exposure_s).ravel()
     return np.asarray((b * variance.astype(np.float32)) @ b.T, dtype=np.float64)  # Eq. (2)

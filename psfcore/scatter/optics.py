@@ -1,17 +1,19 @@
-"""Convolution with a PSF on one field, its inverse, and the derivative of both.
+"""Convolution with a PSF on one field, the inverse of this convolution, and the derivative of the inverse.
 
-    inverse:     x <- x + G (y - H x)                       Eq. (1), G the inverse on the periodic plane
+    inverse:     x <- x + G (y - H x)                       Eq. (1)
     derivative:  d x / d q = -G (dH / dq) x                 Eq. (2)
 
-The core of HRI_EUV's PSF holds 0.43 of the light, so Eq. (1) converges in about five steps. It is linear and has no
-bias on faint pixels, unlike Richardson-Lucy. Fields stay in the engine's own order (its "lanes") between steps, and
-single pixels are read and written there.
+G is the inverse of the convolution on a periodic plane. The core of HRI_EUV's PSF contains 0.43 of the light, so
+Eq. (1) converges in about five steps. Eq. (1) is linear and does not bias faint pixels, unlike Richardson-Lucy. Between
+steps, fields stay in the memory order of the convolution engine (its "lanes"). Functions below read and write single
+pixels in this order.
 
 | symbol | name |
 |---|---|
 | H, H^T | Blur.convolve, Blur.correlate |
 | G, G^T | Optics.invert_once |
-| x, y | lanes of the scene, lanes of the observation |
+| x, y | scene and observation, both as lanes |
+| q | a parameter of the PSF |
 """
 
 from __future__ import annotations
@@ -24,14 +26,15 @@ from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.methods.linear import inverse_filter
 
 Lanes = NDArray[np.float32]
-Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # rows, columns
+Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # (rows, columns) of single pixels
 STEPS = 5
 
 
 class Blur:
-    """Convolution with a kernel on one field, cropped to the field, in float32.
+    """Convolution with a kernel on one field, in float32; the result is cropped to the field.
 
-    kernel: [y, x], centre at [n // 2, n // 2]; its values may have any sign. The field is dark beyond its edges.
+    kernel: [y, x], centre at [n // 2, n // 2]; its values may have any sign. The scene is assumed dark beyond the edges
+    of the field.
     """
 
     def __init__(
@@ -41,11 +44,11 @@ class Blur:
         self._partly_filled = field_shape[0] % BLOCK_ROWS != 0
 
     def lanes(self, field: NDArray[np.floating]) -> Lanes:
-        """A field [y, x] in the engine's order."""
+        """A field [y, x] rearranged into the engine's order."""
         return self.engine.to_lanes(field)
 
     def field(self, lanes: Lanes) -> NDArray[np.float32]:
-        """The field [y, x] from the engine's order."""
+        """The field [y, x], rearranged from the engine's order."""
         return self.engine.from_lanes(lanes)
 
     def convolve(self, lanes: Lanes) -> Lanes:
@@ -53,7 +56,7 @@ class Blur:
         return self._through(lanes, self.engine.transfer)
 
     def correlate(self, lanes: Lanes) -> Lanes:
-        """H^T y: the field correlated with the kernel, the adjoint of `convolve`."""
+        """H^T y: the field correlated with the kernel. This is the adjoint of `convolve`."""
         return self._through(lanes, self.engine.transfer, conjugate=True)
 
     def _through(self, lanes: Lanes, transfer: NDArray[np.float32], *, conjugate: bool = False) -> Lanes:
@@ -61,7 +64,7 @@ class Blur:
         self.engine.rows_forward(lanes)
         self.engine.multiply_columns(transfer, conjugate=conjugate)
         self.engine.rows_inverse(out)
-        if self._partly_filled:  # the last block also contains light that fell beyond the last row
+        if self._partly_filled:  # the last block also contains rows beyond the field; the field is dark there
             rows = self.engine.field_shape[0] % BLOCK_ROWS
             out[-1, :, 0, min(rows, LANES) :] = 0.0
             out[-1, :, 1, max(rows - LANES, 0) :] = 0.0
@@ -82,7 +85,7 @@ class Optics(Blur):
         return self._through(lanes, self._inverse, conjugate=adjoint)
 
     def invert(self, observed: Lanes, start: Lanes | None = None, *, steps: int = STEPS) -> Lanes:
-        """The scene x of an observation by `steps` of Eq. (1). start: first estimate; default: the observation."""
+        """The scene x of an observation, from `steps` iterations of Eq. (1). start: first estimate (default: observed)."""
         x = observed.copy() if start is None else start.copy()
         for _ in range(steps):
             residual = self.convolve(x)

@@ -4,7 +4,7 @@ Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse sc
 
     s(r) = a / (b + r)^c  for r > 0,   s(0) = 1 - total,   total = sum over r > 0 on the full reach    Eq. (1)
 
-The amplitude follows from the total. `total` refers to the 2048 px grid, which reaches to 1448 px.
+The amplitude a follows from `total`, which is summed over the grid of 2048 x 2048 px. This grid reaches to 1448 px.
 
 | symbol | name | unit |
 |---|---|---|
@@ -23,16 +23,16 @@ from psfcore.psf import REACH_GRID_PX, squared_radii
 
 
 def amplitude_for_total(b_px: float, c: float, total: float, *, reach_grid_px: int = REACH_GRID_PX) -> float:
-    """The amplitude a of Eq. (1) for which the weights at r > 0 on a `reach_grid_px` square sum to `total`."""
+    """The amplitude a of Eq. (1) for which the weights at r > 0 sum to `total` on a square of reach_grid_px pixels."""
     shape = _falloff(b_px, c, reach_grid_px)
     centre = reach_grid_px // 2
     return float(total / (shape.sum() - shape[centre, centre]))
 
 
 def scatter_kernel(b_px: float, c: float, total: float, size: int) -> NDArray[np.float64]:
-    """Eq. (1) on (size, size); the centre at [size // 2, size // 2] holds 1 - total.
+    """The kernel of Eq. (1) on (size, size). The central pixel [size // 2, size // 2] is 1 - total.
 
-    The sum is 1 for size 2048, and less on a smaller array.
+    The kernel sums to 1 for size 2048, and to less on a smaller array.
     """
     kernel = amplitude_for_total(b_px, c, total) * _falloff(b_px, c, size)  # Eq. (1)
     kernel[size // 2, size // 2] = 1 - total

@@ -13,7 +13,7 @@ SCHEMA = "psf-fit/1"
 
 
 def fit_json(fit: TransitFit) -> dict[str, Any]:
-    """The fit as JSON: parameters and curves with errors, every frame, the alternatives, and the limits."""
+    """The fit as JSON: parameters and curves with errors, every image, the alternative fits, and the limits."""
     inversion = fit.inversion
     values, sigma = inversion.values, fit.value_sigma
     out: dict[str, Any] = {

@@ -1,7 +1,8 @@
 """Sample PSFs that represent the uncertainty of a fitted PSF.
 
-The samples are the sigma points of the covariance (Julier and Uhlmann 1997): two PSFs per parameter, with the mean
-and the covariance of the fit. A deconvolution with each of them gives the part of the error that comes from the PSF.
+The samples are the sigma points of the covariance (Julier and Uhlmann 1997): two sets of parameters for each parameter
+of the fit. The mean and the covariance of these sets are those of the fit. An image deconvolved with each of these PSFs
+varies. This variation is the part of the image's error that comes from the PSF.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ DIFFRACTION, SCATTER = "DIFFRACTION", "SCATTER"
 
 
 def possible_psfs(psf: Psf, *, threads: int = 1) -> list[Psf]:
-    """The sigma points of a fitted PSF, two per parameter, on its own array and without components.
+    """The PSFs at the sigma points of a fit, two for each parameter. They have the shape of `psf` and no components.
 
     Raises DataError "psf-not-fitted" if the PSF has no covariance.
     """

@@ -1,27 +1,30 @@
 """Shapes of diffuse scatter that can be fitted to a transit.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light", for Eq. (2). Every shape
-is a falloff f(d) of light from the centre to the offset d = (dx, dy). It is scaled on the full reach:
+Eq. (2) comes from Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light". Every
+shape is a falloff: f(d) is proportional to the light that is scattered by the offset d = (dx, dy). The scatter kernel s
+is scaled so that its weights outside the central pixel sum to `total` on the full reach:
 
     s(d) = total f(d) / sum over d != 0 of f   for d != 0,   s(0) = 1 - total        Eq. (1)
 
-    softened power law            f = (b + r)^-c                                      Eq. (2), the paper's
-    stretched                     Eq. (2) of r -> |exp(-[[p, q], [q, -p]]) d|         Eq. (3)
+    softened power law            f = (b + r)^-c, the shape of the paper              Eq. (2)
+    stretched                     Eq. (2) with r = |exp(-[[p, q], [q, -p]]) d|        Eq. (3)
     one-sided                     Eq. (2) times 1 + x_share cos t + y_share sin t      Eq. (4)
     knee                          Eq. (2) times (1 + (r / r_k)^2)^(-bend / 2)          Eq. (5)
-    two power laws                Eq. (2) + a second, (b_2 + r)^-c                     Eq. (6)
+    two power laws                Eq. (2) + a second power law, (b_2 + r)^-c           Eq. (6)
     core                          Eq. (2) + a Gaussian                                 Eq. (7)
 
-In Eq. (3) a stretch by 1 + s along the angle t has ln(1 + s) = hypot(p, q) and 2 t = atan2(q, p). The two numbers p
-and q are smooth at zero stretch, where an angle is not defined. The shares in Eq. (6) and (7) are fractions of `total`.
+For Eq. (3), a stretch by the factor 1 + s along the angle t corresponds to ln(1 + s) = hypot(p, q) and 2 t = atan2(q, p).
+At zero stretch the angle is not defined, but the kernel is a smooth function of p and q. In Eq. (4), t is the direction of
+d. In Eq. (6) and (7), the second term contains a fraction of `total` (halo_share, core_share).
 
-A fit works in unbounded coordinates: the logarithm of a positive number, the logit of a fraction.
+The fit uses unbounded coordinates instead of the parameters: the logarithm of a positive number, the logit of a fraction.
 
 | symbol | name | unit |
 |---|---|---|
 | b, b_2, r_k, sigma | b_px, halo_b_px, knee_px, core_px | px |
 | c, bend | c, bend | - |
 | p, q | stretch_p, stretch_q | - |
+| r | length of d | px |
 """
 
 from __future__ import annotations
@@ -51,7 +54,11 @@ CORE_PX = 1.5
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a shape: the start of a fit, the scale of its coordinate and the largest step of a round."""
+    """A parameter of a shape.
+
+    start: the value at which a fit starts. scale: the function that turns a value into the unbounded coordinate.
+    largest_step: the largest change of the coordinate in one round of the fit.
+    """
 
     name: str
     unit: str
@@ -73,20 +80,20 @@ class Parameter:
         return 1 / (1 + math.exp(-coordinate)) if self.scale == "logit" else coordinate
 
     def slope(self, coordinate: float) -> float:
-        """d value / d coordinate."""
+        """The derivative d value / d coordinate."""
         value = self.value(coordinate)
         if self.scale == "log":
             return value
         return value * (1 - value) if self.scale == "logit" else 1.0
 
 
-Falloff = Callable[[Values, int], Kernel]  # not normalised, on a square of that size
-Radial = Callable[[Vector], Vector]  # not normalised, as a function of radii (px)
+Falloff = Callable[[Values, int], Kernel]  # parameters and size to f on a (size, size) array; not normalised
+Radial = Callable[[Vector], Vector]  # radii (px) to f at these radii; not normalised
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape of scatter. radial: falloff by radius, for isotropic shapes; falloff: on a square, for all others."""
+    """A shape of scatter. An isotropic shape has `radial`, a function of the radius; any other shape has `falloff`."""
 
     name: str
     parameters: tuple[Parameter, ...]
@@ -117,11 +124,11 @@ class Shape:
         return {p.name: p.value(float(q)) for p, q in zip(self.parameters, coordinates, strict=True)}
 
     def coordinates(self, values: Values) -> Vector:
-        """Coordinates of these values. A parameter without a value takes its start."""
+        """Coordinates of these values. A parameter that has no value here gets the value at which a fit starts."""
         return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
 
     def shortened(self, step: Vector) -> tuple[Vector, bool]:
-        """A step shortened until no parameter exceeds its largest step, and whether it kept its full length."""
+        """Shorten a step until no coordinate changes by more than its largest step; True if the step was not shortened."""
         largest = np.array([p.largest_step for p in self.parameters])
         too_far = float((np.abs(step) / largest).max())
         return (step, True) if too_far <= 1 else (step / too_far, False)
@@ -144,7 +151,7 @@ class Shape:
         return np.ascontiguousarray(scaled[first : first + size, first : first + size])
 
     def slope(self, coordinates: Vector, k: int, size: int) -> Kernel:
-        """d kernel / d coordinate k, [y, x] on (size, size), by central differences."""
+        """The derivative of the kernel with respect to coordinate k, [y, x] on (size, size), from central differences."""
         step = np.zeros_like(coordinates)
         step[k] = DIFFERENCE
         ahead, behind = (self.kernel(coordinates + side * step, size) for side in (1, -1))
@@ -299,7 +306,7 @@ def stretch_of(values: Values) -> tuple[float, float]:
 
 @cache
 def _radii(size: int) -> tuple[Vector, Vector]:
-    """Distinct radii of the pixels of a square, the centre first, and the number of pixels at each radius."""
+    """The distinct radii of the pixels of a (size, size) square, in ascending order, and the number of pixels at each."""
     squares, count = np.unique(squared_radii((size, size)), return_counts=True)
     return np.sqrt(squares), count.astype(np.float64)
 
@@ -314,12 +321,12 @@ def _radius_index(size: int) -> NDArray[np.int32]:
 
 
 def _by_radius(size: int, falloff: Radial) -> Kernel:
-    """An isotropic falloff on a square. It is evaluated once per distinct radius."""
+    """An isotropic falloff on a square. The function is evaluated once for each distinct radius."""
     return np.asarray(falloff(_radii(size)[0])[_radius_index(size)])
 
 
 def _scaled_by_radius(falloff: Radial, total: float, size: int) -> Kernel:
-    """Eq. (1) for an isotropic falloff on a square. Beyond the square, only the sum over the full reach is needed."""
+    """The kernel of Eq. (1) on a square, for an isotropic falloff. The falloff is summed over the full reach."""
     r, count = _radii(REACH_GRID_PX)
     whole = float((falloff(r) * count)[1:].sum())
     scaled = falloff(_radii(size)[0]) * (total / whole)
@@ -329,10 +336,10 @@ def _scaled_by_radius(falloff: Radial, total: float, size: int) -> Kernel:
 
 @compiled()
 def _power_law_of_ellipses(size, b, c, p, q):  # type: ignore[no-untyped-def]
-    """Eq. (2) with the radius of Eq. (3), on (size, size)."""
+    """The falloff of Eq. (2) with the radius r of Eq. (3), on (size, size)."""
     out = np.empty((size, size))
     s = math.hypot(p, q)
-    # For a symmetric matrix S without trace, exp(-S) = cosh(s) - S sinh(s) / s.
+    # For a symmetric 2 x 2 matrix S with trace 0 and eigenvalues s and -s, exp(-S) = cosh(s) - S sinh(s) / s.
     grow = math.cosh(s)
     shrink = math.sinh(s) / s if s > 1e-12 else 1.0
     xx, yy, xy = grow - p * shrink, grow + p * shrink, -q * shrink

@@ -1,7 +1,7 @@
 """The total PSF: the scatter kernel convolved with the diffraction PSF, and its derivatives.
 
-Scattered light is diffracted too, so the total PSF is the convolution of the two. On the full reach both sum to 1.
-Their convolution then sums to 1 too, except for a small amount of light that leaves the grid.
+Scattered light is diffracted too, so the total PSF is the convolution of the two. On the full reach, both kernels sum to
+1. The sum of their convolution differs from 1 only by a small amount of light that falls beyond the grid.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 
 
 class TotalPsf:
-    """Total PSFs with one diffraction PSF, on a square of twice the field's size, at most the full reach.
+    """Computes total PSFs that share one diffraction PSF.
 
+    They lie on a square whose edge is twice the longer edge of the field, at most the edge of the full reach.
     diffraction: weights [y, x], sum 1 on its own grid. field_shape: (ny, nx) of the images.
     """
 
@@ -39,11 +40,11 @@ class TotalPsf:
         return np.asarray(self._convolver.apply(scatter), dtype=np.float64)
 
     def slope(self, coordinates: Vector, k: int) -> Kernel:
-        """d kernel / d coordinate k, [y, x]."""
+        """The derivative of the total PSF with respect to coordinate k, [y, x]."""
         return self.diffracted(self.shape.slope(coordinates, k, self.size))
 
     def slopes(self, coordinates: Vector) -> list[Kernel]:
-        """d kernel / d coordinate, one array [y, x] per coordinate."""
+        """The derivatives of the total PSF, one array [y, x] for each coordinate."""
         return [self.slope(coordinates, k) for k in range(coordinates.size)]
 
     @property
@@ -52,5 +53,5 @@ class TotalPsf:
         return np.array([r for r in CURVE_RADII_PX if r < self.size // 2])
 
     def curve_slopes(self, slopes: list[Kernel]) -> NDArray[np.float64]:
-        """d C(R) / d coordinate in percent, (radii, coordinates), with C(R) = 100 (1 - encircled energy)."""
+        """The derivatives of C(R) = 100 (1 - encircled energy), in percent: array (radii, coordinates)."""
         return np.stack([-100 * encircled_energy(slope, self.radii_px) for slope in slopes], axis=1)

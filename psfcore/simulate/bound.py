@@ -1,27 +1,30 @@
-"""The photon bound: the smallest standard errors that any analysis of a transit can reach.
+"""The photon bound: the smallest standard errors that an analysis of a transit can reach.
 
-It is the Fisher information with the true scenes and the diffraction given, and only photon and read noise:
+The bound follows from the Fisher information F. The true scenes and the diffraction PSF are given. The only errors are
+photon noise and read noise.
 
     F_jk = sum over pixels of (dm / dp_j) (dm / dp_k) / var(m)       Eq. (1)
     var(m) = (g m t + r^2) / t^2                                      Eq. (2)
-    dm / dp_j = (ds / dp_j) * d * (S - h)                             Eq. (3)
+    dm / dp_j = (ds / dp_j) * d * (S - h),  dm / dq = -s * d * (dh / dq)   Eq. (3)
     sigma^2(f) = (df / dp)^T F^-1 (df / dp)                           Eq. (4)
 
-The information of a pixel is 1 / var: the most that an estimator which is linear in the pixels can use. The full
-likelihood of a Poisson count with Gaussian read noise contains at most g / (m t) per pixel, which is 5 % more at 2.5
-photons and 2 DN.
+The information that one pixel contains about m is taken as 1 / var(m). An estimator that is linear in the pixel values
+cannot use more. An estimator that uses the full likelihood can use slightly more: at most t / (g m), which is the
+information of the photon count without read noise. This limit exceeds 1 / var(m) by the factor 1 + r^2 / (g m t). For g = 6 DN, r = 2 DN and 2.5 photons (m t = 15 DN) the factor is 94 / 90, about 4 % more.
 
-The data for the scatter are the fully dark pixels (all four corners within the radius) of every image. The pixels around
-the disc are not used, neither here nor by the method: they belong to the scene, which is given here. The data for the
-place of an occulter are the pixels with centres up to 5 px beyond its radius, with the PSF given; in high-only images
-only those that do not clip.
+The data for the scatter are the fully dark pixels of every image: their four corners lie within the occulter's radius.
+The pixels around the disc are not used, neither here nor by the fit. They serve to estimate the scene, which is given
+here. The data for the position of an occulter are the pixels whose centres lie at most 5 px beyond its radius; the PSF
+is given. In high-only images, pixels that clip are left out.
 
 | symbol | name | unit |
 |---|---|---|
 | m | expected pixel | DN/s |
-| p | b, c, total; and the stretch with all three free | px, -, -, - |
-| s, d | scatter kernel, diffraction; * is linear convolution | - |
-| S, h | scene, light hidden by the disc | DN/s |
+| p | b, c, total; the stretch is fitted together with these three | px, -, -, - |
+| q | x or y of the occulter's centre | px |
+| f | any function of the parameters, for example a point of a curve | - |
+| s, d | scatter kernel, diffraction PSF; * is linear convolution | - |
+| S, h | scene, light that the disc hides | DN/s |
 | g, r, t | photon_gain_dn, read_noise_dn, exposure_s | DN, DN, s |
 """
 
@@ -56,12 +59,15 @@ Window = tuple[slice, slice]
 
 CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 PLACE_MARGIN_PX = 5.0
-_LAW = 3  # the first of PARAMETERS: b, c, total
+_LAW = 3  # number of parameters of the power law: b, c and total are the first three of PARAMETERS
 
 
 @dataclass(frozen=True)
 class CurveBound:
-    """The cumulative curves of the total PSF and of the scatter (diffuse) at one radius, percent; errors in points."""
+    """1 - encircled energy, in percent, of the total PSF and of the scatter kernel (diffuse) at one radius.
+
+    total_sigma, diffuse_sigma: standard errors, in percentage points.
+    """
 
     radius_px: float
     total_pct: float
@@ -74,9 +80,9 @@ class CurveBound:
 class PhotonBound:
     """The smallest standard errors that photon noise and read noise allow.
 
-    b_px, c, total, a: errors of the parameters of the power law, fitted together. covariance: of b, c, total.
-    stretch: error of the stretch along stretch_angle_deg, fitted together with b, c and total. places_px: errors of
-    the occulter's x and y in each image. dark_pixels: number of dark pixels in all images.
+    b_px, c, total, a: errors of the parameters of the power law, fitted together. covariance: covariance matrix of b, c
+    and total. stretch: error of the stretch along stretch_angle_deg, fitted together with b, c and total. places_px:
+    errors of the occulter's x and y in each image. dark_pixels: number of fully dark pixels in all images.
     """
 
     images: int
@@ -110,12 +116,15 @@ def photon_bound(simulated: SimulatedTransit, *, threads: int = 1) -> PhotonBoun
 
 
 def bound_of_folder(folder: str | Path, *, threads: int = 1) -> PhotonBound:
-    """The bound of a folder that psfcore.simulate.transit_files.write wrote. Raises also the errors of read_sky."""
+    """The bound of a folder that psfcore.simulate.transit_files.write wrote.
+
+    Raises the errors of photon_bound and of read_sky.
+    """
     return bound_of_sky(read_sky(folder, threads=threads), threads=threads)
 
 
 def bound_of_sky(sky: TrueSky, *, threads: int = 1) -> PhotonBound:
-    """The bound of any transit of a sky."""
+    """The bound of any transit of `sky`; the noise realisation does not matter. Raises the errors of photon_bound."""
     slopes = kernel_slopes(sky.scatter)
     sizes = (*[REACH_GRID_PX] * _LAW, sky.kernel.shape[0])  # the stretch is needed only near the discs
     total_slopes = {
@@ -188,7 +197,7 @@ def _place_bound(sky: TrueSky, index: int) -> tuple[float, float]:
 def _curve(
     sky: TrueSky, law: Plane, slopes: dict[str, Kernel], total_slopes: dict[str, Kernel], threads: int
 ) -> tuple[CurveBound, ...]:
-    """Both cumulative curves with their errors, Eq. (4)."""
+    """1 - encircled energy of the total PSF and of the scatter kernel, with errors from Eq. (4)."""
     diffuse = anisotropic_kernel(sky.scatter)
     total = convolved(diffuse, sky.diffraction, REACH_GRID_PX, threads=threads)
     radii = np.array(CURVE_RADII_PX)
@@ -210,7 +219,7 @@ def _curve(
 
 
 def _inverse(information: Plane) -> Plane:
-    """F^-1; the parameters are scaled first, so that the inverse is accurate."""
+    """F^-1. The parameters are scaled first, so that the inverse is numerically accurate."""
     scale = np.sqrt(np.diag(information))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
         raise DataError(
@@ -233,13 +242,13 @@ def _seen(scene: Plane, kernel: Kernel, margin_px: int, threads: int) -> Plane:
 
 
 def _through(kernel: Kernel, patch: Plane) -> Plane:
-    """A patch convolved with a kernel, on the patch itself."""
+    """A patch convolved with a kernel; the result covers the same pixels as the patch."""
     shape = (patch.shape[0], patch.shape[1])
     return np.asarray(Convolver(kernel, shape, dtype=np.float64).apply(patch), dtype=np.float64)
 
 
 def _window(sky: TrueSky, index: int) -> Window:
-    """The part of the field that contains the occulter and all pixels that depend on its place."""
+    """The slices of the field around the occulter, with all pixels that serve to measure its position."""
     place, size = sky.plan.place(index), sky.plan.size_px
     half = int(np.ceil(place.radius_px + PLACE_MARGIN_PX)) + 1
     row, column = int(np.rint(place.y_px)), int(np.rint(place.x_px))

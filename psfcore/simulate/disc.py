@@ -1,7 +1,7 @@
-"""The light that a dark disc hides, exact to fractions of a pixel.
+"""The light that a dark disc hides, with the exact share of each pixel that is partly behind the disc.
 
-The share of a pixel behind the disc is the area that the circle and the square of the pixel have in common. In closed
-form, with F(x, y) the area of the circle left of x and below y:
+The share of a pixel behind the disc is the area that the disc and the square of the pixel have in common.
+F(x, y) is the area of the part of the disc that lies left of x and below y. In closed form:
 
     share = F(x1, y1) - F(x0, y1) - F(x1, y0) + F(x0, y0)                              Eq. (1)
     F(x, y) = integral from -r to x of max(0, min(y, s) + s) dX,  s = sqrt(r^2 - X^2)   Eq. (2)
@@ -24,14 +24,15 @@ from psfcore.transit.transit import Place
 Plane = NDArray[np.float64]
 
 _PLACE_STEP_PX = 1e-3
-_ROUNDING = 1e-11  # of a share, for differences of areas of 100 px^2
+_ROUNDING = 1e-11  # rounding error of a share, which is a difference of areas of about 100 px^2
 
 
 def covered_share(place: Place, first: tuple[int, int], shape: tuple[int, int], fine: int = 1) -> Plane:
-    """Share (0 to 1) of each pixel behind the disc, Eq. (1); shape (fine * ny, fine * nx).
+    """The share (0 to 1) of each fine pixel that is behind the disc, Eq. (1); array of (fine * ny, fine * nx).
 
-    first: (row, column) of the first of `shape` detector pixels. fine: fine pixels per detector pixel and axis.
-    Exact except for rounding; a pixel entirely inside or outside the disc gets exactly 1 or 0.
+    Each detector pixel is divided into `fine` fine pixels along each axis. first: (row, column) of the first detector
+    pixel. shape: (ny, nx), the number of detector pixels. The shares are exact except for rounding. A pixel entirely
+    inside the disc gets exactly 1, a pixel entirely outside exactly 0.
     """
     y = first[0] - 0.5 + np.arange(fine * shape[0] + 1) / fine - place.y_px
     x = first[1] - 0.5 + np.arange(fine * shape[1] + 1) / fine - place.x_px
@@ -44,7 +45,7 @@ def covered_share(place: Place, first: tuple[int, int], shape: tuple[int, int], 
 def _area_left_below(x: Plane, y: Plane, r: float) -> Plane:
     """F(x, y), Eq. (2)."""
     x, y = np.broadcast_arrays(np.clip(x, -r, r), np.clip(y, -r, r))
-    half = np.sqrt(r**2 - y**2)  # of the chord at y
+    half = np.sqrt(r**2 - y**2)  # half the length of the chord at y
     middle = np.clip(x, -half, half)
     area = y * (middle + half) + _half_segment(middle, r) - _half_segment(-half, r)
     caps = _half_segment(np.minimum(x, -half), r) - _half_segment(np.full_like(x, -r), r)
@@ -59,7 +60,7 @@ def _half_segment(x: Plane, r: float) -> Plane:
 
 
 def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """True for pixels [y, x] with all four corners inside the disc."""
+    """True for pixels [y, x] whose four corners all lie inside the disc. first, shape: as in covered_share."""
     y = np.abs(first[0] + np.arange(shape[0]) - place.y_px) + 0.5
     x = np.abs(first[1] + np.arange(shape[1]) - place.x_px) + 0.5
     return np.asarray(np.hypot(x[None, :], y[:, None]) <= place.radius_px)
@@ -67,9 +68,10 @@ def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Behind:
-    """The scene around one place of the disc: fine pixels [y, x] in DN/s, `fine` per detector pixel and axis.
+    """A patch of the scene around one position of the disc: fine pixels [y, x] in DN/s.
 
-    first: (row, column) of its first detector pixel on the field.
+    first: (row, column) in the field of the first detector pixel of the patch. fine: number of fine pixels in a detector
+    pixel along each axis.
     """
 
     first: tuple[int, int]
@@ -94,7 +96,10 @@ class Behind:
         return binned(self.scene * covered_share(place, self.first, self.shape, self.fine), self.fine)
 
     def hidden_slopes(self, place: Place) -> tuple[Plane, Plane]:
-        """The derivatives of ``hidden`` with respect to x and y, DN/s per px, from differences of 0.001 px."""
+        """The derivatives of ``hidden`` with respect to the disc's x and y, DN/s per px.
+
+        They are central differences between positions 0.001 px to either side.
+        """
         return self._slope(place, _PLACE_STEP_PX, 0.0), self._slope(place, 0.0, _PLACE_STEP_PX)
 
     def _slope(self, place: Place, dx: float, dy: float) -> Plane:
@@ -104,10 +109,10 @@ class Behind:
 
 
 def behind(fine_scene: Plane, place: Place, *, fine: int, margin_px: int) -> Behind:
-    """The part of a scene that a disc at `place`, or less than a pixel away from it, can hide in the field.
+    """The patch of a scene that the disc can hide when its centre lies less than a pixel from `place`.
 
-    fine_scene: pixels [y, x], DN/s, `fine` per detector pixel and axis, margin_px detector pixels beyond the
-    field on each side.
+    fine_scene: fine pixels [y, x], DN/s; it extends margin_px detector pixels beyond the field on each side.
+    fine: number of fine pixels in a detector pixel along each axis.
     """
     reach = place.radius_px + 2
     field = (fine_scene.shape[0] // fine - 2 * margin_px, fine_scene.shape[1] // fine - 2 * margin_px)

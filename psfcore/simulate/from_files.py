@@ -1,4 +1,4 @@
-"""Simulate a transit from files: its diffraction PSF from an instrument or a file, its scenes from images."""
+"""The inputs of a simulated transit: a diffraction PSF from an instrument or a file, and scenes from image files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ Plane = NDArray[np.float64]
 def diffraction_kernel(
     instrument: str, file: Path | None, size: int, limits: FitsLimits, *, threads: int = 1
 ) -> Plane:
-    """Weights of the diffraction PSF [y, x], sum 1: read from ``file``, else built for ``instrument`` on (size, size) px."""
+    """Weights [y, x] of the diffraction PSF. If ``file`` is given, they are read from it and not changed.
+
+    Otherwise they are computed for ``instrument`` on (size, size) px and divided by their sum.
+    """
     if file is not None:
         return read_plane(file, limits)
     kernel = build_psf(
@@ -34,10 +37,10 @@ def diffraction_kernel(
 
 
 def scenes_from_files(files: Sequence[Path], plan: Plan, limits: FitsLimits) -> dict[int, Plane] | None:
-    """A scene for each pointing, by its number; None if ``files`` is empty.
+    """A scene for each pointing; the keys are the pointings' numbers. None if ``files`` is empty.
 
-    One image serves all pointings, mirrored for the west limb; else there is one image for each pointing. Raises DataError
-    "scene-count", "bad-scene".
+    A single image serves for all pointings; for the west limb it is mirrored. Otherwise ``files`` contains one image for
+    each pointing. Raises DataError "scene-count", "bad-scene".
     """
     if not files:
         return None
@@ -53,7 +56,7 @@ def scenes_from_files(files: Sequence[Path], plan: Plan, limits: FitsLimits) -> 
 
 
 def image_rate(file: str | Path, limits: FitsLimits) -> Plane:
-    """Pixels [y, x] of an image, in DN/s if its unit is DN and its exposure time is known; else as they are."""
+    """Pixels [y, x] of an image. They are divided by the exposure time if their unit is DN and that time is known."""
     image = read_image(file, limits)
     if (image.unit or "").replace(" ", "").lower() == "dn" and image.exposure_s is not None:
         return image.pixels / image.exposure_s

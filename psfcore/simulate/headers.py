@@ -1,7 +1,8 @@
-"""The header keywords of the instrument that a simulation imitates, as its real images have them.
+"""The header keywords of a simulated image: those that real images of the imitated instrument have.
 
-HRI_EUV: level 2 files of EUI. AIA: level 1 files of its 171 A channel, which have no DETECTOR and no gain modes. Any
-other instrument: the keywords by which its TOML file recognises it, its wavelength and its plate scale.
+HRI_EUV images get the keywords of level 2 files of EUI. AIA images get those of level 1 files of the 171 A channel, which
+have no DETECTOR and no gain modes. Images of any other instrument get the keywords by which its TOML file recognises
+it, its wavelength and its plate scale.
 """
 
 from __future__ import annotations
@@ -35,16 +36,17 @@ _COMMENTS = {
     "BUNIT": "unit of the pixels",
     "SATURATE": "[DN] level at which pixels clip",
     "FOV": "pointing",
-    "MARGIN": "[pixel] beyond the field on each side",
+    "MARGIN": "[pixel] width beyond the field on each side",
 }
 
 
 @dataclass(frozen=True)
 class Imitated:
-    """An instrument in simulated headers.
+    """The instrument that simulated headers imitate.
 
-    name: as in transit.json. texts: keywords that identify it. wavelength_angstrom: a whole number, as WAVELNTH.
-    date_key, exposure_key: keywords of start and exposure time. has_gain_modes: whether GAINCOMB is written.
+    name: the instrument's name in transit.json. texts: keywords that identify the instrument, with their values.
+    wavelength_angstrom: a whole number, the value of WAVELNTH. date_key, exposure_key: the keywords of the start and of
+    the exposure time. has_gain_modes: whether GAINCOMB is written.
     """
 
     name: str
@@ -56,7 +58,7 @@ class Imitated:
     has_gain_modes: bool = True
 
     def values(self) -> dict[str, CardValue]:
-        """The keywords of every file."""
+        """The keywords that every file of the transit has."""
         return {
             "ORIGIN": "SIMULATED by heliopsf",
             **self.texts,
@@ -66,7 +68,7 @@ class Imitated:
         }
 
     def shot_values(self, shot: Shot, unit: str) -> dict[str, CardValue]:
-        """The keywords of an image in `unit`."""
+        """The keywords of one image whose pixels are in `unit`."""
         begin = (_START + timedelta(seconds=shot.time_s)).isoformat(timespec="milliseconds")
         values = self.values() | {self.date_key: begin, self.exposure_key: shot.exposure_s}
         if self.has_gain_modes:
@@ -78,7 +80,7 @@ HRI_EUV = Imitated("hri_euv", _OWN_TEXTS["hri_euv"], 174, 0.492)
 
 
 def imitated(instrument: Instrument) -> Imitated:
-    """The keywords of an instrument."""
+    """The keywords with which headers imitate `instrument`."""
     if instrument.name == HRI_EUV.name:
         return HRI_EUV
     is_aia = instrument.name.startswith("aia_")
@@ -94,5 +96,5 @@ def imitated(instrument: Instrument) -> Imitated:
 
 
 def commented(values: dict[str, CardValue]) -> dict[str, tuple[CardValue, str]]:
-    """Keywords with their comments."""
+    """Add the comment of each keyword."""
     return {key: (value, _COMMENTS.get(key, "instrument imitated")) for key, value in values.items()}

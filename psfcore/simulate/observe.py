@@ -1,4 +1,4 @@
-"""An observation of a known scene: convolved with a PSF, with photon noise and read noise.
+"""A simulated observation: a known scene, convolved with a PSF, with photon noise and read noise added.
 
 | symbol | name | unit |
 |---|---|---|
@@ -38,14 +38,14 @@ def observe(
     seed: int,
     threads: int = 1,
 ) -> NDArray[np.float64]:
-    """The image [y, x] of `scene` [y, x], both in DN/s: convolved, then with photon noise and read noise.
+    """Convolve `scene` [y, x] with the PSF, then add photon noise and read noise; both arrays are in DN/s.
 
-    The scene is dark outside its field. If both noise figures are 0, the image is noise-free.
+    The scene is assumed dark outside its array. If photon_gain_dn and read_noise_dn are 0, the image is noise-free.
     """
     rng = np.random.default_rng(seed)
     field = (scene.shape[0], scene.shape[1])
     seen_dn = Convolver(psf.kernel, field, dtype=np.float64, threads=threads).apply(scene) * exposure_s
-    seen_dn = np.maximum(seen_dn, 0.0)  # rounding of the transforms gives values below zero in dark pixels
+    seen_dn = np.maximum(seen_dn, 0.0)  # rounding in the transforms makes some dark pixels slightly negative
     if photon_gain_dn > 0:
         seen_dn = rng.poisson(seen_dn / photon_gain_dn) * photon_gain_dn
     noise_dn = rng.normal(0.0, read_noise_dn, field) if read_noise_dn > 0 else 0.0

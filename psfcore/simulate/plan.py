@@ -1,9 +1,10 @@
-"""The plan of a simulated transit: the place, exposure and errors of each image.
+"""The plan of a simulated transit: the occulter's position and the exposure of each image, and the errors.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The observations": there are three pointings. In the
-first the planet approaches the east limb from far off, in the second it crosses the disc, in the third it leaves
-the west limb. Exposures are 5 s in combined gain far off the limb, 0.9 s in high gain near it, and 1.8 s in high gain on
-the disc.
+The default plan follows Hofmeister et al., The point-spread function of HRI_EUV, section "The observations". There are
+three pointings. In the first, the planet approaches the Sun's east limb. In the second, it crosses the solar disc. In the
+third, it moves away from the west limb. While the planet is far from the limb, exposures
+last 5 s in combined gain. Near the limb they last 0.9 s in high gain. In front of the solar disc they last 1.8 s in high
+gain.
 """
 
 from __future__ import annotations
@@ -27,17 +28,18 @@ DARK, ON = "dark", "on"
 COMBINED, HIGH = "combined", "high-only"
 CAMERA = Noise(photon_gain_dn=6.0, read_noise_dn=2.0)
 
-_THIRDS_UP_TO = 60  # images; larger numbers are divided as the paper's 126
+# Up to this number of images, each pointing gets a third of them. More images are divided as in the paper.
+_THIRDS_UP_TO = 60
 _PAPER_LIMB_SHARE = 24 / 126
 _PAPER_FAR_SHARE = 10 / 24
-_MARGIN_PX = 6.0  # least distance between the edges of disc and field
+_MARGIN_PX = 6.0  # smallest distance between the edge of the occulter and the edge of the field
 _MINUTE_S = 60.0
-_KEYS = {"pointing": "fov"}  # the key in truth.json of a field of Shot
+_KEYS = {"pointing": "fov"}  # names of Shot's fields that differ in truth.json
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One image: its pointing (from 1), the occulter's exact centre (px), exposure (s), gain mode, start (s)."""
+    """One image: number of its pointing (from 1), exact centre of the occulter, exposure time, gain mode, start time."""
 
     pointing: int
     x_px: float
@@ -51,11 +53,11 @@ class Shot:
 class Plan:
     """Everything that determines a simulated transit except the PSF and the seed.
 
-    views: what each pointing shows, beginning with pointing 1, each of VIEWS. ephemeris_error_px: rms per axis.
-    saturation_dn: level at which high-only images clip, None: no saturation; combined images do not saturate.
-    brightness: factor on the scenes. oversampling: scene pixels per detector pixel and axis, 1 or 2.
-    beyond: "dark" if the scene ends at the edge of the field; "on" if the Sun continues for beyond_px on each side
-    (None: half the field). Raises DataError "bad-plan".
+    views: what each pointing shows, one of VIEWS for each pointing in turn. ephemeris_error_px: rms error of the
+    reported position along each axis. saturation_dn: level at which high-only images clip; None: no saturation. Combined
+    images do not saturate. brightness: factor by which the scenes are multiplied. oversampling: number of scene pixels
+    in a detector pixel along each axis, 1 or 2. beyond: "dark" if the scene ends at the edge of the field; "on" if the
+    Sun continues for beyond_px on each side (None: half the field). Raises DataError "bad-plan".
     """
 
     size_px: int
@@ -106,7 +108,7 @@ class Plan:
         return tuple(sorted({shot.pointing for shot in self.shots}))
 
     def place(self, index: int) -> Place:
-        """The exact place of the occulter in an image."""
+        """The exact position and the radius of the occulter in an image."""
         return Place(self.shots[index].x_px, self.shots[index].y_px, self.radius_px)
 
     def as_json(self) -> dict[str, Any]:
@@ -138,12 +140,13 @@ def plan_from_json(content: dict[str, Any]) -> Plan:
 
 
 def default_plan(images: int = 30, size_px: int = 512, **changes: Any) -> Plan:
-    """A transit like that of the paper, with any number of images.
+    """A transit like the one of the paper, with any number of images.
 
-    Up to 60 images, each pointing has a third; above, they are divided as the paper's 24, 78 and 24. Of the images of a
-    limb pointing 10 in 24 are far off the limb (5 s, combined), the others near it (0.9 s, high-only); on the disc all
-    are 1.8 s, high-only. changes: fields of Plan other than its size and images. Fields above 1024 px are simulated on
-    whole pixels. Raises DataError "bad-plan".
+    Up to 60 images, each pointing gets a third of them. More images are divided in the ratio of the paper: 24, 78 and 24.
+    In a limb pointing, the planet is far from the limb in 10 of 24 images (5 s, combined) and near it in the others
+    (0.9 s, high-only). In front of the solar disc, all images are 1.8 s, high-only. A field larger than 1024 px is
+    simulated with one scene pixel per detector pixel, a smaller one with two along each axis. changes: values for other
+    fields of Plan. Raises DataError "bad-plan".
     """
     _expect(images >= 1, "at least one image", images)
     limb = images // 3 if images <= _THIRDS_UP_TO else round(images * _PAPER_LIMB_SHARE)
@@ -161,7 +164,10 @@ def default_plan(images: int = 30, size_px: int = 512, **changes: Any) -> Plan:
 
 @dataclass(frozen=True)
 class _Track:
-    """Where the occulter enters and leaves a pointing (in field edges), and when (minutes after 03:42)."""
+    """Where the occulter starts and ends in a pointing: (x, y) divided by the edge of the field.
+
+    start_min, end_min: the times of both points, in minutes after 03:42 UT.
+    """
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -171,7 +177,7 @@ class _Track:
 
 @dataclass(frozen=True)
 class _Phase:
-    """Consecutive images of one kind: pointing, start and end (minutes after 03:42 UT), exposure, gain mode."""
+    """Consecutive images with the same pointing, exposure time and gain mode; times in minutes after 03:42 UT."""
 
     pointing: int
     start_min: float
@@ -195,7 +201,7 @@ _PHASES = (
 
 
 def _shots(phase: _Phase, count: int, size_px: int, radius_px: float) -> list[Shot]:
-    """Images at equal intervals; the planet moves uniformly along its track, away from the edge of the field."""
+    """Images at equal intervals. The planet moves uniformly along its track and stays clear of the field's edge."""
     if count == 1:
         times = np.array([(phase.start_min + phase.end_min) / 2])
     else:

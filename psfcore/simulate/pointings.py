@@ -1,4 +1,4 @@
-"""The scenes of a transit's pointings: east limb, disc, west limb; synthetic, or taken from an image."""
+"""The scene of each pointing of a transit: east limb, solar disc or west limb; synthetic, or taken from an image."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ _LAYOUTS = {EAST: _LIMB, DISC: _DISC, WEST: _LIMB}
 
 
 def drawn_scene(plan: Plan, pointing: int, seed: int) -> Plane:
-    """The synthetic scene of a pointing, DN/s [y, x]: oversampling pixels per detector pixel and axis, with margins.
+    """The synthetic scene of a pointing, with margins: [y, x] in DN/s.
 
-    The west limb is a mirrored east limb of another seed. Equal plans and seeds give equal scenes.
+    Along each axis, a detector pixel contains plan.oversampling scene pixels. A west limb is a mirrored east limb made
+    with another seed. Equal plans and seeds give equal scenes.
     """
     view = plan.views[pointing - 1]
     edge = plan.size_px * plan.oversampling
@@ -38,11 +39,11 @@ def drawn_scene(plan: Plan, pointing: int, seed: int) -> Plane:
 
 
 def scene_from_image(image: Plane, plan: Plan) -> Plane:
-    """A scene, as drawn_scene returns it, from the pixels of an image [y, x] in DN/s.
+    """A scene of the same shape as drawn_scene returns, made from the pixels of an image [y, x] in DN/s.
 
-    If the image is larger than the scene, its middle is used. If it is smaller, it is enlarged until its shorter edge is
-    that of the scene (bilinear, light per pixel unchanged). Pixels that are not finite or below zero become 0.
-    Raises DataError "bad-scene".
+    If the image is larger than the scene, its middle is used. If the image is smaller, it is enlarged by bilinear
+    interpolation until its shorter edge equals the edge of the scene; the values in DN/s keep their level. Pixels that
+    are negative or not finite become 0. Raises DataError "bad-scene".
     """
     if image.ndim != 2 or min(image.shape) < 2:
         raise DataError("bad-scene", f"expected an image of two axes; got shape {image.shape}")

@@ -1,19 +1,19 @@
-"""The true scatter of a simulation: a softened power law that may be stretched and lopsided.
+"""The true scatter kernel of a simulation: a softened power law that may be stretched and lopsided.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light". The paper's scatter is
-isotropic; stretch and dipole are additions. This code is independent of the fit, so that neither hides errors of the
-other.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light". The paper's
+scatter is isotropic; stretch and dipole are additions. This code is independent of the code of the fit. An error in one
+of the two therefore shows in a comparison.
 
-    s(u, v) = a F(u, v)  off the centre,  s(0) = 1 - total                            Eq. (1)
+    s(u, v) = a F(u, v)  outside the central pixel,  s(0) = 1 - total                 Eq. (1)
     F = (b + r')^-c (1 + d cos(theta - t)),  r'^2 = (u / (1 + s))^2 + (v (1 + s))^2    Eq. (2)
-    a = total / sum of F off the centre on the full reach                             Eq. (3)
+    a = total / (sum of F over the full reach without the central pixel)              Eq. (3)
 
 | symbol | name | unit |
 |---|---|---|
 | b, c, total | b_px, c, total | px, -, - |
-| s | stretch along t | - |
+| s in Eq. (2) | stretch: the kernel is 1 + s times as long along t | - |
 | t | angle_deg, from +x towards +y | degrees |
-| d | dipole: more light is scattered towards t | - |
+| d | dipole: if positive, more light is scattered towards t | - |
 | u, v | offset from the centre along t and across it | px |
 | theta | angle of the offset, from +x towards +y | - |
 """
@@ -36,7 +36,7 @@ PARAMETERS = ("b", "c", "total", "stretch")
 
 @dataclass(frozen=True)
 class ScatterTruth:
-    """The true scatter. Raises DataError "bad-scatter" if the parameters do not describe a PSF."""
+    """The true scatter kernel's parameters. Raises DataError "bad-scatter" if they do not describe a PSF."""
 
     b_px: float
     c: float
@@ -71,25 +71,32 @@ def anisotropic_kernel(scatter: ScatterTruth, size: int = REACH_GRID_PX) -> Kern
 def total_kernel(
     scatter: ScatterTruth, diffraction: Kernel, size: int = REACH_GRID_PX, *, threads: int = 1
 ) -> Kernel:
-    """The linear convolution of scatter and diffraction on (size, size), cut to the full reach, not renormalised.
+    """The total PSF: the scatter kernel convolved with the diffraction PSF, on (size, size).
 
-    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1.
+    The convolution is linear, and its result is not renormalised. diffraction: weights [y, x], centre at
+    [n // 2, n // 2], sum 1.
     """
     return convolved(anisotropic_kernel(scatter), diffraction, size, threads=threads)
 
 
 def convolved(full_kernel: Kernel, diffraction: Kernel, size: int, *, threads: int = 1) -> Kernel:
-    """A kernel on the full reach convolved with diffraction, on (size, size); only the needed part is transformed."""
+    """Convolve a kernel on the full reach with the diffraction PSF; the result has shape (size, size).
+
+    Only the part of the kernel that contributes to the result is transformed.
+    """
     needed = size + max(diffraction.shape) + 2
     part = full_kernel if needed >= REACH_GRID_PX else crop_centred(full_kernel, (needed, needed))
     return linear_convolve(part, diffraction, (size, size), threads=threads)
 
 
 def kernel_slopes(scatter: ScatterTruth) -> dict[str, Kernel]:
-    """The derivatives of the kernel with respect to PARAMETERS, on the full reach; Eq. (3) conserves its sum."""
+    """The derivatives of the kernel with respect to PARAMETERS, on the full reach.
+
+    Each derivative sums to 0, because Eq. (3) keeps the sum of the kernel at 1.
+    """
     falloff = _falloff(scatter)
     norm = falloff.sum()
-    # The centre is 1 - total for every shape: there the falloff and its slopes are 0.
+    # The central pixel is 1 - total, whatever b, c and the stretch are: there the falloff and its slopes are 0.
     found = {
         name: (scatter.total / norm) * (slope - falloff * (slope.sum() / norm))
         for name, slope in _falloff_slopes(scatter, falloff).items()

@@ -1,9 +1,10 @@
 """A synthetic EUV scene of the Sun, with realistic contrasts and spatial scales.
 
-All lengths are in units of the field's longer edge, so that a scene looks the same at any size. It consists of quiet Sun
-(lognormal, with power on many scales), two active regions with bright moss and thin loops, a dark coronal hole, a
-filament, a limb, and a corona whose brightness decreases with height. A layout selects and places these parts. A margin
-extends the scene beyond the field.
+All lengths are in units of the field's longer edge ("field edges" below), so that a scene looks the same at any size. The
+default scene shows quiet Sun, two active regions with bright moss and thin loops, a dark coronal hole, a filament and a
+limb. The quiet Sun is lognormal and has structure on many scales. The brightness of the corona decreases with height. A
+layout chooses the limb, the corona, the active regions and the filament, and their positions. A margin extends the scene
+beyond the field.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ Plane = NDArray[np.float64]
 
 QUIET_DN_PER_S = 420.0
 SKY_DN_PER_S = 12.0
-_BRIGHT_POINTS = 60  # in a field
+_BRIGHT_POINTS = 60  # number of bright points in a field
 
 
 @dataclass(frozen=True)
 class _Region:
-    """An active region: centre and size in field edges, moss in DN/s, number of loop bundles."""
+    """An active region: centre and size in field edges, brightness of its moss, number of its loop bundles."""
 
     x: float
     y: float
@@ -34,7 +35,11 @@ class _Region:
 
 @dataclass(frozen=True)
 class _Bundle:
-    """Parallel loops: middle between the footpoints, half their distance, height (field edges), tilt (radians), light."""
+    """Parallel loops. All lengths are in field edges.
+
+    x, y: middle between the footpoints. span: half the distance between the footpoints. rise: height. lean: tilt in
+    radians. light: brightness relative to the region's moss.
+    """
 
     x: float
     y: float
@@ -49,8 +54,12 @@ _REGIONS = (_Region(0.78, 0.24, 0.13, 2300.0, 34), _Region(0.44, 0.31, 0.075, 18
 
 @dataclass(frozen=True)
 class Layout:
-    """The parts of a scene: limb (x, y, radius in field edges), corona (DN/s at the limb, scale height in field edges),
-    sky (DN/s), active regions, and whether there is a filament."""
+    """The parts of a scene; lengths in field edges.
+
+    limb_centre, limb_radius: (x, y) and radius of the solar disc. corona_dn_per_s: brightness of the corona at the limb.
+    corona_height: scale height of the corona. sky_dn_per_s: background that is added everywhere. regions: the active
+    regions. filament: whether there is a filament.
+    """
 
     limb_centre: tuple[float, float] = (1.52, 0.30)
     limb_radius: float = 1.33
@@ -66,7 +75,7 @@ LIMB_AND_REGIONS = Layout()
 
 @dataclass(frozen=True)
 class _Canvas:
-    """The array of a scene: its whole shape, the longer edge of the field, and the margin before the field, px."""
+    """The array of a scene: its shape with margins, the longer edge of the field, the margin on each side; all in px."""
 
     shape: tuple[int, int]
     edge: int
@@ -74,7 +83,7 @@ class _Canvas:
 
     @property
     def fields(self) -> float:
-        """The area of the array over that of the field."""
+        """The area of the array divided by the area of the field."""
         inner = (self.shape[0] - 2 * self.margin) * (self.shape[1] - 2 * self.margin)
         return self.shape[0] * self.shape[1] / inner
 
@@ -89,13 +98,13 @@ def solar_scene(
 ) -> Plane:
     """True intensities [y, x] in DN/s, positive. Equal arguments give equal scenes.
 
-    shape: of the field. The result is margin_px larger on each side, with the Sun beyond the field.
+    shape: (ny, nx) of the field. The result is margin_px larger on each side; the Sun continues beyond the field.
     """
     rng = np.random.default_rng(seed)
     canvas = _Canvas((shape[0] + 2 * margin_px, shape[1] + 2 * margin_px), max(shape), margin_px)
     x, y = canvas.coordinates()
     distance = np.hypot(x - layout.limb_centre[0], y - layout.limb_centre[1])
-    height = layout.limb_radius - distance  # inside the disc: > 0
+    height = layout.limb_radius - distance  # positive inside the solar disc
     on_disc = 1 / (1 + np.exp(np.minimum(-height / 0.0015, 700.0)))
     quiet = QUIET_DN_PER_S * _texture(canvas, rng) * _large_scale(x, y)
     brightening = 1 + 1.3 * np.exp(-np.abs(height) / 0.02)
@@ -109,9 +118,10 @@ def solar_scene(
 
 
 def _octaves(canvas: _Canvas, rng: np.random.Generator, *, slope: float, coarsest: float) -> Plane:
-    """Gaussian noise, rms 1, whose amplitude grows with scale to the power `slope`.
+    """Gaussian noise with structure on many scales: mean 0, rms 1.
 
-    It is a sum of smooth random planes; each has half the scale of the previous one, down to a pixel.
+    The noise is a sum of smooth random planes. Each plane has half the scale of the previous one, down to one pixel. The
+    amplitude of a plane is proportional to its scale to the power `slope`. coarsest: largest scale, in field edges.
     """
     shape, edge = canvas.shape, canvas.edge
     total = np.zeros(shape)
@@ -127,21 +137,21 @@ def _octaves(canvas: _Canvas, rng: np.random.Generator, *, slope: float, coarses
 
 
 def _texture(canvas: _Canvas, rng: np.random.Generator) -> Plane:
-    """Network and cells of the quiet Sun: lognormal, mean about 1."""
+    """Network and cells of the quiet Sun: the brightness is lognormal, with a mean of about 1."""
     fine = _octaves(canvas, rng, slope=0.45, coarsest=0.10)
     ridges = 1 - np.minimum(np.abs(_octaves(canvas, rng, slope=0.9, coarsest=0.07)), 1)
     return np.exp(0.5 * fine - 0.13) * (0.75 + 0.5 * ridges**2)
 
 
 def _large_scale(x: Plane, y: Plane) -> Plane:
-    """A coronal hole at the top right, a tenth as bright, and a brighter belt around the active regions."""
+    """A factor on the quiet Sun: a coronal hole (about a tenth) at the top right, and a bright belt at the active regions."""
     hole = np.exp(-((((x - 0.80) / 0.19) ** 2 + ((y - 0.80 + 0.3 * (x - 0.8)) / 0.17) ** 2) ** 2))
     belt = 1 + 0.9 * np.exp(-(((y - 0.27) / 0.20) ** 2))
     return (1 - 0.88 * hole) * belt
 
 
 def _corona(x: Plane, y: Plane, height: Plane, layout: Layout, rng: np.random.Generator) -> Plane:
-    """The corona beyond the limb: its brightness decreases with height and has radial streaks."""
+    """The corona beyond the limb: its brightness decreases with height and varies in radial streaks."""
     angle = np.arctan2(y - layout.limb_centre[1], layout.limb_centre[0] - x)
     bins = np.linspace(-0.9, 0.9, 4000)
     rays = gaussian_filter(rng.standard_normal(bins.size), 12) * 5
@@ -194,7 +204,7 @@ def _draw_bundle(region: _Region, rng: np.random.Generator) -> _Bundle:
 
 
 def _strand(bundle: _Bundle, edge: int, rng: np.random.Generator) -> tuple[Plane, Plane, Plane]:
-    """Points along one strand, about three per pixel, in field edges, with their light."""
+    """x and y (field edges) and brightness of points along one strand, about three points per pixel."""
     span = bundle.span * rng.normal(1, 0.05)
     rise = bundle.rise * rng.normal(1, 0.13)
     t = np.linspace(0, np.pi, max(16, int(3 * (2 * span + 2 * rise) * edge)))
@@ -209,7 +219,7 @@ def _strand(bundle: _Bundle, edge: int, rng: np.random.Generator) -> tuple[Plane
 
 
 def _bright_points(canvas: _Canvas, rng: np.random.Generator) -> Plane:
-    """Compact brightenings at random places."""
+    """Compact brightenings at random positions."""
     shape, edge = canvas.shape, canvas.edge
     plane = np.zeros(shape)
     count = round(_BRIGHT_POINTS * canvas.fields)
@@ -219,7 +229,7 @@ def _bright_points(canvas: _Canvas, rng: np.random.Generator) -> Plane:
 
 
 def _filament(x: Plane, y: Plane) -> Plane:
-    """The depth, 0 to 1, of a dark winding channel across the disc."""
+    """The depth, 0 to 1, of a dark winding channel across the solar disc."""
     spine = 0.52 + 0.035 * np.sin(9 * x) + 0.018 * np.sin(23 * x + 1)
     ends = np.exp(-(((x - 0.62) / 0.15) ** 4))
     return np.asarray(ends * np.exp(-(((y - spine) / 0.013) ** 2)))

@@ -1,16 +1,16 @@
 """The sky of a simulated transit, and its noise-free images.
 
-    I_i = P (S_f - h_i),   h_i the light of the scene S_f that the disc hides in image i    Eq. (1)
+    I_i = P (S_f - h_i)        Eq. (1)
 
-P is the convolution with the PSF: scatter convolved with diffraction, cut to the full reach, a grid of 2048 px. P is
-linear: the scene of a pointing is convolved once, the hidden light once per image.
+P is the convolution with the total PSF, which is cut to the reach of 2048 x 2048 px. Because P is linear, the scene of a
+pointing is convolved once for all its images; only the hidden light is convolved for each image.
 
 | symbol | name | unit |
 |---|---|---|
-| S_f | scenes[f]: static scene of pointing f, including its part beyond the field | DN/s |
-| P S_f | seen_scenes[f] | DN/s |
-| h_i | Behind.hidden | DN/s |
-| I_i | expected(i), noise_free[i] | DN/s |
+| S_f | scenes[f]: constant scene of pointing f, including the margins beyond the field | DN/s |
+| P S_f | seen_scenes[f]: convolved scene | DN/s |
+| h_i | Behind.hidden: light that the disc hides in image i | DN/s |
+| I_i | expected(i), noise_free[i]: noise-free image i | DN/s |
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ _SUM_TOLERANCE = 1e-3
 class TrueSky:
     """Scenes, occulter and PSF of a transit; all planes float64 [y, x] in DN/s on detector pixels.
 
-    diffraction, kernel: weights [y, x], centre at [n // 2, n // 2]; kernel is the total PSF, as large as the scenes
-    need. scenes: by pointing, plan.margin_px larger than the field on each side. seen_scenes: by pointing, convolved
-    with the PSF, without the occulter, on the field. behind: the scene around the occulter of each image.
+    diffraction, kernel: weights [y, x], centre at [n // 2, n // 2]. kernel is the total PSF on twice the edge of the
+    scenes, at most the full reach. scenes: the scene of each pointing, plan.margin_px larger than the field on each side.
+    seen_scenes: the scene of each pointing without the occulter, convolved with the PSF, on the field. behind: for each
+    image, the patch of the scene around the occulter.
     """
 
     plan: Plan
@@ -56,11 +57,11 @@ class TrueSky:
     threads: int = 1
 
     def true_scene(self, index: int) -> Plane:
-        """The scene of an image with its dark occulter, on the field."""
+        """The scene of an image on the field, with the dark occulter in it."""
         return on_field(self.true_scene_and_beyond(index), self.plan.margin_px)
 
     def true_scene_and_beyond(self, index: int) -> Plane:
-        """The same with plan.margin_px beyond the field on each side."""
+        """The scene of an image with the dark occulter in it, plan.margin_px larger than the field on each side."""
         scene = self.scenes[self.plan.shots[index].pointing].copy()
         around = self.behind[index]
         rows, columns = around.window(self.plan.margin_px)
@@ -96,9 +97,9 @@ def true_sky(
     scenes: Mapping[int, Plane] | None = None,
     threads: int = 1,
 ) -> TrueSky:
-    """The sky of a plan, with synthetic scenes from `seed`, or with `scenes` by pointing as scene_from_image returns them.
+    """The sky of a plan. Without `scenes`, the scenes are synthetic and follow from `seed`.
 
-    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. Raises DataError "bad-diffraction", "bad-scene".
+    scenes: a scene for each pointing, in the form that scene_from_image returns. diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. Raises DataError "bad-diffraction", "bad-scene".
     """
     _check_diffraction(diffraction)
     whole_px = plan.size_px + 2 * plan.margin_px
@@ -130,7 +131,7 @@ def true_sky(
 
 
 def on_field(plane: Plane, margin_px: int) -> Plane:
-    """The part of a plane that is on the field."""
+    """The part of a plane that lies on the field: the plane without its margins."""
     ny, nx = plane.shape
     return plane[margin_px : ny - margin_px, margin_px : nx - margin_px]
 

@@ -1,15 +1,16 @@
-"""A transit whose truth is known: a sky convolved with a PSF, with photon noise and read noise, in whole DN.
+"""A simulated transit: scenes convolved with a known PSF, with photon noise and read noise, in whole DN.
 
     D_i = round(min(g Poisson(I_i t / g) + read + dark, saturation)),  frame i = D_i / t     Eq. (1)
 
-The plan (plan.py) gives places and exposures, the sky (sky.py) the noise-free images, and transit_files.py writes the
-folder.
+The plan (plan.py) gives the positions and exposures, and the sky (sky.py) gives the noise-free images. transit_files.py
+writes the folder. Without a plan's whole_dn, D_i is not rounded. Only high-only images saturate.
 
 | symbol | name | unit |
 |---|---|---|
 | I_i | noise_free[i] | DN/s |
 | g, t | photon_gain_dn, exposure_s | DN, s |
-| dark | dark_offset_dn | DN |
+| read | a normal random number with rms read_noise_dn | DN |
+| dark, saturation | dark_offset_dn, saturation_dn | DN |
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _EPHEMERIS, _NOISE = 1001, 1002  # independent streams of random numbers
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulated transit was made with. places: exact places of the occulter, one per image."""
+    """The values with which a simulated transit was made. places: the occulter's exact position in each image."""
 
     scatter: ScatterTruth
     places: tuple[Place, ...]
@@ -65,10 +66,10 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTransit:
-    """A transit in memory, and its truth.
+    """A simulated transit in memory, with the true values.
 
-    transit: frames in DN/s (float32), made from whole DN; places from the ephemeris, with its errors.
-    imitated: the instrument whose keywords the headers get.
+    transit: frames in DN/s (float32), made from whole DN. The frames' places are the reported positions, which contain
+    the errors of the ephemeris. imitated: the instrument whose keywords the headers get.
     """
 
     transit: Transit
@@ -88,11 +89,11 @@ class SimulatedTransit:
 
     @property
     def scenes(self) -> Mapping[int, Plane]:
-        """The scene of each pointing without occulter, DN/s, plan.margin_px larger than the field on each side."""
+        """The scene of each pointing without the occulter, DN/s, plan.margin_px larger than the field on each side."""
         return self.sky.scenes
 
     def true_scene(self, index: int) -> Plane:
-        """The scene of an image with its dark occulter, on the field: [y, x] in DN/s, float64."""
+        """The scene of an image on the field, with the dark occulter in it: [y, x] in DN/s, float64."""
         return self.sky.true_scene(index)
 
 
@@ -107,12 +108,12 @@ def simulate(
     imitated: Imitated = HRI_EUV,
     threads: int = 1,
 ) -> SimulatedTransit:
-    """A transit of `plan` with the PSF that is scatter convolved with diffraction; equal arguments give equal results.
+    """A transit of `plan`. Its PSF is `scatter` convolved with `diffraction`. Equal arguments give equal results.
 
-    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: for scenes, ephemeris and noise.
-    scene_seed: another seed for the scenes. scenes: by pointing, instead of synthetic ones, as drawn_scene and
-    scene_from_image of psfcore.simulate.pointings return them. imitated: the instrument in the headers.
-    Raises DataError "bad-diffraction", "bad-scene".
+    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: random seed of the scenes, the ephemeris errors
+    and the noise. scene_seed: a different seed for the scenes. scenes: a scene for each pointing, used instead of a
+    synthetic one, in the form that drawn_scene and scene_from_image of psfcore.simulate.pointings return. imitated: the
+    instrument whose keywords the headers get. Raises DataError "bad-diffraction", "bad-scene".
     """
     of_scenes = seed if scene_seed is None else scene_seed
     sky = true_sky(plan, scatter, diffraction, of_scenes, scenes=scenes, threads=threads)
@@ -120,7 +121,10 @@ def simulate(
 
 
 def observed_transit(sky: TrueSky, seed: int, imitated: Imitated = HRI_EUV) -> SimulatedTransit:
-    """Another transit of the same sky, with another noise realisation and other errors of the ephemeris. Quick."""
+    """A transit of a given sky: `seed` determines the noise realisation and the errors of the ephemeris.
+
+    This is faster than `simulate`, because the scenes are already convolved.
+    """
     plan = sky.plan
     reported = _ephemeris(plan, seed)
     start_s = plan.shots[0].time_s
@@ -148,7 +152,7 @@ def observed_transit(sky: TrueSky, seed: int, imitated: Imitated = HRI_EUV) -> S
 
 
 def _read_out(plan: Plan, index: int, expected: Plane, seed: int) -> Plane:
-    """An exposure in DN, Eq. (1)."""
+    """D_i of Eq. (1): one exposure in DN."""
     shot = plan.shots[index]
     rng = np.random.default_rng([seed, _NOISE, index])
     seen_dn = plan.noise.observe(expected, shot.exposure_s, rng) * shot.exposure_s + plan.dark_offset_dn
@@ -158,7 +162,7 @@ def _read_out(plan: Plan, index: int, expected: Plane, seed: int) -> Plane:
 
 
 def _ephemeris(plan: Plan, seed: int) -> list[Place]:
-    """The exact places plus errors of the ephemeris, rounded to a tenth of a pixel."""
+    """The exact positions plus errors of the ephemeris, rounded to a tenth of a pixel."""
     rng = np.random.default_rng([seed, _EPHEMERIS])
     errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))
     return [

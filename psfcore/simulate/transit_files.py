@@ -1,8 +1,13 @@
-"""A simulated transit as a folder: in the format of a real transit, with its truth beside it.
+"""A simulated transit as a folder: the files of a real transit, and files with the true values.
 
-NNN.fits            images, whole DN       noise_free/NNN.fits  the same without noise, DN/s
-diffraction.fits    known part of the PSF  scenes/fovN.fits     scenes of the pointings without occulter, DN/s, with margins
-transit.json        as for a real transit  truth.json           PSF, exact places, seeds, the plan
+| file | content |
+|---|---|
+| NNN.fits | images, whole DN |
+| diffraction.fits | diffraction PSF |
+| transit.json | the description that a real transit also has |
+| noise_free/NNN.fits | images without noise, DN/s |
+| scenes/fovN.fits | scene of each pointing without the occulter, with margins, DN/s |
+| truth.json | PSF, exact positions, seeds, plan |
 """
 
 from __future__ import annotations
@@ -30,7 +35,7 @@ _LARGEST_PX = 16384
 
 
 def write(simulated: SimulatedTransit, folder: str | Path) -> None:
-    """Write a simulated transit into `folder`, which is created if needed; existing files are replaced."""
+    """Write a simulated transit into `folder`. The folder is created if needed; existing files are replaced."""
     folder = Path(folder)
     for name in (".", "noise_free", "scenes"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -51,9 +56,11 @@ def write(simulated: SimulatedTransit, folder: str | Path) -> None:
 
 
 def read_sky(folder: str | Path, *, threads: int = 1) -> TrueSky:
-    """The sky of a folder that `write` wrote. Its scenes are on detector pixels: light is uniform within a pixel.
+    """The sky of a folder that `write` wrote.
 
-    Raises DataError "not-simulated" if the truth is missing, and the errors of reading FITS files.
+    The folder's scenes are stored on detector pixels. The light is therefore uniform within a pixel, even where the
+    original scene had finer pixels. Raises DataError "not-simulated" if truth.json is missing or invalid, and the
+    errors of reading FITS files.
     """
     folder = Path(folder)
     try:

@@ -1,1 +1,1 @@
-"""The inversion as published: segments of the PSF, ring sums, the system of equations, and its six rounds."""
+"""The inversion exactly as published: segments of the PSF, ring sums, the system of equations, and six rounds."""

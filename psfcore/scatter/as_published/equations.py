@@ -4,19 +4,21 @@ Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion 
 
     I_o = sum over S of psf_S A_S + (1 - sum over S of n_S psf_S) B      Eq. (1)
 
-There is one equation per selected pixel, with I_o its observed intensity. Every equation is divided by its scale. The
-coefficients are fitted to many random subsets of the equations: 1000 of occulted pixels, with the same number from each
-shell of the selection mask, and 100 of unocculted pixels near the edge of the disc. A subset has no repetitions: it is
-not a bootstrap sample. The 30 worst of 100 fits are dropped, and the others are averaged.
+Each selected pixel gives one equation; I_o is the observed intensity of this pixel. Every equation is divided by its scale
+(see `Equations`). The coefficients psf_S are fitted to 100 random subsets of the equations. A subset contains 1000
+equations of occulted pixels and 100 equations of unocculted pixels near the edge of the disc. Each shell of the mask that
+selects the occulted pixels contributes the same number of equations. No equation occurs twice in a subset, so a subset
+is not a bootstrap sample. The 30 fits with the largest misfit are dropped, and the other 70 are averaged.
 
-    free fit        psf_S >= 0, by the Trust Region Reflective algorithm             Eq. (2)
-    power law       psf_S = a / (b + r)^c, averaged over S, same algorithm            Eq. (3)
+    free fit        psf_S >= 0, by the Trust Region Reflective algorithm              Eq. (2)
+    power law       psf_S = mean of a / (b + r)^c over S, by the same algorithm       Eq. (3)
 
 | symbol | name | unit |
 |---|---|---|
-| A_S | ring_sums: the scene summed over segment S about the pixel | DN/s px^2 |
-| B | unscattered: the scene convolved with the diffraction PSF | DN/s |
-| n_S | counts: pixels of S | px^2 |
+| S | segment of the PSF: a shell around the centre, or a sector of a shell | - |
+| A_S | ring_sums: sum of the scene over the segment S around the pixel | DN/s px^2 |
+| B | unscattered: the scene convolved with the diffraction PSF, at the pixel | DN/s |
+| n_S | counts: number of pixels in S | px^2 |
 """
 
 from __future__ import annotations
@@ -41,16 +43,17 @@ OCCULTED_EQUATIONS = 1000
 UNOCCULTED_EQUATIONS = 100
 UNOCCULTED = -1
 LEAST_LIGHT = 1e-5
-PRIOR_WEIGHT = 10.0  # misfit, in units of one equation's, of a shell that contains all light
+# With this weight, a shell that contains all light has as much misfit as one equation that is wrong by 10 times its scale.
+PRIOR_WEIGHT = 10.0
 PIVOT_PX = 15.0
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Equations (1) of n pixels: observed, unscattered and scale (n,), ring_sums (n, segments).
+    """Eq. (1) for n pixels: observed, unscattered and scale have shape (n,); ring_sums has shape (n, segments).
 
-    stratum: the shell of the selection mask that contains the pixel (0: outermost), or UNOCCULTED. scale: divisor of
-    the equation.
+    stratum: for an occulted pixel, the shell of the selection mask that contains it (0: outermost); for other pixels,
+    UNOCCULTED. scale: the number by which the equation is divided.
     """
 
     observed: Vector
@@ -75,7 +78,10 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class SubsetFits:
-    """Fits to subsets of equations, without the worst: coefficients (subsets kept, n), and cost per equation."""
+    """Fits to subsets of equations; the worst fits are dropped.
+
+    fits: coefficients, (subsets kept, n). cost: sum of the squared misfits divided by the number of equations.
+    """
 
     fits: Matrix
     cost: Vector
@@ -88,7 +94,7 @@ class SubsetFits:
 
 @dataclass(frozen=True, eq=False)
 class PowerLawSubsetFits:
-    """Mean a, b (px) and c of fits of Eq. (3) to subsets of equations, and the single fits (subsets kept, 3)."""
+    """Fits of Eq. (3) to subsets of equations: mean a, b (px) and c. fits: a, b, c of each kept subset, (subsets, 3)."""
 
     a: float
     b_px: float
@@ -103,10 +109,11 @@ class PowerLawSubsetFits:
 
 
 def choose_subset(equations: Equations, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Indices of one random subset without repetition: equal numbers from each occulted stratum, and unocculted ones.
+    """Indices of one random subset of the equations; no equation occurs twice.
 
-    A stratum with fewer equations than its share contributes all of them. Raises DataError "no-lines" if there is no
-    equation of an occulted pixel.
+    All strata of occulted pixels contribute the same number of equations. A stratum with too few equations contributes
+    all of them. Equations of unocculted pixels follow. Raises DataError "no-lines" if there is no equation of an occulted
+    pixel.
     """
     strata = np.unique(equations.stratum[equations.stratum != UNOCCULTED])
     if strata.size == 0:
@@ -127,10 +134,11 @@ def _some(of: NDArray[np.intp], number: int, rng: np.random.Generator) -> NDArra
 def free_fit(
     equations: Equations, counts: Vector, *, seed: int, subsets: int = SUBSETS, towards: Vector | None = None
 ) -> SubsetFits:
-    """Eq. (2): coefficients (subsets kept, segments), per px^2.
+    """The free fit of Eq. (2): coefficients, (subsets kept, segments), as fractions of the light per pixel.
 
-    towards: coefficients of the shells that no equation constrains. The prior is weak: a shell may double or vanish
-    at the cost of one equation's misfit. Default: the prior is zero for all shells, with PRIOR_WEIGHT.
+    towards: the coefficients that the prior favours; shells that no equation constrains keep them. The prior is weak: if
+    a shell doubles or vanishes, the misfit grows as much as if one equation were wrong by its scale. Default: the prior
+    favours zero for all shells, with PRIOR_WEIGHT.
     """
     prior_at = np.zeros_like(counts) if towards is None else towards
     light = prior_at * counts
@@ -156,9 +164,10 @@ def power_law_fit(
     seed: int,
     subsets: int = SUBSETS,
 ) -> PowerLawSubsetFits:
-    """Eq. (3), a, b (px) and c.
+    """The fit of Eq. (3): a, b (px) and c.
 
-    radii: for each segment, the distances of its pixels and the number of pixels at each. start: a, b, c.
+    radii: for each segment, the distances of its pixels (px) and the number of pixels at each distance. start: the values
+    of a, b and c at which the fit starts.
     """
     rng = np.random.default_rng(seed)
     mean = SegmentMean(radii)
@@ -167,7 +176,8 @@ def power_law_fit(
         def misfit(theta: Vector) -> Vector:
             return np.asarray(matrix @ mean(theta) - target)
 
-        # a, b and c are strongly correlated. The weight at PIVOT_PX replaces a, because the data determine it there.
+        # a, b and c are strongly correlated. The fit uses the weight at PIVOT_PX instead of a, because the data
+        # determine this weight well.
         solved = least_squares(
             misfit,
             _to_pivot(start),
@@ -178,7 +188,7 @@ def power_law_fit(
         return solved.x, float(2 * solved.cost)
 
     fitted = _fit_subsets(equations, counts, rng, subsets, solve)
-    # The mean is taken in coordinates with nearly Gaussian errors; a itself varies by decades between subsets.
+    # The mean is computed in coordinates with nearly Gaussian errors, because a varies by powers of ten between subsets.
     a, b, c = _from_pivot(fitted.mean)
     return PowerLawSubsetFits(
         float(a),
@@ -221,10 +231,11 @@ def _from_pivot(theta: Vector) -> Vector:
 def _solve_free(
     matrix: Matrix, target: Vector, counts: Vector, towards: Vector, prior_weight: Vector
 ) -> tuple[Vector, float]:
-    """Eq. (2) for the light n_S psf_S of each shell, with a prior for shells that no equation constrains.
+    """Solve Eq. (2) for the light n_S psf_S of each shell, with a prior for shells that no equation constrains.
 
-    Difference from the paper: no occulted pixel is close enough to the edge to separate the innermost shells from the
-    centre. Without a prior, the system assigns them more than all light (1.3 in the first round on simulated transits).
+    The paper has no prior. It is needed because no occulted pixel is close enough to the edge of the disc to separate the
+    innermost shells from the centre. Without a prior, the fit assigns these shells more light than there is (a fraction
+    of 1.3 in the first round on simulated transits).
     """
     used = (counts > 0) & (np.linalg.norm(matrix, axis=0) > 0)
     out = towards.copy()
@@ -232,7 +243,7 @@ def _solve_free(
     light = matrix[:, used] / counts[used]
     extended = np.concatenate((light, np.diag(prior_weight[used])))
     extended_target = np.concatenate((target, (prior_weight * towards * counts)[used]))
-    # The triangular factor of a QR factorisation has the same least-squares solution with a twentieth of the rows.
+    # The triangular factor of a QR factorisation gives the same least-squares solution from a twentieth of the rows.
     turned, triangle = np.linalg.qr(extended)
     solved = lsq_linear(triangle, turned.T @ extended_target, bounds=(0.0, np.inf), method="trf")
     out[used] = solved.x / counts[used]
@@ -242,11 +253,11 @@ def _solve_free(
 def _fit_subsets(
     equations: Equations, counts: Vector, rng: np.random.Generator, subsets: int, solve: Solve
 ) -> SubsetFits:
-    """Fit many random subsets, and keep the same fraction of the best fits as the paper."""
+    """Fit many random subsets, and keep the best 70 %, as the paper does."""
     matrix = (equations.ring_sums - equations.unscattered[:, None] * counts) / equations.scale[:, None]
     target = (equations.observed - equations.unscattered) / equations.scale
     fits, cost = [], []
-    # These factorisations are so small that threads slow them down, most of all when the cores are busy.
+    # These factorisations are so small that threads make them slower, above all when the cores are busy.
     with threadpool_limits(limits=1, user_api="blas"):
         for _ in range(subsets):
             chosen = choose_subset(equations, rng)

@@ -1,9 +1,9 @@
-"""The inversion exactly as published, and with each of its four biases corrected alone.
+"""The inversion exactly as published, and variants that each correct one of its four biases.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j), in six
-rounds. Each round deconvolves the images with Richardson-Lucy, locates the occulters and sets their discs to zero, and
-fits subsets of equations: three rounds with free shells, then three with a softened power law. Where the text of the
-paper leaves a choice, a comment at the constant gives the choice made here.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j). The
+steps are repeated in six rounds. Each round deconvolves the images with Richardson-Lucy, locates the occulters, sets
+their discs to zero, and fits subsets of equations. Three rounds fit free shells; then three rounds fit a softened power
+law. Where the text of the paper leaves a choice, a comment beside the constant explains the choice made here.
 
 `Choices` describes the four biases and their corrections.
 
@@ -54,22 +54,23 @@ SHRUNK_PX = 1.0
 UNOCCULTED_WITHIN_PX = 5.0
 UNOCCULTED_A_FRAME = 10
 LEAST_LEVEL_DN_S = 1e-3
-# Each equation is divided by its observed value. In discs of a few photons some values are zero or less, and their
-# weight would be unlimited. Therefore no equation is divided by less than this fraction of its disc's mean.
+# Each equation is divided by its observed value. In discs with only a few photons, some observed values are zero or
+# negative, and their weight would be infinite. Therefore no divisor is smaller than this fraction of the disc's mean.
 LEAST_OF_MEAN = 0.5
 
 
 @dataclass(frozen=True)
 class Choices:
-    """The four biases of the published fit: True as published, False corrected.
+    """The four biases of the published fit. True: as published. False: corrected.
 
-    weighed_by_observed: each equation is divided by its own noisy intensity, which biases faint discs low. Corrected:
-    by the noise expected at the disc's mean.
-    added: scatter is added to the diffraction, Eq. (1) of `equations`. Corrected: the two are convolved, so the ring
-    sums are those of the diffracted scene.
-    counted_on_array: the unscattered light is 1 minus the scatter on the array of the known PSF. Corrected: 1 minus
-    the scatter on the full reach.
-    whole_disc_blanked: all pixels within the radius are set to zero. Corrected: only the fully dark ones.
+    weighed_by_observed: each equation is divided by its own noisy intensity, which biases the light in faint discs low.
+    Corrected: it is divided by the noise expected at the disc's mean.
+    added: the scatter kernel is added to the diffraction PSF, Eq. (1) of `equations`. Corrected: the two are convolved, so
+    the ring sums are computed from the diffracted scene.
+    counted_on_array: the unscattered light is 1 minus the scatter summed over the array of the diffraction PSF. Corrected:
+    the sum covers the full reach.
+    whole_disc_blanked: all pixels whose centres lie within the radius are set to zero. Corrected: only the fully dark
+    pixels are set to zero.
     """
 
     weighed_by_observed: bool = True
@@ -90,7 +91,7 @@ ALL_CORRECTED = Choices(False, False, False, False)
 
 @dataclass(frozen=True)
 class PublishedRound:
-    """One round. fit: free shells or power law; curve_pct: cumulative curve of the total PSF after it, percent."""
+    """One round. fit: free shells or power law. curve_pct: 1 - encircled energy of its total PSF, percent."""
 
     fit: str
     curve_pct: tuple[float, ...]
@@ -100,10 +101,11 @@ class PublishedRound:
 class Published:
     """The result of the published recipe.
 
-    a, b_px, c: the power law of the last round. spread: their standard deviations over the subsets, None if fewer
-    than two subsets were kept. total: scattered light on a grid of grid_px. free: the subset fits of the last round
-    with free shells, on `segments`. curve_pct: cumulative curve of the final total PSF at radii_px, where scatter is
-    convolved with diffraction. equations: their number in the last round.
+    a, b_px, c: the power law of the last round. spread: standard deviations of a, b_px and c over the subsets; None if
+    fewer than two subsets were kept. total: the fraction of scattered light, summed over a square grid of grid_px pixels.
+    free: the subset fits of the last round with free shells. segments: these shells. curve_pct: 1 - encircled energy (in
+    percent) of the final total PSF at radii_px; this PSF is the scatter kernel convolved with the diffraction PSF.
+    equations: the number of equations in the last round.
     """
 
     a: float
@@ -121,7 +123,7 @@ class Published:
 
     @property
     def scatter(self) -> Kernel:
-        """The scatter kernel [y, x] on grid_px."""
+        """The scatter kernel [y, x] on (grid_px, grid_px)."""
         return _power_law_kernel(np.array([self.a, self.b_px, self.c]), self.grid_px)
 
 
@@ -136,8 +138,8 @@ def invert_as_published(
 ) -> Published:
     """Run steps (a) to (j).
 
-    Raises DataError "no-lines" if no pixel is occulted, and "no-scatter" if the fit is not physical: more scatter than
-    light, or a PSF whose maximum is not at its centre.
+    Raises DataError "no-lines" if no pixel is occulted. Raises DataError "no-scatter" if the fit is not physical: it
+    scatters more than all light, or the maximum of its PSF is not at the centre.
     """
     recipe = _Recipe(transit, choices, seed, subsets, threads, progress)
     return recipe.run()
@@ -150,7 +152,8 @@ class _Recipe:
         self.transit, self.choices, self.seed, self.subsets = transit, choices, seed, subsets
         self.threads, self.progress = threads, progress
         field = max(transit.shape)
-        # "Out to the edge of the PSF" means the array of the known PSF, which in the paper is as large as the images.
+        # The paper counts scatter "out to the edge of the PSF". Here this is the edge of the array of the diffraction
+        # PSF. In the paper, this array is as large as the images.
         self.grid = (
             min(transit.diffraction.shape[0], REACH_GRID_PX) if choices.counted_on_array else REACH_GRID_PX
         )
@@ -216,7 +219,7 @@ class _Recipe:
         )
 
     def _equations(self, kernel: Kernel, n: int) -> Equations:
-        """Steps (d) to (h) for all frames: their equations."""
+        """The equations of all images, from steps (d) to (h)."""
         frames = self.transit.frames
         scenes = self._deconvolved(kernel, n)
         rng = np.random.default_rng([self.seed, n])
@@ -237,7 +240,7 @@ class _Recipe:
         return Equations.joined(parts)
 
     def _deconvolved(self, kernel: Kernel, n: int) -> list[NDArray[np.float32]]:
-        """Step (d): the scenes of all frames by Richardson-Lucy."""
+        """Step (d): the scenes of all images, deconvolved with Richardson-Lucy."""
         psf = Psf(kernel, name="round", version=str(n), instrument=None, status="draft")
         conditions = Conditions(edges="zero", margin_px=0, threads=self.threads, engine_for=EngineCache())
         scenes = []
@@ -256,7 +259,7 @@ class _Recipe:
     def _equations_of_frame(
         self, frame: Frame, scene: NDArray[np.float32], found: FoundPlace, rng: np.random.Generator
     ) -> Equations | None:
-        """Steps (f) to (h) for one frame; None if none of its pixels is occulted."""
+        """The equations of one image, from steps (f) to (h); None if no pixel of the image is occulted."""
         shape, place = self.transit.shape, found.place
         distance = disc_distance(shape, place)
         within = distance <= place.radius_px
@@ -287,7 +290,7 @@ class _Recipe:
         )  # step (h)
 
     def _scale(self, frame: Frame, observed: Vector, stratum: NDArray[np.int64]) -> Vector:
-        """The divisor of each equation."""
+        """The number by which each equation is divided."""
         level = np.empty_like(observed)
         for here in (stratum == UNOCCULTED, stratum != UNOCCULTED):
             level[here] = max(float(observed[here].mean()), LEAST_LEVEL_DN_S) if here.any() else 1.0
@@ -303,7 +306,7 @@ class _Recipe:
 
 
 def _check_brightest_at_centre(kernel: Kernel, found: str) -> None:
-    """Raise DataError "no-scatter" if the centre is not the maximum: such a PSF is not physical."""
+    """Raise DataError "no-scatter" if the central pixel is not the maximum; such a PSF is not physical."""
     middle = (kernel.shape[0] // 2, kernel.shape[1] // 2)
     if kernel[middle] < kernel.max() * (1 - CENTRE_TOLERANCE):
         y, x = np.unravel_index(int(kernel.argmax()), kernel.shape)
@@ -331,7 +334,10 @@ def _power_law_kernel(law: Vector, size: int) -> Kernel:
 
 
 def _radii_of(segments: Segments) -> list[tuple[Vector, Vector]]:
-    """For each segment, the distances of its pixels and their numbers; at most 40 mean distances per segment."""
+    """For each segment, the distances of its pixels (px) and the number of pixels at each distance.
+
+    A segment with more than 40 distances is divided into 40 rings; the mean distance of each ring is used.
+    """
     squares, count = np.unique(
         squared_radii((segments.reach_grid_px, segments.reach_grid_px)), return_counts=True
     )

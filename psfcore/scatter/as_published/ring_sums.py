@@ -1,18 +1,18 @@
-"""Sums of an image over the segments of the PSF about many target pixels.
+"""Sums of an image over the segments of the PSF that are centred on many target pixels.
 
 Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", step (h):
 
     A_S[r] = sum over dr in S of I[r - dr]                                                   Eq. (1)
 
-for targets r, with I = 0 beyond the image. In each row, a segment consists of a few runs of adjacent pixels. With
-running sums along the rows of the image, each run costs one difference, independent of its length:
+for targets r, with I = 0 beyond the image. In each row, a segment consists of a few runs of adjacent pixels. Running sums
+P along the rows of the image are computed first. Each run then costs one difference, independent of its length:
 
     P[y, i] = sum over x < i of I[y, x]                                                      Eq. (2)
     sum over dx_start <= dx < dx_stop of I[y, x - dx] = P[y, x - dx_start + 1] - P[y, x - dx_stop + 1]    Eq. (3)
 
-Targets are grouped into strips of up to 24 adjacent pixels of a row. They read adjacent values of P, so the sums of a
-strip are vector operations. Image rows are processed four at a time, and their running sums stay in the cache while all
-strips use them.
+Targets are grouped into strips of up to 24 adjacent pixels of a row. The targets of a strip read adjacent values of P, so
+the sums of a strip are vector operations. Image rows are processed four at a time. Their running sums stay in the cache
+while all strips use them.
 
 | symbol | name |
 |---|---|
@@ -37,8 +37,8 @@ from psfcore.scatter.as_published.segments import Runs, Segments
 
 LANES = 24
 _ROWS = 4
-_VECTOR = 4  # the number of lanes of a strip is a multiple of this
-_LARGEST_SUMS = 2**20  # numbers that one thread keeps at a time: 8 MiB
+_VECTOR = 4  # the number of lanes (pixels) of a strip is a multiple of this number
+_LARGEST_SUMS = 2**20  # largest array of sums that one thread keeps at a time: 8 MiB
 
 Sums = NDArray[np.float64]
 
@@ -46,11 +46,12 @@ Sums = NDArray[np.float64]
 def segment_sums(
     image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments, *, threads: int = 1
 ) -> Sums:
-    """A_S, Eq. (1), (n, segments.size), in the image's unit times px^2, exact to float64 rounding.
+    """A_S of Eq. (1), array (n, segments.size), in the image's unit times px^2; exact to float64 rounding.
 
-    image: [y, x], float32 or float64; dark beyond its edges. targets: (n, 2), (y, x) on the image, in any order.
-    threads: share the targets; the result does not depend on their number. Raises DataError "image-nonfinite" if a
-    pixel is NaN or infinite, and ValueError if the image does not have two axes or a target lies outside it.
+    image: [y, x], float32 or float64; it is taken as 0 beyond its edges. targets: (n, 2), the (y, x) of each target on the
+    image, in any order. threads: number of threads that share the targets; it does not change the result. Raises
+    DataError "image-nonfinite" if a pixel is NaN or infinite, and ValueError if the image does not have two axes or a
+    target lies outside it.
     """
     _check(image, targets)
     out = np.zeros((len(targets), segments.size))
@@ -82,7 +83,10 @@ def segment_sums(
 def ring_sums(
     image: NDArray[np.floating], targets: NDArray[np.integer], edges_px: ArrayLike, *, threads: int = 1
 ) -> Sums:
-    """A_S of rings without sectors, (n, shells): `segment_sums` for `Segments(edges_px)`, cached for the next image."""
+    """A_S of rings without sectors, (n, shells): the result of `segment_sums` for `Segments(edges_px)`.
+
+    The segments are cached for the next image.
+    """
     return segment_sums(image, targets, _rings(tuple(np.asarray(edges_px, float).tolist())), threads=threads)
 
 
@@ -106,7 +110,10 @@ def _check(image: NDArray[np.floating], targets: NDArray[np.integer]) -> None:
 
 
 def _parts(strips: int, threads: int, largest: int) -> list[slice]:
-    """Slices of about equal numbers of strips: one per thread, or more to keep the sums of each in the cache."""
+    """Slices that contain about equal numbers of strips.
+
+    Each thread gets one slice, or more slices if the sums of one slice would exceed `largest` strips.
+    """
     count = min(strips, threads * -(-strips // (threads * largest)))
     bounds = [strips * k // count for k in range(count + 1)]
     return [slice(start, stop) for start, stop in pairwise(bounds)]
@@ -114,7 +121,7 @@ def _parts(strips: int, threads: int, largest: int) -> list[slice]:
 
 @compiled()
 def _strips(targets):  # type: ignore[no-untyped-def]
-    """Strip of each target, and (y, x) of the first pixel of each strip. Targets are sorted by y, then x."""
+    """Index of the strip of each target, and (y, x) of the first pixel of each strip. Targets are sorted by y, then x."""
     strip = np.empty(len(targets), np.int64)
     first = np.empty((len(targets), 2), np.int64)
     count = 0
@@ -128,7 +135,10 @@ def _strips(targets):  # type: ignore[no-untyped-def]
 
 
 def _places(strip_yx: NDArray[np.int64], runs: Runs) -> range:
-    """Indices of P that the strips read. All threads use the same range, because its start determines the rounding."""
+    """The range of x indices at which the strips read P.
+
+    All threads use the same range, because the start of the range determines the rounding of the sums.
+    """
     first = strip_yx[:, 1].min() - runs.dx_stop.max() + 1
     last = strip_yx[:, 1].max() + LANES - runs.dx_start.min()
     return range(int(first), int(last) + 1)
@@ -137,7 +147,7 @@ def _places(strip_yx: NDArray[np.int64], runs: Runs) -> range:
 def _sum_strips(
     image: NDArray[np.floating], strip_yx: NDArray[np.int64], runs: Runs, places: range, sums: Sums
 ) -> None:
-    """Add Eq. (1) for strips to `sums`, (strips, segments, lanes)."""
+    """Add the sums of Eq. (1) for some strips to `sums`, (strips, segments, lanes)."""
     running = np.zeros((_ROWS, len(places)))
     of_row = (runs.first_dy, runs.row, runs.dx_start, runs.dx_stop, runs.segment)
     _accumulate(image, strip_yx, *of_row, places.start, running, sums)
@@ -145,9 +155,10 @@ def _sum_strips(
 
 @compiled()
 def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
-    """Eq. (2) for four rows from `top`, at indices from `first`; constant beyond the columns of the image.
+    """P of Eq. (2) for the four rows that begin at `top`, at indices that begin at `first`.
 
-    Beyond the last row, the last row is used again. Four independent sums hide the latency of each addition.
+    P is constant beyond the columns of the image. Beyond the last row of the image, the last row is used again. The four
+    independent sums hide the latency of each addition.
     """
     ny, nx = image.shape
     places = running.shape[1]
@@ -185,8 +196,8 @@ def _accumulate(image, strip_yx, first_dy, row, dx_start, dx_stop, segment, firs
                     continue
                 p = running[k]
                 for i in range(row[j], row[j + 1]):
-                    # Eq. (3) for adjacent targets. The compiler vectorises this loop only with unsigned indices and
-                    # a number of lanes that is unknown at compile time.
+                    # Eq. (3) for adjacent targets. The compiler vectorises this loop only if the indices are unsigned
+                    # and the number of lanes is not known at compile time.
                     high, low = np.uint64(base - dx_start[i]), np.uint64(base - dx_stop[i])
                     a = np.uint64(segment[i]) * np.uint64(lanes)
                     for w in range(lanes):

@@ -1,17 +1,17 @@
-"""Segments of the PSF: shells or sectors, each with one coefficient.
+"""Segments of the PSF: shells, or sectors of shells; each segment has one coefficient.
 
-Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", step (c): concentric shells,
-optionally divided into angular sectors. A segment S is a set of offsets dr = target - source: light from a source
-falls on target = source + dr. A pixel belongs to shell k if edges[k] <= r < edges[k + 1], and to sector m if its angle
-from +x towards +y lies in [m, m + 1) times 360 / sectors degrees; segment = shell * sectors + sector. The central pixel
-belongs to no segment: its weight is 1 minus the light of all segments.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, "The inversion algorithm", step (c). The shells are
+concentric and can be divided into angular sectors. A segment S is a set of offsets dr = target - source: light from a
+source falls on target = source + dr. A pixel belongs to shell k if edges[k] <= r < edges[k + 1]. It belongs to sector m if
+its angle from +x towards +y lies in [m, m + 1) times 360 / sectors degrees. The index of the segment is
+shell * sectors + sector. The central pixel belongs to no segment: its weight is 1 minus the light of all segments.
 
     n_S = number of pixels of S on the reach grid                                            Eq. (1)
     psf_S = (1 / n_S) sum over dr in S of f(dr)                                              Eq. (2)
 
-Difference from the paper: it prints only the number of the innermost shells, ten, and their outer edge, 5 px. Pixel
-distances below 5 px have only twelve values, so four of ten shells of equal width would be empty. Here each of the ten
-shells contains one or two of these distances.
+Difference from the paper: about the innermost shells, the paper gives only their number, ten, and their outer edge, 5 px.
+There are only twelve different pixel distances below 5 px, so four of ten shells of equal width would be empty. Here each
+of the ten shells contains one or two of these distances.
 
 | symbol | name | unit |
 |---|---|---|
@@ -32,24 +32,24 @@ from numpy.typing import NDArray
 
 from psfcore.psf import REACH_GRID_PX, squared_radii
 
-# Just beyond the corner of the reach grid, which is 1448.15 px from its centre.
+# This radius is slightly larger than 1448.15 px, the distance of the corner of the reach grid from its centre.
 FULL_REACH_PX = 1449.0
 _PUBLISHED_CORE_PX = (0.5, 1.2, 1.7, 2.1, 2.5, 2.9, 3.1, 3.4, 3.8, 4.2, 5.0)
 _PUBLISHED_TAIL = 35
-_EXACT_PX = 32.0  # within this radius every pixel is evaluated
-_CELL = 1 / 16  # side of a cell over its radius
+_EXACT_PX = 32.0  # within this radius, the kernel is evaluated at every pixel
+_CELL = 1 / 16  # side of a cell divided by its distance from the centre
 _RING_EXACT_PX = 64.0
-_RING = 1 / 2048  # width of a thin ring over its radius
+_RING = 1 / 2048  # width of a thin ring divided by its radius
 
 Floats = NDArray[np.float64]
 KernelFunction = Callable[[Floats, Floats], Floats]
 
 
 def shells_as_published(reach_px: float = FULL_REACH_PX) -> Floats:
-    """Edges (51,) in px of the paper's 50 shells.
+    """The edges (51,) of the paper's 50 shells, in px.
 
-    Ten shells reach to 5 px, five to 10 px, and 35 with exponentially growing widths to `reach_px`. Raises ValueError
-    if `reach_px` is not above 10.
+    Ten shells lie within 5 px, and five between 5 and 10 px. The widths of the other 35 grow exponentially up to
+    `reach_px`. Raises ValueError if `reach_px` is not above 10.
     """
     if not reach_px > 10:
         raise ValueError(f"expected a reach above 10 px; got {reach_px}")
@@ -59,10 +59,11 @@ def shells_as_published(reach_px: float = FULL_REACH_PX) -> Floats:
 
 
 def fine_shells(reach_px: float = FULL_REACH_PX, growth: float = 0.03) -> Floats:
-    """Edges in px, from 0.5 to `reach_px`, of shells of width `growth` times the radius, but at least about 1 px.
+    """The edges of shells from 0.5 px to `reach_px`, in px.
 
-    The inner shells are 1 px wide. The outer ones grow, and are slightly wider than requested so that the last one
-    ends at `reach_px`. Raises ValueError if `reach_px` is not above 1.5, or `growth` not above 0.
+    The inner shells are 1 px wide. Farther out, the width of a shell is `growth` times its radius. These shells are
+    slightly wider than that, so that the last one ends at `reach_px`. Raises ValueError if `reach_px` is not above 1.5, or
+    if `growth` is not above 0.
     """
     if not (reach_px > 1.5 and growth > 0):
         raise ValueError(f"expected a reach above 1.5 px and a growth above 0; got {reach_px} and {growth}")
@@ -77,9 +78,10 @@ def fine_shells(reach_px: float = FULL_REACH_PX, growth: float = 0.03) -> Floats
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Segments row by row: run i contains the offsets dx_start[i] <= dx < dx_stop[i] of `segment[i]`.
+    """The segments as runs of adjacent pixels, row by row.
 
-    The runs of a row dy have the indices row[dy - first_dy] to row[dy - first_dy + 1], in the order of dx.
+    Run i contains the offsets dx_start[i] <= dx < dx_stop[i]; they belong to the segment with the index segment[i]. The
+    runs of row dy are sorted by dx. Their indices begin at row[dy - first_dy] and end before row[dy - first_dy + 1].
     """
 
     first_dy: int
@@ -91,7 +93,10 @@ class Runs:
 
 @dataclass(frozen=True, eq=False)
 class _Nodes:
-    """Points (dx, dy) in px and the number of pixels that each represents, sorted by segment."""
+    """Points (dx, dy) in px at which a kernel is evaluated.
+
+    weight: the number of pixels that each point represents. segment: the index of the segment of each point.
+    """
 
     dx: Floats
     dy: Floats
@@ -101,10 +106,11 @@ class _Nodes:
 
 @dataclass(frozen=True)
 class Segments:
-    """Shells with the given edges (px, increasing, the first above 0), each divided into `sectors` (1: isotropic).
+    """Concentric shells, each divided into `sectors` sectors (1: isotropic).
 
-    Only pixels of the reach grid count: (reach_grid_px, reach_grid_px) with centre [n // 2, n // 2]. Raises ValueError
-    if the edges do not increase from above 0, or if `sectors` is below 1.
+    edges_px: edges of the shells, increasing; the first is above 0. Only pixels of the reach grid count. Its shape is
+    (reach_grid_px, reach_grid_px), its centre [n // 2, n // 2]. Raises ValueError if an edge is 0 or negative, if the
+    edges do not increase, or if `sectors` is below 1.
     """
 
     edges_px: tuple[float, ...]
@@ -131,12 +137,12 @@ class Segments:
 
     @cached_property
     def counts(self) -> NDArray[np.int64]:
-        """n_S, Eq. (1), (size,); 0 for a sector too narrow to contain a pixel."""
+        """n_S of Eq. (1), array (size,). It is 0 for a sector that is too narrow to contain a pixel."""
         label = self._reach_map.ravel()
         return np.bincount(label + 1, minlength=self.size + 1)[1:]
 
     def label_map(self, size: int) -> NDArray[np.int32]:
-        """Segment of each pixel [y, x] of (size, size) with centre [size // 2, size // 2].
+        """The index of the segment of each pixel [y, x], on (size, size) with centre [size // 2, size // 2].
 
         The value is -1 at the centre, outside all shells, and outside the reach grid.
         """
@@ -150,27 +156,28 @@ class Segments:
         return out
 
     def mean_of(self, kernel_function: KernelFunction) -> Floats:
-        """psf_S of a smooth kernel, Eq. (2), (size,); 0 for empty segments.
+        """psf_S of Eq. (2) for a smooth kernel, array (size,). It is 0 for empty segments.
 
-        kernel_function: weights at offsets (dx, dy), two arrays in px of the same shape. Beyond 32 px, four points
-        represent each cell of about a sixteenth of the radius. They have the mean and the covariance of its pixels.
-        For power laws, also stretched ones, the result is within 1e-5 of the mean over pixels (tested), which
-        `mean_of_map` computes.
+        kernel_function: returns the weights at the offsets (dx, dy), which are two arrays in px of the same shape. Beyond
+        32 px, pixels are grouped into cells; the side of a cell is about a sixteenth of its distance from the
+        centre. Four points represent a cell. Their mean and covariance are those of the cell's pixels. For power laws, also stretched ones, the result
+        has a relative error of at most 1e-5, compared with the mean over all pixels that `mean_of_map` computes (tested).
         """
         nodes = self._nodes
         return self._mean(nodes, kernel_function(nodes.dx, nodes.dy))
 
     def mean_of_radial(self, radial_function: Callable[[Floats], Floats]) -> Floats:
-        """psf_S, Eq. (2), of an isotropic kernel, (size,); 0 for empty segments.
+        """psf_S of Eq. (2) for an isotropic kernel, array (size,). It is 0 for empty segments.
 
-        radial_function: weights at distances, an array in px. The mean is exact to 64 px. Beyond, rings of width
-        r / 2048 give it to 1e-6 of the mean over pixels (tested).
+        radial_function: returns the weights at an array of distances in px. The mean is exact up to 64 px. Beyond 64 px,
+        the kernel is evaluated once in each ring of width r / 2048; the relative error is then at most 1e-6, compared with
+        the mean over all pixels (tested).
         """
         nodes = self._ring_nodes
         return self._mean(nodes, radial_function(nodes.dx))
 
     def mean_of_map(self, kernel: Floats) -> Floats:
-        """psf_S, Eq. (2), of any kernel [y, x] on the reach grid, (size,); 0 for empty segments.
+        """psf_S of Eq. (2) for any kernel [y, x] on the reach grid, array (size,). It is 0 for empty segments.
 
         Raises ValueError if `kernel` does not have the shape of the reach grid.
         """
@@ -182,7 +189,7 @@ class Segments:
 
     @cached_property
     def runs(self) -> Runs:
-        """The segments row by row, for sums along rows."""
+        """The segments as runs of pixels, row by row; `ring_sums` uses them."""
         label = self._reach_map
         centre = self.reach_grid_px // 2
         # The padding makes every row begin and end outside all segments.
@@ -207,7 +214,7 @@ class Segments:
 
     @cached_property
     def _shell_of_square(self) -> NDArray[np.int32]:
-        """Shell by r^2 (px^2, integers); -1 at the centre and outside all shells."""
+        """The shell of each integer r^2 (px^2), which is the index; -1 at the centre and outside all shells."""
         corner = 2 * (self.reach_grid_px // 2) ** 2
         return _between(self.edges_px, np.sqrt(np.arange(corner + 1)))
 
@@ -222,7 +229,11 @@ class Segments:
         return label.astype(np.int32)
 
     def _ring_of_square(self, exact_px: float, width: float) -> NDArray[np.int64]:
-        """Ring by r^2: one per distance below `exact_px`, then of width `width` times r. No ring crosses a shell's edge."""
+        """The ring of each integer r^2 (px^2), which is the index.
+
+        Below `exact_px`, every distance has its own ring. Farther out, the width of a ring is `width` times r. No ring
+        crosses the edge of a shell.
+        """
         squares = np.arange(self._shell_of_square.size)
         wide = np.floor(np.log(np.maximum(squares, 1)) / (2 * width)).astype(np.int64)
         new = (np.diff(wide, prepend=0) != 0) | (np.diff(self._shell_of_square, prepend=0) != 0)
@@ -230,7 +241,10 @@ class Segments:
 
     @cached_property
     def _ring_nodes(self) -> _Nodes:
-        """One node per segment and distance; farther out, one per segment and thin ring, at its mean distance."""
+        """One node for each segment and distance within 64 px.
+
+        Farther out, one node for each segment and thin ring, at the mean distance of the ring's pixels.
+        """
         squares, label = squared_radii((self.reach_grid_px, self.reach_grid_px)), self._reach_map
         ring = self._ring_of_square(_RING_EXACT_PX, _RING)
         inside = label >= 0
@@ -244,7 +258,7 @@ class Segments:
 
     @cached_property
     def _nodes(self) -> _Nodes:
-        """Every pixel near the centre; farther out, four points per cell of pixels."""
+        """Every pixel within 32 px is a node. Farther out, four nodes represent each cell of pixels."""
         shape = (self.reach_grid_px, self.reach_grid_px)
         squares, label = squared_radii(shape), self._reach_map
         parts = self.sectors * int(np.ceil(2 * np.pi / _CELL / self.sectors))
@@ -265,13 +279,16 @@ class Segments:
 
 
 def _between(edges_px: tuple[float, ...], radius_px: Floats) -> NDArray[np.int32]:
-    """Shell of each distance; -1 outside all shells."""
+    """The index of the shell at each distance; -1 outside all shells."""
     shell = np.searchsorted(edges_px, radius_px, side="right") - 1
     return np.where(shell < len(edges_px) - 1, shell, -1).astype(np.int32)
 
 
 def _sector(shape: tuple[int, int], sectors: int) -> NDArray[np.int32]:
-    """Sector [y, x] by the angle from +x towards +y about [ny // 2, nx // 2]."""
+    """The index of the sector of each pixel [y, x].
+
+    It follows from the angle of the pixel about [ny // 2, nx // 2], from +x towards +y.
+    """
     dy = np.arange(shape[0], dtype=np.float64) - shape[0] // 2
     dx = np.arange(shape[1], dtype=np.float64) - shape[1] // 2
     turn = np.arctan2(dy[:, None], dx[None, :]) / (2 * np.pi) % 1.0
@@ -282,7 +299,10 @@ def _sector(shape: tuple[int, int], sectors: int) -> NDArray[np.int32]:
 def _four_places(
     dx: Floats, dy: Floats, cell: NDArray[np.int64]
 ) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
-    """dx, dy, weight and cell of four points of equal weight, with the mean and covariance of each cell's pixels."""
+    """dx, dy, weight and cell of four points of equal weight in each cell.
+
+    The mean and covariance of the four points are those of the cell's pixels.
+    """
     counted = np.bincount(cell)
     held = np.flatnonzero(counted)
     n = counted[held].astype(np.float64)
@@ -291,7 +311,7 @@ def _four_places(
         return np.asarray(np.bincount(cell, weights=value)[held] / n)
 
     x, y = mean(dx), mean(dy)
-    # Offsets are relative to the centre of the cell, which avoids the cancellation of large squares.
+    # The offsets are taken relative to the centre of the cell. This avoids differences of large squares.
     middle_x, middle_y = np.zeros(counted.size), np.zeros(counted.size)
     middle_x[held], middle_y[held] = x, y
     ex, ey = dx - middle_x[cell], dy - middle_y[cell]

@@ -1,34 +1,36 @@
 """Fit diffuse scatter to a transit: find the PSF for which the occulter is dark.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j). The four
-biases of the published fit are corrected, and its rounds are solved as one non-linear least-squares problem.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (a) to (j). Here
+the four biases of the published fit are corrected. One non-linear least-squares problem replaces the paper's rounds.
 
-H(q) is the total PSF on the field, D selects the fully dark pixels, and x(q) = H(q)^-1 y is the scene of an image y:
+H(q) is the convolution with the total PSF on the field. D selects the fully dark pixels. x(q) = H(q)^-1 y is the scene of
+an image y:
 
     r(q) = D [y - H(q) (1 - D) x(q)]                                  Eq. (1)
     minimise over q   sum over images and dark pixels of r^2 / v      Eq. (2)
     v = variance of photon and read noise at the model's intensity    Eq. (3)
     dr/dq = -D [(dH/dq) (1 - D) x - H (1 - D) G (dH/dq) x]            Eq. (4)
 
-The paper alternates: steps (d) and (f) find a scene at a fixed PSF, steps (h) and (i) a PSF at a fixed scene. Eq. (4)
-contains both effects: the PSF changes the light in the disc, and it changes the scene that scatters into the disc. A
-Gauss-Newton step with Eq. (4) converges in three or four rounds, where the alternation needs six or more. Its normal
-matrix also gives the error of the fit.
+The paper alternates: steps (d) and (f) find the scene for a fixed PSF, steps (h) and (i) find the PSF for a fixed scene.
+Eq. (4) contains both effects of a change of the PSF: it changes the light that the scene scatters into the disc, and it
+changes the scene. Gauss-Newton steps with Eq. (4) converge in three or four rounds, whereas the alternation needs six or
+more. The normal matrix of the steps also gives the error of the fit.
 
 Differences from the paper; the benefit of each was measured on simulated transits:
-- Pixels are weighted by the expected intensity, not by the observed one, Eq. (3).
-- Scatter and diffraction are convolved, so scattered light is diffracted too: Eq. (1) contains the total PSF.
-- Light is counted to the corner of the full reach.
+- The weight of a pixel follows from the expected intensity, not from the observed intensity, Eq. (3).
+- The scatter kernel and the diffraction PSF are convolved, because scattered light is diffracted too. Eq. (1) therefore
+  contains the total PSF.
+- Scattered light is counted to the corner of the full reach.
 - Only fully dark pixels are set to zero, not every pixel within the radius.
-- The scene is reconstructed by a linear method.
-- A formula of scatter needs no shells, because Eq. (1) is exact.
+- The scene is reconstructed by a linear method, not by Richardson-Lucy.
+- The formula of scatter is not averaged over shells, because Eq. (1) uses the kernel at every pixel.
 
 | symbol | name | unit |
 |---|---|---|
 | y | frame.pixels | DN/s |
 | q | coordinates of the shape's parameters | - |
 | D | dark: rows and columns of the fully dark pixels | - |
-| G | optics.invert_once | - |
+| G | optics.invert_once: inverse of H | - |
 """
 
 from __future__ import annotations
@@ -61,10 +63,11 @@ def invert(
 ) -> Solution:
     """Fit a shape of scatter to a transit.
 
-    start: coordinates; default: the start of the shape. near: the start comes from a fit of nearly the same images.
-    Then no pilot fit of a few images runs first, and occulters are located again only if the curve moves. counts: the
-    weight of each frame, as the number of times that it counts; default: once each. A frame with count 0 is held out
-    of the fit, but it still helps to locate the occulters of its neighbours in time.
+    start: coordinates at which the fit starts; default: shape.start. near: True if these coordinates come from a fit to
+    nearly the same images. Then the fit does not begin with a pilot fit to a few images. The occulters are located again
+    only if the fit does not converge, or if C(R) changes by 0.3 percentage points or more. counts: how many times each
+    image counts; default: once. An image with count 0 is held out of the fit, but it still helps to locate the occulters
+    of its neighbours in time.
 
     Raises DataError "too-few-frames" if fewer than three frames contain an occulter, and "transit-says-too-little" if
     the frames do not determine all parameters.
@@ -86,7 +89,7 @@ def invert(
             spread = np.unique(np.linspace(0, len(frames) - 1, PILOT_FRAMES).round().astype(int))
             at = solver.solve(at, [frames[k] for k in spread], PILOT_CONVERGED_POINTS)
         at = solver.solve(at, frames, PILOT_CONVERGED_POINTS)
-    kernel = total.kernel(at)  # step (e) again, now with a PSF that is nearly correct
+    kernel = total.kernel(at)  # repeat step (e) with a PSF that is nearly correct
     sky.find(Optics(kernel, transit.shape, threads=threads), kernel)
     at = solver.solve(at, solver.taking_part(), CONVERGED_POINTS)
     return solver.solution(at)
@@ -101,9 +104,9 @@ def refit(
 ) -> SolutionWithoutErrors:
     """Repeat the fit of a solution with other counts (see `invert`).
 
-    start: coordinates near the expected result, for example one Gauss-Newton step from the solution. The iteration
-    starts from the scenes of the solution, and every occulter is located again with the PSF at the start. Raises
-    DataError as `invert` does.
+    start: coordinates near the expected result, for example one Gauss-Newton step from the solution. The iteration starts
+    from the scenes of the solution. Every occulter is located again with the PSF at the coordinates `start`. Raises the
+    errors of `invert`.
     """
     total, threads = solution.total, solution.threads
     sky = solution.sky.copy()

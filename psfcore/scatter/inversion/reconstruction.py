@@ -1,20 +1,21 @@
-"""A transit reconstructed with one PSF: its scenes, and what the PSF leaves unexplained in its discs.
+"""A transit reconstructed with one PSF: its scenes, and the light in its discs that the PSF does not explain.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (d) to (f). With
-H the total PSF on the field, D the fully dark pixels, and x = H^-1 y the scene of an image:
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (d) to (f).
+H is the convolution with the total PSF on the field. D selects the fully dark pixels. x = H^-1 y is the scene of an
+image y:
 
     r = D [y - H (1 - D) x]                                           Eq. (1)
     v = variance of photon and read noise at the model's intensity    Eq. (3)
     dr/dq = -D [(dH/dq) (1 - D) x - H (1 - D) G (dH/dq) x]            Eq. (4)
 
-The equations have the numbers that they have in `psfcore.scatter.inversion.inversion`.
+The equations have the same numbers as in `psfcore.scatter.inversion.inversion`.
 
 | symbol | name | unit |
 |---|---|---|
 | y | frame.pixels | DN/s |
 | q | coordinates of the shape's parameters | - |
 | D | dark: rows and columns of the fully dark pixels | - |
-| G | optics.invert_once | - |
+| G | optics.invert_once: inverse of H | - |
 """
 
 from __future__ import annotations
@@ -38,12 +39,15 @@ DARK_MARGIN_PX = 0.05
 DARK_MARGIN_SIGMAS = 1.5
 LARGEST_DARK_MARGIN_PX = 2.5
 LEAST_DARK_PIXELS = 30
-# Lower limit of the intensity from which a pixel's variance is computed, as a fraction of the disc's mean.
+# The variance of a pixel is computed from its expected intensity, but at least from this fraction of the disc's mean.
 LEAST_LEVEL = 0.2
 
 
 class TransitScenes:
-    """All frames of a transit in the engine's order, with their latest scenes and occulter positions."""
+    """All images of a transit, with their latest scenes and occulter positions.
+
+    Images and scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.optics`).
+    """
 
     def __init__(self, transit: Transit, optics: Optics, progress: Progress) -> None:
         self.transit = transit
@@ -79,7 +83,7 @@ class TransitScenes:
         self.dark = [dark_pixels(frame, found) for frame, found in zip(frames, self.found, strict=True)]
 
     def left_out(self) -> dict[str, str]:
-        """Frames that the fit cannot use, each with the reason."""
+        """The files that the fit cannot use, with the reason for each."""
         reasons = {}
         for frame, dark, found in zip(self.transit.frames, self.dark, self.found, strict=True):
             if not found.within_reach:
@@ -101,7 +105,7 @@ class TransitScenes:
 
 
 class _SceneFields(Sequence[NDArray[np.float32]]):
-    """Scenes as fields [y, x]. A scene leaves the engine's order only when it is read."""
+    """Scenes as fields [y, x]. A scene is rearranged from the engine's order only when it is read."""
 
     def __init__(self, lanes: Sequence[Lanes], optics: Optics) -> None:
         self._lanes, self._optics = lanes, optics
@@ -121,8 +125,8 @@ class _SceneFields(Sequence[NDArray[np.float32]]):
 def dark_pixels(frame: Frame, found: FoundPlace) -> Pixels:
     """Rows and columns of the pixels that are certainly dark.
 
-    They lie fully within the disc, with a margin for the uncertainty of its position. Filled-in pixels are excluded.
-    There are no dark pixels if the centre of the disc is outside the frame.
+    They lie fully within the disc, with a margin for the uncertainty of the disc's position. Pixels that were filled in are
+    excluded. If the centre of the disc lies outside the image, no pixel counts as dark.
     """
     shape = (frame.pixels.shape[0], frame.pixels.shape[1])
     place = found.place
@@ -140,8 +144,8 @@ def dark_pixels(frame: Frame, found: FoundPlace) -> Pixels:
 class Reconstruction:
     """A transit reconstructed with one PSF: its scenes, its dark pixels, and the residuals there.
 
-    optics: the total PSF. sky: scenes and dark pixels of all frames. part: indices of the frames to which the PSF
-    was fitted.
+    total: computes total PSFs. optics: convolution with the fitted total PSF. sky: scenes and dark pixels of all images.
+    part: indices of the images to which the PSF was fitted.
     """
 
     transit: Transit
@@ -158,27 +162,27 @@ class Reconstruction:
         return scene
 
     def residual(self, n: int) -> tuple[Vector, Vector]:
-        """Eq. (1) for the dark pixels of frame n, and the expected intensity there, DN/s."""
+        """r of Eq. (1) for the dark pixels of image n, and the expected intensity of these pixels, DN/s."""
         expected = pick(self.optics.convolve(self.blanked_scene(n)), self.sky.dark[n])
         return pick(self.sky.observed[n], self.sky.dark[n]) - expected, expected
 
     def weight(self, n: int, expected: Vector) -> Vector:
-        """The inverse of the variance of Eq. (3) at an expected intensity."""
+        """The inverse of the variance of Eq. (3) for pixels of image n with the intensities `expected` (DN/s)."""
         return pixel_weight(self.transit, n, expected)
 
     def jacobian(self, n: int, slope: Blur) -> Vector:
-        """Change of the expected intensity of the dark pixels of frame n for a change of the PSF, Eq. (4)."""
+        """The derivative of the expected dark pixels of image n, from Eq. (4). slope: derivative of the total PSF."""
         return jacobian_row(self.optics, slope, self.blanked_scene(n), self.sky.dark[n])
 
 
 def pixel_weight(transit: Transit, n: int, expected: Vector) -> Vector:
-    """The inverse of the variance of Eq. (3)."""
+    """The inverse of the variance of Eq. (3) for the dark pixels of image n. expected: their intensities, DN/s."""
     level = np.maximum(expected, LEAST_LEVEL * expected.mean())
     return np.asarray(1 / transit.noise.variance(level, transit.frames[n].exposure_s))
 
 
 def jacobian_row(optics: Optics, slope: Blur, blanked: Lanes, dark: Pixels) -> Vector:
-    """Eq. (4) with the opposite sign: change of the expected dark pixels with one coordinate."""
+    """The derivative of the expected dark pixels with respect to one coordinate: Eq. (4) with the opposite sign."""
     changed = slope.convolve(blanked)
     scene = optics.invert_once(changed)
     put(scene, dark, 0.0)

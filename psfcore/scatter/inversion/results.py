@@ -1,4 +1,4 @@
-"""Results of an inversion: its rounds, every frame at the solution, and the parameters with their covariance."""
+"""Results of an inversion: the rounds, the fit of every image, and the parameters with their covariance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from psfcore.transit.occulter import FoundPlace
 
 @dataclass(frozen=True)
 class Round:
-    """One Gauss-Newton step. moved_points: the largest change of the cumulative curve, in percentage points."""
+    """One Gauss-Newton step. frames: number of images. moved_points: largest change of C(R), in percentage points."""
 
     frames: int
     values: dict[str, float]
@@ -26,11 +26,11 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """One frame at the solution: the position of its occulter, and the observed and expected light in the disc.
+    """The fit of one image: the position of its occulter, and the observed and expected light in the disc.
 
     observed, expected: means over the fully dark pixels, DN/s. noise: standard error of the mean residual, DN/s.
-    normal, score: contribution of this frame to the normal equations in coordinates, summed over its pixels.
-    mean_jacobian: change of the expected mean with the coordinates, DN/s.
+    normal, score: matrix and right-hand side that this image adds to the normal equations of the coordinates.
+    mean_jacobian: derivatives of `expected` with respect to the coordinates, DN/s.
     """
 
     file: str
@@ -47,17 +47,18 @@ class FrameFit:
 
     @property
     def residual_pct(self) -> float:
-        """Simulated minus observed, in percent of the observed mean."""
+        """Expected mean minus observed mean, in percent of the observed mean."""
         return 100 * (self.expected - self.observed) / self.observed
 
 
 @dataclass(frozen=True, eq=False)
 class Inversion:
-    """Scatter as fitted to a transit: coordinates with their covariance, curve with its errors, and the rounds.
+    """The scatter that was fitted to a transit: coordinates with their covariance, and the curve C(R) with its errors.
 
-    radii_px, curve_pct, curve_sigma: cumulative curve of the total PSF, 100 (1 - encircled energy), on the square
-    that light within the field can cross. covariance: of the coordinates, from the photon and read noise of all
-    pixels, propagated through the whole estimate. left_out: frames that the fit did not use, with the reasons.
+    curve_pct, curve_sigma: C(R) = 100 (1 - encircled energy) of the total PSF at radii_px, and its standard error. The
+    radii lie within the array of TotalPsf. covariance: covariance matrix of the coordinates; it follows from the photon
+    and read noise of all pixels, propagated through the whole fit. left_out: files that the fit did not use, with the
+    reasons.
     """
 
     shape: Shape
@@ -87,23 +88,26 @@ class Inversion:
 
     @property
     def chi2_per_pixel(self) -> float:
-        """chi2 of all dark pixels over the degrees of freedom; about 1 if photon and read noise explain it."""
+        """chi2 of all dark pixels divided by the degrees of freedom.
+
+        It is about 1 if photon and read noise explain the residuals.
+        """
         pixels = sum(frame.dark[0].size for frame in self.frames)
         return sum(frame.chi2 for frame in self.frames) / (pixels - self.coordinates.size)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution(Reconstruction):
-    """An inversion with the scenes and optics behind it, for later analyses. part is in the order of its frames."""
+    """An inversion together with its scenes and optics, for later analyses. part: in the order of inversion.frames."""
 
     inversion: Inversion
 
 
 @dataclass(frozen=True, eq=False)
 class SolutionWithoutErrors(Reconstruction):
-    """A fit to some of a transit's frames, without errors. left_out: frames that the fit could not use, with reasons.
+    """A fit to some images of a transit, without errors. left_out: files that the fit could not use, with the reasons.
 
-    Scenes of frames outside the fit are those of the solution from which it started.
+    The scenes of images outside the fit are those of the solution from which the fit started.
     """
 
     coordinates: Vector

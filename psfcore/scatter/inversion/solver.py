@@ -1,6 +1,7 @@
-"""Gauss-Newton steps of the inversion: the least-squares problem of Eq. (2).
+"""Gauss-Newton steps that solve the least-squares problem of the inversion, Eq. (2).
 
-The equations have the numbers that they have in `psfcore.scatter.inversion.inversion`.
+The equations have the same numbers as in `psfcore.scatter.inversion.inversion`. The "score" is the right-hand side of the
+normal equations: J^T w r, with J the Jacobian, w the weights and r the residuals.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from psfcore.scatter.optics import Blur, Optics, pick, put
 from psfcore.scatter.shapes import Shape, Vector
 from psfcore.scatter.total_psf import TotalPsf
 
-CONVERGED_POINTS = 0.02  # of the cumulative curve; a tenth of the bias that is allowed
+CONVERGED_POINTS = 0.02  # limit for the change of C(R), in percentage points: a tenth of the allowed bias
 ROUNDS = 12
 WARM_STEPS = 3
 SLOPES_KEPT_BELOW_POINTS = 0.3
 LEAST_FRAMES = 3
-WEAKEST_DIRECTION = 1e-10  # smallest eigenvalue of a normal matrix scaled to a unit diagonal
+WEAKEST_DIRECTION = 1e-10  # smallest allowed eigenvalue of the normal matrix, after scaling its diagonal to 1
 
 
 @dataclass(frozen=True, eq=False)
 class _Slopes:
-    """The Jacobian of one frame, weighted. It is reused while the PSF hardly changes."""
+    """The weighted Jacobian of one image. It is reused while the PSF hardly changes."""
 
     weight: Vector
     weighted: NDArray[np.float64]
@@ -39,7 +40,7 @@ class _Slopes:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """One frame compared with the model: residual and expected intensity of its dark pixels, and its Jacobian."""
+    """One image compared with the model: residual and expected intensity of its dark pixels, and their Jacobian."""
 
     residual: Vector
     expected: Vector
@@ -56,7 +57,7 @@ class _Measured:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """The PSF at some coordinates, prepared for convolution, and its derivatives there."""
+    """The PSF at given coordinates, prepared for convolution, and the derivatives of this PSF."""
 
     optics: Optics
     slope_blurs: list[Blur]
@@ -77,7 +78,7 @@ class Solver:
 
     @property
     def moved_points(self) -> float:
-        """Largest change of the cumulative curve since the first round, in percentage points."""
+        """The largest difference between the curves C(R) of the first and the last round, in percentage points."""
         first, last = (np.array(self.rounds[k].curve_pct) for k in (0, -1))
         return float(np.abs(last - first).max())
 
@@ -99,7 +100,7 @@ class Solver:
         return frames
 
     def solve(self, at: Vector, frames: list[int], tolerance_points: float) -> Vector:
-        """Iterate until the cumulative curve moves by less than the tolerance."""
+        """Iterate until C(R) changes by less than the tolerance in one round. Return the coordinates."""
         kept: dict[int, _Slopes] = {}
         moved, self.converged = np.inf, False
         before: tuple[Vector, float] | None = None
@@ -111,7 +112,7 @@ class Solver:
             kept = {n: m.slopes for n, m in measured.items()}
             chi2 = sum(self._counts[n] * m.chi2 for n, m in measured.items())
             if before is not None and chi2 > 1.2 * before[1]:
-                at, kept = (at + before[0]) / 2, {}  # the step was too long: go back half of it
+                at, kept = (at + before[0]) / 2, {}  # the step was too long: take half of it
                 continue
             before = (at, chi2)
             step, whole = self._step(measured)
@@ -133,7 +134,7 @@ class Solver:
         return at
 
     def _step(self, measured: dict[int, _Measured]) -> tuple[Vector, bool]:
-        """The Gauss-Newton step, shortened to the largest step of each parameter; and whether it is full length."""
+        """The Gauss-Newton step, shortened if it exceeds the largest step of a parameter; True if it was not shortened."""
         normal = np.sum([self._counts[n] * m.slopes.normal for n, m in measured.items()], axis=0)
         _check_determined(normal, self._total.shape)
         score = np.sum([self._counts[n] * m.score for n, m in measured.items()], axis=0)
@@ -158,7 +159,7 @@ class Solver:
         return measured
 
     def _measure_one(self, model: _Model, n: int, kept: _Slopes | None) -> _Measured:
-        """Eq. (1) for one frame, and Eq. (3) and (4) unless they are reused from the last round."""
+        """Compute Eq. (1) for one image. Compute Eq. (3) and (4) too, unless those of an earlier round are reused."""
         sky, optics = self._sky, model.optics
         dark, observed = sky.dark[n], sky.observed[n]
         scene = optics.invert(observed, sky.scenes[n], steps=WARM_STEPS)  # step (d)
@@ -175,7 +176,7 @@ class Solver:
         return _Measured(residual, expected, _Slopes(weight, weighted, weighted @ jacobian.T))
 
     def solution(self, at: Vector) -> Solution:
-        """The results at these coordinates: measures every frame once more, for residuals and errors."""
+        """The results at these coordinates. Every image is measured once more to obtain residuals and errors."""
         model = self._model(at, with_slopes=True)
         frames = self.taking_part()
         measured = self._measure(model, frames, {})
@@ -213,7 +214,7 @@ class Solver:
         )
 
     def _noise_of(self, model: _Model, n: int, measured: _Measured) -> tuple[NDArray[np.float64], float]:
-        """Covariance of the score, and standard error of the mean residual, from the noise of all pixels."""
+        """The covariance of the score and the standard error of the mean residual, from the noise of all pixels."""
         sky, dark = self._sky, self._sky.dark[n]
         templates = [*measured.slopes.weighted, np.full(dark[0].size, 1 / dark[0].size)]
         covariance = noise_covariance(model.optics, sky.transit.frames[n], dark, templates, sky.transit.noise)
@@ -237,7 +238,7 @@ class Solver:
 
 
 def _check_determined(normal: NDArray[np.float64], shape: Shape) -> None:
-    """Raise DataError "transit-says-too-little" if the frames do not determine every combination of parameters."""
+    """Raise DataError "transit-says-too-little" if the images do not determine all combinations of the parameters."""
     diagonal = np.sqrt(np.diag(normal))
     if not (np.isfinite(normal).all() and (diagonal > 0).all()):
         raise DataError(

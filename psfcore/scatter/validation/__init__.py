@@ -1,1 +1,1 @@
-"""Tests of a fitted PSF: held-out images, other shapes, shells without a formula, and wrong dark levels."""
+"""Tests of a fitted PSF with held-out images, other shapes, shells without a formula, and wrong dark levels."""

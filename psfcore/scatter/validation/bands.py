@@ -1,7 +1,8 @@
-"""Medians and error bands over the fits of a cross-validation, and the excess of the free fit over the formula.
+"""Medians and error bands from the fits of a cross-validation, and the excess of the free fit over the formula.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Results". Eq. (2) of
-`psfcore.scatter.validation.cross_validation` defines the excess, and the text there its error.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Results". The module
+`psfcore.scatter.validation.cross_validation` defines the excess (Eq. (2)) and its error. Each fit belongs to one
+bootstrap sample. A band extends from a low to a high percentile of a quantity over the samples.
 """
 
 from __future__ import annotations
@@ -18,23 +19,26 @@ from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.cross_validation import FoldFit, FoldShells
 from psfcore.scatter.validation.free_shells import shells
 
-# Percentiles at one and two standard deviations below and above the mean of a Gaussian.
+# The percentiles of a Gaussian at one and two standard deviations below and above its mean.
 ONE_SIGMA: tuple[float, float] = (100 * float(ndtr(-1)), 100 * float(ndtr(1)))
 TWO_SIGMA: tuple[float, float] = (100 * float(ndtr(-2)), 100 * float(ndtr(2)))
 LIMITS = (TWO_SIGMA[0], ONE_SIGMA[0], 50.0, ONE_SIGMA[1], TWO_SIGMA[1])
 LIMIT_NAMES = ("minus_2_sigma", "minus_1_sigma", "median", "plus_1_sigma", "plus_2_sigma")
-NEAR_CENTRE_PX = 3.0  # where the free fit of the paper differs from its power law
+# Within this distance, the free fit of the paper differs from the power law of the paper.
+NEAR_CENTRE_PX = 3.0
 PARTING_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class ShellBands:
-    """Free fit and formula over all samples, as limits (5, shells): -2, -1, 0, +1 and +2 sigma.
+    """The free fits and the formulas of all samples, shell by shell.
 
-    edges_px: (shells + 1,). free_weight, law_weight: weight per pixel of each shell, of the free fit and the formula.
-    free_beyond_pct, law_beyond_pct: diffuse light beyond the inner edge of each shell. excess_pct: Eq. (2) within the
-    outer edge of each shell, percentage points of all light, with its error excess_sigma (shells,). law_within_pct:
-    median light of the formula within the same edge.
+    Arrays (5, shells) contain percentiles over the samples, at -2, -1, 0, +1 and +2 sigma. "law" stands for the formula.
+    edges_px: edges of the shells, (shells + 1,). free_weight, law_weight: weight per pixel of each shell, (5, shells).
+    free_beyond_pct, law_beyond_pct: percentage of the light that is scattered beyond the inner edge of each shell,
+    (5, shells). excess_pct: excess of Eq. (2) within the outer edge of each shell, in percentage points of all light,
+    (5, shells). excess_sigma: error of the excess, (shells,). law_within_pct: median of the formula's light within the
+    outer edge of each shell, (shells,).
     """
 
     edges_px: Vector
@@ -57,7 +61,10 @@ class ShellBands:
 
     @property
     def near_centre(self) -> Excess:
-        """The excess within NEAR_CENTRE_PX, to the last shell that ends before the next possible pixel distance."""
+        """The excess within NEAR_CENTRE_PX.
+
+        It includes all shells that contain only pixels up to this distance.
+        """
         beyond = np.sqrt(NEAR_CENTRE_PX**2 + 1)
         return self.excess(int(np.flatnonzero(self.edges_px[1:] < beyond)[-1]))
 
@@ -87,9 +94,10 @@ class ShellBands:
 
 @dataclass(frozen=True)
 class Excess:
-    """Light of the free fit minus light of the formula within a distance, in percentage points of all light.
+    """The light of the free fit within a distance minus the light of the formula within the same distance.
 
-    sigma: its error. of_formula_pct: the same difference, in percent of the formula's light there.
+    points: this difference in percentage points of all light. sigma: error of `points`. of_formula_pct: the same
+    difference in percent of the formula's light within the distance.
     """
 
     within_px: float
@@ -99,16 +107,17 @@ class Excess:
 
     @property
     def parts(self) -> bool:
-        """Whether free fit and formula differ here by more than PARTING_SIGMAS errors."""
+        """Whether the free fit and the formula differ by more than PARTING_SIGMAS standard errors."""
         return abs(self.points) > PARTING_SIGMAS * self.sigma
 
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Medians and bands over all samples, as limits at -2, -1, 0, +1 and +2 sigma.
+    """Medians and bands of all samples: percentiles at -2, -1, 0, +1 and +2 sigma.
 
-    curve_pct: limits (5, radii) of the cumulative curve at radii_px. values: limits of each parameter. totals: of all
-    fits. held_out_pct: mean residual of each held-out image. shells: None if the formula is not isotropic.
+    curve_pct: percentiles of C(R) at radii_px, (5, radii). values: percentiles of each parameter, (5,). totals: the total
+    of scatter of each fit. held_out_pct: mean residual of each held-out image, percent. shells: percentiles by shell;
+    None if the formula is not isotropic.
     """
 
     radii_px: Vector
@@ -120,7 +129,10 @@ class Bands:
 
     @property
     def held_out(self) -> dict[str, float]:
-        """Mean, rms and largest of the held-out residuals, percent. Each image counts once, with its mean residual."""
+        """Mean, rms and largest absolute value of the held-out residuals, in percent.
+
+        Each image counts once, with its mean residual over the samples.
+        """
         found = np.array(list(self.held_out_pct.values()))
         if found.size == 0:
             return {}
@@ -147,7 +159,7 @@ class Bands:
 
 
 def bands(fits: tuple[FoldFit, ...], radii_px: Vector) -> Bands:
-    """Medians and percentiles over the samples. radii_px: of the fits' curves."""
+    """Medians and percentiles over the samples. radii_px: the radii at which the fits' curves C(R) are given."""
     held_out: dict[int, list[float]] = {}
     for fit in fits:
         for image, residual in fit.held_out_pct.items():
@@ -164,7 +176,7 @@ def bands(fits: tuple[FoldFit, ...], radii_px: Vector) -> Bands:
 
 
 def shell_bands(folds: Sequence[FoldShells]) -> ShellBands:
-    """Medians and percentiles over the samples, by shell."""
+    """Medians and percentiles over the samples, for each shell."""
     free, law = np.array([fold.free for fold in folds]), np.array([fold.law for fold in folds])
     counts = shells().counts
     excess = 100 * np.cumsum(free - law, axis=1)  # Eq. (2)

@@ -1,28 +1,31 @@
 """Cross-validation of a fit: hold out blocks of images and bootstrap the rest, in many runs.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Results". Ten sequential blocks are each held out once,
-with a guard on both sides. In every other block, images are resampled with replacement (bootstrap). Ten runs give 100
-PSFs. There are two schemes.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Results". The images are divided into ten
+blocks in the order of time (fewer blocks if there are fewer than 30 images). Each block is held out once, with a guard on
+both sides. In all other blocks, images are resampled with replacement (bootstrap). Ten runs give 100 PSFs. There are two
+schemes.
 
-Shared: a fold differs by a small step from the solution of all images. The contributions of the images to the normal
-equations give this step at once:
+Shared: the fit of a fold differs by a small step from the fit to all images. The contributions of the images to the
+normal equations give this step directly:
 
     q_f = q + (sum over images of k_i A_i)^-1 sum over images of k_i v_i        Eq. (1)
 
-where k_i is how often image i occurs in the bootstrap sample. All folds share the reconstructions, so this scheme
-costs almost nothing; its error is of second order.
+where k_i is the number of times that image i occurs in the bootstrap sample. All folds share the reconstructed scenes, so
+this scheme costs almost no time. Its error is of second order in the step.
 
-Exact: every fold is a fit of its own. It starts from the result of Eq. (1) with the scenes of the solution of all
-images, so it converges in one or two rounds. Its occulters are located again, and its scenes are iterated until they
+Exact: every fold is fitted separately. The fit starts from the PSF of Eq. (1) and from the scenes of the fit to all
+images, so it converges in one or two rounds. The occulters are located again, and the scenes are iterated until they
 converge.
 
-If the scatter is isotropic, every sample also gets a fit without a formula (`free_shells`), which is compared with it:
+If the scatter is isotropic, every sample is also fitted without a formula (`free_shells`). The free fit is compared with
+the formula:
 
     excess within R = sum over shells within R of (free - formula)              Eq. (2)
 
-There are two estimates of the error of an excess. The spread over the samples contains the noise of the images. It is
-too small if a weight is at its lower bound of zero, or if only the prior determines a shell. Therefore the error is the
-larger of this spread and the error from the covariance of the free fit, which has no bounds and includes the prior.
+There are two estimates of the error of an excess. The first is the spread over the samples, which contains the noise of
+the images. This spread is too small if a weight is at its lower bound of zero, or if only the prior determines a shell.
+The second estimate follows from the covariance of the free fit, which ignores the bounds and includes the prior. The
+larger of the two estimates is used.
 
 | symbol | name |
 |---|---|
@@ -53,7 +56,7 @@ SETTLE_STEPS = 1
 
 @dataclass(frozen=True)
 class FoldSample:
-    """One fold of one run. counts: how often each image counts; held_out: indices of the held-out images."""
+    """One fold of one run. counts: how many times each image counts. held_out: indices of the held-out images."""
 
     run: int
     fold: int
@@ -63,9 +66,10 @@ class FoldSample:
 
 @dataclass(frozen=True)
 class FoldShells:
-    """Diffuse light per shell in one sample, as fractions of all light: of the free fit and of the formula.
+    """The scattered light in each shell for one sample, as a fraction of all light.
 
-    excess_sigma: error of the excess within the outer edge of each shell, from the covariance of the free fit.
+    free: light of the free fit. law: light of the formula. excess_sigma: error of the excess within the outer edge of
+    each shell, from the covariance of the free fit.
     """
 
     free: tuple[float, ...]
@@ -87,8 +91,8 @@ class FoldShells:
 class FoldFit:
     """The PSF fitted to one sample.
 
-    curve_pct: cumulative curve 100 (1 - encircled energy). held_out_pct: residuals of the held-out images by index,
-    percent of the observed mean. shells: None if the formula is not isotropic.
+    curve_pct: C(R) = 100 (1 - encircled energy) of the total PSF. held_out_pct: the residual of each held-out image, in
+    percent of the observed mean; the keys are the images' indices. shells: None if the formula is not isotropic.
     """
 
     run: int
@@ -126,7 +130,10 @@ class FoldFit:
 
 
 def bootstrap_samples(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[FoldSample, ...]:
-    """The samples of all runs, one per held-out block. Raises DataError "too-few-images" below two blocks."""
+    """The samples of all runs; each run has one sample for each held-out block.
+
+    Raises DataError "too-few-images" if the images do not suffice for two blocks.
+    """
     blocks = folds(images)
     if not blocks:
         raise DataError("too-few-images", f"expected at least 6 images for held-out blocks; got {images}")
@@ -183,7 +190,10 @@ def shared_fits(
 
 
 def shared_step(solution: Solution, sample: FoldSample) -> Vector:
-    """Eq. (1): step in coordinates from the solution of all images to that of a sample. Raises as `shared_fits`."""
+    """The step of Eq. (1): coordinates fitted to a sample minus coordinates fitted to all images.
+
+    Raises DataError "transit-says-too-little" if the sample does not determine all parameters.
+    """
     counts = [sample.counts[n] for n in solution.part]
     counted = [(k, frame) for k, frame in zip(counts, solution.inversion.frames, strict=True) if k]
     normal = np.sum([k * frame.normal for k, frame in counted], axis=0)
@@ -198,10 +208,10 @@ def shared_step(solution: Solution, sample: FoldSample) -> Vector:
 def exact_fit(
     solution: Solution, sample: FoldSample, *, progress: Progress = lambda stage, step, steps: None
 ) -> FoldFit:
-    """The PSF of one sample by a fit of its own. Afterwards it is applied to the held-out images.
+    """The PSF of one sample, from a separate fit, and the residuals of the held-out images with this PSF.
 
-    solution: of all images. progress is called before each image is processed, so that a worker can report that it is
-    alive, and can stop. Raises DataError as `shared_fits` and `invert` do.
+    solution: the fit to all images. progress: called before each image is processed, so that a worker can report that it
+    is alive, and can stop. Raises the errors of `shared_fits` and `invert`.
     """
     shape = solution.inversion.shape
     start = solution.inversion.coordinates + shared_step(solution, sample)
@@ -217,7 +227,7 @@ def exact_fit(
         held_out[n] = float(-100 * residual.mean() / (expected + residual).mean())
     free = None
     if shape.isotropic:
-        # The last step of the fit changed the PSF by a negligible amount, but did not update the scenes.
+        # The last step of the fit changed the PSF by a negligible amount but did not update the scenes. Update them here.
         for step, n in enumerate(found.part):
             progress("settling", step, len(found.part))
             sky.scenes[n] = found.optics.invert(sky.observed[n], sky.scenes[n], steps=SETTLE_STEPS)

@@ -1,4 +1,4 @@
-"""Plot a cross-validation: free fit and formula with their bands, totals of all fits, held-out residuals."""
+"""Plot a cross-validation: free fit and formula with their bands, totals of all fits, residuals of held-out images."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _POINTINGS = ("#1b4f91", "#c73e2b", "#2b8a6e", "#e0a100", "#7b3fa0")
 def cross_validation_png(
     bands: Bands, fits: tuple[FoldFit, ...], fov_of: list[int], path: str | Path
 ) -> None:
-    """Cumulative curve, totals of all fits and held-out residuals, with bands of 1 and 2 sigma.
+    """Write a PNG with C(R), the totals of all fits, and the residuals of held-out images; bands of 1 and 2 sigma.
 
-    If there is a free fit, an upper row shows its weights, diffuse light and excess, compared with the formula.
+    If there is a free fit, an upper row of panels compares it with the formula: weights, diffuse light and excess.
     fov_of: the pointing of each image.
     """
     rows = 1 if bands.shells is None else 2
@@ -57,7 +57,7 @@ def draw_weights(axes: Axes, shells: ShellBands) -> None:
     radius = np.sqrt(shells.edges_px[1:] * shells.edges_px[:-1])
     lowest = 0.1 * float(shells.law_weight.min())
     _band(axes, radius, shells.law_weight, FORMULA, "formula")
-    # A logarithmic axis cannot show a shell without light, so its median is not drawn.
+    # The logarithmic axis cannot show a shell without light, so the median of such a shell is not drawn.
     free = np.maximum(shells.free_weight, lowest)
     free[2, shells.free_weight[2] < lowest] = np.nan
     _band(axes, radius, free, FREE, "free fit", marker="o", line="")
@@ -73,7 +73,7 @@ def draw_weights(axes: Axes, shells: ShellBands) -> None:
 
 
 def draw_diffuse_light(axes: Axes, shells: ShellBands) -> None:
-    """1 - encircled energy of the diffuse scatter, percent of all light."""
+    """Draw 1 - encircled energy of the scatter kernel, in percent of all light."""
     for name, limits, colour in (
         ("free fit", shells.free_beyond_pct, FREE),
         ("formula", shells.law_beyond_pct, FORMULA),
@@ -90,7 +90,7 @@ def draw_diffuse_light(axes: Axes, shells: ShellBands) -> None:
 
 
 def draw_excess(axes: Axes, shells: ShellBands) -> None:
-    """Light of the free fit minus light of the formula within each distance, with its error."""
+    """Draw the excess within each distance (light of the free fit minus light of the formula), with its error."""
     radius, sigma = shells.edges_px[1:], shells.excess_sigma
     axes.fill_between(
         radius, -sigma, sigma, color="#bbbbbb", alpha=0.5, linewidth=0, label="error: image noise and prior"
@@ -108,7 +108,7 @@ def draw_excess(axes: Axes, shells: ShellBands) -> None:
 
 
 def draw_curve(axes: Axes, bands: Bands) -> None:
-    """1 - encircled energy of the total PSF, percent."""
+    """Draw 1 - encircled energy of the total PSF, percent."""
     _band(axes, bands.radii_px, bands.curve_pct, FORMULA, "median", marker="o")
     axes.set(
         xscale="log",

@@ -1,12 +1,13 @@
 """Effect of a wrong dark level on a fitted PSF: repeat the fit with an offset added to every readout.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", its last experiment. An
-offset of o DN adds o / t DN/s to a frame of exposure t, Eq. (1). The effect is largest for short exposures with the
-occulter far off the limb, where the disc contains a few tens of counts.
+Source: the last experiment in Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness".
+An offset of o DN adds o / t DN/s to an image with exposure time t, Eq. (1). The effect is largest for short exposures
+while the occulter is far from the limb. A pixel of the disc then contains only a few tens of DN.
 
-Weights are the diffuse weights by distance, as means over rings one pixel wide. They are compared within the field,
-because the PSF farther out is an extrapolation of the formula. Curves are 100 (1 - encircled energy), of the diffuse
-scatter as in the paper, and of the total PSF.
+Two quantities are compared with the fit without an offset. The first is the diffuse weight: the weight of the scatter
+kernel per pixel, averaged over rings one pixel wide. It is compared only within the field, because the PSF farther out is
+an extrapolation of the formula. The second is the cumulative curve C(R) = 100 (1 - encircled energy) of the scatter kernel,
+as in the paper, and also of the total PSF.
 
 | symbol | name | unit |
 |---|---|---|
@@ -33,11 +34,11 @@ _RADII = 48
 
 @dataclass(frozen=True, eq=False)
 class DarkOffset:
-    """The fit with one offset, compared with the nominal fit.
+    """The fit with one offset, compared with the fit without an offset.
 
     weight_change_pct: relative change of the diffuse weight per pixel at radii_px, percent. curve_change_points,
-    total_curve_change_points: change of the cumulative curves of the diffuse scatter and of the total PSF at
-    curve_radii_px, in percentage points. images: number of fitted images.
+    total_curve_change_points: change of C(R) of the scatter kernel and of the total PSF at curve_radii_px, in percentage
+    points. images: number of fitted images.
     """
 
     offset_dn: float
@@ -51,8 +52,10 @@ class DarkOffset:
 
 @dataclass(frozen=True, eq=False)
 class DarkOffsetStudy:
-    """Effects of dark offsets on the PSF of a transit. largest_...: largest absolute change over all distances and
-    offsets."""
+    """Effects of dark offsets on the PSF of a transit. nominal: the parameters of the fit without an offset.
+
+    largest_...: the largest absolute change at any distance and for any offset.
+    """
 
     radii_px: Vector
     curve_radii_px: Vector
@@ -66,12 +69,12 @@ class DarkOffsetStudy:
 
     @property
     def largest_curve_change_points(self) -> float:
-        """Largest change of the cumulative curve of the diffuse scatter, percentage points."""
+        """Largest change of C(R) of the scatter kernel, percentage points."""
         return max(float(np.abs(o.curve_change_points).max()) for o in self.offsets)
 
     @property
     def largest_total_curve_change_points(self) -> float:
-        """Largest change of the cumulative curve of the total PSF, percentage points."""
+        """Largest change of C(R) of the total PSF, percentage points."""
         return max(float(np.abs(o.total_curve_change_points).max()) for o in self.offsets)
 
 
@@ -84,10 +87,10 @@ def dark_offset_study(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> DarkOffsetStudy:
-    """Repeat the fit of a transit with each offset, starting from the nominal fit.
+    """Repeat the fit of a transit with each offset, starting from the fit without an offset.
 
-    nominal: the fit without an offset, with its own shape; default: a new fit of `shape`. Raises DataError as `invert`
-    does.
+    nominal: the fit without an offset; the shape of this fit is used, not `shape`. Default: a new fit of `shape`. Raises
+    the errors of `invert`.
     """
     if nominal is None:
         nominal = invert(transit, shape, threads=threads, progress=progress).inversion
@@ -131,7 +134,7 @@ def with_offset(transit: Transit, offset_dn: float) -> Transit:
 
 
 class _WeightsAndCurves:
-    """Weights and cumulative curves of a shape by distance."""
+    """Computes the diffuse weights and the curves C(R) of a shape at fixed distances."""
 
     def __init__(self, transit: Transit, shape: Shape, threads: int) -> None:
         self._total = TotalPsf(transit.diffraction, shape, transit.shape, threads=threads)
@@ -140,7 +143,7 @@ class _WeightsAndCurves:
         self.curve_radii_px = np.concatenate(([0.5], self.radii_px))
 
     def at(self, coordinates: Vector) -> tuple[Vector, Vector, Vector]:
-        """Mean diffuse weight at radii_px; cumulative curves of diffuse and total PSF at curve_radii_px, percent."""
+        """Mean diffuse weight at radii_px; C(R) of the scatter kernel and of the total PSF at curve_radii_px, percent."""
         scatter = self._total.shape.kernel(coordinates, REACH_GRID_PX)
         ring, mean = radial_profile(scatter)
         return (

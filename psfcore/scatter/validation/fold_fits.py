@@ -1,8 +1,8 @@
 """Fit a transit without some of its images, to test the PSF on held-out images.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", without the bootstrap. Each
-sequential block of images (`psfcore.transit.blocks`) is held out in turn, with a guard on both sides. The fit of a fold
-uses only its own images: the held-out ones do not help to locate occulters either.
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness", without the bootstrap.
+Each block of consecutive images (`psfcore.transit.blocks`) is held out in turn, with a guard on both sides. The fit of a
+fold does not use the held-out images at all, not even to locate the occulters of other images.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from psfcore.transit.transit import Transit
 
 @dataclass(frozen=True, eq=False)
 class FoldInversion:
-    """The fit of one fold. kernel: its total PSF [y, x], on a square of twice the field's size."""
+    """The fit of one fold. kernel: the total PSF [y, x] of this fit, on the square of TotalPsf."""
 
     fold: Fold
     inversion: Inversion
@@ -29,7 +29,7 @@ class FoldInversion:
 
 @dataclass(frozen=True, eq=False)
 class FoldKernels:
-    """Total PSFs by image, each fitted without that image. A call with the index of an image returns its PSF."""
+    """The total PSF for each image, fitted without that image. A call with the image's index returns this PSF."""
 
     fits: tuple[FoldInversion, ...]
 
@@ -46,10 +46,10 @@ def fold_kernels(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> FoldKernels:
-    """Fit a shape of scatter once per fold.
+    """Fit a shape of scatter once for each fold.
 
-    start: coordinates, for example of the fit to all images; default: the start of the shape. Raises DataError
-    "too-few-frames" if there are too few images for two folds, and as `invert` does.
+    start: coordinates at which each fit starts, for example those of the fit to all images; default: shape.start. Raises
+    DataError "too-few-frames" if there are too few images for two folds, and the errors of `invert`.
     """
     parts = folds(len(transit.frames))
     if not parts:
@@ -72,7 +72,7 @@ def fit_fold(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> FoldInversion:
-    """Fit one fold. Raises DataError as `invert` does; the message first names the held-out images."""
+    """Fit one fold. Raises the errors of `invert`; the message begins with the names of the held-out images."""
     part = replace(transit, frames=tuple(transit.frames[n] for n in fold.fitted))
     try:
         solution = invert(part, shape, start=start, threads=threads, progress=progress)
@@ -87,7 +87,7 @@ def _named(transit: Transit, images: Sequence[int]) -> str:
 
 
 class _FoldProgress:
-    """Progress over all folds, which count equally."""
+    """Progress of the fits of all folds; each fold counts equally."""
 
     def __init__(self, progress: Progress, number: int, of: int) -> None:
         self._progress, self._number, self._of = progress, number, of

@@ -1,32 +1,33 @@
-"""Fit scatter without a formula: the difference in light between each shell and the fitted formula.
+"""Fit scatter without a formula: fit the light of each shell minus the light that the formula puts in this shell.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Results", which compares a free fit with the power law
-for all samples of the cross-validation. Near a fitted PSF both are steps of the same problem, Eq. (4) of
-`psfcore.scatter.inversion.inversion`, which also defines H, G, D and r. For d, the light of each shell minus the
-formula's,
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Results". It compares a free fit with the power
+law for all samples of the cross-validation. Near a fitted PSF, both fits are steps of the same linear problem, Eq. (4) of
+`psfcore.scatter.inversion.inversion`. That module also defines H, G, D and r; w are the weights 1 / v of its Eq. (3). The
+unknown d contains, for each shell, the light of the free fit minus the light of the formula:
 
     r = D [H D G c d + noise],   c_S = A_S / n_S - B                              Eq. (1)
     minimise over d >= -l   sum w (r - J d)^2 + sum ((d - d_f) / s)^2,   J = D H D G c   Eq. (2)
 
-c_S is the change of the image when light moves from the centre to shell S, with A_S and B of the diffracted scene. Eq.
-(1) includes the response of the scene, as Eq. (4) does there: D [c - H (1 - D) G c] equals D H D G c if H G = 1, and
-G c consists of ring sums of G B. All shells therefore cost the ring sums of one image and one small matrix product.
-Compared with the exact derivatives, J is accurate to a few percent, and to a tenth for discs near the edge of the
-field; r is exact.
+c_S is the change of the image when light moves from the centre to shell S. A_S and B are computed from the diffracted
+scene. Eq. (1) includes the change of the scene, as Eq. (4) of that module does: D [c - H (1 - D) G c] equals D H D G c if
+H G = 1. G c consists of ring sums of G B. All shells together therefore need only the ring sums of one image and one
+small matrix product. Compared with the exact derivatives, J is accurate to a few percent; for discs near the edge of the
+field, it is accurate to a tenth. r is exact.
 
-Images are additive: the fit of a bootstrap sample uses sums of the J^T w J and J^T w r of its images.
+The normal equations are sums over images: the fit of a bootstrap sample uses the sums of J^T w J and J^T w r over the
+images of the sample.
 
-Differences from the paper: all dark pixels count with their noise weights, instead of a thousand pixels selected by
-shell. A Gaussian prior of width s about the formula constrains every shell. Near the centre the prior is so wide that
-the images determine the shells; far out it is narrow, and the images add little. Without the prior the innermost shells
-cannot be separated from the centre, and the light beyond the field is undetermined.
+Differences from the paper: all dark pixels are used, with weights from their noise, instead of a thousand pixels selected
+by shell. A Gaussian prior of width s about the formula constrains every shell. Near the centre the prior is so wide that
+the images determine the shells. Far from the centre the prior is narrow, and the images add little. Without the prior,
+the innermost shells cannot be separated from the centre, and the light beyond the field is undetermined.
 
 | symbol | name | unit |
 |---|---|---|
-| d | step: light of a shell minus that of the formula | fraction of all light |
-| d_f | towards: change of the formula's light by the sample's own step | fraction of all light |
-| l | law_light: light of the formula before that step | fraction of all light |
-| A_S, B, n_S | ring sums, unscattered, counts | DN/s, DN/s, px |
+| d | step: light of a shell in the free fit minus its light in the formula | fraction of all light |
+| d_f | towards: change of the formula's light between the fitted PSF and the fit of the sample | fraction of all light |
+| l | law_light: light of the formula in the fitted PSF | fraction of all light |
+| A_S, B, n_S | ring sums, unscattered, counts | DN/s px^2, DN/s, px^2 |
 | s | looseness: width of the prior | fraction of all light |
 """
 
@@ -52,16 +53,17 @@ from psfcore.scatter.total_psf import Kernel
 Matrix = NDArray[np.float64]
 
 NEAR_PX = 100.0
-# Width of the prior, in units of the formula's light in the shell, within and beyond NEAR_PX.
+# Width of the prior divided by the formula's light in the shell: for shells within NEAR_PX, and for shells beyond.
 NEAR_LOOSE, FAR_LOOSE = 10.0, 1.0
 LEAST_LIGHT = 1e-5  # smallest width of the prior, as a fraction of all light
 
 
 @dataclass(frozen=True, eq=False)
 class FreeLight:
-    """A free fit. light: of each shell, as a fraction of all light; law_light: the same of the formula.
+    """A free fit. light: the fitted light in each shell, as a fraction of all light.
 
-    covariance: of light, (shells, shells), with the prior included.
+    law_light: the light that the formula puts in each shell. covariance: covariance matrix of `light`,
+    (shells, shells); it includes the prior.
     """
 
     light: Vector
@@ -71,10 +73,10 @@ class FreeLight:
 
 @dataclass(frozen=True, eq=False)
 class FreeShares:
-    """Contributions of each image to the normal equations of the shells near one PSF, Eq. (2).
+    """The contributions of each image to the normal equations of Eq. (2), near one PSF.
 
     normal: J^T w J, (images, shells, shells). score: J^T w r, (images, shells). frames: indices of the images.
-    law_light: light of each shell by the formula of the PSF.
+    law_light: the light that the formula of this PSF puts in each shell.
     """
 
     frames: tuple[int, ...]
@@ -83,7 +85,7 @@ class FreeShares:
     score: Matrix
 
     def fit(self, counts: Sequence[int], law_light: Vector) -> FreeLight:
-        """Solve Eq. (2). counts: how often each image of the transit counts; law_light: centre of the prior."""
+        """Solve Eq. (2). counts: how many times each image of the transit counts. law_light: centre of the prior."""
         times = np.array([counts[n] for n in self.frames], dtype=np.float64)
         looseness = looseness_of(self.law_light)
         towards = law_light - self.law_light
@@ -102,12 +104,12 @@ def shells() -> Segments:
 
 
 def law_light(shape: Shape, coordinates: Vector) -> Vector:
-    """Light of each shell by the formula, as a fraction of all light."""
+    """The light that the formula puts in each shell, as a fraction of all light."""
     return shells().mean_of_map(shape.kernel(coordinates, REACH_GRID_PX)) * shells().counts
 
 
 def looseness_of(light: Vector) -> Vector:
-    """Width s of the prior of each shell."""
+    """The width s of the prior for each shell. light: the formula's light in each shell."""
     edges = np.array(shells().edges_px)
     near = edges[1:] <= NEAR_PX
     return np.maximum(np.where(near, NEAR_LOOSE, FAR_LOOSE) * light, LEAST_LIGHT)
@@ -119,7 +121,7 @@ def free_shares(
     *,
     progress: Progress = lambda stage, step, steps: None,
 ) -> FreeShares:
-    """Contributions of the fitted images to the normal equations of the shells, near the PSF at these coordinates."""
+    """Compute FreeShares for the fitted images, near the PSF at these coordinates."""
     diffract = Blur(of.transit.diffraction, of.transit.shape, threads=of.threads)
     kernel = of.total.kernel(coordinates)
     counts = shells().counts
@@ -147,7 +149,10 @@ def free_shares(
 def free_kernel(
     free: FreeLight, shape: Shape, coordinates: Vector, diffraction: Kernel, size: int, *, threads: int = 1
 ) -> Kernel:
-    """The total PSF [y, x] of a free fit on (size, size): the formula, scaled in each shell to the fitted light."""
+    """The total PSF [y, x] of a free fit, on (size, size).
+
+    In each shell, the formula is scaled so that the shell contains the fitted light.
+    """
     ratio = np.divide(free.light, free.law_light, out=np.ones_like(free.light), where=free.law_light > 0)
     label = shells().label_map(size)
     scatter = shape.kernel(coordinates, size) * np.where(label >= 0, ratio[np.maximum(label, 0)], 1.0)

@@ -1,20 +1,21 @@
-"""Compare other shapes of scatter with the fitted one, on held-out images.
+"""Compare other shapes of scatter with the fitted shape, on held-out images.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". Every shape contains the
-softened power law and one or two additional parameters, which are zero for the power law itself. Near the solution all
-shapes are linear in their parameters. One pass over the frames therefore gives the normal equations of all shapes, and
-the fit of a fold and its gain on held-out images are sums of matrices:
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness". Every shape is the
+softened power law with one or two additional parameters. If these are zero, the shape equals the power law. Near the
+solution, the model is nearly linear in the parameters. One pass over the images therefore gives the normal equations of
+all shapes. The fit of a fold, and its gain on held-out images, follow from sums of these equations. The gain is the
+decrease of chi2 (to first order):
 
     q_f = q + A_f^-1 v_f,   A_f, v_f summed over the fitted frames of fold f             Eq. (1)
-    gain = sum over f of 2 d . v_h - d . A_h d,   d = q_f - q, summed over held-out frames   Eq. (2)
+    gain = sum over folds f of (2 d . v_h - d . A_h d),   d = q_f - q                        Eq. (2)
 
-The reported gain is the difference from the softened power law, refitted in the same folds. It can be negative: a
-parameter that fits noise makes the prediction of held-out images worse.
+The reported gain is the gain of the shape minus the gain of the softened power law, which is refitted in the same folds.
+It can be negative: a parameter that fits noise makes the prediction of held-out images worse.
 
 | symbol | name |
 |---|---|
-| A_f, v_f | normal, score: sums over the fitted frames |
-| A_h, v_h | normal, score: sums over the held-out frames |
+| A_f, v_f | matrix (normal) and right-hand side (score) of the normal equations, summed over the fitted images |
+| A_h, v_h | the same matrix and right-hand side, summed over the held-out images |
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ BASE = len(SOFTENED_POWER_LAW.parameters)
 
 @dataclass(frozen=True)
 class ComparedShape:
-    """Improvement of one shape over the softened power law, to first order.
+    """The improvement of the fit by one shape, compared with the softened power law, to first order.
 
-    added: value and standard error of each additional parameter. gain: decrease of chi2 on all frames. held_out_gain:
-    decrease on held-out frames; None if there are too few frames for folds.
+    added: value and standard error of each additional parameter. gain: decrease of chi2 for all images. held_out_gain:
+    decrease of chi2 for held-out images; None if there are too few images for folds.
     """
 
     name: str
@@ -91,7 +92,7 @@ def compare_shapes(
 
 
 def _slope(solution: Solution, shape: Shape, parameter: int) -> Blur:
-    """Derivative of the total PSF by one parameter of a shape, at the solution of the power law."""
+    """The derivative of the total PSF with respect to one parameter of a shape, at the solution of the power law."""
     total = TotalPsf(solution.transit.diffraction, shape, solution.transit.shape, threads=solution.threads)
     at = shape.coordinates(solution.inversion.values)
     return Blur(total.slope(at, parameter), solution.transit.shape, threads=solution.threads)
@@ -126,11 +127,11 @@ class _ParameterSubset:
         self._score = score[:, columns]
 
     def solved(self) -> tuple[Vector, Matrix]:
-        """Step and covariance from all frames."""
+        """Gauss-Newton step and covariance of the parameters, from all images."""
         covariance = np.linalg.inv(self._normal.sum(axis=0))
         return covariance @ self._score.sum(axis=0), covariance
 
     def gain(self, fitted: list[int], held: list[int]) -> float:
-        """Eq. (1) and (2) for one fold: the gain on the held-out frames."""
+        """The gain of one fold on its held-out images, from Eq. (1) and (2)."""
         step = np.linalg.solve(self._normal[fitted].sum(axis=0), self._score[fitted].sum(axis=0))
         return float(2 * step @ self._score[held].sum(axis=0) - step @ self._normal[held].sum(axis=0) @ step)

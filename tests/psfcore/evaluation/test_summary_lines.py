@@ -41,7 +41,7 @@ def evaluation(**changes: Any) -> dict[str, Any]:
 def test_every_pointing_has_a_line_and_all_together() -> None:
     lines = summary_lines(evaluation())
     assert lines[1] == (
-        "pointing 1: 4 images, mean +0.50 % (noise 1.50), rms 2.50 % (noise 3.50), at most 5.50 %; centre +6.50 %"
+        "pointing 1: 4 images, mean +0.50 % (noise 1.50), rms 2.50 % (noise 3.50), largest 5.50 %; centre +6.50 %"
     )
     assert lines[2].startswith("pointing 2: 4 images, mean -1.25 %") and "centre" not in lines[2]
     assert lines[3].startswith("all pointings: 8 images")
