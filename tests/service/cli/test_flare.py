@@ -36,7 +36,7 @@ def test_a_psf_is_judged_along_an_arm(files: dict[str, Path], tmp_path: Path) ->
     assert tuple(found["centre_xy"]) == CENTRE and found["arm_deg"] == 0
     assert found["total"]["chi2_per_distance"] < 1.5 and found["chi2_factor"] > 7
     assert len(found["observed"]) == len(found["distance_px"]) == len(found["total"]["simulated"])
-    assert f"{found['rms_factor']:.1f} times the error" in result.output
+    assert f"{found['rms_factor']:.1f} times the rms error" in result.output
     assert "note:" not in result.output
     assert plot.read_bytes().startswith(b"\x89PNG")
 
