@@ -211,7 +211,7 @@ def _read(exact_to_px: float, grid: Numbers, row: Numbers, at: int, radius: floa
 
 
 def _sigma(tables: Tables, of: Callable[[Numbers], Numbers]) -> dict[str, Numbers]:
-    """The 1-sigma errors of the numbers that `of` computes from E, by component; empty if the PSF was not fitted."""
+    """The 1-sigma errors of numbers that `of` computes linearly from E, by component; empty if the PSF was not fitted."""
     return {
         name: [math.hypot(*column) for column in zip(*(of(row) for row in rows), strict=True)]
         for name, rows in tables["encircled_changes"].items()
