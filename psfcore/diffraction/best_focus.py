@@ -1,9 +1,9 @@
 """The separation of the mirrors that focuses a telescope on its detector.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "The instrument", prints radii and distances that
-are not consistent: with them the detector is far out of focus. This module solves for the separation of the mirrors,
-because the secondary magnifies an error of this length more than the error of any other length. All other values stay
-as printed, and the result states the shift of the separation.
+are not consistent: with them the detector is far out of focus. This module solves for the separation of the mirrors.
+The focus is most sensitive to this length, because the secondary magnifies its error. All other values stay as printed,
+and the result states the shift of the separation.
 
 Rays near the axis meet on the detector where y(L) = 0 in Eq. (1) of light_path:
 

@@ -1,8 +1,8 @@
 """The diffraction of a whole telescope: entrance pupil and filter-wheel meshes, component by component.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation", the simplified-combined
-solution: a Fraunhofer transform of the entrance pupil (aperture, mount and entrance mesh in one mask), an analytic
-series for the filter-wheel mesh, and the convolution of both patterns. The patterns of the spectral lines of the
+solution. The pattern of the entrance pupil (aperture, mount and entrance mesh in one mask) is a Fraunhofer transform; the
+pattern of the filter-wheel mesh is an analytic series. Both patterns are convolved with each other. The patterns of the spectral lines of the
 bandpass are multiplied by the weights of the lines and added.
 
 One rule decides how each component of the entrance is computed, and the provenance records the decision:
@@ -215,7 +215,7 @@ class _OneWavelength:
         return self._far_field(MOUNT, self._mounted(()), progress)
 
     def _entrance(self, progress: Progress) -> Kernel:
-        """The pattern of the whole entrance pupil. Without a mesh or without a mount, it is a pattern computed before."""
+        """The pattern of the whole entrance pupil. If it has no mesh or no mount, this pattern has been computed already."""
         has_mesh, has_mount = bool(_meshes(self.instrument, "entrance")), self.route.mount
         if has_mesh and has_mount and self.route.meshes_in_mask:
             pupil = self._mounted(_meshes(self.instrument, "entrance"))

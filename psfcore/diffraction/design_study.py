@@ -48,9 +48,8 @@ class MeshDesign:
 
     peak_visibility: the contrast (high - low) / (high + low) of the orders along the axis, for a flare of `flare_px` px
     per side. It is 1 if the orders are separate, and 0 if they merge.
-    peak_over_scatter: for each order on the axis from 50 to 150 px, the light of the order in a pixel is divided by the
-    diffuse scatter of the same flare in this pixel. The field holds the largest of these ratios, or None if the
-    instrument has no scatter.
+    peak_over_scatter: the light of an order in a pixel, divided by the diffuse scatter of the same flare in this pixel.
+    The field holds the largest ratio of all orders on the axis from 50 to 150 px; None if the instrument has no scatter.
     """
 
     pitch_um: float
@@ -88,8 +87,8 @@ def design_study(
 ) -> DesignStudy:
     """Compute every combination of pitch and wire at the entrance of `instrument`, and the first mesh that it has there.
 
-    Raises DataError "bad-design" if there is no mesh, if there are more than 400 meshes, if a wire is not narrower than
-    its pitch, or if the flare is smaller than 1 px.
+    Raises DataError "bad-design" for no mesh or more than 400 meshes, for a wire that is not narrower than every pitch,
+    and for a flare smaller than 1 px.
     """
     pitches, wires = sorted(set(pitches_um)), sorted(set(wires_um))
     _check(pitches, wires, flare_px)

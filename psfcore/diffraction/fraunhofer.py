@@ -1,7 +1,7 @@
 """Far-field diffraction by the entrance pupil, summed over detector pixels.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Fraunhofer propagation", without the phase
-factors that cancel in |E|^2, and with the focal length f instead of the distance z:
+Hofmeister et al., The point-spread function of HRI_EUV, section "Fraunhofer propagation". The phase factors
+that cancel in |E|^2 are left out, and the focal length f replaces the distance z:
 
     E(q) = sum over cells i of c_i exp(-2 pi i q . i / n),   dx = lambda f / (n p)                  Eq. (1)
     P_j = 1/S^2 sum over s, t = 0 .. S-1 of |E(j + (o_s, o_t))|^2,   o_s = (s + 1/2) / S - 1/2      Eq. (2)
@@ -15,9 +15,9 @@ each transform are kept. With Eq. (3) the sum over all n x n pixels equals the s
 
 Departure from the paper: the open share of a cell is a mean over the cell. This mean multiplies E by
 sinc(x / n) sinc(y / n), so the pattern is divided by the square of this factor. Light beyond the n x n pixels wraps
-around to the opposite side. At the position x, the amplitude of the wrapped light is (x / (n - x))^2 of the correct
-amplitude: 11 % at n / 4, 1 % at n / 11. For HRI_EUV and n = 4096, the pupil puts 0.13 % of its light beyond the inner
-2048 px, and the wrapped light is 1e-5 of all light.
+around to the opposite side. At the position x, its amplitude is (x / (n - x))^2 of the correct amplitude: 11 % at n / 4,
+1 % at n / 11. The pupil of HRI_EUV puts 0.13 % of its light beyond the inner 2048 px. With n = 4096 the wrapped light
+is then 1e-5 of all light.
 
 Eq. (2) uses a sum instead of an integral. The sum conserves the energy, but single weights are not exact: for the open
 disc of HRI_EUV the central pixel is 3e-4 too low.
@@ -33,7 +33,7 @@ vector r (Freivalds): M r must equal the product of the mirrored M with r, and M
 | p | pixel_pitch_um | um |
 | D | pupil.width_mm | mm |
 | S | samples per pixel and axis, even | - |
-| n | period: pixels of the transform, of which the inner `size` are kept | px |
+| n | period: the transform has n x n pixels, and the inner size x size pixels are kept | px |
 | c | mask.rows, open share of the cells | - |
 | dx | mask.cell_mm | mm |
 """

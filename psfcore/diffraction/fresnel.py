@@ -17,8 +17,8 @@ Departures from the paper, with reasons:
   would fold back into X2.
 - Each plane has the step that Eq. (4) requires. A plain FFT would couple the steps of successive planes, and its field
   would be too small for short distances. A chirp transform computes the same sum without this coupling.
-- A sample that a wire or a rim covers partly counts with the open share of its length, so that the positions of wires
-  and rims are not rounded to the grid.
+- If a wire or a rim covers a sample partly, the sample counts with the open share of its length. So the positions of
+  wires and rims are not rounded to the grid.
 
 Eq. (1) is paraxial, and in this approximation a pair of parabolas (K = -1) focuses perfectly. The conic constant of the
 secondary differs from -1. This leaves about 0.1 wave of spherical aberration at the rim of the beam; refocusing

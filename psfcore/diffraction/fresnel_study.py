@@ -15,8 +15,8 @@ The paper leaves some choices open; the result states each of them:
   the mesh. The range of the single phases is given with the means.
 - The series has the number of windows of the instrument file (all windows that the field illuminates), or a number that
   the caller gives. The wave crosses only the few windows within the beam of one field point. This small number would
-  be wrong for the series: the image of the entrance already contains the diffraction at the edges of the beam, and a
-  series of few windows would add it a second time. With more windows the two methods agree better.
+  be wrong for the series. The image of the entrance already contains the diffraction at the edges of the beam; a series
+  of few windows would add this diffraction a second time. With more windows the two methods agree better.
 - To study another distance, the filter wheel is moved between secondary and detector. The distance from secondary to
   detector does not change.
 - Each one-dimensional image ("line") is normalised to the light within REACH_PX of the axis.
@@ -67,7 +67,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Sampling:
-    """The sampling of a plane: width X, step dx and count N = X / dx. least_samples: X1 X2 / (lambda z), None at the end."""
+    """The sampling of a plane: width X, step dx and count N = X / dx. least_samples: X1 X2 / (lambda z), None for the detector."""
 
     plane: str
     width_mm: float

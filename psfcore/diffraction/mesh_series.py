@@ -13,8 +13,8 @@ factor is a finite cosine series (Fejer), and each term has an antiderivative wi
     g(k) = (1 - cos(k x)) / x^2,  integral of g(k) from 0 to x = k Si(k x) - (1 - cos(k x)) / x      Eq. (4)
 
 The pattern of a rotated mesh is rotated by the same angle and is not separable on the pixels.
-`rotated_mesh_kernel` divides each axis of the rotated pattern into cells, which are small at the orders,
-and distributes the light of every pair of cells over the pixels that it covers:
+`rotated_mesh_kernel` divides each axis of the rotated pattern into cells. The cells are small at the orders. The light
+of every pair of cells is distributed over the pixels that the pair covers. The light of all cells together is known:
 
     integral of Eq. (1) over all x = (N d / w) (lambda z / d)                                        Eq. (5)
 

@@ -88,8 +88,8 @@ class FlareFit:
 
     box [y, x]: light of the flare. simulated: s_u. rms_pct: root mean square of 100 (s_u / d_u - 1) over the distances
     with d_u > 0. chi2_per_distance: the sum in Eq. (2) divided by the number of distances; None if the noise is unknown.
-    reduced_chi2: the same sum divided by the degrees of freedom, which are the number of distances minus the number of
-    used pixels of the box, plus 1 for the constraint. matched: mean s divided by mean d at 60 to 70 px.
+    reduced_chi2: the same sum divided by the degrees of freedom (number of distances - number of used pixels of the box
+    + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px.
     matched_noise_pct: the noise of this mean d in percent; the constraint treats the mean d as exact.
     """
 
@@ -353,7 +353,7 @@ def _noise_of_mean_pct(profile: ArmProfile, matched: Flags) -> float | None:
 
 
 def _percent_error(observed: Vector, level: float) -> Vector:
-    """d_u, but at least a tenth of the mean at 60 to 70 px, so that a value near 0 (by noise) does not dominate the fit."""
+    """d_u, but at least a tenth of the mean at 60 to 70 px. Otherwise a value near 0 (by noise) would dominate the fit."""
     return np.maximum(observed, 0.1 * level)
 
 

@@ -1,7 +1,7 @@
 """Folds of a cross-validation: sequential blocks of held-out images, with a guard on both sides.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness": 126 images are divided into
-ten sequential blocks, and three images on each side of a block are not used. Here N images give min(10, N // 3) blocks
+ten sequential blocks. Three images on each side of a block are not used. Here N images give min(10, N // 3) blocks
 and a guard of round(3 N / 126) images on each side; if N >= 12, the guard has at least one image.
 """
 

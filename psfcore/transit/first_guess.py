@@ -16,9 +16,9 @@ the mean in a ring ("shell") of 50 px around the disc.
 | I_o,dc / mean I_o | ratio | 1 |
 | r_disk | radius_px | px |
 
-The paper judges by eye how homogeneous the Sun is. Here the inhomogeneity is a number, the larger one of two ratios: the
-range (largest minus smallest) of the three estimators divided by their mean, and the range of the means in the four
-quadrants of the shell divided by their mean.
+The paper judges by eye how homogeneous the Sun is. Here the inhomogeneity is a number. For the three
+estimators, their range (largest minus smallest) is divided by their mean. The same is done for the means in the four
+quadrants of the shell. The larger ratio is the inhomogeneity.
 """
 
 from __future__ import annotations

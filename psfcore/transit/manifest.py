@@ -121,9 +121,15 @@ def read_manifest(folder: str | Path) -> TransitManifest:
 def parse_manifest(content: bytes) -> TransitManifest:
     """A manifest from the bytes of transit.json.
 
-    Raises DataError "bad-manifest" for JSON that cannot be read, a wrong schema, missing or wrong values, no image or
-    more than MAX_IMAGES images, a file name that is not plain or occurs twice, and noise figures that are both zero. The
-    message names the key, and an image by its index and file, with the expected and the given value.
+    Raises DataError "bad-manifest":
+
+    - if the JSON cannot be read, or the schema is wrong;
+    - if values are missing or wrong;
+    - if there is no image, or more than MAX_IMAGES images;
+    - if a file name is not plain or occurs twice;
+    - if both noise figures are zero.
+
+    The message names the key (an image by its index and file), the expected value and the given value.
     """
     if len(content) > MAX_MANIFEST_BYTES:
         raise _bad(f"expected at most {MAX_MANIFEST_BYTES} bytes; got more")

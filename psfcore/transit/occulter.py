@@ -1,16 +1,16 @@
 """The position of the occulter, found by simulating the occulter in front of the scene that other images show.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", step (e). The scene behind
-the occulter of frame i is taken from the frames of the same pointing that are nearest in time and show it unocculted.
+the occulter of frame i comes from its neighbours: frames of the same pointing, nearest in time, that show this scene.
 The light that a disc hides in this scene is convolved with the PSF and subtracted:
 
     m = scale Q + level - H (P c)                                                                   Eq. (1)
     chi2 = sum (y - m)^2 / var + ((x - x0)^2 + (y - y0)^2) / s^2 + (scale - 1)^2 / t^2              Eq. (2)
 
-Q is the mean of the observed images of these neighbours, P the mean of their deconvolved scenes, c the share of a pixel
-that the disc covers, and H the convolution with the PSF on the patch. (x, y) is the centre of the disc, (x0, y0) the
-centre from the ephemeris. Scale and level are fitted too. They describe smooth differences around the disc, for example
-light that the occulters of the neighbours hide, or another gain, so that such differences do not shift the position.
+Q is the mean of the observed images of the neighbours, and P the mean of their deconvolved scenes. c is the share of a
+pixel that the disc covers, and H the convolution with the PSF on the patch. (x, y) is the centre of the disc, (x0, y0)
+the centre from the ephemeris. Scale and level are fitted too, so that smooth differences around the disc do not shift
+the position. Such differences come, for example, from another gain, or from light that the neighbours' occulters hide.
 The paper moves the disc until the simulation looks best; here Gauss-Newton steps minimise Eq. (2).
 
 If no neighbour shows the scene, Q and P are the mean of a ring around the disc in the frame itself.
@@ -134,8 +134,8 @@ def patch_window(shape: tuple[int, int], place: Place, margin_px: float = PATCH_
 def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], noise: Noise) -> list[int]:
     """The frames of the same pointing, nearest in time, whose occulters do not overlap the patch of this one.
 
-    At least LEAST_NEIGHBOURS frames are chosen if there are so many, and more until they have ENOUGH_PHOTONS photons per
-    pixel together.
+    At least LEAST_NEIGHBOURS such frames are chosen, if the transit has enough. More are chosen until all of them together
+    have ENOUGH_PHOTONS photons per pixel.
     """
     here, frame = places[index], frames[index]
     reach = here.radius_px + PATCH_MARGIN_PX

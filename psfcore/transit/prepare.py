@@ -9,7 +9,7 @@ pointing, because the scene moves on the detector with the pointing. Its values 
 
 | symbol | name | unit |
 |---|---|---|
-| I_i, I_j | pixels of the frame with the gap, and of the frame from which it is filled | DN/s |
+| I_i, I_j | pixels of the frame with the gap, and of the frame from which the gap is filled | DN/s |
 | s | scale | 1 |
 
 ``Frame.filled`` marks the pixels of all gaps; analyses of the occulter do not use these pixels.
@@ -130,8 +130,8 @@ def exposure_of(
 def prepare(exposures: Sequence[Exposure]) -> tuple[tuple[Frame, ...], Prepared]:
     """Return frames without gaps, in the given order, and the counts of each frame.
 
-    A pixel in a gap gets its value from the frame of the same pointing that is nearest in time and has no gap at this
-    pixel. If there is no such frame, a finite (saturated) pixel keeps its value, and any other pixel gets the median of
+    A pixel in a gap gets its value from another frame of the same pointing: from the frame nearest in time that has no
+    gap at this pixel. If there is no such frame, a finite (saturated) pixel keeps its value, and any other pixel gets the median of
     its neighbours. The pixel arrays of the exposures are changed in place; the frames use the same arrays.
     Raises DataError "all-saturated" if more than half of the pixels of a frame stay saturated.
     """

@@ -41,7 +41,7 @@ def source_centre(
 ) -> tuple[tuple[float, float], float]:
     """Return the position (x, y) of the source in px, and the radius of its saturated patch in px.
 
-    If no position is given, it is the middle of the patch, or the brightest pixel if no pixel is saturated. In the
+    If no position is given, the middle of the patch is used, or the brightest pixel if no pixel is saturated. In the
     latter case the radius is 1.5 px. Raises DataError "arms-bad-input", "no-flare".
     """
     radius = float(np.sqrt(patch.sum() / np.pi)) if patch.any() else 1.5
@@ -86,7 +86,7 @@ def expected_light(image: Plane, reference: Plane | None, usable: Flags) -> Plan
 
 
 def pixel_sigma(expected: Plane, noise: tuple[float, float] | None) -> Plane:
-    """The standard error of each pixel, DN. Without `noise` it is only proportional: the square root of the light."""
+    """The standard error of each pixel, DN. Without `noise` it is the square root of the light, correct up to a factor."""
     gain, read = noise or (1.0, 0.0)
     floor = max(1e-3 * float(np.median(expected)), 1e-12)
     return np.asarray(np.sqrt(gain * np.maximum(expected, floor) + read**2))
