@@ -34,12 +34,10 @@ from psfcore.compiled import compiled
 
 _MM_PER_ANGSTROM = 1e-7
 _UM_PER_MM = 1e3
-_TABLE_STEP = 0.02  # step in v of the table of B; B changes noticeably only over a step of about 1
+_TABLE_STEP = 0.02  # step in v of the table of B; B needs a step of about 1 to change noticeably
 NEAR_PX = 24
-NEAR_POINTS, FAR_POINTS = (
-    48,
-    16,
-)  # points of the integral along an edge: within NEAR_PX of an axis, farther out
+# Number of points of the integral along an edge: within NEAR_PX of an axis, and farther out.
+NEAR_POINTS, FAR_POINTS = 48, 16
 
 
 def airy_light_beyond(v: NDArray[np.float64], obscured: float = 0.0) -> NDArray[np.float64]:
@@ -77,9 +75,8 @@ def airy_kernel(
     table = airy_light_beyond(v, obscuration_diameter_mm / diameter_mm)
     near, far = (np.polynomial.legendre.leggauss(points) for points in (NEAR_POINTS, FAR_POINTS))
     flux = _edge_fluxes(table, v_per_px / _TABLE_STEP, half, near, far)
-    out_x = np.diff(flux, axis=0, prepend=-flux[:1])[
-        : half + 1
-    ]  # flux through the right edge minus flux through the left edge
+    # Flux through the right edge minus flux through the left edge.
+    out_x = np.diff(flux, axis=0, prepend=-flux[:1])[: half + 1]
     quarter = -(out_x.T + out_x)
     quarter[0, 0] += 1  # Eq. (3)
     distance = np.abs(np.arange(size) - half)

@@ -41,8 +41,8 @@ class BestFocus:
     """The separation of best focus, and the quantities that follow from it.
 
     printed_blur_px: width of the geometric image of a point at the printed separation.
-    beyond_central_pixel_*: share of the light outside the central pixel, for the open aperture without meshes in one
-    dimension; at the printed separation and in focus. nominal_focal_length_mm: the focal length of the instrument file.
+    beyond_central_pixel_*: share of the light outside the central pixel, at the printed separation and in focus. This
+    share is computed in one dimension, for the open aperture without meshes. nominal_focal_length_mm: the focal length of the instrument file.
     order_spacing_px: spacing of the orders of the entrance mesh, measured in the focused image. The distance from order
     -`orders` to order +`orders` is divided by 2 x `orders`.
     """
@@ -110,8 +110,8 @@ def paraxial_separation_mm(path: LightPath) -> float:
 def best_focus(path: LightPath, *, nominal_focal_length_mm: float) -> BestFocus:
     """Solve for the separation of best focus.
 
-    nominal_focal_length_mm: the focal length of the instrument file, for comparison. Raises DataError "no-focus" if there is no maximum
-    within SEARCH_MM of the paraxial separation.
+    nominal_focal_length_mm: the focal length of the instrument file, for comparison. Raises DataError "no-focus" if there
+    is no maximum within SEARCH_MM of the paraxial separation.
     """
     waves = _WithoutWheel(path)
     at_primary = waves.at_primary(path.aperture_mm)

@@ -2,8 +2,8 @@
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation", the simplified-combined
 solution. The pattern of the entrance pupil (aperture, mount and entrance mesh in one mask) is a Fraunhofer transform; the
-pattern of the filter-wheel mesh is an analytic series. Both patterns are convolved with each other. The patterns of the spectral lines of the
-bandpass are multiplied by the weights of the lines and added.
+pattern of the filter-wheel mesh is an analytic series. Both patterns are convolved with each other. The patterns of the
+spectral lines of the bandpass are multiplied by the weights of the lines and added.
 
 One rule decides how each component of the entrance is computed, and the provenance records the decision:
 

@@ -55,7 +55,7 @@ from psfcore.diffraction.pupil import MaskGrid, Pupil
 STRIP_ROWS = 16
 SURVEY_CELLS = 4096  # cells across the pupil when its area and symmetry are determined
 FEWEST_SAMPLES = 14
-SPECTRA_BYTES = 700 * 2**20  # memory for the transforms along x that are kept at a time
+SPECTRA_BYTES = 700 * 2**20  # memory for the transforms along x that are kept at the same time
 _SYMMETRY_TOLERANCE_CELLS = 1e-2
 _SYMMETRY_SEED = 174
 _MM_PER_ANGSTROM = 1e-7

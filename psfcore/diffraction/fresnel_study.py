@@ -74,9 +74,8 @@ class Sampling:
     step_um: float
     samples: int
     least_samples: int | None
-    light: (
-        float  # fraction of the entering light that is left behind the mask of this plane; mean over phases
-    )
+    # Fraction of the entering light that is left behind the mask of this plane; mean over phases.
+    light: float
 
 
 @dataclass(frozen=True)
@@ -284,7 +283,7 @@ def _entrance_line(path: LightPath, focal_length_mm: float) -> Vector:
 
 
 def _combined_line(path: LightPath, entrance_line: Vector, distance_mm: float, windows: int) -> Vector:
-    """The entrance's image convolved with the wheel mesh's series, sum 1."""
+    """The image of the entrance, convolved with the series of the filter-wheel mesh, sum 1."""
     series = mesh_line(
         wavelength_angstrom=path.wavelength_mm * _ANGSTROM_PER_MM,
         distance_mm=distance_mm,

@@ -14,7 +14,7 @@ factor is a finite cosine series (Fejer), and each term has an antiderivative wi
 
 The pattern of a rotated mesh is rotated by the same angle and is not separable on the pixels.
 `rotated_mesh_kernel` divides each axis of the rotated pattern into cells. The cells are small at the orders. The light
-of every pair of cells is distributed over the pixels that the pair covers. The light of all cells together is known:
+of every pair of cells is distributed over the pixels that the pair covers. The light on a whole axis is known:
 
     integral of Eq. (1) over all x = (N d / w) (lambda z / d)                                        Eq. (5)
 

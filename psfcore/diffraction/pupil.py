@@ -1,8 +1,8 @@
 """The entrance pupil as a transmission mask, computed in strips of rows.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation": amplitude masks of the aperture,
-its mount and its mesh. A cell of the mask holds the open share of its area. This share is exact, because every
-outline is a polygon, and the area under an edge of a polygon in a cell is a trapezoid. A circle is replaced by a polygon
+its mount and its mesh. A cell of the mask holds the open share of its area. This share is exact: every outline
+is a polygon, and in a cell the area under an edge of a polygon is a trapezoid. A circle is replaced by a polygon
 of the same area with 4096 corners.
 
     open area of cell i = sum over edges of dy (i + 1 - x), with x the mean x of the edge in the cell   Eq. (1)
@@ -211,7 +211,7 @@ class MaskGrid:
 
 
 def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float64]:
-    """Integral of the open share along a mesh, up to a constant: windows of width w at a pitch d."""
+    """The integral of the open share along an axis of a mesh, up to a constant."""
     window_um = mesh.pitch_um - mesh.wire_um
     from_window_um = x_um + window_um / 2 - (0 if mesh.windows % 2 else mesh.pitch_um / 2)
     whole, part_um = np.divmod(from_window_um, mesh.pitch_um)

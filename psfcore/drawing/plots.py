@@ -1,6 +1,6 @@
 """Plots: an image before and after deconvolution, and a PSF.
 
-Each plot has its own figure on the Agg canvas, so threads and processes share no state. With pyplot they would.
+Each plot has its own figure on the Agg canvas, so threads and processes share no state. With pyplot they would share it.
 """
 
 from __future__ import annotations

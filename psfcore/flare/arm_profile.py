@@ -46,14 +46,12 @@ from psfcore.scatter.samples import DIFFRACTION, SCATTER
 BOX_PX = 7
 MATCHED_PX = (60.0, 70.0)
 FITTED_PX = (10.0, 80.0)
-HALF_WIDTH_PX = (
-    BOX_PX / 2
-)  # the strip is as wide as the box and so contains the orders of all pixels of the box
+# The strip is as wide as the box, so that it contains the orders of all pixels of the box.
+HALF_WIDTH_PX = BOX_PX / 2
 FEWEST_DISTANCES = 20
 _CONSTRAINT_WEIGHT = 1e4
-_USED_SHARE = (
-    1e-6  # a pixel with a smaller fraction of the light of the box does not count as a free parameter
-)
+# A pixel with a smaller fraction of the light of the box does not count as a free parameter.
+_USED_SHARE = 1e-6
 
 Plane = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -89,8 +87,8 @@ class FlareFit:
     box [y, x]: light of the flare. simulated: s_u. rms_pct: root mean square of 100 (s_u / d_u - 1) over the distances
     with d_u > 0. chi2_per_distance: the sum in Eq. (2) divided by the number of distances; None if the noise is unknown.
     reduced_chi2: the same sum divided by the degrees of freedom (number of distances - number of used pixels of the box
-    + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px.
-    matched_noise_pct: the noise of this mean d in percent; the constraint treats the mean d as exact.
+    + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px. matched_noise_pct: the noise of this mean
+    d in percent; the constraint treats the mean d as exact.
     """
 
     box: Plane

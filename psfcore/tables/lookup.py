@@ -19,9 +19,8 @@ from psfcore.tables.layout import SCHEMA as SCHEMA
 from psfcore.tables.layout import TOTAL, WHOLE_TO_PX
 
 LARGEST_COUNT = 500  # largest number of radii in one question
-NEGLIGIBLE_POINTS = (
-    0.005  # smaller interpolation errors (percentage points) are reported only as "below 0.005"
-)
+# Smaller interpolation errors (percentage points) are reported only as "below 0.005".
+NEGLIGIBLE_POINTS = 0.005
 
 Tables = Mapping[str, Any]
 Numbers = list[float]

@@ -20,7 +20,7 @@ _HIDDEN = ("__MACOSX", "PaxHeader", "PaxHeaders", "Thumbs.db", "desktop.ini")
 class ArchiveLimits:
     """Bounds on what an archive may contain.
 
-    max_files: members of any kind, hidden ones included. max_bytes: unpacked bytes of all members.
+    max_files: members of any kind, including hidden files. max_bytes: unpacked bytes of all members.
     max_member_bytes: unpacked bytes of one member. max_ratio: unpacked bytes divided by the bytes of the archive. This
     bound applies only above RATIO_FLOOR_BYTES.
     """
@@ -58,7 +58,7 @@ class Gate:
         self._check(self._unpacked)
 
     def admit(self, raw_name: str, size: int) -> str | None:
-        """The plain name of a file, or None if the file is hidden and must be skipped.
+        """Check a file; return its plain name, or None if the file is hidden and must be skipped.
 
         Raises DataError "archive-climbs", "archive-not-plain", "archive-too-large".
         """

@@ -79,7 +79,7 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
 
     If all files are in one folder of the archive, that folder's name is dropped. Hidden files and files that operating
     systems add are skipped.
-    Raises DataError, and then removes all files that it wrote: "not-an-archive"; "archive-climbs" for a name that leads
+    Raises one of these DataErrors, and then removes all files that it wrote: "not-an-archive"; "archive-climbs" for a name that leads
     out of the folder; "archive-not-plain" for links, devices, sparse or encrypted files, nested folders, a name that
     occurs twice, and a name that is not a plain file name; "archive-too-large" if there are more bytes or members than
     the limits allow; "archive-broken". An OSError of the disk is raised unchanged.

@@ -188,7 +188,7 @@ def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
 
 
 def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
-    """The pixels around the disc, to beyond the shell, without filled pixels; and their x and y from the disc's centre (1-D)."""
+    """The pixels of a square around the shell (one axis), without filled pixels; and their x and y from the disc's centre."""
     reach = place.radius_px + EDGE_PX + SHELL_PX + 2
     ny, nx = frame.pixels.shape
     top, bottom = (min(max(int(place.y_px + side * reach), 0), ny) for side in (-1, 1))

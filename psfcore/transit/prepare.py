@@ -131,8 +131,8 @@ def prepare(exposures: Sequence[Exposure]) -> tuple[tuple[Frame, ...], Prepared]
     """Return frames without gaps, in the given order, and the counts of each frame.
 
     A pixel in a gap gets its value from another frame of the same pointing: from the frame nearest in time that has no
-    gap at this pixel. If there is no such frame, a finite (saturated) pixel keeps its value, and any other pixel gets the median of
-    its neighbours. The pixel arrays of the exposures are changed in place; the frames use the same arrays.
+    gap at this pixel. If there is no such frame, a finite (saturated) pixel keeps its value. Any other pixel then gets the
+    median of its neighbours. The pixel arrays of the exposures are changed in place; the frames use the same arrays.
     Raises DataError "all-saturated" if more than half of the pixels of a frame stay saturated.
     """
     done = [(_frame(exposure), counts) for exposure, counts in ((e, _fill(e, exposures)) for e in exposures)]

@@ -82,9 +82,8 @@ def first_fit(
     state = FitState(pattern, np.ones(arm.size), source)
     for _ in range(2):  # first with all orders, then with the significant orders
         orders = select_pixels(difference, usable, sigma, geometry, pattern, arm, k)
-        check_enough_orders(
-            orders.arm, pattern.size - 1
-        )  # if the source is near a corner, an arm may have no order on the image
+        # If the source is near a corner, an arm may have no order on the image.
+        check_enough_orders(orders.arm, pattern.size - 1)
         state, error = _alternate(orders, geometry, state)
         significant = state.amplitude > ORDER_SIGMA * error
         arm, k = orders.arm[significant], orders.k[significant]
