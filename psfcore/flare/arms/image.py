@@ -22,7 +22,8 @@ def prepared(image: Plane, reference: Plane | None, saturated: Flags | None) -> 
     for name, plane in (("reference", reference), ("saturated", saturated)):
         if plane is not None and plane.shape != image.shape:
             raise DataError(
-                "arms-bad-input", f"expected {name} of the image's shape {image.shape}; got {plane.shape}"
+                "arms-bad-input",
+                f"expected {name} with the shape of the image, {image.shape}; got {plane.shape}",
             )
     difference = np.asarray(image if reference is None else image - reference, dtype=np.float64)
     usable = np.isfinite(difference)
