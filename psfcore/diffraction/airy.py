@@ -6,18 +6,18 @@ e the obscured fraction of the diameter and v = pi D r / (lambda f):
     U(v) = (2 J1(v) / v - e^2 2 J1(e v) / (e v)) / (1 - e^2)                                     Eq. (1)
     dB/dv = -(1 - e^2) v U(v)^2 / 2;   for a disc B = J0(v)^2 + J1(v)^2                          Eq. (2)
 
-B(r) is the share of the light beyond r (1 - encircled energy). The pattern is the divergence of the radial field
--B / (2 pi r), so the light in a pixel is a flux through its four edges. The integrand of this flux is smooth, while
-the pattern itself has hundreds of rings:
+B(r) is the share of the light beyond the radius r (1 - encircled energy). The pattern is the divergence of the radial
+field -B / (2 pi r), so the light in a pixel is a flux through its four edges. The flux is easier to integrate than the
+pattern, because B / (2 pi r) is smooth and the pattern has hundreds of rings:
 
-    light in a pixel = [1 in the central one] - outward flux of B / (2 pi r)                      Eq. (3)
+    light in a pixel = [1 in the central pixel, else 0] - outward flux of B / (2 pi r)            Eq. (3)
 
 | symbol | name | unit |
 |---|---|---|
 | D, e D | diameter_mm, obscuration_diameter_mm | mm |
 | lambda | wavelength_angstrom | Angstrom |
 | f | focal_length_mm | mm |
-| v | v, pi times radius over lambda f / D | - |
+| v | v = pi D r / (lambda f), with r the radius on the detector | - |
 | B | airy_light_beyond | - |
 """
 
@@ -34,13 +34,14 @@ from psfcore.compiled import compiled
 
 _MM_PER_ANGSTROM = 1e-7
 _UM_PER_MM = 1e3
-_TABLE_STEP = 0.02  # in v; B changes on a scale of about 1
+_TABLE_STEP = 0.02  # step in v of the table of B; B needs a step of about 1 to change noticeably
 NEAR_PX = 24
-NEAR_POINTS, FAR_POINTS = 48, 16  # of the integral along an edge, within NEAR_PX of an axis and farther out
+# Number of points of the integral along an edge: within NEAR_PX of an axis, and farther out.
+NEAR_POINTS, FAR_POINTS = 48, 16
 
 
 def airy_light_beyond(v: NDArray[np.float64], obscured: float = 0.0) -> NDArray[np.float64]:
-    """B of Eq. (2) at v, which must ascend from 0 in equal steps; `obscured` is e."""
+    """Return B of Eq. (2) at each v. v must ascend from 0 in equal steps; `obscured` is e."""
     if obscured == 0:
         return np.asarray(j0(v) ** 2 + j1(v) ** 2)
     amplitude = (_jinc(v) - obscured**2 * _jinc(obscured * v)) / (1 - obscured**2)  # Eq. (1)
@@ -61,9 +62,9 @@ def airy_kernel(
     size: int,
     obscuration_diameter_mm: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Share of all light in each of (size, size) pixels, size even, centre at [size // 2, size // 2].
+    """The share of all light in each pixel, shape (size, size), centre at [size // 2, size // 2]; size must be even.
 
-    It is not normalised: the light beyond the grid is missing from the sum.
+    The kernel is not normalised: its sum lacks the light beyond the array.
     """
     resolved_px = (
         wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / diameter_mm * _UM_PER_MM / pixel_pitch_um
@@ -74,7 +75,8 @@ def airy_kernel(
     table = airy_light_beyond(v, obscuration_diameter_mm / diameter_mm)
     near, far = (np.polynomial.legendre.leggauss(points) for points in (NEAR_POINTS, FAR_POINTS))
     flux = _edge_fluxes(table, v_per_px / _TABLE_STEP, half, near, far)
-    out_x = np.diff(flux, axis=0, prepend=-flux[:1])[: half + 1]  # right edge less left edge
+    # Flux through the right edge minus flux through the left edge.
+    out_x = np.diff(flux, axis=0, prepend=-flux[:1])[: half + 1]
     quarter = -(out_x.T + out_x)
     quarter[0, 0] += 1  # Eq. (3)
     distance = np.abs(np.arange(size) - half)
@@ -82,13 +84,13 @@ def airy_kernel(
 
 
 def first_dark_ring_v() -> float:
-    """v of the first zero of the Airy pattern of a disc, 1.22 pi."""
+    """v at the first zero of the Airy pattern of a disc, 1.22 pi."""
     return float(jn_zeros(1, 1)[0])
 
 
 @compiled()
 def _edge_fluxes(table, steps_per_px, half, near, far):  # type: ignore[no-untyped-def]
-    """Flux of B / (2 pi r) in +x through the right edge of each pixel [x, y] of a quadrant."""
+    """Flux of B / (2 pi r) in the direction +x through the right edge of each pixel [x, y] of one quadrant."""
     flux = np.empty((half + 1, half + 1))
     for i in range(half + 1):
         x = i + 0.5
@@ -103,5 +105,5 @@ def _edge_fluxes(table, steps_per_px, half, near, far):  # type: ignore[no-untyp
                 low = int(at)
                 beyond = table[low] + (at - low) * (table[low + 1] - table[low])
                 total += weights[g] * beyond * x / r2
-            flux[i, k] = total / (4 * math.pi)  # half the pixel's edge times 1 / (2 pi)
+            flux[i, k] = total / (4 * math.pi)  # half the length of the edge, times 1 / (2 pi)
     return flux

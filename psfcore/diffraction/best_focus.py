@@ -1,15 +1,17 @@
 """The separation of the mirrors that focuses a telescope on its detector.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "The instrument", prints radii and distances that
-are not consistent: with them the detector is far out of focus. This module solves for the separation of the mirrors,
-because the secondary magnifies its error most. All other values stay as printed, and the result states the shift.
+are not consistent: with them the detector is far out of focus. This module solves for the separation of the mirrors.
+The focus is most sensitive to this length, because the secondary magnifies its error. All other values stay as printed,
+and the result states the shift of the separation.
 
 Rays near the axis meet on the detector where y(L) = 0 in Eq. (1) of light_path:
 
     s = f1 - L / (1 - L / f2)                                                                      Eq. (1)
 
-The search starts there. Best focus is the separation at which the wave through the open aperture, without meshes,
-has the largest intensity on the axis; the pixels of the detector are too coarse to show it as precisely.
+The search for best focus starts at this separation. Best focus is the separation at which the wave through the open
+aperture, without meshes, has the largest intensity on the axis. Light in the pixels of the detector would be a less
+precise criterion, because the pixels are too coarse.
 
 | symbol | name | unit |
 |---|---|---|
@@ -36,11 +38,13 @@ HIGHEST_ORDER = 15
 
 @dataclass(frozen=True)
 class BestFocus:
-    """The separation of best focus, and what follows from it.
+    """The separation of best focus, and the quantities that follow from it.
 
-    printed_blur_px: width of the geometric image of a point with the printed separation.
-    beyond_central_pixel_*: share of the open aperture's light outside the central pixel, without meshes, in one dimension.
-    order_spacing_px: measured in the focused image through the entrance mesh, over 2 x `orders` orders.
+    printed_blur_px: width of the geometric image of a point at the printed separation.
+    beyond_central_pixel_*: share of the light outside the central pixel, at the printed separation and in focus. This
+    share is computed in one dimension, for the open aperture without meshes. nominal_focal_length_mm: the focal length of the instrument file.
+    order_spacing_px: spacing of the orders of the entrance mesh, measured in the focused image. The distance from order
+    -`orders` to order +`orders` is divided by 2 x `orders`.
     """
 
     printed_separation_mm: float
@@ -70,7 +74,7 @@ class _WithoutWheel:
         self._step = FresnelStep(
             self._secondary, self.detector, wavelength_mm=path.wavelength_mm, distance_mm=length_mm
         )
-        # for x2 = 0, Eq. (1) of fresnel is a plain sum
+        # at x2 = 0, Eq. (1) of fresnel is a plain sum
         self._to_axis = np.exp(1j * np.pi / path.wavelength_mm / length_mm * self._secondary.x_mm**2)
 
     def at_primary(self, openings_mm: Vector) -> Wave:
@@ -95,7 +99,7 @@ def paraxial_separation_mm(path: LightPath) -> float:
     f1, f2, length = focal_mm(path.primary), focal_mm(path.secondary), path.secondary_to_detector_mm
     separation_mm = f1 - length * f2 / (f2 - length) if f2 != length else 0.0  # Eq. (1)
     if separation_mm <= 0:
-        found = f"{separation_mm:g} mm" if f2 != length else "none"
+        found = f"{separation_mm:g} mm" if f2 != length else "no finite separation"
         raise DataError(
             "no-focus",
             f"expected mirrors that can focus on the detector at a positive separation; got {found}",
@@ -106,8 +110,8 @@ def paraxial_separation_mm(path: LightPath) -> float:
 def best_focus(path: LightPath, *, nominal_focal_length_mm: float) -> BestFocus:
     """Solve for the separation of best focus.
 
-    nominal_focal_length_mm: of the instrument, for comparison. Raises DataError "no-focus" if there is no maximum
-    within SEARCH_MM of the paraxial separation.
+    nominal_focal_length_mm: the focal length of the instrument file, for comparison. Raises DataError "no-focus" if there
+    is no maximum within SEARCH_MM of the paraxial separation.
     """
     waves = _WithoutWheel(path)
     at_primary = waves.at_primary(path.aperture_mm)
@@ -131,7 +135,7 @@ def best_focus(path: LightPath, *, nominal_focal_length_mm: float) -> BestFocus:
         beyond_central_pixel_focused=_beyond_central_pixel(waves, at_primary, separation_mm),
         message=(
             f"mirror separation moved from the printed {printed_mm:.3f} mm by {separation_mm - printed_mm:+.3f} mm "
-            f"to {separation_mm:.3f} mm, where the open aperture's wave is most intense on the axis"
+            f"to {separation_mm:.3f} mm. There the wave through the open aperture is most intense on the axis"
         ),
     )
 
@@ -153,7 +157,7 @@ def _sharpest(waves: _WithoutWheel, at_primary: Wave, paraxial_mm: float) -> flo
 
 
 def _order_spacing_px(waves: _WithoutWheel, separation_mm: float) -> tuple[float, int]:
-    """Mean spacing of the entrance mesh's orders, from the outermost pair used, and the order of that pair."""
+    """Mean spacing (px) of the orders of the entrance mesh, and the order n: the spacing is measured from -n to +n."""
     path = waves.path
     field = waves.at_detector(waves.at_primary(path.entrance_mm), separation_mm)
     pitch_mm = path.entrance_mesh.pitch_um * MM_PER_UM
@@ -167,7 +171,7 @@ def _order_spacing_px(waves: _WithoutWheel, separation_mm: float) -> tuple[float
 
 
 def _peak_px(intensity: Vector, grid: Grid, pixel_mm: float, near_px: float) -> float:
-    """Position of the highest sample within a pixel of `near_px`, refined by a parabola."""
+    """Position (px) of the highest sample at most 1 px from `near_px`, refined by a parabola."""
     x_px = grid.x_mm / pixel_mm
     window = np.flatnonzero(np.abs(x_px - near_px) <= 1.0)
     top = int(window[np.argmax(intensity[window])])

@@ -1,21 +1,22 @@
 """The diffraction of a whole telescope: entrance pupil and filter-wheel meshes, component by component.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation", the simplified-combined
-solution: a Fraunhofer transform of the entrance pupil (aperture, mount and entrance mesh in one mask), an analytic
-series for the filter-wheel mesh, and the convolution of both patterns. Spectral lines of the bandpass are added by
-weight.
+solution. The pattern of the entrance pupil (aperture, mount and entrance mesh in one mask) is a Fraunhofer transform; the
+pattern of the filter-wheel mesh is an analytic series. Both patterns are convolved with each other. The patterns of the
+spectral lines of the bandpass are multiplied by the weights of the lines and added.
 
 One rule decides how each component of the entrance is computed, and the provenance records the decision:
 
-- The mask is transformed if at most 32 samples per pixel are needed (fraunhofer, Eq. (3)). Otherwise the aperture
-  is an analytic Airy pattern, and a mount is left out.
-- Entrance meshes are in that mask if all of them cover the whole pupil and are parallel to the pixels. Otherwise
-  each has its series, rotated by its angle; their sum by share is convolved with the pattern of the aperture.
+- The mask is transformed if at most 32 samples per pixel are needed (fraunhofer, Eq. (3)). Otherwise the pattern of
+  the aperture is an analytic Airy pattern, and a mount is left out.
+- The transformed mask contains the entrance meshes if all of them cover the whole pupil and are parallel to the pixels.
+  Otherwise each mesh is an analytic series, rotated by the angle of the mesh. The series of meshes side by side are
+  multiplied by their shares and added. The result is convolved with the pattern of the aperture and its mount.
 
 | symbol | name |
 |---|---|
 | S | samples, per pixel and axis |
-| P | patterns, shares of the light of a point per pixel [y, x], centre at [n // 2, n // 2] |
+| P | patterns: the share of a point's light in each pixel [y, x], centre at [n // 2, n // 2] |
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from psfcore.diffraction.pupil import Pupil, entrance_pupil
 from psfcore.instruments.model import Instrument, Mesh, SpectralLine
 
 MOST_SAMPLES = 32
-PERIOD_PX = 4096  # of the transform: light wraps around this grid, not around the 2048 px that are kept
-NARROW_WINDOWS = 400  # so many windows make the orders of a series narrow
-STEPS_A_PUPIL = 20  # of progress, for each part
+PERIOD_PX = 4096  # size of the transform: light wraps around at 4096 px, not at the 2048 px that are kept
+NARROW_WINDOWS = 400  # a series of at least 400 windows has narrow orders
+STEPS_A_PUPIL = 20  # steps of progress for each component
 AIRY, ENTRANCE_MESH, MOUNT, ENTRANCE = "AIRY", "ENTRANCE_MESH", "MOUNT", "ENTRANCE"
 FILTER_WHEEL, DIFFRACTION = "FILTER_WHEEL", "DIFFRACTION"
 
@@ -47,7 +48,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Route:
-    """Which components of the entrance are in the transformed mask; as a text, why."""
+    """The components of the entrance that are in the transformed mask. As a text: this decision and its reason."""
 
     samples: int
     mask: bool
@@ -64,14 +65,14 @@ class Route:
 
 @dataclass
 class Patterns:
-    """Patterns by component, each the share of all light on the grid, and notes on how they were computed."""
+    """The pattern of each component (the share of all light in each pixel), and notes on how it was computed."""
 
     kernels: dict[str, Kernel] = field(default_factory=dict)
     notes: dict[str, Any] = field(default_factory=dict)
 
 
 def route_of(instrument: Instrument) -> Route:
-    """The rule above, applied to the shortest wavelength of the bandpass."""
+    """Apply the rule of this module, with the largest number of samples that a line of the bandpass needs."""
     samples = max(
         samples_per_pixel(
             instrument.aperture.diameter_mm,
@@ -125,7 +126,11 @@ def diffraction_patterns(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> Patterns:
-    """The wanted components on (size, size), not normalised; spectral lines are added by weight."""
+    """Compute the wanted components, shape (size, size), not normalised.
+
+    The patterns of the spectral lines are multiplied by the weights of the lines and added. mount_image: pixels [y, x] of
+    the mount's mask image, if the instrument has one. progress: called with (done, of).
+    """
     needed = needed_parts(instrument, wanted)
     made = Patterns(notes={"entrance_route": str(route_of(instrument))})
     lines = instrument.spectral_lines
@@ -143,7 +148,7 @@ def diffraction_patterns(
 
 
 def _scaled(progress: Progress | None, before: int, steps: int) -> Progress:
-    """Report the progress of one component as steps of the whole."""
+    """Report the progress of one component as progress of the whole computation."""
 
     def report(done: int, of: int) -> None:
         if progress is not None:
@@ -210,7 +215,7 @@ class _OneWavelength:
         return self._far_field(MOUNT, self._mounted(()), progress)
 
     def _entrance(self, progress: Progress) -> Kernel:
-        """The whole entrance pupil; if only one component is in it, the pattern of that component."""
+        """The pattern of the whole entrance pupil. If it has no mesh or no mount, this pattern has been computed already."""
         has_mesh, has_mount = bool(_meshes(self.instrument, "entrance")), self.route.mount
         if has_mesh and has_mount and self.route.meshes_in_mask:
             pupil = self._mounted(_meshes(self.instrument, "entrance"))
@@ -249,9 +254,10 @@ class _OneWavelength:
         return found.pattern
 
     def _series(self, place: str) -> Kernel:
-        """The pattern of the meshes of one place.
+        """The pattern of all meshes at the entrance, or of all meshes at the filter wheel.
 
-        Meshes that all light crosses are convolved; meshes side by side are added by their share.
+        The patterns of meshes that all light crosses are convolved with each other. The patterns of meshes side by side
+        are multiplied by the shares of the meshes and added.
         """
         whole = [mesh for mesh in _meshes(self.instrument, place) if mesh.share == 1]
         shared = [mesh for mesh in _meshes(self.instrument, place) if mesh.share < 1]
@@ -273,7 +279,7 @@ class _OneWavelength:
             "distance_mm": self.instrument.mesh_distance_mm(mesh),
             "pitch_um": mesh.pitch_um,
             "wire_um": mesh.wire_um,
-            # The pattern of the aperture already holds the width of the orders, so those of the series must be narrow.
+            # The orders get their width from the pattern of the aperture, so the orders of the series must be narrow.
             "windows": max(mesh.windows, NARROW_WINDOWS) if mesh.place == "entrance" else mesh.windows,
             "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
             "size": self.size,

@@ -18,7 +18,7 @@ _Number = Callable[[MeshDesign], float | None]
 
 
 def design_png(study: DesignStudy, path: str | Path) -> None:
-    """Panels over the pitch, one curve per wire width; a star marks the flown mesh."""
+    """Draw each quantity against the pitch, one curve per wire width; a star marks the flown mesh."""
     panels: list[tuple[str, str, _Number]] = [
         ("All diffracted light", "% of all light", lambda row: row.diffracted_pct),
         ("Light beyond 10 px", "1 - encircled energy (%)", lambda row: row.beyond_10_px_pct),
@@ -30,7 +30,7 @@ def design_png(study: DesignStudy, path: str | Path) -> None:
         ),
     ]
     if all(row.peak_over_scatter is not None for row in study.rows):
-        panels.append(("Order at 50 to 150 px over the scatter", "ratio", lambda row: row.peak_over_scatter))
+        panels.append(("Order divided by scatter, 50 to 150 px", "ratio", lambda row: row.peak_over_scatter))
     layout = ConstrainedLayoutEngine(w_pad=0.08, wspace=0.04)
     figure = Figure(figsize=(4.1 * len(panels), 4.6), dpi=100, facecolor="white", layout=layout)
     figure.suptitle(

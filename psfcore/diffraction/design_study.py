@@ -8,14 +8,15 @@ distinguished. With f = 1 - wire / pitch:
     share of the light in the order (k, 0) = f^2 sinc^2(pi k f)                                      Eq. (1)
     share outside the order (0, 0) = 1 - f^2                                                         Eq. (2)
 
-The light beyond a radius (1 - encircled energy) is that of the pattern of mesh_series: a square pupil as wide as the
-aperture, normalised to the light on the full reach, without mount, filter wheel or scatter.
+The light beyond a radius (1 - encircled energy) is computed from the pattern of mesh_series. This pattern is for a
+square pupil as wide as the aperture, without mount, filter wheel or scatter. It is normalised to the light on the full
+reach.
 
 | symbol | name | unit |
 |---|---|---|
 | d | pitch_um | um |
 | - | wire_um | um |
-| N | windows: aperture over pitch | - |
+| N | windows: diameter of the aperture divided by the pitch | - |
 | lambda f / d | spacing_px | px |
 """
 
@@ -38,7 +39,7 @@ NEAR_PX = 10.0
 FAR_PX = 100.0
 FLARE_PX = 5
 MOST_MESHES = 400
-_COMPARED_PX = (50.0, 150.0)  # the orders compared with the scatter
+_COMPARED_PX = (50.0, 150.0)  # orders at these radii are compared with the scatter
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,9 @@ class MeshDesign:
     """One mesh: its geometry, and its effect in percent of all transmitted light.
 
     peak_visibility: the contrast (high - low) / (high + low) of the orders along the axis, for a flare of `flare_px` px
-    per side: 1 where the orders are separate, 0 where they merge.
-    peak_over_scatter: the largest ratio, among the orders on the axis from 50 to 150 px, of an order to the diffuse
-    scatter of the same flare at its position; None if the instrument has no scatter.
+    per side. It is 1 if the orders are separate, and 0 if they merge.
+    peak_over_scatter: the light of an order in a pixel, divided by the diffuse scatter of the same flare in this pixel.
+    The field holds the largest ratio of all orders on the axis from 50 to 150 px; None if the instrument has no scatter.
     """
 
     pitch_um: float
@@ -65,7 +66,7 @@ class MeshDesign:
 
 @dataclass(frozen=True)
 class DesignStudy:
-    """All meshes, in order of wire and pitch, and the mesh that is flown (None if there is none)."""
+    """The computed meshes, sorted by wire and then by pitch, and the flown mesh (None if the instrument has no mesh)."""
 
     instrument: str
     flare_px: int
@@ -84,9 +85,10 @@ def design_study(
     *,
     flare_px: int = FLARE_PX,
 ) -> DesignStudy:
-    """Compute every pitch with every wire at the entrance of `instrument`, and its own first entrance mesh.
+    """Compute every combination of pitch and wire at the entrance of `instrument`, and its own first entrance mesh.
 
-    Raises DataError "bad-design": no mesh, over 400 meshes, or a wire not narrower than its pitch.
+    Raises DataError "bad-design" for no mesh or more than 400 meshes, for a wire that is not narrower than every pitch,
+    and for a flare smaller than 1 px.
     """
     pitches, wires = sorted(set(pitches_um)), sorted(set(wires_um))
     _check(pitches, wires, flare_px)
@@ -155,9 +157,9 @@ def _mesh(
 
 
 def _contrast(spacing_px: float, flare_px: int) -> float:
-    """Contrast along the axis of equally bright orders of a flare, as pixels record them; see MeshDesign.
+    """`peak_visibility` of MeshDesign: the contrast along the axis of the orders of a flare, as pixels record it.
 
-    Each order is the flare's box convolved with a pixel, a trapezium. Neighbouring orders are taken as equally bright.
+    Each order is the box of the flare convolved with a pixel, a trapezium. All orders are assumed to be equally bright.
     """
     x = np.linspace(0.0, spacing_px, 401)
     neighbours = int(np.ceil((flare_px + 1) / spacing_px)) + 1
@@ -168,9 +170,9 @@ def _contrast(spacing_px: float, flare_px: int) -> float:
 
 
 def _over_scatter(open_share: float, spacing_px: float, flare_px: int, halo: NDArray[np.float64]) -> float:
-    """The largest ratio of an order to the scatter from 50 to 150 px; 0 if no order lies there."""
+    """`peak_over_scatter` of MeshDesign; 0 if no order lies at 50 to 150 px."""
     k = np.arange(np.ceil(_COMPARED_PX[0] / spacing_px), np.floor(_COMPARED_PX[1] / spacing_px) + 1)
     share = open_share**2 * np.sinc(k * open_share) ** 2  # Eq. (1)
     under = halo[np.rint(k * spacing_px).astype(int)]
-    # The light of the order spreads over as many pixels as the flare; under it the flare's scatter is nearly constant.
+    # The light of an order spreads over as many pixels as the flare has. In these pixels the scatter is nearly constant.
     return float((share / flare_px**2 / under).max(initial=0.0))

@@ -1,28 +1,30 @@
 """Far-field diffraction by the entrance pupil, summed over detector pixels.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Fraunhofer propagation", without the phase
-factors that cancel in |E|^2, and with the focal length f instead of the distance z:
+Hofmeister et al., The point-spread function of HRI_EUV, section "Fraunhofer propagation". The phase factors
+that cancel in |E|^2 are left out, and the focal length f replaces the distance z:
 
     E(q) = sum over cells i of c_i exp(-2 pi i q . i / n),   dx = lambda f / (n p)                  Eq. (1)
     P_j = 1/S^2 sum over s, t = 0 .. S-1 of |E(j + (o_s, o_t))|^2,   o_s = (s + 1/2) / S - 1/2      Eq. (2)
     S >= 2 D p / (lambda f), and at least 14                                                       Eq. (3)
 
-The paper transforms the whole padded mask at once. Here each pair (s, t) of positions within the pixel is one
-n x n transform: exp(-2 pi i j . i / n) has the period n in i, so the cells, times exp(-2 pi i o . i / n), are first
-added modulo n ("folded"), along x for all rows, then along y. Of each transform only the requested pixels are kept.
-With Eq. (3) the sum over all n x n pixels is exactly that of the mask's squares (Parseval).
+The paper transforms the whole padded mask at once. Here each pair (s, t) of positions within the pixel needs one
+n x n transform. Because exp(-2 pi i j . i / n) has the period n in i, the cells are first multiplied by
+exp(-2 pi i o . i / n) and added modulo n ("folded"): along x for all rows, then along y. Only the requested pixels of
+each transform are kept. With Eq. (3) the sum over all n x n pixels equals the sum of the squares of the mask
+(Parseval).
 
-Departure from the paper: the open share of a cell is a mean over the cell, which weakens E by sinc(x / n) sinc(y / n)
-far from the centre; the pattern is divided by the square of that. Light beyond the n x n pixels wraps around to the
-opposite side. Its amplitude is (x / (n - x))^2 of the correct one there: 11 % at n / 4, 1 % at n / 11. With n = 4096,
-where the pupil of HRI_EUV puts 0.13 % of its light beyond the inner 2048 px, this is 1e-5 of all light.
+Departure from the paper: the open share of a cell is a mean over the cell. This mean multiplies E by
+sinc(x / n) sinc(y / n), so the pattern is divided by the square of this factor. Light beyond the n x n pixels wraps
+around to the opposite side. At the position x, its amplitude is (x / (n - x))^2 of the correct amplitude: 11 % at n / 4,
+1 % at n / 11. The pupil of HRI_EUV puts 0.13 % of its light beyond the inner 2048 px. With n = 4096 the wrapped light
+is then 1e-5 of all light.
 
-The sum of Eq. (2), in place of an integral, conserves the energy but not each weight: for the open disc of HRI_EUV
-the central pixel is 3e-4 too low.
+Eq. (2) uses a sum instead of an integral. The sum conserves the energy, but single weights are not exact: for the open
+disc of HRI_EUV the central pixel is 3e-4 too low.
 
-A real mask has P(-q) = P(q). With one mirror axis, x or y, P has both mirror axes. A mask that also equals its
-transpose needs an eighth of the transforms. The symmetry is tested on the mask itself: for random vectors r, M r must
-equal r M and the products of the mirrored M (Freivalds).
+The mask is real, so P(-q) = P(q). If the mask is symmetric in x or in y, P is symmetric in both. If the mask also
+equals its transpose, an eighth of the transforms is enough. The symmetries of the mask M are tested with a random
+vector r (Freivalds): M r must equal the product of the mirrored M with r, and M r must equal r M.
 
 | symbol | name | unit |
 |---|---|---|
@@ -31,7 +33,7 @@ equal r M and the products of the mirrored M (Freivalds).
 | p | pixel_pitch_um | um |
 | D | pupil.width_mm | mm |
 | S | samples per pixel and axis, even | - |
-| n | period: pixels of the transform, of which the inner `size` are kept | px |
+| n | period: the transform has n x n pixels, and the inner size x size pixels are kept | px |
 | c | mask.rows, open share of the cells | - |
 | dx | mask.cell_mm | mm |
 """
@@ -51,9 +53,9 @@ from psfcore.convolution.convolver import transform_axis
 from psfcore.diffraction.pupil import MaskGrid, Pupil
 
 STRIP_ROWS = 16
-SURVEY_CELLS = 4096  # across the pupil, for its area and symmetry
+SURVEY_CELLS = 4096  # cells across the pupil when its area and symmetry are determined
 FEWEST_SAMPLES = 14
-SPECTRA_BYTES = 700 * 2**20  # memory for the transforms along x that are kept at a time
+SPECTRA_BYTES = 700 * 2**20  # memory for the transforms along x that are kept at the same time
 _SYMMETRY_TOLERANCE_CELLS = 1e-2
 _SYMMETRY_SEED = 174
 _MM_PER_ANGSTROM = 1e-7
@@ -68,7 +70,7 @@ Progress = Callable[[int, int], None]
 class FarField:
     """Share of the pupil's light in each pixel [y, x], centre at [n // 2, n // 2], and how it was computed.
 
-    open_area_mm2: of the pupil. samples: S of Eq. (3). symmetry: "none", "mirror" or "mirror and transpose".
+    open_area_mm2: the open area of the pupil. samples: S of Eq. (3). symmetry: "none", "mirror" or "mirror and transpose".
     The pattern sums to less than 1: the remaining light is beyond the grid.
     """
 
@@ -81,7 +83,7 @@ class FarField:
 def samples_per_pixel(
     width_mm: float, *, wavelength_angstrom: float, focal_length_mm: float, pixel_pitch_um: float
 ) -> int:
-    """Smallest even S of Eq. (3)."""
+    """The smallest even S that satisfies Eq. (3)."""
     resolved_mm = wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / (pixel_pitch_um * _MM_PER_UM)
     return max(FEWEST_SAMPLES, 2 * math.ceil(width_mm / resolved_mm - 1e-9))
 
@@ -97,9 +99,10 @@ def far_field(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> FarField:
-    """Eq. (2) for a pupil, on (size, size).
+    """The far field of a pupil, Eq. (2), with a pattern of shape (size, size).
 
-    period: n, at least `size` and of the same parity; default: size. progress: called with (done, of) after each transform.
+    period: n, at least `size`, both even or both odd; default: size. progress: called with (done, of) after each
+    transform.
     """
     n = period or size
     optics = {
@@ -135,9 +138,10 @@ class _Survey:
 
 
 def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
-    """Open area, and the symmetry of the mask as tested with random vectors.
+    """The open area of the mask, and its symmetry, tested with a random vector.
 
-    Its cells may differ from those of the transform: shares of area miss no part of the mask.
+    The cells of this mask may be larger or smaller than the cells of the transform. No detail of the pupil is lost,
+    because each cell holds the open share of its area.
     """
     r = np.random.default_rng(_SYMMETRY_SEED).random(mask.cells)
     right = np.stack([r, r[::-1]], axis=1)
@@ -154,7 +158,7 @@ def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
     by_row, by_mirrored_row = np.concatenate(after).T  # M r, M r[::-1]
     area_mm2 = open_cells * mask.cell_mm**2
     mirror_x = _agree(by_row, by_mirrored_row)
-    # M mirrored in y: its product with r is (M r)[::-1], and r^T times it is r[::-1]^T M
+    # If M is mirrored in y, its product with r is (M r)[::-1].
     mirror_y = _agree(by_row, by_row[::-1])
     if not (mirror_x or mirror_y):
         return _Survey(area_mm2, NO_SYMMETRY, mirror_y=False)
@@ -171,7 +175,10 @@ def _strips(cells: int) -> range:
 
 
 class _Transforms:
-    """The transforms of Eq. (2) that the symmetry of the mask leaves to compute, one per position in the pixel."""
+    """Compute the transforms of Eq. (2), one for each position (s, t) within the pixel.
+
+    Positions that follow from others by the symmetry of the mask are left out.
+    """
 
     def __init__(
         self,
@@ -188,7 +195,7 @@ class _Transforms:
         self.pool, self.threads = pool, threads
         # If the mask is symmetric in y, half of its rows are enough.
         rows = mask.cells // 2 if survey.mirror_y else mask.cells
-        # Several s share one pass over the mask, as many as fit in the memory.
+        # One pass over the mask serves several s, as many as fit into SPECTRA_BYTES.
         together = max(1, min(samples // 2, SPECTRA_BYTES // (8 * rows * size)))
         self.spectra = np.empty((together, rows, size), dtype=np.complex64)
         self.field = np.empty((period, size), dtype=np.complex64)
@@ -202,18 +209,18 @@ class _Transforms:
             if t == 0 and s % together == 0:
                 self._transform_along_x(range(s, min(s + together, half)))
             self._transform_along_y(self.spectra[s % together], t)
-            # The transpose is added at the end, which would count s = t twice.
+            # The transpose is added at the end. It would count positions with s = t twice, so these get half the weight.
             self._add(0.5 if s == t and self.symmetry == MIRROR_AND_TRANSPOSE else 1.0)
             progress(done + 1, len(places))
         return _completed(self.total, self.symmetry)
 
     def _along_y(self, s: int) -> range:
-        """The t that must be computed for one s: all, one half, or those up to s."""
+        """The values of t that must be computed for one s. Depending on the symmetry: all, half of them, or those up to s."""
         half = self.samples // 2
         return range({NO_SYMMETRY: self.samples, MIRROR: half, MIRROR_AND_TRANSPOSE: s + 1}[self.symmetry])
 
     def _transform_along_x(self, columns: range) -> None:
-        """spectra[y, j] of all rows, for several s; they are the same for all t."""
+        """Compute spectra[y, j] of all rows, for several s. The spectra do not depend on t."""
         phases = [
             _phases(_turns(s, self.samples, self.period), self.mask.cells, self.period) for s in columns
         ]
@@ -231,7 +238,7 @@ class _Transforms:
         list(self.pool.map(transform, _blocks(self.spectra.shape[1], self.threads)))
 
     def _transform_along_y(self, spectrum: NDArray[np.complex64], t: int) -> None:
-        """field[j_y, j_x] for one t, all j_y of the period."""
+        """Compute field[j_y, j_x] for one t, for all j_y of the period."""
         within, of_period = _phases(_turns(t, self.samples, self.period), self.mask.cells, self.period)
 
         def fold(block: slice) -> None:
@@ -259,7 +266,7 @@ def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]
 
 
 def _turns(place: int, samples: int, size: int) -> float:
-    """o_s - n // 2: so the origin of j is at [n // 2], and the result needs no shift."""
+    """o_s - n // 2. With the term n // 2 the origin of j is at [n // 2], so the result needs no shift."""
     return (place + 0.5) / samples - 0.5 - size // 2
 
 
@@ -296,7 +303,7 @@ def _fold_strip(strip, within, of_period, folded):  # type: ignore[no-untyped-de
 
 @compiled(fastmath=True)
 def _fold_block(spectra, cells, within, of_period, field, start, stop):  # type: ignore[no-untyped-def]
-    """field[m] = sum over k of spectra[m + k n] exp(-2 pi i turns (m + k n) / n); rows left out are mirrored."""
+    """field[m] = sum over k of spectra[m + k n] exp(-2 pi i turns (m + k n) / n); rows that were not computed are mirror images."""
     rows, columns = spectra.shape
     period = len(field)
     for m in range(start, stop):

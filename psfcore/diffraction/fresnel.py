@@ -11,22 +11,25 @@ propagation"; in one dimension, without the constant phase exp(2 pi i z / lambda
 
 Departures from the paper, with reasons:
 
-- Eq. (3): the paper prints sqrt(x^2 + y^2) over R (...); the sag of a conic has x^2 + y^2 there.
-- Eq. (4): the paper prints 1 / (lambda z)^2 for the product of the counts of two axes; one axis has 1 / (lambda z).
-  dx1 is finer by SAMPLING_MARGIN, because otherwise light that would land outside X2 folds back into it.
-- Each plane has the step that Eq. (4) requires. A plain FFT would couple the steps of successive planes, and leave
-  too small a field over short distances. A chirp transform computes the same sum without this coupling.
-- Wires and rims cover samples partly, by length, so that their positions are not rounded to the grid.
+- Eq. (3): the paper prints sqrt(x^2 + y^2) in the numerator; the sag of a conic has x^2 + y^2 in this position.
+- Eq. (4): the paper prints 1 / (lambda z)^2. This is correct for the product of the counts of two axes; the count of
+  one axis has 1 / (lambda z). dx1 is divided by SAMPLING_MARGIN, because otherwise light that would land outside X2
+  would fold back into X2.
+- Each plane has the step that Eq. (4) requires. A plain FFT would couple the steps of successive planes, and its field
+  would be too small for short distances. A chirp transform computes the same sum without this coupling.
+- If a wire or a rim covers a sample partly, the sample counts with the open share of its length. So the positions of
+  wires and rims are not rounded to the grid.
 
-Eq. (1) is paraxial: a pair of parabolas (K = -1) then focuses perfectly. The secondary's own conic constant leaves
-about 0.1 wave of spherical aberration at the rim of the beam; refocusing compensates most of it.
+Eq. (1) is paraxial, and in this approximation a pair of parabolas (K = -1) focuses perfectly. The conic constant of the
+secondary differs from -1. This leaves about 0.1 wave of spherical aberration at the rim of the beam; refocusing
+compensates most of the aberration.
 
 | symbol | name | unit |
 |---|---|---|
 | lambda, z | wavelength_mm, distance_mm | mm |
 | X, dx, N | width_mm, step_mm, samples of a Grid | mm, mm, - |
 | R, K | radius_mm, conic | mm, - |
-| E | field; sum of abs(E)^2 times the step is the light | mm^-1/2 |
+| E | field; the light is the sum of abs(E)^2 times the step | mm^-1/2 |
 """
 
 from __future__ import annotations
@@ -79,7 +82,7 @@ class Grid:
 def grid_for(
     plane: str, *, width_mm: float, next_width_mm: float, wavelength_mm: float, distance_mm: float
 ) -> Grid:
-    """The grid of a plane from which light must reach all of `next_width_mm` at `distance_mm`.
+    """The grid of a plane, fine enough that its light reaches the full `next_width_mm` of the plane at `distance_mm`.
 
     Raises DataError "too-many-samples" if the distance is too short.
     """
@@ -95,7 +98,7 @@ def grid_for(
 
 
 class FresnelStep:
-    """Free space between two grids, Eq. (1); prepared once, then applied to any number of fields."""
+    """Propagation through free space between two grids, Eq. (1): prepared once, then applied to any number of fields."""
 
     def __init__(self, source: Grid, target: Grid, *, wavelength_mm: float, distance_mm: float) -> None:
         reach_mm2 = wavelength_mm * distance_mm
@@ -125,7 +128,7 @@ def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Vector:
 
 
 def mirror_transmission(mirror: Mirror, grid: Grid, wavelength_mm: float) -> Wave:
-    """The factor that a mirror applies to a field: its phase, and 0 outside its rim; shape (samples,)."""
+    """The factor by which a mirror multiplies a field, shape (samples,): the phase of Eq. (2), and 0 outside the rim."""
     sign = 1.0 if mirror.figure == "convex" else -1.0
     radius_mm = mirror.diameter_mm / 2
     inside = open_share(grid, np.array([[-radius_mm, radius_mm]]))
@@ -137,7 +140,7 @@ def mirror_transmission(mirror: Mirror, grid: Grid, wavelength_mm: float) -> Wav
 def mesh_openings_mm(*, pitch_mm: float, wire_mm: float, phase: float, width_mm: float) -> Vector:
     """Windows of a mesh over at least `width_mm`, rows of (begin, end).
 
-    phase: shift of the mesh in pitches; at 0 a window is centred on the axis, at 0.5 a wire.
+    phase: shift of the mesh divided by the pitch. At 0 a window is centred on the axis; at 0.5 a wire is centred on it.
     """
     reach = math.ceil(width_mm / pitch_mm / 2) + 1
     centres_mm = (np.arange(-reach, reach + 1) + phase) * pitch_mm
@@ -152,7 +155,7 @@ def aperture_openings_mm(aperture: Aperture) -> Vector:
 
 
 def common_openings_mm(first: Vector, second: Vector) -> Vector:
-    """The openings that both lists share, rows of (begin, end) in order."""
+    """The intersection of two lists of openings, rows of (begin, end) in order."""
     begin = np.maximum(first[:, None, 0], second[None, :, 0]).ravel()
     end = np.minimum(first[:, None, 1], second[None, :, 1]).ravel()
     both = np.stack([begin, end], axis=1)[end > begin]
@@ -170,7 +173,7 @@ def open_share(grid: Grid, openings_mm: Vector) -> Vector:
 def fraunhofer_field(
     openings_mm: Vector, grid: Grid, *, wavelength_mm: float, focal_length_mm: float
 ) -> Wave:
-    """The field in focus of an evenly illuminated pupil: the sum of the openings' transforms, shape (samples,).
+    """The field in focus of an evenly illuminated pupil, shape (samples,): the sum of the transforms of the openings.
 
     An opening of width w around c gives w sinc(pi w u) exp(-2 pi i c u), with u = x / (lambda f).
     """
@@ -185,7 +188,7 @@ def fraunhofer_field(
 
 
 def binned_light(field: Wave, grid: Grid, samples_per_pixel: int) -> Vector:
-    """Light in each pixel: abs(E)^2 summed over its samples, times their step."""
+    """Light in each pixel: the sum of abs(E)^2 over the samples of the pixel, times the step."""
     return (np.abs(field) ** 2).reshape(-1, samples_per_pixel).sum(axis=1) * grid.step_mm
 
 

@@ -1,8 +1,8 @@
 """How well the simplified-combined method approximates Fresnel propagation, in one dimension.
 
-Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation" and the discussion of where
-diffracting components may stand. Two images of a point, both binned to pixels, are compared by the light
-beyond a distance from the centre (1 - encircled energy):
+Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation" and the discussion of the
+positions that diffracting components may have. Two images of a point, both binned to pixels, are compared by the
+light beyond a distance from the centre (1 - encircled energy):
 
 - Fresnel: entrance aperture and mesh -> primary -> secondary -> filter-wheel mesh -> detector;
 - simplified-combined: Fraunhofer image of the entrance aperture and mesh, convolved with the analytic series
@@ -10,15 +10,16 @@ beyond a distance from the centre (1 - encircled energy):
 
 The paper leaves some choices open; the result states each of them:
 
-- The mirror separation is that of best focus. Both methods use the focal length that follows from it.
+- The mirrors have the separation of best focus. Both methods use the focal length that follows from this separation.
 - The position of the filter-wheel wires across the beam is unknown. Results are means over equally spaced phases of
-  the mesh, together with the range of the single phases.
-- The series has the instrument's number of windows (all that the field illuminates), or the caller's. The wave meets
-  only the few wires within the beam of one field point. Their number is not the right one for the series: the image
-  of the entrance already holds the diffraction at the edges of the beam, and a series of few windows adds it a second
-  time. The more windows, the closer the two methods agree.
-- For other distances the filter wheel moves between secondary and detector; the total distance stays.
-- Each line is normalised to the light within REACH_PX of the axis.
+  the mesh. The range of the single phases is given with the means.
+- The series has the number of windows of the instrument file (all windows that the field illuminates), or a number that
+  the caller gives. The wave crosses only the few windows within the beam of one field point. This small number would
+  be wrong for the series. The image of the entrance already contains the diffraction at the edges of the beam; a series
+  of few windows would add this diffraction a second time. With more windows the two methods agree better.
+- To study another distance, the filter wheel is moved between secondary and detector. The distance from secondary to
+  detector does not change.
+- Each one-dimensional image ("line") is normalised to the light within REACH_PX of the axis.
 """
 
 from __future__ import annotations
@@ -66,23 +67,25 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Sampling:
-    """The sampling of a plane: width X, step dx and count N = X / dx; least_samples is X1 X2 / (lambda z)."""
+    """The sampling of a plane: width X, step dx and count N = X / dx. least_samples: X1 X2 / (lambda z), None for the detector."""
 
     plane: str
     width_mm: float
     step_um: float
     samples: int
     least_samples: int | None
-    light: float  # share of the entering light behind this plane's mask; mean over phases
+    # Fraction of the entering light that is left behind the mask of this plane; mean over phases.
+    light: float
 
 
 @dataclass(frozen=True)
 class DistanceResult:
-    """Both methods with the filter wheel at one distance from the detector.
+    """The results of both methods with the filter wheel at one distance from the detector.
 
     Lines have shape (2 REACH_PX + 1,), sum 1 and their centre at [REACH_PX]. Curves are given at FresnelStudy.radii_px:
-    1 - encircled energy in percent, and differences (Fresnel less combined) in percentage points. Differences are those of
-    the mean over phases; phase_lowest_points and phase_highest_points are the range of the single phases.
+    1 - encircled energy in percent, and differences (Fresnel minus combined) in percentage points. difference_points is
+    the difference for the mean over phases; phase_lowest_points and phase_highest_points are the range of the differences
+    for single phases.
     """
 
     distance_mm: float
@@ -97,7 +100,7 @@ class DistanceResult:
     difference_points: Vector
     phase_lowest_points: Vector
     phase_highest_points: Vector
-    phase_largest_points: Vector  # largest absolute difference of each phase, shape (phases,)
+    phase_largest_points: Vector  # for each phase the largest absolute difference, shape (phases,)
 
     @property
     def largest_points(self) -> float:
@@ -128,9 +131,10 @@ class FresnelStudy:
     distances: tuple[DistanceResult, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain numbers: curves at every radius up to ZOOM_PX and at growing steps beyond; lines up to ZOOM_PX.
+        """The study as JSON values.
 
-        The largest differences are those over all radii.
+        Curves are given at every radius up to ZOOM_PX and in growing steps beyond; lines are given up to ZOOM_PX. The
+        largest differences are taken over all radii.
         """
         kept = _thinned(self.radii_px)
         return {
@@ -160,8 +164,8 @@ def fresnel_study(
 ) -> FresnelStudy:
     """Compare the methods with the filter wheel at each distance (mm) from the detector.
 
-    phases: number of positions of the filter-wheel mesh, equally spaced over its pitch. windows: of the analytic series;
-    default: the instrument's. progress: called with (done, of).
+    phases: number of positions of the filter-wheel mesh, equally spaced over its pitch. windows: number of windows of the
+    analytic series; default: the number in the instrument file. progress: called with (done, of).
     Raises DataError "bad-instrument-file", "no-focus", "bad-distance", "bad-phases", "bad-windows" or
     "too-many-samples".
     """
@@ -202,7 +206,7 @@ def fresnel_study(
 
 
 def _grids(path: LightPath, distance_mm: float) -> tuple[Grid, Grid]:
-    """Grids of secondary and filter wheel, for a filter wheel at this distance from the detector."""
+    """The grids of the secondary and of a filter wheel at this distance from the detector."""
     wheel = path.wheel_grid(distance_mm)
     behind_mm = path.secondary_to_detector_mm - distance_mm
     return path.secondary_grid(next_width_mm=wheel.width_mm, distance_mm=behind_mm), wheel
@@ -232,7 +236,7 @@ class _AtWheel:
         return binned_light(self._step.apply(field), self._detector, SAMPLES_PER_PIXEL)
 
     def sampling(self, detector_light: float) -> tuple[Sampling, ...]:
-        """All planes from the aperture to the detector, with the light behind each."""
+        """The sampling of all planes from the aperture to the detector, with the light behind each plane."""
         wheel_light = float(np.mean(self._lights))
         planes = [*self._upstream, (self._grid, wheel_light), (self._detector, detector_light)]
         lengths_mm = [
@@ -279,7 +283,7 @@ def _entrance_line(path: LightPath, focal_length_mm: float) -> Vector:
 
 
 def _combined_line(path: LightPath, entrance_line: Vector, distance_mm: float, windows: int) -> Vector:
-    """The entrance's image convolved with the wheel mesh's series, sum 1."""
+    """The image of the entrance, convolved with the series of the filter-wheel mesh, sum 1."""
     series = mesh_line(
         wavelength_angstrom=path.wavelength_mm * _ANGSTROM_PER_MM,
         distance_mm=distance_mm,
@@ -294,11 +298,11 @@ def _combined_line(path: LightPath, entrance_line: Vector, distance_mm: float, w
 
 
 def _compared(wheel: _AtWheel, lines: Vector, combined: Vector) -> DistanceResult:
-    """Curves and differences from the lines of all phases, shape (phases, 2 REACH_PX + 1)."""
+    """Compute curves and differences from the lines of all phases, shape (phases, 2 REACH_PX + 1)."""
     path = wheel.path
     radii_px = np.arange(REACH_PX)
     combined_beyond = 100 * line_light_beyond(combined, radii_px)
-    # Each phase's line is normalised by its own light, so that the mean of the curves is the curve of the mean.
+    # Each line is divided by its sum. So the mean of the curves equals the curve of the mean line.
     shares = lines / lines.sum(axis=1, keepdims=True)
     single = np.array([100 * line_light_beyond(line, radii_px) for line in shares]) - combined_beyond
     mean_line = shares.mean(axis=0)

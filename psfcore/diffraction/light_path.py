@@ -1,8 +1,8 @@
 """The optical path of a two-mirror telescope: the planes that a wave crosses, and the paths of rays.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Fresnel propagation": the wave goes from
-the entrance aperture over primary and secondary to the filter wheel and the detector. For rays parallel to the
-axis at height 1, with thin mirrors, f = R / 2 for a concave and -R / 2 for a convex one:
+the entrance aperture to primary, secondary, filter wheel and detector, in this order. Eq. (1) describes a ray that
+enters parallel to the axis at height 1. The mirrors are thin: f = R / 2 for a concave mirror, -R / 2 for a convex one.
 
     y2 = 1 - s / f1,   u2 = -1 / f1 - y2 / f2,   y(z) = y2 + z u2,   focal length = -1 / u2        Eq. (1)
 
@@ -43,7 +43,7 @@ _MM_PER_ANGSTROM = 1e-7
 
 @dataclass(frozen=True)
 class LightPath:
-    """The quantities of a telescope that propagation needs. Lengths are in mm."""
+    """The quantities of a telescope that are needed to propagate a wave. Lengths are in mm."""
 
     wavelength_mm: float
     aperture: Aperture
@@ -59,25 +59,25 @@ class LightPath:
 
     @property
     def detector_grid(self) -> Grid:
-        """SAMPLES_PER_PIXEL for each pixel within REACH_PX of the axis."""
+        """The grid of the detector: SAMPLES_PER_PIXEL samples for each pixel within REACH_PX of the axis."""
         samples = (2 * REACH_PX + 1) * SAMPLES_PER_PIXEL
         return Grid("detector", samples, self.pixel_mm / SAMPLES_PER_PIXEL)
 
     @property
     def aperture_mm(self) -> Vector:
-        """The open entrance, without its mesh, rows of (begin, end)."""
+        """The openings of the entrance without its mesh, rows of (begin, end)."""
         return aperture_openings_mm(self.aperture)
 
     @property
     def entrance_mm(self) -> Vector:
-        """The entrance through its mesh, rows of (begin, end)."""
-        # With an odd number of windows one is on the axis, with an even number a wire.
+        """The openings of the entrance with its mesh, rows of (begin, end)."""
+        # If the number of windows is odd, a window is on the axis; if it is even, a wire is.
         phase = 0.0 if self.entrance_mesh.windows % 2 else 0.5
         windows_mm = mesh_windows_mm(self.entrance_mesh, phase, self.aperture.diameter_mm)
         return common_openings_mm(self.aperture_mm, windows_mm)
 
     def slope_per_mm(self, separation_mm: float) -> float:
-        """Slope behind the secondary of a ray that enters at height 1, Eq. (1)."""
+        """The slope u2 of a ray behind the secondary, Eq. (1)."""
         f1, f2 = focal_mm(self.primary), focal_mm(self.secondary)
         return -1 / f1 - (1 - separation_mm / f1) / f2
 
@@ -86,13 +86,13 @@ class LightPath:
         return -1 / self.slope_per_mm(separation_mm)
 
     def beam_mm(self, separation_mm: float, behind_secondary_mm: float) -> float:
-        """Width of the beam of one field point at a distance behind the secondary, Eq. (1)."""
+        """The width of the beam of one field point at a distance behind the secondary, Eq. (1)."""
         height = 1 - separation_mm / focal_mm(self.primary)
         height += behind_secondary_mm * self.slope_per_mm(separation_mm)
         return abs(height) * self.aperture.diameter_mm
 
     def entrance_grids(self) -> tuple[Grid, Grid]:
-        """Grids of the aperture and of the primary; light from each must reach all of the next mirror."""
+        """The grids of aperture and primary, so fine that light from each reaches the full width of the next mirror."""
         return self._grid(
             "aperture", self.aperture.diameter_mm, self.primary.diameter_mm, self.aperture_to_primary_mm
         ), self._grid(
@@ -100,13 +100,13 @@ class LightPath:
         )
 
     def secondary_grid(self, *, next_width_mm: float, distance_mm: float) -> Grid:
-        """Grid of the secondary; its light must reach all of a plane of `next_width_mm`."""
+        """The grid of the secondary, so fine that its light reaches the full width of a plane of `next_width_mm`."""
         return self._grid("secondary", self.secondary.diameter_mm, next_width_mm, distance_mm)
 
     def wheel_grid(self, distance_mm: float) -> Grid:
-        """Grid of a filter wheel at a distance from the detector.
+        """The grid of a filter wheel at a distance from the detector.
 
-        Its width includes all straight lines from the secondary to the detector.
+        The grid is so wide that all straight lines from the secondary to the detector cross it.
         """
         share = distance_mm / self.secondary_to_detector_mm
         detector_mm = self.detector_grid.width_mm
@@ -123,7 +123,7 @@ class LightPath:
         )
 
     def field_at_primary(self, openings_mm: Vector, aperture: Grid, primary: Grid) -> Wave:
-        """The field behind the primary, of a plane wave along the axis through the openings; light 1 enters."""
+        """The field behind the primary, for a plane wave along the axis. The light that enters through the openings is 1."""
         field = open_share(aperture, openings_mm).astype(np.complex128)
         field /= np.sqrt(aperture.light(field))
         field = propagate(
@@ -150,12 +150,12 @@ class LightPath:
 
 
 def focal_mm(mirror: Mirror) -> float:
-    """Focal length of a thin mirror: half its radius, negative where it is convex."""
+    """The focal length of a thin mirror: half its radius of curvature, negative if the mirror is convex."""
     return mirror.radius_mm / 2 if mirror.figure == "concave" else -mirror.radius_mm / 2
 
 
 def mesh_windows_mm(mesh: Mesh, phase: float, width_mm: float) -> Vector:
-    """Windows of an instrument's mesh over at least `width_mm`, rows of (begin, end)."""
+    """The windows of a mesh over at least `width_mm`, rows of (begin, end)."""
     return mesh_openings_mm(
         pitch_mm=mesh.pitch_um * MM_PER_UM,
         wire_mm=mesh.wire_um * MM_PER_UM,

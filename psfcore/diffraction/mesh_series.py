@@ -1,32 +1,32 @@
 """Diffraction by a regular mesh in the far field.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Analytical solution for mesh diffraction",
-here Eq. (1). It is separable in x and y; this is one axis, with sinc(u) = sin(u) / u:
+here Eq. (1). The pattern is separable in x and y. Eq. (1) is the factor of one axis, with sinc(u) = sin(u) / u:
 
     I(x) = sinc^2(pi w x / (lambda z)) (sin(N pi d x / (lambda z)) / sin(pi d x / (lambda z)))^2     Eq. (1)
 
-The paper samples Eq. (1) finely and bins it. Here it is integrated exactly over each pixel: the grating
+The paper samples Eq. (1) finely and bins the samples. Here Eq. (1) is integrated exactly over each pixel: the grating
 factor is a finite cosine series (Fejer), and each term has an antiderivative with the sine integral Si:
 
     (sin(N p) / sin(p))^2 = sum_m (N - |m|) cos(2 m p)                                               Eq. (2)
     sinc^2(alpha x) cos(q x) = (g(2 alpha + q) + g(2 alpha - q) - 2 g(q)) / (4 alpha^2)              Eq. (3)
     g(k) = (1 - cos(k x)) / x^2,  integral of g(k) from 0 to x = k Si(k x) - (1 - cos(k x)) / x      Eq. (4)
 
-The pattern of a mesh at an angle is rotated with the mesh, and is no longer separable on the pixels.
-`rotated_mesh_kernel` divides each axis of the rotated pattern into cells, which are small at the orders,
-and distributes the light of every pair of cells over the pixels that it covers:
+The pattern of a rotated mesh is rotated by the same angle and is not separable on the pixels.
+`rotated_mesh_kernel` divides each axis of the rotated pattern into cells. The cells are small at the orders. The light
+of every pair of cells is distributed over the pixels that the pair covers. The light on a whole axis is known:
 
-    integral of Eq. (1) over all x = N d w^-1 lambda z / d                                           Eq. (5)
+    integral of Eq. (1) over all x = (N d / w) (lambda z / d)                                        Eq. (5)
 
-(Of the cosine series only m = 0 lies within the support of the envelope's transform, a triangle.) The weights
-are fractions of the light on the whole plane, so light outside the array is missing from the sum.
+(The transform of the envelope is a triangle. Only the term m = 0 of the cosine series lies within its support.) The
+weights are fractions of the light on the whole plane, so light outside the array is missing from the sum.
 
 | symbol | name | unit |
 |---|---|---|
 | lambda | wavelength_angstrom | Angstrom |
-| z | distance_mm: from the mesh, or the focal length for a mesh in the entrance pupil | mm |
+| z | distance_mm: from the mesh to the detector; for a mesh in the entrance pupil, the focal length | mm |
 | d | pitch_um | um |
-| w | pitch_um - wire_um, the window | um |
+| w | pitch_um - wire_um, the width of a window | um |
 | N | windows | - |
 | x | offset on the detector | px |
 | lambda z / d | order_spacing_px | px |
@@ -44,8 +44,8 @@ _UM_PER_ANGSTROM = 1e-4
 _UM_PER_MM = 1e3
 _FINEST_CELL_PX = 0.02
 _LARGEST_CELL_PX = 0.4
-# The number of cells grows with the root of light times width: _CELLS_AN_ORDER within one order, _CELLS_IN_ALL over all
-# light, and fewer in an order that holds less than _FAINT_SHARE of all light.
+# The density of cells is proportional to the square root of light times width. _CELLS_AN_ORDER cells go to one order and
+# _CELLS_IN_ALL cells to all light. An order that holds less than _FAINT_SHARE of all light gets fewer cells.
 _CELLS_AN_ORDER = 30
 _CELLS_IN_ALL = 600
 _FAINT_SHARE = 1e-4
@@ -70,9 +70,9 @@ def mesh_line(
     pixel_pitch_um: float,
     size: int,
 ) -> NDArray[np.float64]:
-    """Eq. (1) integrated over `size` pixels, centre at [size // 2], as a fraction of the light on them.
+    """Integrate Eq. (1) over each of `size` pixels, centre at [size // 2].
 
-    Returns shape (size,), sum 1.
+    Returns shape (size,), normalised to sum 1.
     """
     spacing_px = order_spacing_px(
         wavelength_angstrom=wavelength_angstrom,
@@ -103,11 +103,11 @@ def rotated_mesh_kernel(
     angle_deg: float,
     size: int,
 ) -> NDArray[np.float64]:
-    """Eq. (1) rotated by `angle_deg` (from +x towards +y) and integrated over pixels.
+    """The pattern of a mesh, rotated by `angle_deg` (from +x towards +y) and integrated over pixels.
 
-    Returns shape (size, size), centre at [size // 2, size // 2]; weights are fractions of the light on
-    the whole plane, Eq. (5). At angle 0 each pixel differs from the product of exact lines by at most 1e-4 of the
-    light, and the sum of all absolute differences is at most 5e-4; misplaced light stays within neighbouring pixels.
+    Returns shape (size, size), centre at [size // 2, size // 2]; the weights are fractions of the light on the whole
+    plane, Eq. (5). At angle 0 each pixel differs from the product of the exact lines by at most 1e-4 of the light. The
+    sum of all absolute differences is at most 5e-4. Light that falls into a wrong pixel falls into a neighbour.
     """
     spacing_px = order_spacing_px(
         wavelength_angstrom=wavelength_angstrom,
@@ -115,7 +115,7 @@ def rotated_mesh_kernel(
         pitch_um=pitch_um,
         pixel_pitch_um=pixel_pitch_um,
     )
-    # A square mesh is unchanged by a turn of 90 degrees.
+    # A rotation by 90 degrees does not change a square mesh.
     turn = np.deg2rad((angle_deg + 45.0) % 90.0 - 45.0)
     reach_px = (size // 2 + 1.5) * float(np.cos(turn) + abs(np.sin(turn)))
     where_px, width_px, light = _cells(
@@ -129,10 +129,10 @@ def rotated_mesh_kernel(
 def _cells(
     reach_px: float, *, spacing_px: float, open_share: float, windows: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """One axis of the pattern from -reach_px to reach_px as cells: middle (px), width (px), light.
+    """Divide one axis of the pattern, from -reach_px to reach_px, into cells; return their middles (px), widths (px), light.
 
-    The light is a fraction of that on the whole axis. A cell is a lobe of the grating factor, or a part of one, or
-    several lobes where there is little light. Its middle is the centroid of its light.
+    The light of a cell is a fraction of the light on the whole axis. A cell is a part of a lobe of the grating factor, a
+    whole lobe, or, where there is little light, several lobes. The middle of a cell is the centroid of its light.
     """
     lobe_px = spacing_px / windows
     parts = max(1, int(np.ceil(lobe_px / _FINEST_CELL_PX)))
@@ -158,7 +158,7 @@ def _cells(
 def _first_of_each_cell(
     edges: NDArray[np.float64], light: NDArray[np.float64], spacing_px: float
 ) -> NDArray[np.intp]:
-    """Index of the first fine cell of each cell; width and light determine the number of cells."""
+    """Combine fine cells into cells by their width and light; return the index of the first fine cell of each cell."""
     half = max(spacing_px, 1.0) / 2
     below = np.concatenate(([0.0], np.cumsum(light)))
     middle = (edges[1:] + edges[:-1]) / 2
@@ -191,9 +191,10 @@ def _share_out(
     cosine: float,
     sine: float,
 ) -> None:
-    """Add the light of all pairs of cells (u along the mesh, v across) to the pixels that they cover.
+    """Add the light of all pairs of cells (one along the mesh, one across) to the pixels that they cover.
 
-    A rotated cell is replaced by an upright box of the same extent, narrower than a pixel and evenly bright.
+    The area of a pair is a rotated rectangle, narrower than a pixel. An upright, evenly bright box of the same extent
+    replaces it.
     """
     size = kernel.shape[0]
     origin = size // 2 + 0.5  # pixel i extends from i to i + 1

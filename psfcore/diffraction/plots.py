@@ -1,6 +1,6 @@
 """Plots of the Fresnel study.
 
-Each plot has its own figure on the Agg canvas. So threads and processes share no state, as they would with pyplot.
+Each plot has its own figure on the Agg canvas, so threads and processes share no state. With pyplot they would share it.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ _FRESNEL, _COMBINED, _DIFFERENCE, _INK = "#1f6fb4", "#e0761a", "#2b8a4e", "#2222
 
 
 def fresnel_png(study: FresnelStudy, path: str | Path, *, distance_mm: float | None = None) -> None:
-    """Three panels: the centre of the PSF, 1 - encircled energy with the difference, and all distances.
+    """Draw three panels: the centre of the PSF, 1 - encircled energy with the difference, and all distances.
 
-    distance_mm: the first two panels show the study's nearest distance to it; default: the printed distance.
+    distance_mm: the first two panels show the distance of the study that is nearest to this value; default: the printed
+    distance.
     """
     wanted_mm = study.printed_distance_mm if distance_mm is None else distance_mm
     shown = min(study.distances, key=lambda result: abs(result.distance_mm - wanted_mm))
@@ -53,7 +54,7 @@ def fresnel_png(study: FresnelStudy, path: str | Path, *, distance_mm: float | N
 def _draw_centre(axes: Any, shown: DistanceResult, centre: int) -> None:
     offsets = np.arange(-SHOWN_PX, SHOWN_PX + 1)
     near = slice(centre - SHOWN_PX, centre + SHOWN_PX + 1)
-    # Where the two agree, the wider curve is visible on both sides of the thinner one.
+    # Where the two curves agree, the wider curve is visible on both sides of the thinner curve.
     for line, colour, width, label in (
         (shown.combined_line, _COMBINED, 3.2, "Simplified-combined"),
         (shown.fresnel_line, _FRESNEL, 1.2, "Fresnel"),

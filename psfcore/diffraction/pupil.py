@@ -1,21 +1,21 @@
 """The entrance pupil as a transmission mask, computed in strips of rows.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation": amplitude masks of the aperture,
-its mount and its mesh. A cell of the mask holds the open share of its area. This share is exact, because every
-outline is a polygon (a circle is one with 4096 corners and the circle's area), and the area under a polygon's edge in
-a cell is a trapezoid:
+its mount and its mesh. A cell of the mask holds the open share of its area. This share is exact: every outline
+is a polygon, and in a cell the area under an edge of a polygon is a trapezoid. A circle is replaced by a polygon
+of the same area with 4096 corners.
 
-    open area of cell i = sum over edges of dy (i + 1 - x), x the mean of the edge's part in the cell   Eq. (1)
-    circle of radius R: corners at R sqrt((2 pi / m) / sin(2 pi / m))                                   Eq. (2)
+    open area of cell i = sum over edges of dy (i + 1 - x), with x the mean x of the edge in the cell   Eq. (1)
+    circle of radius R: corners at the radius R sqrt((2 pi / m) / sin(2 pi / m))                        Eq. (2)
 
-Where outlines of different parts cross in one cell, their open shares are multiplied.
+If outlines of different components cross in one cell, their open shares are multiplied.
 
 | symbol | name | unit |
 |---|---|---|
 | d | pitch_um of a mesh; wires are at (k + 1/2) d, or at k d if its number of windows is even | um |
 | wire_um | width of a wire | um |
 | dx | cell_mm, edge of a cell of the mask | mm |
-| N | cells along an edge of the mask, the optical axis in its middle | - |
+| N | cells along an edge of the mask; the optical axis is in the middle | - |
 | m | corners of a circle | - |
 
 Angles are measured from +x of the detector towards +y, and mask[y, x] has the axes of image[y, x].
@@ -36,7 +36,7 @@ from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount
 
 CIRCLE_CORNERS = 4096
 _UM_PER_MM = 1e3
-# A ring that crosses the rim is a mistake in the instrument file; rounding may exceed the rim by this much.
+# A ring that crosses the rim is a mistake in the instrument file; by rounding a ring may exceed the rim by this length.
 _RIM_TOLERANCE_MM = 1e-6
 
 Corners = NDArray[np.float64]
@@ -45,7 +45,7 @@ Outline = tuple[Corners, ...]
 
 @dataclass(frozen=True)
 class MaskPicture:
-    """A mask given as pixels: open share 0 to 1 [y, x] of a square of `width_mm`, row 0 at the lowest y."""
+    """A mask given as pixels [y, x]: open share, 0 to 1, on a square of `width_mm`; row 0 is at the lowest y."""
 
     open_share: NDArray[np.float64]
     width_mm: float
@@ -53,7 +53,7 @@ class MaskPicture:
 
 @dataclass(frozen=True)
 class Pupil:
-    """The open area: the opening, less the opaque outlines, the wires of the meshes and the closed parts of a picture.
+    """The open area: the opening without the opaque outlines, the wires of the meshes and the opaque parts of a picture.
 
     An outline is one or more closed polygons with corners (x, y) in mm; its polygons may cut holes into each other.
     """
@@ -76,10 +76,11 @@ def entrance_pupil(
     mount_image: NDArray[np.floating] | None = None,
     meshes: Iterable[Mesh] = (),
 ) -> Pupil:
-    """The pupil of an aperture, with its mount and meshes if given.
+    """The pupil of an aperture, with its mount and its meshes if they are given.
 
-    mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y, 0 opaque.
-    Raises DataError "bad-mount" (names the key) for a bar outside the aperture or an unfit mask image.
+    mount_image: pixels [y, x] of the mount's mask image; row 0 is at the lowest y, and 0 is opaque.
+    Raises DataError "bad-mount", with the name of the key: if the hub or a ray is as wide as the aperture, if a ring
+    crosses the rim, or if the mask image is missing or cannot be used.
     """
     radius_mm = aperture.diameter_mm / 2
     opening: Outline = (circle(radius_mm),)
@@ -93,7 +94,7 @@ def entrance_pupil(
 
 
 def circle(radius_mm: float) -> Corners:
-    """Corners (4096, 2) in mm of a polygon with the area of a circle, counter-clockwise."""
+    """Corners (4096, 2) in mm, counter-clockwise, of a polygon that has the area of a circle."""
     step = 2 * math.pi / CIRCLE_CORNERS
     # No corner lies on an axis or a diagonal, so the polygon has the mirror symmetries of a circle.
     angle = (np.arange(CIRCLE_CORNERS) + 0.5) * step
@@ -102,7 +103,10 @@ def circle(radius_mm: float) -> Corners:
 
 
 def bar(start_mm: float, end_mm: float, width_mm: float, angle_deg: float, across_mm: float = 0.0) -> Corners:
-    """Corners (4, 2) in mm of a bar along `angle_deg` from start to end, its centre line `across_mm` to the left."""
+    """Corners (4, 2) in mm of a bar from start_mm to end_mm along the direction `angle_deg`.
+
+    across_mm: distance of the centre line of the bar from the optical axis, to the left of the direction.
+    """
     left, right = across_mm + width_mm / 2, across_mm - width_mm / 2
     corners = np.array([(start_mm, right), (end_mm, right), (end_mm, left), (start_mm, left)])
     return corners @ _rotation(angle_deg).T
@@ -149,7 +153,7 @@ def _mask_picture(
             "bad-mount", f"{key}: expected a square image with two axes; got shape {pixels.shape}"
         )
     if not np.isfinite(pixels).all() or pixels.min() < 0 or pixels.max() <= 0:
-        wanted = "expected finite values of 0 (opaque) or more, with an open part above 0"
+        wanted = "expected finite values of at least 0 (0 is opaque), some of them above 0 (open)"
         raise DataError("bad-mount", f"{key}: {wanted}; got {pixels.min():g} to {pixels.max():g}")
     if described.width_mm < aperture.diameter_mm:
         wanted = f"{key}.width_mm: expected at least the aperture's {aperture.diameter_mm:g} mm"
@@ -174,7 +178,7 @@ class MaskGrid:
         self._picture = pupil.picture
 
     def rows(self, first: int, stop: int, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Open shares of the rows `first` to `stop` - 1; shape (stop - first, cells), written to `out` if given."""
+        """The open shares of the rows `first` to `stop` - 1, shape (stop - first, cells), written to `out` if it is given."""
         strip = np.empty((stop - first, self.cells), dtype=np.float32) if out is None else out[: stop - first]
         _cover(
             strip,
@@ -191,7 +195,7 @@ class MaskGrid:
         return strip
 
     def _in_cells(self, outlines: tuple[Outline, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """All edges (x0, y0, x1, y1) in cells from the mask's lower left corner, and the outline of each edge."""
+        """All edges (x0, y0, x1, y1), measured in cells from the lower left corner of the mask, and the outline of each edge."""
         edges, owners = [], []
         for owner, outline in enumerate(outlines):
             for corners in outline:
@@ -201,13 +205,13 @@ class MaskGrid:
         return np.concatenate(edges), np.concatenate(owners).astype(np.int64)
 
     def _mesh_line(self, mesh: Mesh) -> NDArray[np.float64]:
-        """Open share of each cell along an axis that crosses the wires of a mesh; shape (cells,)."""
+        """The open share of each cell along an axis of the mesh, shape (cells,)."""
         edges_um = (np.arange(self.cells + 1, dtype=np.float64) - self.cells / 2) * self.cell_mm * _UM_PER_MM
         return np.diff(_open_length_um(edges_um, mesh)) / (self.cell_mm * _UM_PER_MM)
 
 
 def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float64]:
-    """Integral of the open share along a mesh, up to a constant: windows of width w at a pitch d."""
+    """The integral of the open share along an axis of a mesh, up to a constant."""
     window_um = mesh.pitch_um - mesh.wire_um
     from_window_um = x_um + window_um / 2 - (0 if mesh.windows % 2 else mesh.pitch_um / 2)
     whole, part_um = np.divmod(from_window_um, mesh.pitch_um)
@@ -216,7 +220,7 @@ def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float6
 
 def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
     """The wires of a tilted mesh, as bars that extend beyond the pupil; all wires of one direction are one outline."""
-    reach_mm = width_mm  # > width / sqrt(2), half the diagonal
+    reach_mm = width_mm  # longer than half the diagonal, width / sqrt(2)
     pitch_mm, wire_mm = mesh.pitch_um / _UM_PER_MM, mesh.wire_um / _UM_PER_MM
     count = math.ceil(reach_mm / pitch_mm)
     across_mm = (np.arange(-count, count + 1) + (0.5 if mesh.windows % 2 else 0.0)) * pitch_mm
@@ -228,7 +232,7 @@ def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
 
 @compiled()
 def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
-    """For each row of cells the edges that cross it: entries[first[row] : first[row + 1]], in order."""
+    """List the edges that cross each row of cells: entries[first[row] : first[row + 1]], in order."""
     first = np.zeros(rows + 1, dtype=np.int64)
     low = np.empty(len(edges), dtype=np.int64)
     high = np.empty(len(edges), dtype=np.int64)
@@ -249,7 +253,10 @@ def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
-    """Write open shares into `strip`: mesh, times the opening (outline 0), times the open share of the other outlines."""
+    """Write open shares into `strip`.
+
+    A share is the product of the open shares of the meshes, of the opening (outline 0) and of all other outlines.
+    """
     rows, cells = strip.shape
     area = np.zeros(cells + 2)
     most = 1
@@ -271,16 +278,15 @@ def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries)
                     touched += 1
             inside, done = 0.0, cells
             for j in range(touched):
-                # Between the cells that edges cross the covered share is constant.
+                # The covered share is constant over cells that no edge crosses.
                 _apply(strip[k], line, line[row], done, begins[j], inside, outline)
                 for i in range(max(begins[j], done if j else 0), min(ends[j] + 2, cells)):
                     inside += area[i]
                     area[i] = 0.0
                     _apply(strip[k], line, line[row], i, i + 1, inside, outline)
                 done = max(ends[j] + 2, done if j else 0)
-            _apply(
-                strip[k], line, line[row], done, cells, inside, outline
-            )  # an edge may lie outside the mask
+            # The cells after the last edge may be covered too, because an outline may extend beyond the mask.
+            _apply(strip[k], line, line[row], done, cells, inside, outline)
             area[cells:] = 0.0
 
 
@@ -296,7 +302,7 @@ def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]
-    """Open (outline 0) or close the cells from start to stop by the share that lies inside an outline."""
+    """Open (outline 0) or close (other outlines) the cells from start to stop by the share of their area inside an outline."""
     covered = np.float32(min(abs(inside), 1.0))
     if outline == 0:
         covered *= line_y
@@ -309,9 +315,9 @@ def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-
 
 @compiled()
 def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
-    """Add an edge's part in a row, Eq. (1), to `area`, whose running sum is the covered share of each cell.
+    """Add the part of an edge that lies in a row, Eq. (1), to `area`. The running sum of `area` is the covered share.
 
-    Returns the first and last cell that the edge crosses; if there is none, the last is before the first.
+    Returns the first and last cell that the edge crosses. If the edge crosses no cell, the last is before the first.
     """
     x0, y0, x1, y1 = edge[0], edge[1], edge[2], edge[3]
     ya, yb = min(max(y0, row), row + 1), min(max(y1, row), row + 1)
@@ -347,10 +353,10 @@ def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-untyped-def]
-    """Multiply `strip` by the mean of a picture over each cell; outside the picture all is opaque."""
+    """Multiply `strip` by the mean of a picture over each cell. Everything outside the picture is opaque."""
     rows, cells = strip.shape
     pixels = len(open_share)
-    corner = 0.5 * (cells - pixels * cells_per_pixel)  # lower left of the picture, in cells
+    corner = 0.5 * (cells - pixels * cells_per_pixel)  # lower left corner of the picture, in cells
     running = np.zeros(pixels + 1)
     for k in range(rows):
         low = (first_row + k - corner) / cells_per_pixel
@@ -371,7 +377,7 @@ def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-un
 
 @compiled()
 def _running_at(running, x):  # type: ignore[no-untyped-def]
-    """The running sum at a position between pixels."""
+    """The running sum at a position between pixels, interpolated linearly."""
     last = len(running) - 1
     if x <= 0:
         return running[0]

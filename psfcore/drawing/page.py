@@ -1,6 +1,6 @@
-"""One HTML page that contains all it needs: text, figures, tables, and numbers with their errors.
+"""An HTML page in one file, with text, figures, tables, and numbers with their errors.
 
-A browser can open the page from a file: it has no script and loads nothing over a network, and the figures are inside.
+A browser can open the page without a network: the page has no script, loads nothing, and contains its figures.
 Every text is escaped, including texts from the data, such as the name of a file.
 
     Page("Title", "What was found.", (Section("Figures", ("A paragraph.", Figure(png, "How to read it.", "What it shows"))),))
@@ -24,7 +24,7 @@ from psfcore.errors import DataError
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 DASH = "\N{EN DASH}"
-PLOT_DPI = 160  # of the figures on a page: sharp on screens of high resolution and on paper
+PLOT_DPI = 160  # resolution of the figures on a page: sharp on screens of high resolution and on paper
 CSS_DPI = 96  # CSS pixels per inch: a figure is shown in the size in inches in which it was drawn
 
 _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?[\d.]+(e[-+]?\d+)?( ?%)?( (±|to) [-+]?[\d.]+(e[-+]?\d+)?)?")
@@ -32,7 +32,7 @@ _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?[\d.]+(e[-+]?\d+)?( ?%)?( (±|to) [-+]
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A figure (PNG). caption: how to read it; alt: a description for readers who cannot see it.
+    """A figure (PNG). caption: how to read the figure. alt: a description for readers who cannot see it.
 
     Raises DataError "not-a-png".
     """
@@ -70,7 +70,7 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of cells, shown as given; columns of numbers are right-aligned.
+    """Rows of cells. The texts of the cells are not changed; columns of numbers are right-aligned.
 
     Raises DataError "uneven-table" if a row does not have the length of the header.
     """
@@ -97,7 +97,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Value:
-    """A number with its standard error, or a text. sigma: None if the error is unknown or there is none."""
+    """A number with its standard error, or a text. sigma: None if the error is unknown or the value has no error."""
 
     name: str
     value: float | str
@@ -166,7 +166,7 @@ class Page:
 
 
 def with_error(value: float, sigma: float | None = None) -> str:
-    """A number rounded to the second digit of its error, "12.34 ± 0.56"; to five digits if it has no error."""
+    """A number rounded to the second digit of its error, "12.34 ± 0.56". Without an error it is rounded to five digits."""
     if not math.isfinite(value):
         return DASH
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
@@ -179,7 +179,7 @@ def with_error(value: float, sigma: float | None = None) -> str:
 
 
 def provenance_values(provenance: Mapping[str, Any]) -> Values:
-    """The provenance of a report as names and texts; a nested name is preceded by the names around it."""
+    """The provenance of a report as names and texts. A nested name is preceded by the names of the levels above."""
     return Values([Value(name, text) for name, text in _named_texts(provenance)])
 
 

@@ -1,6 +1,6 @@
 """Plots: an image before and after deconvolution, and a PSF.
 
-Each plot has its own figure on the Agg canvas. So threads and processes share no state, as they would with pyplot.
+Each plot has its own figure on the Agg canvas, so threads and processes share no state. With pyplot they would share it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Plane = NDArray[np.floating]
 
 
 def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str = "DN/s") -> None:
-    """Three panels [y, x], first row at the bottom: before, after (same stretch), change in percent."""
+    """Draw three panels [y, x], first row at the bottom: before, after (same stretch), change in percent."""
     step = max(1, -(-max(before.shape) // PANEL_PX))
     small_before, small_after = binned(before, step), binned(after, step)
     stretch = square_root_stretch(small_before, small_after)
@@ -81,9 +81,9 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
 
 
 def psf_png(psf: Psf, path: str | Path) -> None:
-    """Three panels: the centre on a logarithmic scale, mean weight by radius, 1 - encircled energy by radius.
+    """Draw three panels: the centre on a logarithmic scale, mean weight by radius, 1 - encircled energy by radius.
 
-    The curves are those of the total PSF and of each component; the Airy pattern of the open aperture is for reference.
+    There is a curve for the total PSF and one for each component. The Airy pattern of the open aperture is a reference.
     """
     figure = Figure(
         figsize=(15.6, 5.6),
@@ -123,9 +123,9 @@ def psf_png(psf: Psf, path: str | Path) -> None:
 
 
 def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Radius (px) and mean weight, over rings of 1 px, and from 17 px on over rings of 1/17 of the radius.
+    """The radius (px) and the mean weight of rings. Up to 17 px rings are 1 px wide, farther out 1/17 of the radius.
 
-    The centre is at half a pixel, because a logarithmic axis has no zero. Rings without light are left out.
+    The centre is drawn at half a pixel, because a logarithmic axis has no zero. Rings without light are left out.
     """
     ring, mean = radial_profile(np.asarray(kernel, dtype=np.float64))
     group = np.where(ring < 17, ring, 17 + np.floor(17 * np.log(np.maximum(ring, 17) / 17))).astype(int)
@@ -156,7 +156,7 @@ def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:
 
 
 def binned(plane: Plane, step: int) -> NDArray[np.float64]:
-    """Means of step x step pixels; NaN only where all of them are NaN. An incomplete last row or column is dropped."""
+    """Means of the finite values of step x step pixels; NaN if there are none. Incomplete last rows or columns are dropped."""
     ny, nx = plane.shape[0] // step, plane.shape[1] // step
     data = np.asarray(plane[: ny * step, : nx * step], dtype=np.float32)
     finite = np.isfinite(data)

@@ -7,19 +7,19 @@ around the centre are free:
     s(r) = sum over k of x_k h(r - p_k),   x_k >= 0                                          Eq. (1)
     minimise sum over u of ((s_u - d_u) / e_u)^2   with   mean s = mean d at 60 to 70 px     Eq. (2)
 
-d is the flare image less an image from before the flare. s_u and d_u are means over the pixels of a strip along the
-arm, one mean per pixel of distance u. If the camera's noise is known, e_u is the noise of d_u and the sum is chi^2.
-If not, e_u = d_u, and the root mean square is the percentage error that the paper minimises. Non-negative least
-squares (Lawson and Hanson 1974, chapter 23) finds the minimum; the constraint is one more row with a large weight
-(their chapter 22).
+d is the flare image minus an image from before the flare. s_u and d_u are means over the pixels of a strip along the
+arm, one mean for each distance u in steps of 1 px. If the noise of the camera is known, e_u is the noise of d_u, and the
+sum is chi^2. If not, e_u = d_u, and the root mean square is the percentage error that the paper minimises. Non-negative
+least squares (Lawson and Hanson 1974, chapter 23) finds the minimum; the constraint is an additional row with a large
+weight (their chapter 22).
 
-Departure from the paper: it iterates "until the percentage root mean square error was minimized" and does not say
-how. Here chi^2 is minimised if the noise is known, because beyond 60 px the percentage error of single pixels is
+Departure from the paper: the paper iterates "until the percentage root mean square error was minimized" and does not
+say how. Here chi^2 is minimised if the noise is known, because beyond 60 px the percentage error of single pixels is
 mostly noise.
 
-What the comparison can show: x is fitted for each PSF separately, so the unknown flare does not count against a PSF.
-But x also absorbs a scatter that is too strong or too weak at all distances. What remains is a test of the shape:
-the light between the orders against the light in them.
+What the comparison can show: x is fitted for each PSF separately, so the unknown flare does not make a PSF look wrong.
+But x also compensates for scatter that is too strong or too weak at all distances. The comparison therefore tests only
+the shape of the PSF: the light between the orders relative to the light in the orders.
 
 | symbol | name | unit |
 |---|---|---|
@@ -46,10 +46,12 @@ from psfcore.scatter.samples import DIFFRACTION, SCATTER
 BOX_PX = 7
 MATCHED_PX = (60.0, 70.0)
 FITTED_PX = (10.0, 80.0)
-HALF_WIDTH_PX = BOX_PX / 2  # a strip as wide as the box holds the orders of all its pixels
+# The strip is as wide as the box, so that it contains the orders of all pixels of the box.
+HALF_WIDTH_PX = BOX_PX / 2
 FEWEST_DISTANCES = 20
 _CONSTRAINT_WEIGHT = 1e4
-_USED_SHARE = 1e-6  # of the box's light; pixels with less do not count as free parameters
+# A pixel with a smaller fraction of the light of the box does not count as a free parameter.
+_USED_SHARE = 1e-6
 
 Plane = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -58,7 +60,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ArmProfile:
-    """Light along an arm: the strip's mean at each distance from the flare, with its noise if known.
+    """Light along an arm: the mean over the strip at each distance from the flare, and its noise if known.
 
     rows, columns: the pixels of the strip; member: for each pixel, the index of its distance.
     """
@@ -80,13 +82,13 @@ class ArmProfile:
 
 @dataclass(frozen=True, eq=False)
 class FlareFit:
-    """The light along an arm that one PSF simulates, with the fitted flare.
+    """The light along an arm as simulated with one PSF, and the fitted flare.
 
-    box [y, x]: light of the flare; simulated: s_u. rms_pct: root mean square of 100 (s_u / d_u - 1).
-    chi2_per_distance: the sum in Eq. (2) over the number of distances; None if the noise is unknown. reduced_chi2:
-    the sum over the degrees of freedom: distances less used pixels of the box, plus one for the constraint.
-    matched: mean s over mean d at 60 to 70 px. matched_noise_pct: the noise of that mean d, which the constraint
-    treats as exact.
+    box [y, x]: light of the flare. simulated: s_u. rms_pct: root mean square of 100 (s_u / d_u - 1) over the distances
+    with d_u > 0. chi2_per_distance: the sum in Eq. (2) divided by the number of distances; None if the noise is unknown.
+    reduced_chi2: the same sum divided by the degrees of freedom (number of distances - number of used pixels of the box
+    + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px. matched_noise_pct: the noise of this mean
+    d in percent; the constraint treats the mean d as exact.
     """
 
     box: Plane
@@ -99,7 +101,7 @@ class FlareFit:
     matched_noise_pct: float | None
 
     def as_json(self) -> dict[str, Any]:
-        """All fields except the profile, as JSON."""
+        """All fields except `simulated` as JSON values; `flare_light` is the sum of the box."""
         return {
             "rms_pct": self.rms_pct,
             "chi2_per_distance": self.chi2_per_distance,
@@ -114,10 +116,10 @@ class FlareFit:
 
 @dataclass(frozen=True, eq=False)
 class FlareComparison:
-    """The total PSF and its diffraction PSF alone, compared along one arm of one flare.
+    """The fits of the total PSF and of its diffraction PSF alone along one arm of one flare.
 
-    diffraction: None if the PSF's file does not separate diffraction from scatter.
-    explained: the share of the changes off the arm that the total PSF and its box explain, see `explained_share`.
+    diffraction: None if the file of the PSF does not separate diffraction from scatter.
+    explained: the share of the changes off the arm that the total PSF and its fitted box explain, see `explained_share`.
     """
 
     profile: ArmProfile
@@ -127,12 +129,12 @@ class FlareComparison:
 
     @property
     def rms_factor(self) -> float | None:
-        """Percentage error of diffraction alone over that of the total PSF."""
+        """rms_pct of diffraction alone divided by rms_pct of the total PSF; None if diffraction is None."""
         return None if self.diffraction is None else self.diffraction.rms_pct / self.total.rms_pct
 
     @property
     def chi2_factor(self) -> float | None:
-        """chi^2 of diffraction alone over that of the total PSF."""
+        """chi^2 of diffraction alone divided by chi^2 of the total PSF; None if one of the two is not known."""
         alone = None if self.diffraction is None else self.diffraction.chi2_per_distance
         if alone is None or not self.total.chi2_per_distance:
             return None
@@ -160,9 +162,9 @@ class FlareComparison:
 def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tuple[int, int]:
     """Position (x, y) of the flare, px.
 
-    It is the middle of the largest patch of pixels that became unusable since the image before; if there is none, the
-    brightest pixel of the smoothed difference. usable, usable_before: usable pixels of the two images. Raises DataError
-    "flare-no-light" if nothing became brighter.
+    It is the middle of the largest patch of pixels that became unusable since the image before. If there is no such
+    patch, it is the brightest pixel of the smoothed difference. usable, usable_before: True for the usable pixels of the
+    image and of the image before. Raises DataError "flare-no-light" if no pixel became brighter.
     """
     labels, count = ndimage.label(~usable & usable_before, structure=np.ones((3, 3)))
     if count:
@@ -187,8 +189,8 @@ def arm_profile(
 ) -> ArmProfile:
     """Profile along the arm that leaves the centre at `arm_deg`, degrees from +x towards +y.
 
-    Distances at which less than half of the strip is usable are left out. variance: of each pixel of the difference.
-    Raises DataError "flare-bad-centre", "flare-short-arm".
+    Distances at which less than half of the strip is usable are left out. variance [y, x]: the variance of each pixel of
+    the difference. Raises DataError "flare-bad-centre", "flare-short-arm".
     """
     ny, nx = difference.shape
     if not (0 <= centre_xy[0] < nx and 0 <= centre_xy[1] < ny):
@@ -248,7 +250,7 @@ def fit_flare(
     error = profile.sigma if profile.sigma is not None else _percent_error(observed, level)
     constraint = design[matched].mean(axis=0)
     weight = _CONSTRAINT_WEIGHT * np.sqrt(observed.size) / level
-    # The solver needs columns of similar size: they differ, and the light is about 1e7.
+    # The solver needs columns of similar size. Before scaling they differ, and the light is about 1e7.
     scale = np.linalg.norm(design / error[:, None], axis=0)
     rows = np.vstack((design / error[:, None], weight * constraint)) / np.where(scale > 0, scale, 1.0)
     found, _ = nnls(rows, np.append(observed / error, weight * level))
@@ -267,9 +269,10 @@ def compare_on_flare(
     distances_px: tuple[float, float] = FITTED_PX,
     matched_px: tuple[float, float] = MATCHED_PX,
 ) -> FlareComparison:
-    """Compare the total PSF along one arm of a flare; also its diffraction alone if the PSF has both components.
+    """Compare the total PSF with the light along one arm of a flare.
 
-    Raises DataError as `arm_profile` and `fit_flare` do.
+    If the PSF has the components diffraction and scatter, the diffraction PSF alone is compared too.
+    Raises the DataErrors of `arm_profile` and `fit_flare`.
     """
     profile = arm_profile(
         difference, usable, centre_xy, arm_deg, variance=variance, distances_px=distances_px
@@ -293,11 +296,13 @@ def explained_share(
     *,
     variance: Plane | None = None,
 ) -> float:
-    """Share of the changes around the flare, off the arm but at the arm's distances, that stray light explains:
+    """The share of the changes around the flare that its stray light explains:
 
         1 - (sum (s - d)^2 - sum e^2) / (sum d^2 - sum e^2)
 
-    It is 1 if all changes are stray light of the flare, and 0 or less if other changes are as large.
+    The sums are over pixels at the same distances as the profile, without the strip along the arm. The share is 1 if all
+    changes are stray light of the flare. It is 0 or less if the changes are not smaller after the simulated stray light
+    is subtracted.
     """
     x0, y0 = profile.centre_xy
     near, far = profile.distance_px[[0, -1]]
@@ -319,7 +324,7 @@ def explained_share(
 
 
 def _judged(profile: ArmProfile, design: Plane, box: Plane, matched: Flags) -> FlareFit:
-    """The fit's result for the given box."""
+    """The result of the fit for this fitted box."""
     simulated, observed = design @ box.ravel(), profile.observed
     used = int(np.count_nonzero(box > _USED_SHARE * box.sum()))
     chi2 = None if profile.sigma is None else float((((simulated - observed) / profile.sigma) ** 2).sum())
@@ -338,7 +343,7 @@ def _judged(profile: ArmProfile, design: Plane, box: Plane, matched: Flags) -> F
 
 
 def _noise_of_mean_pct(profile: ArmProfile, matched: Flags) -> float | None:
-    """Noise of the mean over the matched distances, percent of that mean."""
+    """Noise of the mean observed light at the matched distances, in percent of this mean."""
     if profile.sigma is None:
         return None
     sigma = np.sqrt((profile.sigma[matched] ** 2).sum()) / np.count_nonzero(matched)
@@ -346,12 +351,12 @@ def _noise_of_mean_pct(profile: ArmProfile, matched: Flags) -> float | None:
 
 
 def _percent_error(observed: Vector, level: float) -> Vector:
-    """d_u, but at least a tenth of the mean at 60 to 70 px: a distance that noise made dark must not dominate."""
+    """d_u, but at least a tenth of the mean at 60 to 70 px. Otherwise a value near 0 (by noise) would dominate the fit."""
     return np.maximum(observed, 0.1 * level)
 
 
 def _design(profile: ArmProfile, kernel: Plane, box_px: int) -> Plane:
-    """Design matrix (distances, pixels of the box): the profile of unit light in each pixel of the box."""
+    """Design matrix (distances, pixels of the box): each column is the profile of unit light in one pixel of the box."""
     columns = [
         profile.mean(_at(kernel, profile.rows - row, profile.columns - column))
         for row, column, _ in _box(profile, np.zeros((box_px, box_px)))

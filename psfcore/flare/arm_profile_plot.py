@@ -1,4 +1,4 @@
-"""A plot of a PSF compared on a flare: image and arm, the light along the arm, and its residuals."""
+"""A plot that compares a PSF with a flare: the image with the arm, the light along the arm, and the residuals."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def flare_png(
 def _heading(found: FlareComparison) -> str:
     words = f"Arm at {found.profile.arm_deg:.2f} degrees: {_summary('total PSF', found.total)}"
     if found.diffraction is not None:
-        words += f"; {_summary('diffraction alone', found.diffraction)}, {found.rms_factor:.1f} times the rms of the total PSF"
+        words += f"; {_summary('diffraction alone', found.diffraction)}, {found.rms_factor:.1f} times the rms error of the total PSF"
     return words
 
 
@@ -83,7 +83,7 @@ def _draw_flare(
         ylim=(max(-0.5, y - reach), min(difference.shape[0] - 0.5, y + reach)),
         xlabel="x (px)",
         ylabel="y (px)",
-        title="Flare less the image before (white: unusable)",
+        title="Flare minus the image before (white: unusable)",
     )
     axes.legend(loc="upper right", fontsize=9)
     figure.colorbar(drawn, ax=axes, shrink=0.8, label=unit)
@@ -114,7 +114,7 @@ def _draw_profile(axes: Any, found: FlareComparison, unit: str) -> None:
 
 
 def _draw_residuals(axes: Any, found: FlareComparison) -> None:
-    """Simulated less observed: over the noise, or over the observed light if the noise is unknown."""
+    """Draw simulated minus observed, divided by the noise, or by the observed light if the noise is unknown."""
     profile = found.profile
     unit = np.maximum(profile.observed, 1e-300) / 100 if profile.sigma is None else profile.sigma
     residuals = [((fit.simulated - profile.observed) / unit, colour) for _, fit, colour in _fits(found)]
@@ -123,7 +123,7 @@ def _draw_residuals(axes: Any, found: FlareComparison) -> None:
     limit = min(100.0, 1.2 * float(np.percentile(np.abs(np.concatenate([r for r, _ in residuals])), 98)))
     axes.axhline(0, color="#999999", linewidth=0.8)
     axes.set(
-        xlabel="Distance from the flare along the arm (px); shaded: means are matched",
+        xlabel="Distance from the flare along the arm (px); shaded: matched distances",
         ylabel="Simulated - observed\n(% of observed)"
         if profile.sigma is None
         else "Simulated - observed\n(sigma)",

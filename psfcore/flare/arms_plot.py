@@ -1,4 +1,4 @@
-"""A plot of measured arms: the image with the fitted orders, and the fit beside the data along the arms."""
+"""A plot of measured arms: the image with the fitted orders, and cuts along the arms through image and fit."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _draw_image(figure: Figure, axes: Any, image: NDArray[np.float64], found: Ar
 
 
 def _draw_cuts(axes: Any, image: NDArray[np.float64], found: ArmMeasurement) -> None:
-    """Cuts along each arm: the image, and the fit where pixels were fitted; one arm above the other."""
+    """Draw image and fit along each arm, where pixels were fitted. The curves of the arms are stacked."""
     reach = max((abs(peak.order) for peak in found.peaks), default=1) * found.spacing_px + 5
     along = np.arange(-reach, reach, 0.25)
     clean = np.nan_to_num(image)

@@ -1,4 +1,4 @@
-"""Test a PSF on the stray light of a flare, from an image during the flare and one before it."""
+"""Test a PSF on the stray light of a flare, with one image during the flare and one image before the flare."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class FlareTest:
-    """A PSF compared with a flare, and the planes [y, x] that it was compared on.
+    """The comparison of a PSF with a flare, and the planes [y, x] that were used.
 
-    difference: the flare's light, in ``unit``. usable: pixels that both images trust.
+    difference: the light of the flare, in ``unit``. usable: True for pixels that are valid in both images.
     """
 
     comparison: FlareComparison
@@ -44,11 +44,12 @@ def judge_on_flare(
     distances_px: tuple[float, float] = (10.0, 80.0),
     noise: Noise | None = None,
 ) -> FlareTest:
-    """Simulate the flare's stray light with ``psf`` and compare it along a diffraction arm.
+    """Simulate the stray light of a flare with ``psf``, and compare it with the observed light along a diffraction arm.
 
-    centre_xy: the flare, px; default: found. arm_deg: direction from +x towards +y; default: the measured arm nearest
-    to +x. noise: of the camera, for chi2. Raises DataError "plate-scale-mismatch", "flare-shapes", "flare-units", and
-    as ``compare_on_flare`` and ``measure_arms`` do.
+    centre_xy: position of the flare, px; default: found in the images. arm_deg: direction of the arm, from +x towards +y;
+    default: measured, the arm nearest to +x. noise: the noise of the camera; chi2 is computed only if it is given.
+    Raises DataError "plate-scale-mismatch", "flare-shapes", "flare-units", and the errors of ``compare_on_flare`` and
+    ``measure_arms``.
     """
     check_compatible(flaring, psf)
     light, quiet, unit = _same_unit(flaring, before)
@@ -72,7 +73,7 @@ def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
     """Both images [y, x], 0 where a pixel has no value, and their unit: DN/s if the exposures are known."""
     if flaring.pixels.shape != before.pixels.shape:
         shapes = f"{flaring.pixels.shape} and {before.pixels.shape}"
-        raise DataError("flare-shapes", f"expected two images of the same frame; got {shapes}")
+        raise DataError("flare-shapes", f"expected two images of the same shape; got {shapes}")
     rates = [_rate(image) for image in (flaring, before)]
     if flaring.exposure_s is None and before.exposure_s is None and flaring.unit == before.unit:
         rates, unit = [flaring.pixels, before.pixels], flaring.unit or "image unit"
@@ -95,7 +96,7 @@ def _rate(image: Image) -> Plane | None:
 
 
 def _variance(noise: Noise, image: Image) -> Plane:
-    """Variance of each pixel, in the square of the unit that the images are compared in."""
+    """The variance of each pixel, in the square of the unit of the comparison."""
     rate = _rate(image)
     exposure_s = 1.0 if image.exposure_s is None else image.exposure_s
     values = np.nan_to_num(image.pixels if rate is None else rate, posinf=0.0, neginf=0.0)
@@ -105,7 +106,7 @@ def _variance(noise: Noise, image: Image) -> Plane:
 def _measured_arm(
     light: Plane, quiet: Plane, usable: NDArray[np.bool_], centre_xy: tuple[int, int], reach_px: float
 ) -> float:
-    """Direction of the arm nearest to +x, measured as far out as it is used."""
+    """The direction (degrees) of the arm nearest to +x, measured out to reach_px."""
     try:
         found = measure_arms(
             light,
@@ -121,7 +122,7 @@ def _measured_arm(
 
 
 def summary_lines(found: FlareComparison) -> list[str]:
-    """What the comparison says, as lines to print."""
+    """The result of the comparison, as lines to print."""
     profile = found.profile
     lines = [
         f"flare at x, y = {profile.centre_xy[0]}, {profile.centre_xy[1]}; arm at {profile.arm_deg:.2f} degrees; "
@@ -131,14 +132,14 @@ def summary_lines(found: FlareComparison) -> list[str]:
         if fit is not None:
             chi2 = "" if fit.chi2_per_distance is None else f", chi2 {fit.chi2_per_distance:.2f} per distance"
             lines.append(
-                f"{name:<18} {fit.rms_pct:7.1f} % rms{chi2}; flare of {fit.box.sum():.3g} in {fit.used_pixels} px"
+                f"{name:<18} {fit.rms_pct:7.1f} % rms error{chi2}; fitted flare: {fit.box.sum():.3g} in {fit.used_pixels} px"
             )
     if found.rms_factor is not None:
-        chi2 = "" if found.chi2_factor is None else f", {found.chi2_factor:.0f} times the chi2"
-        lines.append(f"diffraction alone: {found.rms_factor:.1f} times the error{chi2}")
+        chi2 = "" if found.chi2_factor is None else f" and {found.chi2_factor:.0f} times the chi2"
+        lines.append(f"diffraction alone: {found.rms_factor:.1f} times the rms error{chi2} of the total PSF")
     else:
         lines.append(
-            "note: the PSF file does not separate DIFFRACTION from SCATTER, so they are not compared"
+            "note: the PSF file does not separate DIFFRACTION from SCATTER, so diffraction alone is not compared"
         )
     return lines + _cautions(found)
 
@@ -147,12 +148,12 @@ def _cautions(found: FlareComparison) -> list[str]:
     lines = []
     if found.explained < ENOUGH_EXPLAINED:
         lines.append(
-            f"note: outside the arm the flare's box explains {100 * max(found.explained, 0):.0f} % of the change "
-            "between the images. The change is not the stray light of a compact flare alone, and says little about the PSF"
+            f"note: outside the arm, the stray light of the fitted flare explains only {100 * max(found.explained, 0):.0f} % "
+            "of the change between the images. Something else changed too, so this comparison says little about the PSF"
         )
     noise_pct = found.total.matched_noise_pct
     if noise_pct is not None and noise_pct > WELL_MATCHED_PCT:
         lines.append(
-            f"note: the fit is matched to the light at 60 to 70 px, which is known only to {noise_pct:.0f} %"
+            f"note: the fit is matched to the light at 60 to 70 px, but noise makes this light uncertain by {noise_pct:.0f} %"
         )
     return lines

@@ -1,6 +1,6 @@
 """Finds the instrument files: by name, by the hash of their bytes, and by the header of an image.
 
-Standard library only, so that the web process can import it.
+This module imports no numerical library, so that the web process can import it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def instrument_digest(name: str) -> str:
 
 
 def match_instrument(cards: Mapping[str, object]) -> str | None:
-    """Name of the first instrument whose [match] cards all equal the given header cards, or None."""
+    """Name of the first instrument whose cards in the table [match] all equal the given header cards, or None."""
     for name in instrument_names():
         wanted = _match_table(name)
         if wanted and all(_same(cards.get(key), value) for key, value in wanted.items()):

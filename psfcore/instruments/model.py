@@ -15,11 +15,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_path
 
-_MOST_DOTS = 64  # in one part of a file without brackets, commas or line ends
+_MOST_DOTS = 64  # largest number of dots in a part of the file without brackets, commas or line ends
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-# The software multiplies and divides lengths by each other. Within these limits no result overflows or becomes 0, and
-# no telescope from X-rays to the far infrared comes close to them in the units of the keys.
+# The software multiplies lengths and divides them by each other. Within these limits no result overflows or becomes 0.
+# In the units of the keys, all telescopes from X-rays to the far infrared are far inside these limits.
 _LEAST, _MOST = 1e-9, 1e9
 Size = Annotated[float, Field(ge=_LEAST, le=_MOST, allow_inf_nan=False)]
 SizeOrNone = Annotated[float, Field(ge=0, le=_MOST, allow_inf_nan=False)]
@@ -33,7 +33,7 @@ class _Frozen(BaseModel):
 
 
 class GainMode(_Frozen):
-    """Saturation and noise of one readout mode. ``basis`` says where the numbers come from."""
+    """Saturation and noise of one readout mode. ``basis``: the origin of the numbers."""
 
     saturation_dn: Positive | None = None
     photon_gain_dn: Positive | None = None
@@ -42,7 +42,7 @@ class GainMode(_Frozen):
 
 
 class Detector(_Frozen):
-    """The sensor. The keys of ``gain_modes`` are the values of the header's GAINCOMB."""
+    """The sensor. The keys of ``gain_modes`` are the values of the header keyword GAINCOMB."""
 
     pixel_pitch_um: Size
     pixels: Count
@@ -74,7 +74,7 @@ class SpectralLine(_Frozen):
 
 
 class Mirror(_Frozen):
-    """A conic mirror: sag r^2 / (R (1 + sqrt(1 - (1 + K) r^2 / R^2)))."""
+    """A conic mirror. Its sag is r^2 / (R (1 + sqrt(1 - (1 + K) r^2 / R^2)))."""
 
     name: str
     radius_mm: Size
@@ -95,8 +95,9 @@ class Distances(_Frozen):
 class Mesh(_Frozen):
     """A square mesh that supports a filter.
 
-    ``windows``: how many windows the light of one field point crosses in each direction, as the paper counts them.
-    ``share``: the share of the light that crosses this mesh, where several meshes stand side by side.
+    ``windows``: number of windows of the diffraction series in each direction. At the entrance, this is the diameter of
+    the aperture divided by the pitch; at the filter wheel, the number of windows that the light crosses.
+    ``share``: the fraction of the light that crosses this mesh, if several meshes are mounted side by side.
     """
 
     name: str
@@ -146,7 +147,7 @@ class MaskImage(_Frozen):
 
 
 class Mount(_Frozen):
-    """The mount of the entrance filter. ``basis`` must say where its description comes from."""
+    """The mount of the entrance filter. ``basis``: the origin of its description."""
 
     basis: Literal["drawing", "assumed"]
     rays: tuple[Rays, ...] = ()
@@ -166,7 +167,7 @@ class Scatter(_Frozen):
 
 
 class Instrument(_Frozen):
-    """An instrument: all quantities that a PSF is computed from."""
+    """An instrument: all quantities from which a PSF is computed."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
     version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")]
@@ -191,7 +192,7 @@ class Instrument(_Frozen):
         return tuple(line.model_copy(update={"weight": line.weight / total}) for line in lines)
 
     def mesh_distance_mm(self, mesh: Mesh) -> float:
-        """Distance over which a mesh diffracts: the focal length at the entrance, else the distance to the detector.
+        """Diffraction distance of a mesh: the focal length at the entrance, otherwise the distance to the detector.
 
         Raises DataError "bad-instrument-file" if the file gives no distances.
         """
@@ -234,7 +235,7 @@ def parse_instrument(text: str, label: str) -> Instrument:
         problem = f"{label}: {key}: {first['msg']}; got {first['input']!r:.80}{more}"
         raise DataError("bad-instrument-file", problem) from None
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
-        # Integers of thousands of digits raise ValueError, deeply nested lists RecursionError.
+        # An integer of thousands of digits raises ValueError; deeply nested lists raise RecursionError.
         deep = isinstance(error, RecursionError)
         reason = "too many levels of nesting" if deep else " ".join(str(error).split())
         raise DataError("bad-instrument-file", f"{label}: expected TOML; {reason:.200}") from None

@@ -1,9 +1,9 @@
-"""Answers questions about a PSF from its tables: numbers are looked up and interpolated, pixels are not read.
+"""Answers questions about a PSF from its tables, without reading the pixels of the PSF.
 
-`psfcore.tables.layout` describes the tables, E(R) and 1 - E(R). E is a staircase as far as the tables are exact, and
-interpolated linearly between their radii farther out.
+`psfcore.tables.layout` describes the tables, E(R) and 1 - E(R). Up to `exact_to_px`, E is an exact staircase. Farther
+out, E is interpolated linearly between the radii of the tables.
 
-This module imports no numerical library: the web process and the command line answer with it.
+This module imports no numerical library, because the web process and the command line use it.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 from psfcore.tables.layout import SCHEMA as SCHEMA
 from psfcore.tables.layout import TOTAL, WHOLE_TO_PX
 
-LARGEST_COUNT = 500  # of radii in one question
-NEGLIGIBLE_POINTS = 0.005  # an interpolation error below this is not given as a number
+LARGEST_COUNT = 500  # largest number of radii in one question
+# Smaller interpolation errors (percentage points) are reported only as "below 0.005".
+NEGLIGIBLE_POINTS = 0.005
 
 Tables = Mapping[str, Any]
 Numbers = list[float]
 
 
 def curve(tables: Tables, radii: Sequence[float] | None = None) -> dict[str, Any]:
-    """1 - encircled energy at each radius in percent, by component; without radii, at those of the tables.
+    """1 - encircled energy at each radius, in percent, by component. Default of `radii`: the radii of the tables.
 
     Raises DataError "bad-radius", "radius-beyond-reach".
     """
@@ -46,16 +47,16 @@ def curve(tables: Tables, radii: Sequence[float] | None = None) -> dict[str, Any
 
 
 def profile(tables: Tables) -> dict[str, Any]:
-    """Mean weight of a pixel by ring, by component; each ring is one pixel wide."""
+    """The mean weight of the pixels in each ring, by component. A ring is one pixel wide."""
     return {
         **_about(tables),
         **tables["profile"],
-        "resolution": "rings one pixel wide: the distance r, rounded to whole pixels, is radius_px",
+        "resolution": "rings are one pixel wide: a pixel belongs to the ring whose radius_px is its distance r, rounded to whole pixels",
     }
 
 
 def encircled(tables: Tables, radius: float) -> dict[str, Any]:
-    """Encircled energy within a radius as a fraction of all light, by component.
+    """The encircled energy within a radius, as a fraction of all light, by component.
 
     Raises DataError "bad-radius", "radius-beyond-reach".
     """
@@ -70,7 +71,7 @@ def encircled(tables: Tables, radius: float) -> dict[str, Any]:
 
 
 def annulus(tables: Tables, inner: float, outer: float) -> dict[str, Any]:
-    """Light at inner < r <= outer as a fraction of all light, by component.
+    """The light at inner < r <= outer, as a fraction of all light, by component.
 
     Raises DataError "bad-annulus", "bad-radius", "radius-beyond-reach".
     """
@@ -101,7 +102,7 @@ QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
 
 
 def compare(one: Tables, other: Tables) -> dict[str, Any]:
-    """Differences of two PSFs, `other` minus `one`: of 1 - encircled energy at common radii, and of the totals.
+    """Differences `other` minus `one` of two PSFs: 1 - encircled energy at common radii, sum, and central weight.
 
     Raises DataError "plate-scale-mismatch".
     """
@@ -145,7 +146,7 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
         "difference_of_central_weights": other["central_weight"] - one["central_weight"],
         "only_in_one": sorted(set(one["encircled"]) - set(names)),
         "only_in_other": sorted(set(other["encircled"]) - set(names)),
-        "resolution": "at the radii of the tables, without interpolation; errors assume two fits of independent data",
+        "resolution": "at radii that both tables have, without interpolation; the errors assume that the two PSFs were fitted to independent data",
     }
 
 
@@ -188,7 +189,7 @@ def _reader_at(tables: Tables, radii: Sequence[float]) -> Callable[[Numbers], Nu
                 "radius-beyond-reach",
                 f"expected radii up to the reach of the PSF, {reach:.1f} px; got {radius:g}",
             )
-    # Stored radii are rounded, and a caller may give a radius such as sqrt(2) with more or fewer digits.
+    # Allow for rounding: stored radii are rounded, and a caller may give a radius such as sqrt(2) with fewer digits.
     places = [min(bisect_right(grid, radius * (1 + 1e-9)) - 1, len(grid) - 1) for radius in radii]
 
     def find(row: Numbers) -> Numbers:
@@ -209,7 +210,7 @@ def _read(exact_to_px: float, grid: Numbers, row: Numbers, at: int, radius: floa
 
 
 def _sigma(tables: Tables, of: Callable[[Numbers], Numbers]) -> dict[str, Numbers]:
-    """1-sigma errors of numbers that are linear in E, by component; empty if the PSF was not fitted."""
+    """The 1-sigma errors of numbers that `of` computes linearly from E, by component; empty if the PSF was not fitted."""
     return {
         name: [math.hypot(*column) for column in zip(*(of(row) for row in rows), strict=True)]
         for name, rows in tables["encircled_changes"].items()

@@ -2,14 +2,14 @@
 
 `psfcore.tables.layout` describes the tables, E(R) and 1 - E(R). The radii are the same for every PSF, up to its reach:
 
-- up to EXACT_TO_PX every distance that a pixel can have, so that the staircase E is exact;
-- up to WHOLE_TO_PX every whole pixel;
-- farther out steps of 2 %, and the reach itself.
+- up to EXACT_TO_PX: every distance that a pixel can have, so that the staircase E is exact;
+- up to WHOLE_TO_PX: every whole number of pixels;
+- farther out: steps of 2 %, and the reach itself.
 
-Between the radii beyond EXACT_TO_PX, E is interpolated linearly. The tables state the largest error found at test radii.
+Beyond EXACT_TO_PX, E is interpolated linearly between the radii. The tables state the largest error found at test radii.
 
-If the PSF was fitted, the tables also hold the changes of E by 1 sigma along each axis of the fit's covariance, to
-first order, as in the fit's own report.
+If the PSF was fitted, the tables also hold the changes of E for a step of 1 sigma along each axis of the covariance of
+the fit. These changes are computed to first order, as in the report of the fit.
 
 | symbol | name | unit |
 |---|---|---|
@@ -91,9 +91,9 @@ def _test_radii(radii: Vector) -> Vector:
 
 
 def _changes(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vector], list[Vector]]]:
-    """1-sigma changes along the axes of the covariance: of E at the radii, and of the mean weights by ring.
+    """The changes of E at the radii, and of the mean weight of each ring, for 1 sigma along each axis of the covariance.
 
-    Given for the total PSF and for its scatter; empty if the PSF was not fitted.
+    The keys are the total PSF and its scatter; the dictionary is empty if the PSF was not fitted.
     """
     if psf.fitted is None or DIFFRACTION not in psf.components:
         return {}
@@ -113,7 +113,7 @@ def _changes(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vect
 
 
 def _read_off(changes: list[Kernel], radii: Vector) -> tuple[list[Vector], list[Vector]]:
-    """E at the radii, and mean weights by ring, of each change."""
+    """E at the radii, and the mean weight of each ring, for each change of the kernel."""
     within = [encircled_energy(change, radii) for change in changes]
     return within, [radial_profile(change)[1] for change in changes]
 

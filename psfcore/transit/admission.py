@@ -1,6 +1,7 @@
-"""Which members of an archive are accepted: their names, their number, their sizes.
+"""The rules for accepting the members of an archive: their names, their number, their sizes.
 
-The rules are the same for a .zip and a .tar. Standard library only, so that the web process can apply them.
+The rules are the same for a .zip and a .tar. This module imports no numerical library, so that the web process can apply
+the rules.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from psfcore.errors import DataError
 from psfcore.transit.manifest import is_plain_name
 
-RATIO_FLOOR_BYTES = 64 * 2**20  # the ratio does not count below this many bytes of output
+RATIO_FLOOR_BYTES = 64 * 2**20  # an archive may always unpack to this number of bytes, whatever its ratio
 _HIDDEN = ("__MACOSX", "PaxHeader", "PaxHeaders", "Thumbs.db", "desktop.ini")
 
 
@@ -19,9 +20,9 @@ _HIDDEN = ("__MACOSX", "PaxHeader", "PaxHeaders", "Thumbs.db", "desktop.ini")
 class ArchiveLimits:
     """Bounds on what an archive may contain.
 
-    max_files: members of any kind, hidden ones included. max_bytes: unpacked bytes of all members.
-    max_member_bytes: unpacked bytes of one member. max_ratio: unpacked bytes over the size of the archive; it
-    counts only above RATIO_FLOOR_BYTES.
+    max_files: members of any kind, including hidden files. max_bytes: unpacked bytes of all members.
+    max_member_bytes: unpacked bytes of one member. max_ratio: unpacked bytes divided by the bytes of the archive. This
+    bound applies only above RATIO_FLOOR_BYTES.
     """
 
     max_files: int = 16_384
@@ -45,19 +46,19 @@ class Gate:
         self._names: set[str] = set()
 
     def count_members(self, count: int = 1) -> None:
-        """Count more members, of any kind. Raises DataError "archive-too-large"."""
+        """Add members of any kind to the count. Raises DataError "archive-too-large"."""
         self._members += count
         if self._members > self.limits.max_files:
             message = f"expected at most {self.limits.max_files} members; got more"
             raise DataError("archive-too-large", message)
 
     def count_unpacked(self, count: int) -> None:
-        """Count more unpacked bytes. Raises DataError "archive-too-large"."""
+        """Add unpacked bytes to the count. Raises DataError "archive-too-large"."""
         self._unpacked += count
         self._check(self._unpacked)
 
     def admit(self, raw_name: str, size: int) -> str | None:
-        """The plain name of a file, or None if the file is hidden and must be skipped.
+        """Check a file; return its plain name, or None if the file is hidden and must be skipped.
 
         Raises DataError "archive-climbs", "archive-not-plain", "archive-too-large".
         """
@@ -87,7 +88,7 @@ class Gate:
         return name
 
     def check_folder(self, raw_name: str) -> None:
-        """Check the entry of a folder, which is not created. Raises as ``admit``."""
+        """Check the entry of a folder; the folder is not created. Raises DataError "archive-climbs", "archive-not-plain"."""
         parts = _parts(raw_name)
         if len(parts) > 1 and not _is_hidden(parts):
             raise not_plain(raw_name, "expected files at the top level or in one folder")
@@ -104,7 +105,7 @@ def not_plain(raw_name: str, message: str) -> DataError:
 
 
 def shown(raw_name: str) -> str:
-    """A member's name, as a message may contain it."""
+    """A member's name for a message: in ASCII, at most 80 characters of the name."""
     return ascii(raw_name[:80])
 
 

@@ -1,9 +1,10 @@
-"""A transit in one file, .zip, .tar or .tar.gz: list it, unpack it, and pack one.
+"""A transit in one archive file (.zip, .tar or .tar.gz): list, unpack and pack it.
 
-The first bytes tell the kind. The members must be plain files with plain names, at the top level or in one folder.
-``members`` reads them, ``admission`` says which are accepted. If an archive is refused, nothing of it is left on disk.
+The first bytes of the file identify the kind of archive. The members must be plain files with plain names, at the top
+level or in one folder. ``members`` reads them, ``admission`` decides which of them are accepted. If an archive is
+refused, none of its files is left on disk.
 
-Standard library and the manifest only, so that the web process can list an upload.
+This module imports no numerical library, so that the web process can list an upload.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")
 
 @dataclass(frozen=True)
 class ArchiveContents:
-    """What a list of an archive tells: its kind, its manifest, and the name and declared bytes of each file."""
+    """The contents of an archive: its kind, its manifest, and the name and the declared bytes of each file."""
 
     kind: Kind
     manifest: TransitManifest
@@ -42,10 +43,10 @@ class ArchiveContents:
 def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
     """List an archive. It reads transit.json and the first bytes of every other file, and writes nothing.
 
-    A .zip has a table of contents, and in a .tar the data can be skipped. A .tar.gz must be inflated from start
-    to end, within the limits.
-    Raises DataError as ``unpack`` does, and "no-manifest", "bad-manifest", "missing-file" if transit.json names a
-    file that the archive does not contain, "not-fits" if a named file cannot be FITS.
+    A .zip has a table of contents, and in a .tar the data can be skipped. A .tar.gz must be decompressed from start to
+    end, within the limits.
+    Raises the DataErrors of ``unpack``; also "no-manifest", "bad-manifest", "missing-file" if transit.json names a file
+    that the archive does not contain, and "not-fits" if a named file cannot be FITS.
     """
     files: dict[str, int] = {}
     starts: dict[str, bytes] = {}
@@ -78,10 +79,10 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
 
     If all files are in one folder of the archive, that folder's name is dropped. Hidden files and files that operating
     systems add are skipped.
-    Raises DataError, and then leaves nothing behind: "not-an-archive"; "archive-climbs" for a name that leads out of
-    the folder; "archive-not-plain" for links, devices, sparse or encrypted files, nested folders, a name that occurs
-    twice, a name that no file may have; "archive-too-large" if there are more bytes or members than the limits allow;
-    "archive-broken". Passes on OSError of the disk.
+    Raises one of these DataErrors, and then removes all files that it wrote: "not-an-archive"; "archive-climbs" for a name that leads
+    out of the folder; "archive-not-plain" for links, devices, sparse or encrypted files, nested folders, a name that
+    occurs twice, and a name that is not a plain file name; "archive-too-large" if there are more bytes or members than
+    the limits allow; "archive-broken". An OSError of the disk is raised unchanged.
     """
     folder = Path(folder)
     names: list[str] = []
@@ -104,7 +105,7 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
 def pack(folder: str | Path, path: str | Path) -> TransitManifest:
     """Write the transit in a folder as a .tar: transit.json and the files that it names.
 
-    Equal files give equal bytes: the hash of the archive is the identity of the transit.
+    Equal files give equal bytes, so the hash of the archive is the identity of the transit.
 
     Raises DataError "no-manifest", "bad-manifest", "missing-file".
     """
@@ -115,14 +116,14 @@ def pack(folder: str | Path, path: str | Path) -> TransitManifest:
 
 
 def pack_into(folder: Path, manifest: TransitManifest, target: IO[bytes]) -> None:
-    """Write the .tar that ``pack`` writes to an open file, of which only ``write`` and ``tell`` are called."""
+    """Write the same .tar as ``pack``, but into an open file. Only ``write`` and ``tell`` of this file are called."""
     with tarfile.open(fileobj=target, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for name in (MANIFEST_NAME, *manifest.files):
             if not (folder / name).is_file():
                 message = f"expected every file that {MANIFEST_NAME} names; missing: {name}"
                 raise DataError("missing-file", message)
             with (folder / name).open("rb") as file:
-                entry = tarfile.TarInfo(name)  # with its default owner, mode and time: constants
+                entry = tarfile.TarInfo(name)  # owner, mode and time keep their defaults, which are constants
                 entry.size = file.seek(0, io.SEEK_END)
                 file.seek(0)
                 archive.addfile(entry, file)

@@ -1,8 +1,8 @@
 """Folds of a cross-validation: sequential blocks of held-out images, with a guard on both sides.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Accuracy and robustness": 126 images are divided into
-ten sequential blocks, and three images on each side of a block are not used. For N images: min(10, N // 3) blocks and a
-guard of round(3 N / 126) images, at least one image if N >= 12.
+ten sequential blocks. Three images on each side of a block are not used. Here N images give min(10, N // 3) blocks
+and a guard of round(3 N / 126) images on each side; if N >= 12, the guard has at least one image.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GUARD_FROM = 12
 
 @dataclass(frozen=True)
 class Fold:
-    """The held-out images, and the images to fit: all others except the guard. Indices in the order of time."""
+    """The held-out images of a block, and the images to fit: all other images except the guard. Indices in time order."""
 
     held_out: tuple[int, ...]
     fitted: tuple[int, ...]

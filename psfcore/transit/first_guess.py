@@ -6,8 +6,8 @@ homogeneous, all light in the centre of a small dark disc comes from farther tha
     I_o,dc = I_t sum over dr > r_disk of psf(dr),  mean I_o = I_t
     sum over dr > r_disk of psf(dr) = I_o,dc / mean I_o                     Eq. (1)
 
-There are three estimators of the characteristic intensity, mean I_o: the mean of the image, its median, and the mean in
-a shell of 50 px around the disc.
+There are three estimators of the characteristic intensity, mean I_o: the mean of the image, the median of the image, and
+the mean in a ring ("shell") of 50 px around the disc.
 
 | symbol | name | unit |
 |---|---|---|
@@ -16,8 +16,9 @@ a shell of 50 px around the disc.
 | I_o,dc / mean I_o | ratio | 1 |
 | r_disk | radius_px | px |
 
-The paper judges by eye how homogeneous the Sun is. Here it is a number: the range of the three estimators over their
-mean, or the range of the four quadrants of the shell over their mean, whichever is larger.
+The paper judges by eye how homogeneous the Sun is. Here the inhomogeneity is a number. For the three
+estimators, their range (largest minus smallest) is divided by their mean. The same is done for the means in the four
+quadrants of the shell. The larger ratio is the inhomogeneity.
 """
 
 from __future__ import annotations
@@ -35,9 +36,8 @@ from psfcore.transit.transit import Frame, Place, Transit
 
 CENTRE_PX = 2.0
 SHELL_PX = 50.0
-EDGE_PX = (
-    2.0  # departure from the paper: the shell excludes the blurred edge, and ephemeris errors of a pixel
-)
+# Departure from the paper: the shell begins 2 px outside the disc, beyond its blurred edge and ephemeris errors of 1 px.
+EDGE_PX = 2.0
 ESTIMATORS = ("image_mean", "image_median", "shell")
 
 Progress = Callable[[int, int], None]
@@ -46,9 +46,10 @@ Flat = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrameGuess:
-    """One image: intensities in DN/s; characteristic intensity and ratio by estimator, NaN if there is none.
+    """The first guess from one image. Intensities are in DN/s; a value that cannot be computed is NaN.
 
-    inhomogeneity: infinite if the centre of the disc is not in the image, or the Sun behind it is dark.
+    characteristic_dn_s and ratio have one value for each estimator. inhomogeneity: infinite if the centre of the disc is
+    not in the image, or if one of the estimators is not above 0.
     """
 
     file: str
@@ -60,15 +61,15 @@ class FrameGuess:
 
     @property
     def ratio(self) -> dict[str, float]:
-        """The fraction of light from farther than the radius of the disc, by estimator."""
+        """The fraction of light that comes from farther than the radius of the disc, by estimator."""
         return {name: _ratio(self.centre_dn_s, level) for name, level in self.characteristic_dn_s.items()}
 
 
 @dataclass(frozen=True)
 class PointingGuess:
-    """One pointing: mean and standard deviation (scatter) of the ratio over its images, by estimator.
+    """The first guess from one pointing: mean and standard deviation (scatter) of the ratio over its images, by estimator.
 
-    inhomogeneity: the median over its images.
+    inhomogeneity: the median over the images of the pointing.
     """
 
     pointing: int
@@ -80,10 +81,11 @@ class PointingGuess:
 
 @dataclass(frozen=True)
 class FirstGuess:
-    """The first guess from all images, in the order of time, and all pointings.
+    """The first guess from all images, in the order of time, and from all pointings.
 
-    best_pointing: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratio over its
-    images and the three estimators. The ratio is 1 - encircled energy at radius_px, a fraction.
+    best_pointing: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratio over the
+    images of this pointing and the three estimators. radius_px: the mean radius of the disc in these images. The ratio is
+    1 - encircled energy at radius_px, as a fraction.
     """
 
     frames: tuple[FrameGuess, ...]
@@ -94,7 +96,7 @@ class FirstGuess:
     radius_px: float
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; NaN and infinity become null. The key "fov" is the pointing."""
+        """The first guess as JSON values; NaN and infinity become null. The key "fov" is the pointing."""
         return {
             "best_fov": self.best_pointing,
             "share": _number(self.share),
@@ -129,8 +131,9 @@ def first_guess(
 ) -> FirstGuess:
     """The first guess of a transit.
 
-    places: exact places of the occulter, one per frame; None: those of the ephemeris. progress(done, of) is called after
-    each image. Raises DataError "no-first-guess" if no image shows the centre of the occulter in front of the Sun.
+    places: exact positions of the occulter, one per frame; default: the positions from the ephemeris. progress(done, of)
+    is called after each image. Raises DataError "no-first-guess" if no image shows the centre of the occulter in front of
+    the Sun.
     """
     places = [frame.place for frame in transit.frames] if places is None else places
     guesses = []
@@ -143,7 +146,7 @@ def first_guess(
     )
     telling = [p for p in pointings if math.isfinite(p.inhomogeneity)]
     if not telling:
-        message = "expected at least one image with the centre of the occulter in the field, in front of the Sun; got none"
+        message = "expected at least one image with the centre of the occulter in the field, in front of the Sun; got no such image"
         raise DataError("no-first-guess", message)
     best = min(telling, key=lambda guess: guess.inhomogeneity)
     ratios = _finite([r for g in guesses if g.pointing == best.pointing for r in g.ratio.values()])
@@ -185,7 +188,7 @@ def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
 
 
 def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
-    """The pixels out to the edge of the shell (one axis, without filled ones), and their x and y from the centre."""
+    """The pixels of a square around the shell (one axis), without filled pixels; and their x and y from the disc's centre."""
     reach = place.radius_px + EDGE_PX + SHELL_PX + 2
     ny, nx = frame.pixels.shape
     top, bottom = (min(max(int(place.y_px + side * reach), 0), ny) for side in (-1, 1))
@@ -214,7 +217,7 @@ def _ratio(centre_dn_s: float, level_dn_s: float) -> float:
 
 
 def _range_over_mean(values: list[float]) -> float:
-    """The range of the finite values over their mean; infinite if the mean is not above 0."""
+    """The range of the finite values divided by their mean; infinite if the mean is not above 0."""
     known = _finite(values)
     if known.size == 0 or known.mean() <= 0:
         return math.inf

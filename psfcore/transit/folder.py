@@ -1,7 +1,7 @@
 """Read a transit from its folder: transit.json, its images one after the other, and the known part of the PSF.
 
-All headers are read first, so that a missing file or a wrong shape is reported at once, before the pixels, which take
-minutes. Pixels are kept as float32: 126 images of 2048 px take 2.1 GiB.
+All headers are read first, so that a missing file or a wrong shape is reported at once. Reading the pixels takes minutes.
+Pixels are kept as float32: 126 images of 2048 px take 2.1 GiB.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from psfcore.transit.transit import Kernel, Place, Transit, check_reaches_in
 
 KNOWN_PSF_SUM_TOLERANCE = 1e-3
 SMALLEST_KNOWN_PSF_PX = 16
-LARGEST_RADIUS_SHARE = 0.25  # of the smaller side of an image
-_NEGATIVE_TOLERANCE = 1e-6  # of the peak; rounding gives such values below zero
+LARGEST_RADIUS_SHARE = 0.25  # largest radius of an occulter, as a fraction of the smaller side of an image
+_NEGATIVE_TOLERANCE = 1e-6  # fraction of the peak: rounding can make weights negative by this amount
 
 Progress = Callable[[int, int], None]
 KernelSource = Kernel | Callable[[str | None, tuple[int, int]], Kernel]
@@ -46,7 +46,7 @@ def read_transit(
     noise: Noise | None = None,
     saturation_dn: float | None = None,
 ) -> Transit:
-    """The transit in a folder: as ``read_prepared``, without the counts."""
+    """Read the transit in a folder; arguments and errors as in ``read_prepared``, but no counts are returned."""
     return read_prepared(
         folder,
         limits,
@@ -66,17 +66,17 @@ def read_prepared(
     noise: Noise | None = None,
     saturation_dn: float | None = None,
 ) -> tuple[Transit, Prepared]:
-    """The transit in a folder, in DN/s, frames in the order of time; and the counts of saturated and filled pixels.
+    """Read the transit in a folder, in DN/s, with frames in time order; also return the counts of saturated and filled pixels.
 
     progress(done, of) is called after each image. diffraction: weights [y, x], or a function of (name of the instrument
-    or None, shape of the images) that makes them; used if transit.json has no known_psf. noise: replaces that of
-    transit.json. saturation_dn: level in DN of one exposure, in addition to those of the headers; None: the
-    instrument's level for the gain mode of the image, if known. Times come from DATE-BEG or DATE-OBS. If one image has
-    neither, the order of transit.json is used, with one second between images.
+    or None, shape of the images) that returns them; used if transit.json has no known_psf. noise: replaces the noise
+    figures of transit.json. saturation_dn: saturation level of one exposure in DN, used in addition to the levels in the
+    headers; default: the instrument's level for the gain mode of the image, if it is known. Times come from DATE-BEG or
+    DATE-OBS. If one image has neither, all images keep the order of transit.json, with one second between them.
 
     Raises DataError: "no-manifest", "bad-manifest", "missing-file", "transit-shapes", "occulter-outside",
     "occulter-too-large", "no-noise-figures", "no-known-psf", "known-psf-..." (see ``checked_kernel``), the errors of
-    ``read_image`` with the name of the file, the errors of ``prepare``; HeaderError for faults of a header.
+    ``read_image`` with the name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -116,7 +116,7 @@ def read_prepared(
 
 @dataclass(frozen=True)
 class _Look:
-    """What is known about an image before its pixels are read."""
+    """The facts about an image that are known before its pixels are read."""
 
     entry: ImageEntry
     time_s: float
@@ -179,7 +179,7 @@ def _check_frames(images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]
 
 
 def _times_s(headers: Sequence[HeaderSummary]) -> list[float]:
-    """Start of each image, s after the first; the index of each image if one of them has no readable date."""
+    """Start of each image in seconds after the first image; if one image has no readable date, the index of each image."""
     starts = [_instant(header.date_obs) for header in headers]
     known = [start for start in starts if start is not None]
     if len(known) < len(starts):
@@ -189,7 +189,7 @@ def _times_s(headers: Sequence[HeaderSummary]) -> list[float]:
 
 
 def _instant(text: str | None) -> datetime | None:
-    """A date of a header, in UTC unless it has another time zone."""
+    """A date of a header as an instant; without a time zone it is UTC. None if it cannot be read."""
     if text is None:
         return None
     try:
@@ -200,7 +200,7 @@ def _instant(text: str | None) -> datetime | None:
 
 
 def _level_dn(header: HeaderSummary, saturation_dn: float | None) -> float | None:
-    """The saturation level of one exposure in DN: the given one, or the instrument's for the gain mode of the image."""
+    """The saturation level of one exposure in DN: the given level, or the instrument's level for the image's gain mode."""
     if saturation_dn is not None or header.gain_mode is None or header.instrument not in instrument_names():
         return saturation_dn
     return saturation_for(_instrument(header.instrument), Header({"GAINCOMB": header.gain_mode}))
@@ -252,7 +252,7 @@ def _known_psf(
 def checked_kernel(kernel: Kernel, label: str) -> Kernel:
     """Check the known part of a PSF [y, x], centre at [ny // 2, nx // 2], and normalise it to sum 1.
 
-    A sum that differs from 1 by at most KNOWN_PSF_SUM_TOLERANCE counts as rounding. label: its name in errors.
+    A sum that differs from 1 by at most KNOWN_PSF_SUM_TOLERANCE counts as rounding. label: the name of the PSF in errors.
     Raises DataError "known-psf-small", "known-psf-nonfinite", "known-psf-negative", "known-psf-sum",
     "known-psf-not-centred".
     """

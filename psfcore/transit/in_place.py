@@ -1,6 +1,6 @@
-"""A transit in a folder, read where it is: checked and identified as if it were packed, but nothing is written.
+"""A transit in a folder that is not packed first. It is checked and identified like its archive; nothing is written.
 
-Standard library and the manifest only, as ``psfcore.transit.archive``.
+This module imports no numerical library, so that the web process can use it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")
 
 @dataclass(frozen=True)
 class FolderTransit:
-    """A folder with a transit. sha256, bytes: of the .tar file that ``pack`` would write."""
+    """A folder with a transit. sha256, bytes: hash and size of the .tar file that ``pack`` would write."""
 
     folder: Path
     sha256: str
@@ -28,7 +28,7 @@ class FolderTransit:
 
 
 class _Digest:
-    """A file to write to that keeps nothing but the SHA-256 and the number of bytes."""
+    """A file object for writing. It keeps only the SHA-256 and the number of the bytes that are written to it."""
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256()

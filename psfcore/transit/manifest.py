@@ -1,7 +1,7 @@
-"""transit.json: the files of a transit, and the place of the occulter in each image according to the ephemeris.
+"""transit.json: the files of a transit, and the position of the occulter in each image according to the ephemeris.
 
-This module loads no numerics, so that the web process can check an upload. Unknown keys are ignored, so that files of a
-newer version can be read.
+This module imports no numerical library, so that the web process can check an upload. Unknown keys are ignored, so that
+files of a newer version can be read.
 
 | key | meaning | unit |
 |---|---|---|
@@ -55,7 +55,7 @@ def _printable(text: str) -> str:
 
 
 FileName = Annotated[str, AfterValidator(_plain)]
-# Strict: neither "12.5" nor true is accepted as a number.
+# strict: the values "12.5" (a string) and true are not accepted as numbers.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Coordinate = Annotated[Number, Field(ge=-FARTHEST_PX, le=FARTHEST_PX)]
 
@@ -65,13 +65,13 @@ class _Frozen(BaseModel):
 
 
 class _Noise(NoiseFigures):
-    """As in a request, but unknown keys of transit.json are ignored."""
+    """The noise figures, as in a request; but unknown keys are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
 
 class ImageEntry(_Frozen):
-    """One image of a transit: its file, its pointing, and the place and radius of the occulter, px."""
+    """One image of a transit: its file, its pointing, and the centre and radius of the occulter, px."""
 
     file: FileName
     pointing: Annotated[int, Field(strict=True, ge=0, le=10_000, alias="fov")]
@@ -81,7 +81,7 @@ class ImageEntry(_Frozen):
 
 
 class TransitManifest(_Frozen):
-    """The content of transit.json; the images are in its order."""
+    """The content of transit.json; the images keep the order of the file."""
 
     schema_: Literal["transit/1"] = Field(alias="schema")
     instrument: Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_printable)] | None = None
@@ -121,9 +121,15 @@ def read_manifest(folder: str | Path) -> TransitManifest:
 def parse_manifest(content: bytes) -> TransitManifest:
     """A manifest from the bytes of transit.json.
 
-    Raises DataError "bad-manifest" for JSON that cannot be read, a wrong schema, missing or wrong values, no image or
-    more than MAX_IMAGES, a name that is not a plain file name or occurs twice, noise figures that are both zero. The
-    message says what was expected and what came, and names the image by index and file.
+    Raises DataError "bad-manifest":
+
+    - if the JSON cannot be read, or the schema is wrong;
+    - if values are missing or wrong;
+    - if there is no image, or more than MAX_IMAGES images;
+    - if a file name is not plain or occurs twice;
+    - if both noise figures are zero.
+
+    The message names the key (an image by its index and file), the expected value and the given value.
     """
     if len(content) > MAX_MANIFEST_BYTES:
         raise _bad(f"expected at most {MAX_MANIFEST_BYTES} bytes; got more")
@@ -155,7 +161,7 @@ def _check_once(manifest: TransitManifest) -> None:
             raise _bad(f"images[{index}] ({image.file}): {message}")
         if image.file in (MANIFEST_NAME, manifest.known_psf):
             raise _bad(
-                f"images[{index}] ({image.file}): expected the file of an image; got that of the {_role(manifest, image)}"
+                f"images[{index}] ({image.file}): expected the file of an image; got the file of the {_role(manifest, image)}"
             )
         seen[image.file] = index
     if manifest.known_psf == MANIFEST_NAME:
@@ -179,7 +185,7 @@ def _first_problem(error: ValidationError, data: dict[str, Any]) -> str:
 
 
 def _where(location: tuple[int | str, ...], data: dict[str, Any]) -> str:
-    """A place in transit.json for a message; an image is named by its index and file."""
+    """The path of a value in transit.json, for a message; an image is named by its index and file."""
     match location:
         case ("images", int() as index, *rest):
             entry = data["images"][index]

@@ -1,10 +1,10 @@
 """The members of a .zip, .tar or .tar.gz, read one after the other by ``zipfile`` and ``tarfile``.
 
-An archive may lie in every field. The gate checks each member before its bytes are read, and unpacked bytes are
-counted as they are read. The two libraries limit neither memory nor time by themselves; where they need a bound,
-they get a file object that enforces it (``_BoundedFile``, ``_TarInput``).
+No field of an archive can be trusted: an attacker may have written it. The gate checks each member before its bytes are
+read, and unpacked bytes are counted as they are read. The two libraries do not limit the memory and the time that they
+use. This module gives them file objects that enforce limits (``_BoundedFile``, ``_TarInput``).
 
-Standard library only, so that the web process can list an upload.
+This module imports no numerical library, so that the web process can list an upload.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from psfcore.errors import DataError
 from psfcore.transit.admission import ArchiveLimits, Gate, not_plain, shown
 
 Kind = Literal["zip", "tar", "tar.gz"]
-START_BYTES = 262  # bytes at the start of a file that suffice to tell its kind
+START_BYTES = 262  # number of bytes at the start of a file that identify its kind
 _CHUNK = 1 << 20
 _TAR_MAGIC = b"ustar"
 _TAR_MAGIC_AT = 257
-_MAX_HEADER_BYTES = 1 << 16  # of all headers of one member: pax records, GNU long names
+_MAX_HEADER_BYTES = 1 << 16  # limit for all headers of one member together: pax records, GNU long names
 _MAX_GLOBAL_RECORDS = 64
 _PAX_TYPES = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
 _PAX_RECORD = re.compile(rb"([1-9]\d{0,5}) [^=\n]+=")
 _MANY_DIGITS = re.compile(rb"\d{65}")
 _ZIP_ENTRY = b"PK\1\2"
-_DIRECTORY_BYTES_PER_MEMBER = 512  # in a zip's central directory; a generous mean
+_DIRECTORY_BYTES_PER_MEMBER = 512  # generous mean size of an entry in the central directory of a zip
 _ZIP_ENCRYPTED = 0x1 | 0x40 | 0x2000
 _ZIP_METHODS = {zipfile.ZIP_STORED: "stored", zipfile.ZIP_DEFLATED: "deflated"}
 # The exceptions that a damaged archive raises, depending on where the damage is.
@@ -57,7 +57,7 @@ _DAMAGE = (
 
 
 def could_be_archive(start: bytes) -> bool:
-    """False as soon as the first bytes of a file (any number of them) rule out every kind."""
+    """False if the first bytes of a file rule out every kind of archive. `start` may have any length."""
     if _starts_like(start, b"PK\x03\x04") or _starts_like(start, b"PK\x05\x06"):
         return True
     if _starts_like(start, b"\x1f\x8b"):
@@ -66,7 +66,7 @@ def could_be_archive(start: bytes) -> bool:
 
 
 def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
-    """The kind of a file by its first START_BYTES, or None. ``opened`` checks what a gzip file contains."""
+    """The kind of a file from its first START_BYTES, or None. ``opened`` checks that a gzip file contains a tar."""
     if start.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return "zip"
     if start.startswith(b"\x1f\x8b"):
@@ -75,19 +75,19 @@ def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
 
 
 def _starts_like(start: bytes, known: bytes) -> bool:
-    """True if one of the two is the beginning of the other."""
+    """True if `start` begins with `known`, or `known` with `start`."""
     return start.startswith(known) or known.startswith(start)
 
 
 class Member:
-    """A file in an archive. gate: counts the unpacked bytes, unless the archive's input counts them."""
+    """A file in an archive. gate: counts the unpacked bytes; None if the input of the archive counts them already."""
 
     def __init__(self, name: str, size_bytes: int, stream: IO[bytes], gate: Gate | None = None) -> None:
         self.name, self.size_bytes = name, size_bytes
         self._stream, self._gate, self._read = stream, gate, 0
 
     def read(self, count: int) -> bytes:
-        """The next bytes, b"" at the end. Raises DataError "archive-broken", "archive-too-large"."""
+        """Read the next bytes; b"" at the end. Raises DataError "archive-broken", "archive-too-large"."""
         got = self._stream.read(count)  # zipfile checks the CRC at the end
         self._read += len(got)
         if self._gate is not None:
@@ -104,16 +104,16 @@ class OpenArchive(Protocol):
     kind: Kind
 
     def members(self) -> Iterator[Member]:
-        """The accepted members; each must be read before the next is asked for."""
+        """The accepted members. Each member must be read before the next member is requested."""
         ...
 
 
 @contextmanager
 def opened(path: Path, limits: ArchiveLimits) -> Iterator[OpenArchive]:
-    """Open an archive. Errors that damage causes, here or in the with block, become "archive-broken".
+    """Open an archive. An error from a damaged archive, here or in the with block, becomes DataError "archive-broken".
 
     Raises DataError "not-an-archive", "archive-climbs", "archive-not-plain", "archive-too-large", "archive-broken".
-    Passes on OSError of the disk.
+    An OSError of the disk is raised unchanged.
     """
     with path.open("rb") as file:
         kind = archive_kind(file.read(START_BYTES))
@@ -152,10 +152,10 @@ def _truncated() -> DataError:
 
 
 class _BoundedFile:
-    """The file that ``zipfile`` reads; a single read is never larger than the largest central directory allowed.
+    """The file that ``zipfile`` reads. A single read is limited to the size of the largest allowed central directory.
 
-    zipfile reads the central directory at once and makes an object for each entry. The entries are counted
-    here, by their signature, before zipfile makes those objects.
+    zipfile reads the whole central directory in one read and makes an object for each entry. This class counts the
+    entries by their signature before zipfile makes the objects.
     """
 
     def __init__(self, file: BinaryIO, gate: Gate) -> None:
@@ -190,7 +190,7 @@ class _Zip:
         self._archive, self._gate = archive, gate
 
     def members(self) -> Iterator[Member]:
-        """All entries are checked before the first is read."""
+        """Yield the accepted members; all entries are checked before the first member is read."""
         entries = self._archive.infolist()
         self._gate.count_members(len(entries))
         admitted = [(info, name) for info in entries if (name := self._admit(info)) is not None]
@@ -215,7 +215,7 @@ class _Zip:
             raise not_plain(
                 info.orig_filename, f"expected {wanted} files, not compression method {info.compress_type}"
             )
-        # Deflate adds at most five bytes per block. A larger compressed size means that the declared size is wrong.
+        # Deflate adds at most five bytes per block. If the compressed size is far larger, the declared size is wrong.
         if info.compress_size > 2 * info.file_size + 1024:
             got = f"{info.compress_size} compressed bytes for a declared size of {info.file_size} bytes"
             message = f"{shown(info.orig_filename)}: expected sizes that agree; got {got}"
@@ -227,14 +227,14 @@ class _Zip:
 
 
 class _TarInput:
-    """The file that ``tarfile`` reads: forward only, every byte counted, headers bounded.
+    """The file that ``tarfile`` reads. It is read only forward, every byte is counted, and the size of headers is limited.
 
-    tarfile believes the sizes in headers: it reads a pax header or a GNU long name of any size at once, follows any
-    number of them by recursion, and collects the maps of sparse files without a limit. Here the headers of one member
-    may take _MAX_HEADER_BYTES in all, which bounds each of these. A step back would inflate a .tar.gz again from its
-    start; tarfile needs none as long as members are read in order.
+    tarfile trusts the sizes in headers. It reads a pax header or a GNU long name of any size in one read. It follows any
+    number of such headers by recursion, and it collects the maps of sparse files without a limit. Here all headers of
+    one member together may have at most _MAX_HEADER_BYTES, which limits all three. Seeking backwards is refused, because a
+    .tar.gz would be decompressed again from its start. tarfile does not seek backwards if members are read in order.
 
-    size: of a file in which data can be skipped by seeking; None: skipped data is read, and counted too.
+    size: the size of a file in which data can be skipped by seeking. None: skipped data is read, and counted too.
     """
 
     def __init__(self, file: BinaryIO, gate: Gate, size: int | None = None) -> None:
@@ -244,11 +244,11 @@ class _TarInput:
         self.pax_text_is_next = False
 
     def expect_headers(self) -> None:
-        """From here to ``expect_data`` only headers are read."""
+        """Announce that only headers are read until ``expect_data`` is called."""
         self._header_bytes_left = _MAX_HEADER_BYTES
 
     def expect_data(self) -> None:
-        """From here the data of a member are read."""
+        """Announce that the data of a member are read next."""
         self._header_bytes_left = None
 
     def tell(self) -> int:
@@ -256,7 +256,7 @@ class _TarInput:
 
     def seek(self, offset: int) -> int:
         if offset < self._at:
-            raise ValueError("a member that starts before the end of the one before")
+            raise ValueError("a member that starts before the end of the previous member")
         if self._size is not None:
             if offset > self._size:
                 raise _truncated()
@@ -288,7 +288,8 @@ class _TarInput:
 def _check_pax_records(text: bytes) -> None:
     """Raise DataError "archive-broken" unless a pax header consists of records "length key=value\\n".
 
-    On other text tarfile's regular expressions take quadratic time and memory (long runs of digits: CVE-2024-6232).
+    On some other texts, such as long runs of digits, the regular expressions of tarfile need quadratic time and memory
+    (CVE-2024-6232).
     """
     at = 0
     while at < len(text) and text[at] != 0:
@@ -302,15 +303,17 @@ def _check_pax_records(text: bytes) -> None:
 
 
 def _checked_headers(source: _TarInput, gate: Gate) -> type[tarfile.TarInfo]:
-    """A TarInfo whose ``frombuf``, which tarfile calls for every header block, checks the block first."""
+    """A TarInfo class that checks every header block: tarfile calls its ``frombuf`` for each block."""
 
     class Header(tarfile.TarInfo):
         @classmethod
         def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
             if len(buf) < tarfile.BLOCKSIZE:
-                raise _truncated()  # tarfile would take this, and a damaged header, as the end of the archive
+                # tarfile would accept an incomplete or damaged header as the end of the archive.
+                raise _truncated()
             if not any(buf):
-                return super().frombuf(buf, encoding, errors)  # raises what ends the archive
+                # An empty block ends the archive: tarfile raises the exception that it expects at the end.
+                return super().frombuf(buf, encoding, errors)
             gate.count_members()
             try:
                 header = super().frombuf(buf, encoding, errors)
@@ -329,7 +332,7 @@ class _Tar:
         self.kind, self._source, self._gate = kind, source, gate
 
     def members(self) -> Iterator[Member]:
-        with tarfile.TarFile(  # reads the first header
+        with tarfile.TarFile(  # the constructor reads the first header
             fileobj=cast(IO[bytes], self._source),
             tarinfo=_checked_headers(self._source, self._gate),
             encoding="utf-8",
@@ -341,11 +344,12 @@ class _Tar:
                 self._source.expect_data()
                 if info is None:
                     return
-                if len(archive.pax_headers) > _MAX_GLOBAL_RECORDS:  # each member gets a copy of them
+                # Each member gets a copy of the global records.
+                if len(archive.pax_headers) > _MAX_GLOBAL_RECORDS:
                     message = f"expected at most {_MAX_GLOBAL_RECORDS} global pax records; got more"
                     raise DataError("archive-broken", message)
                 name = self._admit(info)
-                info.pax_headers = {}  # tarfile keeps each TarInfo
+                info.pax_headers = {}  # to save memory, because tarfile keeps each TarInfo
                 stream = None if name is None else archive.extractfile(info)
                 if name is not None and stream is not None:
                     with stream:

@@ -1,24 +1,26 @@
-"""The place of the occulter, found by simulating the occulter in front of the scene that other images show.
+"""The position of the occulter, found by simulating the occulter in front of the scene that other images show.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", step (e). The scene behind
-the occulter of frame i is taken from the frames of the same pointing that are nearest in time and show it unocculted.
-A disc is removed from it, and the result is convolved with the PSF:
+the occulter of frame i comes from its neighbours: frames of the same pointing, nearest in time, that show this scene.
+The light that a disc hides in this scene is convolved with the PSF and subtracted:
 
-    m = scale Q + level - H (P c)                         Eq. (1)
-    chi2 = sum (y - m)^2 / var + ((x - x0)^2 + (y - y0)^2) / s^2   Eq. (2)
+    m = scale Q + level - H (P c)                                                                   Eq. (1)
+    chi2 = sum (y - m)^2 / var + ((x - x0)^2 + (y - y0)^2) / s^2 + (scale - 1)^2 / t^2              Eq. (2)
 
-Q is the mean of these neighbours as observed, P that of their deconvolved scenes, c the share of a pixel that the disc
-covers, H the convolution with the PSF near its centre. Scale and level are free. They absorb smooth differences around
-the disc (light that the occulters of the neighbours hide, another gain), so that these do not shift the place.
+Q is the mean of the observed images of the neighbours, and P the mean of their deconvolved scenes. c is the share of a
+pixel that the disc covers, and H the convolution with the PSF on the patch. (x, y) is the centre of the disc, (x0, y0)
+the centre from the ephemeris. Scale and level are fitted too, so that smooth differences around the disc do not shift
+the position. Such differences come, for example, from another gain, or from light that the neighbours' occulters hide.
 The paper moves the disc until the simulation looks best; here Gauss-Newton steps minimise Eq. (2).
 
-If no neighbour shows the scene, the mean of a ring around the disc in the frame itself replaces it.
+If no neighbour shows the scene, Q and P are the mean of a ring around the disc in the frame itself.
 
 | symbol | name | unit |
 |---|---|---|
-| y, var | observed, variance: patch around the place of the ephemeris | DN/s, (DN/s)^2 |
+| y, var (in the sum) | observed, variance: patch around the position from the ephemeris | DN/s, (DN/s)^2 |
 | c | coverage | - |
 | s | ephemeris_sigma_px | px |
+| t | SCALE_SIGMA | - |
 """
 
 from __future__ import annotations
@@ -40,10 +42,10 @@ Window = tuple[slice, slice]
 
 EPHEMERIS_SIGMA_PX = 1.0
 LEAST_NEIGHBOURS = 4  # their mean adds a quarter to the variance of the frame; the paper's two add half
-ENOUGH_PHOTONS = 300.0  # per pixel, in all neighbours together: faint places need more neighbours
-LARGEST_TEMPLATE_NOISE = (
-    0.3  # of the mean; noisier templates are smoothed, else the disc would fit their noise
-)
+ENOUGH_PHOTONS = 300.0  # photons per pixel in all neighbours together: a faint scene needs more neighbours
+# The largest noise of a mean scene P, as a fraction of its mean. A noisier P is smoothed; otherwise the disc would be
+# fitted to the noise.
+LARGEST_TEMPLATE_NOISE = 0.3
 LARGEST_SMOOTHING_PX = 8.0
 PATCH_MARGIN_PX = 9
 LARGEST_SHIFT_PX = 5.0
@@ -52,8 +54,8 @@ STEPS = 30
 LEAST_DEPTH = 0.5
 SCALE_SIGMA = 0.02  # the brightness of images of one pointing differs by one or two percent
 DOUBT_SIGMAS = 3.0
-UNDESCRIBED = 4.0  # chi2 per pixel above which the simulation does not describe a patch
-DAMPED_FROM = 6  # steps: in front of a faint scene they may oscillate
+UNDESCRIBED = 4.0  # if chi2 per pixel is larger, the simulation does not describe the patch
+DAMPED_FROM = 6  # after this number of steps, steps are halved: in front of a faint scene they may oscillate
 DECONVOLUTION_NOISE = 2.3  # factor by which a deconvolution increases noise, for a core weight of 0.43
 _STRIPS = 32
 _DIFFERENCE_PX = 0.05
@@ -61,11 +63,12 @@ _DIFFERENCE_PX = 0.05
 
 @dataclass(frozen=True)
 class FoundPlace:
-    """The place of an occulter with its errors (px, each axis), and how it was found.
+    """The position of an occulter with its errors (px, each axis), and how it was found.
 
-    The errors from the patch are multiplied by sqrt(chi2_per_pixel) if that is above 1. neighbours: number of frames
-    that show the scene behind the occulter; 0: the surroundings of the disc were used. depth: the missing light over the
-    light that a disc would hide, 1 for an occulter and 0 without one, with its error.
+    The errors from the patch are multiplied by sqrt(chi2_per_pixel) if this factor is above 1. neighbours: number of
+    frames that show the scene behind the occulter; 0 if the ring around the disc was used. settled: whether the steps
+    converged. depth: the missing light divided by the light that a disc would hide; 1 with an occulter, 0 without an
+    occulter. depth_sigma: the error of depth. within_reach: whether the position is near enough to the ephemeris.
     """
 
     place: Place
@@ -83,15 +86,16 @@ class FoundPlace:
     def seen(self) -> bool:
         """Whether an occulter may be there.
 
-        False if, by more than DOUBT_SIGMAS, too little light is missing; if the search reached LARGEST_SHIFT_PX; or if
-        a patch that the simulation does not describe put the place more than DOUBT_SIGMAS from the ephemeris.
+        It is False in three cases: depth is below LEAST_DEPTH by more than DOUBT_SIGMAS standard errors; the search ended
+        at its limit LARGEST_SHIFT_PX; or the simulation does not describe the patch and the position differs from the
+        ephemeris by more than DOUBT_SIGMAS standard errors of the ephemeris.
         """
         return self.within_reach and self.depth + DOUBT_SIGMAS * self.depth_sigma >= LEAST_DEPTH
 
 
 def coverage(shape: tuple[int, int], place: Place) -> Plane:
     """The share of each pixel [y, x] that a disc covers, 0 to 1: exact chords in x, averaged over strips in y."""
-    rows, columns = patch_window(shape, place, 1.0)  # outside it no pixel is covered
+    rows, columns = patch_window(shape, place, 1.0)  # no pixel outside this window is covered
     strip = (np.arange(rows.start * _STRIPS, rows.stop * _STRIPS) + 0.5) / _STRIPS - 0.5
     half = np.sqrt(np.maximum(place.radius_px**2 - (strip - place.y_px) ** 2, 0.0))
     left = np.arange(columns.start, columns.stop)[None, :] - 0.5
@@ -111,7 +115,7 @@ def fully_dark(shape: tuple[int, int], place: Place, margin_px: float = 0.0) -> 
 
 
 def disc_distance(shape: tuple[int, int], place: Place) -> Plane:
-    """The distance of the centre of each pixel [y, x] from that of the occulter, px."""
+    """The distance of the centre of each pixel [y, x] from the centre of the occulter, px."""
     y = np.arange(shape[0]) - place.y_px
     x = np.arange(shape[1]) - place.x_px
     return np.asarray(np.hypot(y[:, None], x[None, :]))
@@ -130,7 +134,8 @@ def patch_window(shape: tuple[int, int], place: Place, margin_px: float = PATCH_
 def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], noise: Noise) -> list[int]:
     """The frames of the same pointing, nearest in time, whose occulters do not overlap the patch of this one.
 
-    Four, or more until a pixel has ENOUGH_PHOTONS in all of them together.
+    At least LEAST_NEIGHBOURS such frames are chosen, if the transit has enough. More are chosen until all of them together
+    have ENOUGH_PHOTONS photons per pixel.
     """
     here, frame = places[index], frames[index]
     reach = here.radius_px + PATCH_MARGIN_PX
@@ -149,7 +154,7 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
         if len(chosen) >= LEAST_NEIGHBOURS and photons >= ENOUGH_PHOTONS:
             break
         level = float(frames[k].pixels[window].mean(dtype=np.float64))
-        # The square of signal over noise: the number of photons, reduced by the read noise.
+        # The square of signal / noise: the number of photons, reduced because of the read noise.
         photons += level**2 / float(noise.variance(np.array(max(level, 0.0)), frames[k].exposure_s))
         chosen.append(k)
     return chosen
@@ -165,10 +170,10 @@ def find_occulter(
     *,
     ephemeris_sigma_px: float = EPHEMERIS_SIGMA_PX,
 ) -> FoundPlace:
-    """The place of the occulter in frame `index`.
+    """Find the position of the occulter in frame `index`.
 
-    scenes: deconvolved frames [y, x], DN/s. places: the best known places in all frames; they decide which frames are
-    neighbours. psf_kernel: weights [y, x], centre at [n // 2, n // 2].
+    scenes: deconvolved frames [y, x], DN/s. places: the best known positions of the occulter in all frames; they decide
+    which frames are neighbours. psf_kernel: weights [y, x], centre at [n // 2, n // 2].
     """
     frame, start = frames[index], frames[index].place
     window = patch_window(frame.pixels.shape, start)
@@ -201,7 +206,7 @@ def find_occulter(
     sigma = np.sqrt(np.diag(scaled_inverse(solved.normal)))
     chi2_per_pixel = solved.chi2 / observed.size
     described = chi2_per_pixel < UNDESCRIBED
-    # A patch that the simulation does not describe can move the place anywhere: then only a place near the ephemeris counts.
+    # If the simulation does not describe the patch, the position may be wrong. Then it must be near the ephemeris.
     reach_px = LARGEST_SHIFT_PX - 1e-6 if described else DOUBT_SIGMAS * ephemeris_sigma_px
     return FoundPlace(
         place=place,
@@ -229,7 +234,7 @@ def _shares(
 
 
 class _SimulatedDisc:
-    """Eq. (1) on a patch."""
+    """The simulation of Eq. (1) on a patch."""
 
     def __init__(self, seen: Plane, behind: Plane, psf_kernel: Plane) -> None:
         self.seen, self.behind = seen, behind
@@ -244,7 +249,7 @@ class _SimulatedDisc:
 
 @dataclass(frozen=True)
 class _Solved:
-    """The minimum of Eq. (2). normal: the inverse covariance of x, y, scale and level."""
+    """The minimum of Eq. (2). at: x, y, scale and level. normal: the inverse covariance of these four."""
 
     at: NDArray[np.float64]
     normal: NDArray[np.float64]
@@ -262,10 +267,10 @@ def _solve(
     start: Place,
     sigma_px: float,
 ) -> _Solved:
-    """Gauss-Newton on Eq. (2). The weights come from the simulation, because observed noise would bias them."""
+    """Minimise Eq. (2) by Gauss-Newton steps. Weights come from the simulation; the observed noise would bias them."""
     at = np.array([start.x_px, start.y_px, 1.0, 0.0])
     origin, radius = at.copy(), start.radius_px
-    # Noise of the neighbours biases a free scale towards 0; the remaining gradient of the scene would then shift the disc.
+    # Noise of the neighbours would bias a free scale towards 0, and the rest of the scene's gradient would shift the disc.
     prior = np.diag([sigma_px**-2, sigma_px**-2, SCALE_SIGMA**-2, 0.0])
     h = _DIFFERENCE_PX
     settled, done = False, 0
@@ -314,9 +319,9 @@ def _solve(
 
 
 def _excess(weight: Plane, misfit: Plane) -> float:
-    """The variance of the misfit over that of the noise, at least 1.
+    """The variance of the misfit divided by the variance of the noise, at least 1.
 
-    It is above 1 if the ring replaces the scene, or if the scene changed.
+    The ratio is above 1 if the ring replaces the scene, or if the scene changed.
     """
     return max(float(np.mean(weight * misfit**2)), 1.0)
 
@@ -330,7 +335,7 @@ def _ring_mean(frame: Frame, place: Place, window: Window) -> float:
 
 
 def _level(plane: Plane) -> Plane:
-    """The expected intensity: smoothed over 3 px, at least a twentieth of the mean."""
+    """The expected intensity: the plane smoothed by a Gaussian with sigma 3 px, at least a twentieth of the mean."""
     return np.asarray(np.maximum(gaussian_filter(plane, 3.0), 0.05 * max(float(plane.mean()), 0.0)))
 
 

@@ -1,18 +1,18 @@
-"""From exposures to frames: all pixels in DN/s, and none without a value.
+"""Makes frames from exposures: all pixels are in DN/s, and every pixel has a value.
 
 Paper (Hofmeister et al.), section "The observations": images are normalised by their exposure time, and saturated
-pixels are replaced by those of the unsaturated image that is nearest in time. Here that image must have the same
-pointing, because the scene moves on the detector with the pointing, and its values are scaled:
+pixels are replaced by the pixels of the unsaturated image that is nearest in time. Here this image must have the same
+pointing, because the scene moves on the detector with the pointing. Its values are scaled:
 
     s = median of I_i / I_j over the bright pixels near the gap, unsaturated in both    Eq. (1)
     I_i(gap) = s I_j(gap)                                                               Eq. (2)
 
 | symbol | name | unit |
 |---|---|---|
-| I_i, I_j | pixels of the frame with the gap, and of the frame from which it is filled | DN/s |
+| I_i, I_j | pixels of the frame with the gap, and of the frame from which the gap is filled | DN/s |
 | s | scale | 1 |
 
-``Frame.filled`` marks the replaced pixels; analyses of the occulter do not use them.
+``Frame.filled`` marks the pixels of all gaps; analyses of the occulter do not use these pixels.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
 from psfcore.transit.transit import Frame, PixelMask, Pixels, Place
 
-NEAR_PX = 16  # the scale is measured on pixels up to this distance from a gap
+NEAR_PX = 16  # the scale s is measured on pixels up to this distance from a gap
 FEWEST_SCALE_PIXELS = 100
-OCCULTER_MARGIN_PX = 5.0  # for the error of the ephemeris and the blurred edge
+OCCULTER_MARGIN_PX = 5.0  # margin around the disc, for the error of the ephemeris and the blurred edge
 NEIGHBOUR_PX = 2  # half width of the window of the local median
 _CHUNK = 65_536
 
@@ -40,10 +40,10 @@ Places = NDArray[np.intp]
 
 @dataclass(eq=False)
 class Exposure:
-    """An image as read, normalised: pixels [y, x] in DN/s, with gaps.
+    """An image as it was read, with gaps: pixels [y, x] in DN/s.
 
-    gaps: True for pixels that are saturated or not finite; None: no such pixel. saturated: the number of saturated
-    pixels. The pixels are changed in place when gaps are filled.
+    gaps: True for pixels that the mask marks (for example saturated pixels) or that are not finite; None if there are
+    none. saturated: the number of saturated pixels. The pixels are changed in place when gaps are filled.
     """
 
     file: str
@@ -59,9 +59,10 @@ class Exposure:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """The numbers of saturated and not finite pixels of one frame, and how they were filled.
+    """The numbers of saturated and of not finite pixels of one frame, and how their values were replaced.
 
-    unfilled: saturated pixels that no frame of the pointing shows; they keep their values.
+    from_frames: pixels with a value from another frame. from_neighbours: pixels with the median of pixels near them.
+    unfilled: saturated pixels that no other frame of the pointing can fill; they keep their values.
     """
 
     file: str
@@ -84,7 +85,7 @@ class Prepared:
         return sum(frame.unfilled for frame in self.frames)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values: the number of frames, and the counts of those with saturated or not finite pixels."""
+        """JSON values: the number of frames, and the counts of the frames that have saturated or not finite pixels."""
         told = [asdict(frame) for frame in self.frames if frame.saturated or frame.nonfinite]
         return {"images": len(self.frames), "unfilled": self.unfilled, "frames": told}
 
@@ -92,7 +93,7 @@ class Prepared:
 def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
     """The pixels [y, x] in DN/s (float32) of an image in DN or DN/s, and its exposure, s.
 
-    Raises DataError "no-exposure", and "unknown-unit" if BUNIT is neither.
+    Raises DataError "no-exposure", and "unknown-unit" if BUNIT is neither DN nor DN/s.
     """
     unit = (image.unit or "").replace(" ", "").lower()
     if unit not in ("dn", "dn/s"):
@@ -100,14 +101,14 @@ def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
     if image.exposure_s is None:
         raise DataError("no-exposure", f"{file}: expected XPOSURE or EXPTIME above 0 s; got neither")
     rate = image.pixels if unit == "dn/s" else image.pixels / image.exposure_s
-    with np.errstate(over="ignore"):  # a value beyond float32 becomes infinite, hence a gap
+    with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite and so a gap
         return rate.astype(np.float32), image.exposure_s
 
 
 def exposure_of(
     image: Image, *, file: str, pointing: int, place: Place, time_s: float, gain_mode: str | None
 ) -> Exposure:
-    """An exposure from an image; its gaps are the pixels that the mask marks or that are not finite.
+    """Make an exposure from an image. Its gaps are the pixels that the mask marks or that are not finite.
 
     Raises the errors of ``to_rate``.
     """
@@ -127,11 +128,11 @@ def exposure_of(
 
 
 def prepare(exposures: Sequence[Exposure]) -> tuple[tuple[Frame, ...], Prepared]:
-    """Frames without gaps, in the given order, and the counts of each.
+    """Return frames without gaps, in the given order, and the counts of each frame.
 
-    A gap is filled from the frame of the same pointing that is nearest in time and has no gap there, then from the next.
-    If no frame can fill it, a saturated pixel keeps its value, and any other pixel gets the median of its neighbours.
-    The pixels of the exposures are changed in place and become those of the frames.
+    A pixel in a gap gets its value from another frame of the same pointing: from the frame nearest in time that has no
+    gap at this pixel. If there is no such frame, a finite (saturated) pixel keeps its value. Any other pixel then gets the
+    median of its neighbours. The pixel arrays of the exposures are changed in place; the frames use the same arrays.
     Raises DataError "all-saturated" if more than half of the pixels of a frame stay saturated.
     """
     done = [(_frame(exposure), counts) for exposure, counts in ((e, _fill(e, exposures)) for e in exposures)]
@@ -185,7 +186,7 @@ def _fill_from_frames(exposure: Exposure, exposures: Sequence[Exposure]) -> Pixe
     assert exposure.gaps is not None
     left = exposure.gaps.copy()
     rows, columns = np.nonzero(left)
-    # Gaps on the occulter stay: another frame shows the Sun there.
+    # Gaps on the occulter are not filled here, because another frame shows the Sun at these pixels.
     off = ~_on_disc(exposure.place, rows, columns)
     rows, columns = rows[off], columns[off]
     for donor in _donors(exposure, exposures):
@@ -208,13 +209,17 @@ def _donors(exposure: Exposure, exposures: Sequence[Exposure]) -> list[Exposure]
 
 
 def _on_disc(place: Place, rows: Places, columns: Places) -> PixelMask:
-    """True for places on the occulter or in a margin around it."""
+    """True for pixels on the occulter or in a margin around the occulter."""
     dy, dx = rows - place.y_px, columns - place.x_px
     return np.asarray(dx * dx + dy * dy <= (place.radius_px + OCCULTER_MARGIN_PX) ** 2)
 
 
 def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> float:
-    """The brightness of the frame over that of the donor, Eq. (1): near the gaps, else in the whole image, else 1."""
+    """The scale s of Eq. (1): the brightness of the frame divided by the brightness of the donor.
+
+    It is measured near the gaps. If there are too few pixels near them, it is measured in the whole image; if there are
+    too few again, it is 1.
+    """
     wanted = np.zeros(exposure.pixels.shape, dtype=bool)
     wanted[here] = True
     known = np.ones_like(wanted)
@@ -234,7 +239,10 @@ def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> 
 
 
 def _fill_from_neighbours(pixels: Pixels, wanted: PixelMask, gaps: PixelMask) -> None:
-    """Fill each wanted pixel with the median of the valid pixels near it, or, if there are none, near the closest one."""
+    """Fill each wanted pixel with the median of the valid pixels near it.
+
+    If there are none, the median is taken near the closest valid pixel.
+    """
     if not wanted.any():
         return
     rows, columns = np.nonzero(wanted)
@@ -248,7 +256,7 @@ def _fill_from_neighbours(pixels: Pixels, wanted: PixelMask, gaps: PixelMask) ->
 
 
 def _local_median(known: Pixels, rows: Places, columns: Places) -> NDArray[np.float32]:
-    """The median of the known (not NaN) pixels in a window around each place; NaN if there are none."""
+    """The median of the known (not NaN) pixels in a window around each given pixel; NaN if there are none."""
     padded = np.pad(known, NEIGHBOUR_PX, constant_values=np.nan)
     side = 2 * NEIGHBOUR_PX + 1
     windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))

@@ -23,7 +23,7 @@ PixelMask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Place:
-    """The place of an occulter: centre and radius, px."""
+    """The position of an occulter: its centre and its radius, px."""
 
     x_px: float
     y_px: float
@@ -31,7 +31,10 @@ class Place:
 
 
 def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
-    """Raise DataError "occulter-outside" if the square around a disc is outside (ny, nx) px; label begins the message."""
+    """Raise DataError "occulter-outside" if the square around a disc lies completely outside an image of (ny, nx) px.
+
+    label: the beginning of the message.
+    """
     ny, nx = shape
     out_x = max(-0.5 - place.x_px, place.x_px - (nx - 0.5))
     out_y = max(-0.5 - place.y_px, place.y_px - (ny - 0.5))
@@ -45,10 +48,11 @@ def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image of a transit: pixels [y, x] in DN/s (float32, finite), and the occulter's place from the ephemeris.
+    """One image of a transit: pixels [y, x] in DN/s (float32, finite), and the occulter's position from the ephemeris.
 
-    time_s: since the start of the first frame. filled: True for pixels [y, x] whose value comes from another frame
-    (saturated) or from neighbours (not finite); an analysis of the occulter must not use them.
+    time_s: seconds since the start of the first frame. filled: True for pixels [y, x] without a valid value of their own.
+    Their values come from another frame or from neighbouring pixels, or they are saturated. An analysis of the occulter
+    must not use these pixels.
     Raises DataError "frame-shape", "frame-nonfinite", "frame-exposure", "occulter-outside".
     """
 
@@ -80,9 +84,10 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Transit:
-    """All frames of a transit, in the order of time and of equal shape; the known part of the PSF; the noise.
+    """All frames of a transit, in time order and of equal shape, with the known part of the PSF and the noise.
 
-    diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1 on its own grid. sha256: of each input file.
+    diffraction: the known part of the PSF, weights [y, x], centre at [n // 2, n // 2], sum 1 on this array. sha256: the
+    SHA-256 of each input file, by name.
     Raises DataError "transit-shapes" if the shapes differ, "transit-empty" if there is no frame.
     """
 

@@ -1,7 +1,7 @@
 """The least-squares fit of Eq. (2) of `measure`: amplitudes, source, angles and spacing.
 
-Amplitudes and source are fitted alternately first, at fixed angles and spacing; then Gauss-Newton steps
-fit everything at once.
+First, amplitudes and source are fitted in turn, at fixed angles and spacing. Then Gauss-Newton steps fit all quantities
+together.
 """
 
 from __future__ import annotations
@@ -23,15 +23,18 @@ from psfcore.flare.arms.orders import (
     select_pixels,
 )
 
-_STEPS = 30  # of Gauss-Newton at most
-_TURNS = 3  # of amplitudes and source, fitted alternately
-_CONVERGED = 1e-3  # of a standard error
-_RANK = 1e-11  # of the largest eigenvalue; smaller ones are taken as 0
+_STEPS = 30  # largest number of Gauss-Newton steps
+_TURNS = 3  # number of fits of the amplitudes; between two of them the source is fitted
+_CONVERGED = 1e-3  # the fit stops if angles and spacing change by less than this fraction of their errors
+_RANK = 1e-11  # eigenvalues below this fraction of the largest eigenvalue are taken as 0
 
 
 @dataclass(frozen=True)
 class FitState:
-    """The fitted quantities: angles (radian) followed by the spacing (px); A_ak; coefficients of S [y, x]."""
+    """The fitted quantities.
+
+    pattern: the angles (radian), then the spacing (px). amplitude: A_ak. source: the coefficients of S [y, x].
+    """
 
     pattern: NDArray[np.float64]
     amplitude: NDArray[np.float64]
@@ -49,10 +52,10 @@ class FitState:
 
 @dataclass(frozen=True)
 class FitResult:
-    """How a fit ended.
+    """The result of a fit, apart from its state.
 
-    error: of pattern and amplitudes; freedom: degrees of freedom; light: the fitted light of each pixel, DN;
-    done, why: the steps done, and why they stopped.
+    error: the standard errors of pattern and amplitudes. freedom: degrees of freedom. light: the fitted light of each
+    pixel, DN. done: the number of steps. why: the reason why the steps stopped.
     """
 
     error: NDArray[np.float64]
@@ -77,9 +80,10 @@ def first_fit(
     """
     arm, k = orders_between(pattern, geometry.radii_px)
     state = FitState(pattern, np.ones(arm.size), source)
-    for _ in range(2):  # first all orders, then the significant ones
+    for _ in range(2):  # first with all orders, then with the significant orders
         orders = select_pixels(difference, usable, sigma, geometry, pattern, arm, k)
-        check_enough_orders(orders.arm, pattern.size - 1)  # near a corner an arm may leave the image at once
+        # If the source is near a corner, an arm may have no order on the image.
+        check_enough_orders(orders.arm, pattern.size - 1)
         state, error = _alternate(orders, geometry, state)
         significant = state.amplitude > ORDER_SIGMA * error
         arm, k = orders.arm[significant], orders.k[significant]
@@ -89,7 +93,7 @@ def first_fit(
 
 
 def iterate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitState, FitResult]:
-    """Gauss-Newton steps in all quantities at once; the first values must be close to the solution."""
+    """Fit all quantities together by Gauss-Newton steps. The values in `state` must be close to the solution."""
     weight = 1 / orders.sigma
     of_pattern = state.pattern.size
     done, why = 0, f"the limit of {_STEPS} steps was reached"
@@ -121,7 +125,7 @@ def iterate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitSta
 
 
 def _alternate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitState, NDArray[np.float64]]:
-    """Fit amplitudes and S in turn at given angles and spacing; return the state and the amplitudes' errors."""
+    """Fit amplitudes and S in turn at given angles and spacing; return the state and the errors of the amplitudes."""
     bases = _bases(orders, geometry, state.pattern)
     weight = 1 / orders.sigma
     target = _without_planes(orders, orders.value * weight)
@@ -140,7 +144,7 @@ def _alternate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[Fit
 
 
 def first_source(geometry: Geometry) -> Plane:
-    """First coefficients of S: a round Gaussian."""
+    """The coefficients of S from which the fit starts: a round Gaussian."""
     knots = np.arange(-geometry.reach, geometry.reach + 1) * KNOT_PX
     line = np.exp(-0.5 * (knots / (0.4 * geometry.half_px)) ** 2)
     return np.outer(line, line)
@@ -148,7 +152,7 @@ def first_source(geometry: Geometry) -> Plane:
 
 @dataclass(frozen=True)
 class _Bases:
-    """Cubic splines and their slopes at the pixels around each order, [order, pixel of the box, coefficient].
+    """The cubic splines and their slopes at the pixels around each order [order, pixel of the box, coefficient].
 
     `index` [order, y, x] is the index of the pixel among the fitted pixels, or -1.
     """
@@ -203,7 +207,7 @@ def _spline_slope(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _light(orders: Orders, bases: _Bases, state: FitState) -> NDArray[np.float64]:
-    """Sum of A S of Eq. (2) at the fitted pixels."""
+    """The sum of A_ak S in Eq. (2) at the fitted pixels."""
     return _added_up(orders, bases, state.amplitude[:, None, None] * bases.stamps(state.source))
 
 
@@ -215,7 +219,7 @@ def _added_up(orders: Orders, bases: _Bases, stamps: NDArray[np.float64]) -> NDA
 
 
 def _columns_of_stamps(orders: Orders, bases: _Bases, stamps: NDArray[np.float64]) -> Plane:
-    """Columns [pixel, order] of the Jacobian: one stamp each."""
+    """Columns [pixel, order] of the Jacobian for the amplitudes: each column is the stamp (S) of one order."""
     columns = np.zeros((orders.value.size, orders.k.size))
     which, y, x = np.nonzero(bases.index >= 0)
     columns[bases.index[which, y, x], which] = stamps[which, y, x]
@@ -225,7 +229,7 @@ def _columns_of_stamps(orders: Orders, bases: _Bases, stamps: NDArray[np.float64
 def _columns_of_source(
     orders: Orders, bases: _Bases, geometry: Geometry, amplitude: NDArray[np.float64]
 ) -> Plane:
-    """Columns of the Jacobian [pixel, coefficient of S on the disc]."""
+    """Columns of the Jacobian for S [pixel, coefficient of S on the disc]."""
     row, column = np.nonzero(geometry.disc)
     columns = np.zeros((orders.value.size, row.size))
     for which, a in enumerate(amplitude):
@@ -252,9 +256,10 @@ def _columns_of_pattern(orders: Orders, bases: _Bases, state: FitState) -> Plane
 
 
 def _without_planes(orders: Orders, weighted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Columns (or one column), already divided by sigma, less their best-fitting planes around each order.
+    """Subtract from each column its best-fitting planes around the orders.
 
-    The planes then need no parameters in the fit: solution and errors stay the same.
+    weighted: the columns, or one column, already divided by sigma. With these columns the fit needs no parameters for
+    the planes, and its solution and errors stay the same.
     """
     rest = weighted.copy()
     for pixels, basis in orders.planes():
@@ -263,10 +268,10 @@ def _without_planes(orders: Orders, weighted: NDArray[np.float64]) -> NDArray[np
 
 
 def _solve(columns: Plane, target: NDArray[np.float64]) -> tuple[NDArray[np.float64], Plane, int]:
-    """Least squares of least norm: solution, covariance and rank. Undetermined combinations stay 0.
+    """Solve the least-squares problem with the smallest norm; return solution, covariance and rank.
 
-    The planes can absorb a constant and slopes of S, and A can absorb a factor of S. These combinations are
-    undetermined, and neither the angles nor the spacing depend on them.
+    Some combinations of parameters are undetermined: the planes can compensate for a constant and for slopes of S, and
+    the amplitudes for a factor of S. These combinations stay 0. Neither the angles nor the spacing depend on them.
     """
     scale = np.sqrt((columns**2).sum(axis=0))
     scale[scale == 0] = 1.0

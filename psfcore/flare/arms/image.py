@@ -22,7 +22,8 @@ def prepared(image: Plane, reference: Plane | None, saturated: Flags | None) -> 
     for name, plane in (("reference", reference), ("saturated", saturated)):
         if plane is not None and plane.shape != image.shape:
             raise DataError(
-                "arms-bad-input", f"expected {name} of the image's shape {image.shape}; got {plane.shape}"
+                "arms-bad-input",
+                f"expected {name} with the shape of the image, {image.shape}; got {plane.shape}",
             )
     difference = np.asarray(image if reference is None else image - reference, dtype=np.float64)
     usable = np.isfinite(difference)
@@ -41,8 +42,8 @@ def source_centre(
 ) -> tuple[tuple[float, float], float]:
     """Return the position (x, y) of the source in px, and the radius of its saturated patch in px.
 
-    Without a given position it is the middle of the patch, or the brightest pixel where nothing is saturated.
-    Raises DataError "arms-bad-input", "no-flare".
+    If no position is given, the middle of the patch is used, or the brightest pixel if no pixel is saturated. In the
+    latter case the radius is 1.5 px. Raises DataError "arms-bad-input", "no-flare".
     """
     radius = float(np.sqrt(patch.sum() / np.pi)) if patch.any() else 1.5
     if given is not None:
@@ -80,13 +81,13 @@ def smooth(plane: Plane, usable: Flags, width_px: float) -> Plane:
 
 
 def expected_light(image: Plane, reference: Plane | None, usable: Flags) -> Plane:
-    """Light whose photon noise is in the difference, DN: of the image, or of image and reference together."""
+    """The light (DN, smoothed) whose photon noise is in the difference: of the image, plus the reference if there is one."""
     counts = image if reference is None else image + reference
     return smooth(np.nan_to_num(counts), usable, 2.0)
 
 
 def pixel_sigma(expected: Plane, noise: tuple[float, float] | None) -> Plane:
-    """Standard error of each pixel, DN; without `noise` it is proportional to the square root of the light."""
+    """The standard error of each pixel, DN. Without `noise` it is the square root of the light, correct up to a factor."""
     gain, read = noise or (1.0, 0.0)
     floor = max(1e-3 * float(np.median(expected)), 1e-12)
     return np.asarray(np.sqrt(gain * np.maximum(expected, floor) + read**2))
@@ -99,7 +100,7 @@ def ring_halo(
     angles_deg: NDArray[np.float64],
     half_px: float,
 ) -> Plane:
-    """Smooth light around the source: the median of each ring away from the arms, interpolated linearly."""
+    """The smooth light around the source: the median of each ring without the arms, interpolated linearly in radius."""
     dy, dx = np.indices(difference.shape, dtype=np.float64)
     dy, dx = dy - centre[1], dx - centre[0]
     away = usable.copy()

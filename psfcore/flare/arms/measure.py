@@ -2,23 +2,24 @@
 
 Hofmeister et al., The point-spread function of HRI_EUV, sections "Solar flare" and "Mesh geometry": the
 diffraction pattern of a flare shows the orientation of the meshes and the spacing of their orders. The core of
-the flare is saturated and its shape is unknown, so the shape S is fitted together with the pattern. Every order
-is narrow, so every order is the same picture S of the source:
+the flare is saturated and its shape is unknown, so the shape S is fitted together with the pattern. The orders
+are narrow, so every order is the same picture S of the source:
 
     r_ak = r_0 + k s e_a,   e_a = (cos t_a, sin t_a),   k = +-1, +-2, ...                            Eq. (1)
     d(r) = sum over a, k of A_ak S(r - r_ak) + plane_ak(r),                                          Eq. (2)
 
-S is a cubic spline on the pixels. The plane is that of the nearest order. Before the fit, the median of each ring
-away from the arms is subtracted. Weighted least squares (Gauss-Newton) fits all quantities at once except r_0: an
-error of r_0 shifts S and nothing else. The errors of t and s come from the normal equations with all other
-quantities free, times the square root of the reduced chi^2. S must be blurred over at least one pixel, as in real
-images: where each order of a point source fills one pixel, the fit would only find the pixel centres.
+S is a cubic spline on the pixels. Each order has its own plane, on the pixels that are nearest to this order. Before the
+fit, the smooth light around the source is subtracted: the median of each ring without the arms. Weighted least squares
+(Gauss-Newton) fits all quantities together except r_0, because an error of r_0 only shifts S. The errors of t and s come
+from the normal equations with all other quantities free; they are multiplied by the square root of the reduced chi^2.
+S must be at least one pixel wide, as in real images. If each order of a point source filled a single pixel, the fit
+would only find the centres of pixels.
 
-`search` finds the first values, `image` prepares the data, `orders` and `fit` hold Eq. (1) and Eq. (2).
+`search` finds the first values, `image` prepares the data, `orders` implements Eq. (1) and `fit` implements Eq. (2).
 
 | symbol | name | unit |
 |---|---|---|
-| d | difference: image, less the reference if there is one | DN |
+| d | difference: image minus the reference, if there is one | DN |
 | r_0 | centre_xy | px |
 | t_a | angles_deg, from +x towards +y, -90 to 90: an arm is a line through the centre | degrees |
 | s | spacing_px | px |
@@ -49,13 +50,13 @@ from psfcore.flare.arms.search import search_arms
 SMALLEST_SPACING_PX = 4.0
 LARGEST_SPACING_PX = 40.0
 _LARGEST_SEARCH_PX = 300.0
-_NEAR_PX = 100.0  # the first fit uses orders within this radius,
-_NEAR_ORDERS = 6  # or at least so many orders of each arm
+_NEAR_PX = 100.0  # the first fit uses the orders within this radius
+_NEAR_ORDERS = 6  # the first fit uses at least this number of orders on each side of an arm
 
 
 @dataclass(frozen=True)
 class Peak:
-    """One diffraction order: index of its arm, its order k, fitted position (px), amplitude over its error."""
+    """One diffraction order: index of its arm, order k, fitted position (px). significance: amplitude / error."""
 
     arm: int
     order: int
@@ -68,9 +69,9 @@ class Peak:
 class ArmMeasurement:
     """Directions of the arms and spacing of the orders, with 1-sigma errors.
 
-    angles_deg: ascending, within -90 to 90. spacing_px: common to all arms. chi2: of the fitted pixels;
-    degrees_of_freedom: their number less that of the fitted quantities. source [y, x]: S around the centre;
-    model [y, x]: the fitted image; fitted [y, x]: True where it was fitted.
+    angles_deg: ascending, within -90 to 90. spacing_px: the same for all arms. chi2: the sum over the fitted pixels.
+    degrees_of_freedom: the number of fitted pixels minus the number of fitted quantities. source [y, x]: the
+    coefficients of S. model [y, x]: the fitted image. fitted [y, x]: True for the fitted pixels.
     """
 
     angles_deg: tuple[float, ...]
@@ -89,11 +90,11 @@ class ArmMeasurement:
 
     @property
     def reduced_chi2(self) -> float:
-        """chi^2 over degrees of freedom; its square root scales the errors."""
+        """chi^2 divided by the degrees of freedom. The errors are multiplied by its square root."""
         return self.chi2 / self.degrees_of_freedom
 
 
-# The matrices are so small that threads cost several times more than they save.
+# The matrices are so small that threads cost several times more time than they save.
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def measure_arms(
     image: Plane,
@@ -108,20 +109,21 @@ def measure_arms(
     source_radius_px: float | None = None,
     reach_px: float | None = None,
 ) -> ArmMeasurement:
-    """Measure `n_arms` arms around a flare in `image` [y, x] (DN), or in image less `reference`.
+    """Measure `n_arms` arms around a flare in `image` [y, x] (DN), or in `image` minus `reference`.
 
-    centre_xy: the source; default: the middle of the largest saturated patch, else the brightest pixel.
+    centre_xy: position of the source; default: the middle of the largest saturated patch, else the brightest pixel.
     noise: (DN per photon, rms of the read noise in DN); default: estimated from the residuals.
     saturated: True where pixels must not be used; pixels that are not finite are never used.
-    angles_near_deg: search one arm within 3 degrees of each. spacing_range_px: search only there.
-    source_radius_px: half size of S; default: from the saturated patch. reach_px: largest radius of an order.
+    angles_near_deg: one arm is searched within 3 degrees of each of these angles. spacing_range_px: the smallest and
+    the largest spacing that are searched.
+    source_radius_px: half size of S; default: from the saturated patch. reach_px: largest radius at which orders are used.
 
     Raises DataError "arms-bad-input", "all-masked", "no-flare", "too-few-peaks".
     """
     difference, usable, patch = prepared(image, reference, saturated)
     centre, patch_radius = source_centre(difference, usable, patch, centre_xy)
     half = source_radius_px or float(np.clip(patch_radius + 2.0, 3.0, 8.0))
-    inner = 2 * (patch_radius + half)  # closer in, a plane does not describe the halo
+    inner = 2 * (patch_radius + half)  # nearer to the source, a plane does not describe the smooth light
     reach = min(reach_px or np.inf, _LARGEST_SEARCH_PX, float(np.hypot(*image.shape)))
     angles, spacing = search_arms(
         difference, usable, centre, n_arms, spacing_range_px, angles_near_deg, (inner, reach)
@@ -129,7 +131,7 @@ def measure_arms(
     halo = ring_halo(difference, usable, centre, angles, half)
     difference = difference - halo
     expected = expected_light(image, reference, usable)
-    # Near orders first: the search's angles are too uncertain to find the far ones.
+    # The near orders are fitted first, because the angles of the search are too uncertain for the far orders.
     near = Geometry(centre, half, (inner, min(reach, max(_NEAR_PX, inner + _NEAR_ORDERS * spacing))))
     geometry = Geometry(centre, half, (inner, reach))
     sigma = pixel_sigma(expected, noise)
@@ -138,7 +140,7 @@ def measure_arms(
     state, _ = iterate(orders, near, state)
     state, orders = first_fit(difference, usable, sigma, geometry, state.pattern, state.source)
     state, result = iterate(orders, geometry, state)
-    # Once more, with weights from the light that the fitted model expects.
+    # Fit once more, with weights from the light of the fitted model.
     rest = (expected - smooth(difference, usable, 2.0))[orders.row, orders.column]
     orders = replace(orders, sigma=pixel_sigma(result.light + rest, noise))
     state, result = iterate(orders, geometry, state)

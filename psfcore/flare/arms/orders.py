@@ -11,17 +11,17 @@ from scipy import ndimage
 from psfcore.errors import DataError
 from psfcore.flare.arms.image import Flags, Plane
 
-KNOT_PX = 1.0  # between the spline's knots
+KNOT_PX = 1.0  # distance between the knots of the spline
 NEEDED_ORDERS_AN_ARM = 3
 ORDER_SIGMA = 5.0
-_USABLE_SHARE = 0.7  # of the pixels around an order, for the order to be fitted
+_USABLE_SHARE = 0.7  # an order is fitted if at least this fraction of the pixels around it is usable
 
 
 @dataclass(frozen=True)
 class Geometry:
     """The quantities that the fit does not change.
 
-    centre: (x, y) px; half_px: half size of S; radii_px: the range of radii whose orders are fitted.
+    centre: (x, y) px. half_px: half size of S. radii_px: the smallest and the largest radius of the fitted orders.
     """
 
     centre: tuple[float, float]
@@ -35,7 +35,7 @@ class Geometry:
 
     @property
     def disc(self) -> Flags:
-        """The knots of S that are fitted [y, x]: those within its half size."""
+        """True for the knots [y, x] of S that are fitted, which lie within the half size of S."""
         knots = np.arange(-self.reach, self.reach + 1) * KNOT_PX
         return np.asarray(np.hypot(knots[:, None], knots) <= self.half_px + 0.25)
 
@@ -64,7 +64,7 @@ class Orders:
     number: NDArray[np.intp]
 
     def planes(self) -> list[tuple[NDArray[np.intp], Plane]]:
-        """For each order its pixels, and an orthonormal basis of weighted planes on them [pixel, 3]."""
+        """For each order: the indices of its pixels, and an orthonormal basis of weighted planes on these pixels [pixel, 3]."""
         found = []
         by_order = np.argsort(self.nearest, kind="stable")
         for pixels in np.split(by_order, np.cumsum(np.bincount(self.nearest))[:-1]):
@@ -142,7 +142,7 @@ def select_pixels(
 
 
 def check_enough_orders(arm: NDArray[np.intp], arms: int) -> None:
-    """Raise DataError "too-few-peaks" unless each arm has the orders that a fit needs."""
+    """Raise DataError "too-few-peaks" unless each arm has at least NEEDED_ORDERS_AN_ARM orders."""
     count = np.bincount(arm, minlength=arms)
     if count.min() < NEEDED_ORDERS_AN_ARM:
         wanted = f"at least {NEEDED_ORDERS_AN_ARM} orders above {ORDER_SIGMA:g} sigma on each arm"

@@ -1,7 +1,7 @@
 """First values of the arms' angles and of the spacing of their orders, found by a grid search.
 
-The smooth part of the image is removed. At the right angle and spacing the rest is brighter at the orders
-than halfway between them.
+The smooth part of the image is removed. At the correct angle and spacing, the remaining image is brighter at the orders
+than halfway between the orders.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from psfcore.flare.arms.orders import NEEDED_ORDERS_AN_ARM
 _SEARCH_STEP_DEG = 0.25
 _SEARCH_STEP_PX = 0.25
 _APART_DEG = 4.0  # two arms are at least this far apart
-_NEAR_DEG = 3.0  # from an angle that the caller gives
-_CUT = 5.0  # of the contrast, in local standard deviations
+_NEAR_DEG = 3.0  # an arm is searched within this distance of an angle that the caller gives
+_CUT = 5.0  # largest contrast, in local standard deviations
 
 
 def search_arms(
@@ -31,8 +31,8 @@ def search_arms(
 ) -> tuple[NDArray[np.float64], float]:
     """Return first values of the angles (degrees) and of the spacing (px).
 
-    Along an arm the orders are brighter than the pixels beside the arm and than the pixels between the orders.
-    The spacing is the one at which, on those arms, the orders exceed the pixels between them most.
+    Along an arm, the orders are brighter than the pixels beside the arm and than the pixels between the orders. At the
+    returned spacing, the difference between the orders and the pixels between the orders is largest on the found arms.
     """
     degrees = np.arange(-90.0, 90.0, _SEARCH_STEP_DEG)
     lit, seen = _along_lines(_contrast(difference, usable), usable, centre, degrees, radii_px)
@@ -50,7 +50,7 @@ def search_arms(
 
 
 def _contrast(difference: Plane, usable: Flags) -> Plane:
-    """Image without its smooth part, over its local standard deviation, clipped at +-_CUT; 0 where unusable."""
+    """The image without its smooth part, divided by its local standard deviation, clipped at +-_CUT; 0 where unusable."""
     detail = smooth(difference, usable, 0.7) - smooth(difference, usable, 5.0)
     scatter = np.sqrt(smooth(detail**2, usable, 15.0))
     ratio = np.divide(detail, scatter, out=np.zeros_like(detail), where=usable & (scatter > 0))
@@ -64,7 +64,7 @@ def _along_lines(
     degrees: NDArray[np.float64],
     radii_px: tuple[float, float],
 ) -> tuple[Plane, Plane]:
-    """Contrast and number of usable pixels [angle, radius step], summed over both sides of the centre."""
+    """The contrast and the number of usable pixels [angle, radius step], each summed over both sides of the centre."""
     radii = np.arange(0.0, radii_px[1], _SEARCH_STEP_PX)
     lit, seen = np.zeros((degrees.size, radii.size)), np.zeros((degrees.size, radii.size))
     cosine, sine = np.cos(np.deg2rad(degrees))[:, None], np.sin(np.deg2rad(degrees))[:, None]
@@ -78,9 +78,10 @@ def _along_lines(
 
 
 def _scores(lit: Plane, seen: Plane, spacing: float, radii_px: tuple[float, float]) -> Plane:
-    """Two scores [2, angle]: the sum at the orders, and that sum less the sum between the orders.
+    """Two scores [2, angle] that are large if orders lie at this spacing along this angle.
 
-    Each is divided by the square root of the number of its pixels.
+    The first is the summed contrast at the orders. The second is this sum minus the summed contrast between the orders.
+    Each score is divided by the square root of its number of pixels. It is 0 if too few orders are usable.
     """
     orders = np.arange(1, int(radii_px[1] / spacing))
     at = np.rint(orders * spacing / _SEARCH_STEP_PX).astype(int)

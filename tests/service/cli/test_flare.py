@@ -36,7 +36,7 @@ def test_a_psf_is_judged_along_an_arm(files: dict[str, Path], tmp_path: Path) ->
     assert tuple(found["centre_xy"]) == CENTRE and found["arm_deg"] == 0
     assert found["total"]["chi2_per_distance"] < 1.5 and found["chi2_factor"] > 7
     assert len(found["observed"]) == len(found["distance_px"]) == len(found["total"]["simulated"])
-    assert f"{found['rms_factor']:.1f} times the error" in result.output
+    assert f"{found['rms_factor']:.1f} times the rms error" in result.output
     assert "note:" not in result.output
     assert plot.read_bytes().startswith(b"\x89PNG")
 
@@ -72,7 +72,7 @@ def test_what_is_no_flare_is_said(files: dict[str, Path], tmp_path: Path) -> Non
     assert busy.exit_code == 0 and "says little about the PSF" in busy.output
     fits.PrimaryHDU(flare_psf().kernel.astype("f4")).writeto(tmp_path / "plain.fits")
     plain = run(files, *options, psf=tmp_path / "plain.fits")
-    assert plain.exit_code == 0 and "so they are not compared" in plain.output
+    assert plain.exit_code == 0 and "so diffraction alone is not compared" in plain.output
 
 
 def test_what_cannot_be_judged_is_one_line(files: dict[str, Path], tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_what_cannot_be_judged_is_one_line(files: dict[str, Path], tmp_path: Pat
         fits.PrimaryHDU((hdus[0].data + noise).astype("f4"), hdus[0].header).writeto(noisy)
     cases = [
         (run(files, *SATURATED, before=bare), "exposure time of both"),
-        (run(files, *SATURATED, before=small), "same frame"),
+        (run(files, *SATURATED, before=small), "same shape"),
         (run(files, *SATURATED, "--arm", 0, "--centre", 5000, 5), "expected a centre"),
         (
             run(files, "--arm", 0, "--centre", *CENTRE, flare=files["before"], before=files["flare"]),
