@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from typing import Any
 
 from psfcore.instruments.files import instrument_path
-from workers.contract.requests import PsfBuild, PsfTables
+from workers.contract.methods import Parameters
+from workers.contract.requests import PsfBuild
 from workers.contract.resolved import (
     ResolvedCrossValidate,
     ResolvedDeconvolve,
@@ -48,13 +50,6 @@ def psf_identity(build: PsfBuild) -> str:
             "parameters": build.model_dump(mode="json", include={"mask_id", "size", "component"}),
             "algorithm_version": build.algorithm_version,
         }
-    )
-
-
-def psf_tables_identity(request: PsfTables) -> str:
-    """Identity of the tables of a PSF: the PSF and the version of the algorithm."""
-    return canonical_hash(
-        {"kind": "psf-tables", "psf_id": request.psf_id, "algorithm_version": request.algorithm_version}
     )
 
 
@@ -104,6 +99,16 @@ def _transit_identity(kind: str, request: ResolvedOnTransit, excluded: tuple[str
             "algorithm_version": request.algorithm_version,
         }
     )
+
+
+def request_identity(kind: str) -> Callable[[Any], str]:
+    """The identity function of a kind whose result depends only on its parameters and its ``algorithm_version``."""
+
+    def identity(request: Parameters) -> str:
+        version = {"algorithm_version": request.algorithm_version}  # type: ignore[attr-defined]
+        return canonical_hash({"kind": kind, **request.model_dump(mode="json"), **version})
+
+    return identity
 
 
 def rerun_identity(request: ResolvedRerun, job_id: str) -> str:

@@ -19,8 +19,8 @@ from workers.contract.identities import (
     product_identity,
     psf_fit_identity,
     psf_identity,
-    psf_tables_identity,
     report_identity,
+    request_identity,
 )
 from workers.contract.methods import Parameters
 from workers.contract.queues import Queue
@@ -156,7 +156,7 @@ _ROWS = (
         result=Result.PSF,
         parameters=PsfTables,
         resolved=PsfTables,
-        identity=psf_tables_identity,
+        identity=request_identity("psf-tables"),
         needs_room=False,  # the quota does not count tables
         time_advice="crop the PSF",
         memory_advice="crop the PSF",

@@ -15,8 +15,8 @@ from workers.contract.identities import (
     product_identity,
     psf_fit_identity,
     psf_identity,
-    psf_tables_identity,
     report_identity,
+    request_identity,
 )
 from workers.contract.methods import RichardsonLucy
 from workers.contract.requests import PsfBuild, PsfTables
@@ -129,7 +129,7 @@ FROZEN: list[tuple[Callable[[], str], str]] = [
         "3e43fc58cebff856c7d2d15e187d1b0b1569004ec53962f077255c53156cef5e",
     ),
     (
-        lambda: psf_tables_identity(PsfTables(psf_id=B)),
+        lambda: request_identity("psf-tables")(PsfTables(psf_id=B)),
         "9d664534c5deabe05e6ed2f333d0076ae5ae3d0d1fe4d40e3277c472bd47414e",
     ),
     (
