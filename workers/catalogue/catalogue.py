@@ -90,7 +90,8 @@ class Catalogue:
                 session.flush()
                 add_bytes(session, row.owner, row.bytes)
                 if quota_mib is not None:
-                    hold_to_quota(session, row.owner, row.bytes, quota_mib)
+                    removable = isinstance(row, SolutionRow)
+                    hold_to_quota(session, row.owner, row.bytes, quota_mib, removable=removable)
             return row, True
         except IntegrityError:
             existing = self.get(type(row), row.id, row.owner)

@@ -143,14 +143,18 @@ def add_bytes(session: Session, owner: str, count: int) -> None:
     )
 
 
-def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int) -> None:
+def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, removable: bool) -> None:
     """Raise OverQuota if ``count`` bytes, which are counted already, did not fit; remove solutions that are in the way.
 
-    Other transactions of the owner wait until this one ends. If several uploads fit one by one but not together, the
-    last ones are refused.
+    removable: whether they are the bytes of a solution. Other transactions of the owner wait until this one ends. If
+    several uploads fit one by one but not together, the last ones are refused.
     """
     counted = _usage(session, owner, quota_mib)
-    before = replace(counted, used_bytes=counted.used_bytes - count)
+    before = replace(
+        counted,
+        used_bytes=counted.used_bytes - count,
+        removable_bytes=counted.removable_bytes - (count if removable else 0),
+    )
     if not before.allows(count):
         raise OverQuota(before)
     if counted.limit_bytes is not None:

@@ -159,7 +159,10 @@ def test_compressed_and_damaged_files_are_refused(file: Path, tmp_path: Path) ->
     content = file.read_bytes()
     middle = len(content) // 2
     damaged = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(tmp_path / "z", "w", zipfile.ZIP_DEFLATED) as packed:
+    with (
+        zipfile.ZipFile(file) as archive,
+        zipfile.ZipFile(tmp_path / "z", "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
         for name in archive.namelist():
             packed.writestr(name, archive.read(name))
     for bad in (damaged, content[:middle], b"", (tmp_path / "z").read_bytes()):
