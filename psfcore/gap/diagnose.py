@@ -108,8 +108,8 @@ def diagnose(
     refits with the answer's effects in the model. seed: of the simulation and of the intervals. solution: of this transit,
     shape and start, made before, or a function that makes it; None: `invert`. If the images show another noise than the
     transit states, it must be the solution with the noise that they show. Raises DataError as
-    `psfcore.scatter.inversion.solution_of` and `invert` do, "bad-library" if no effect of the library can be an answer, and "bad-effects" if
-    an added effect fails.
+    `psfcore.scatter.inversion.solution_of` and `invert` do, "bad-library" if no effect of the library can be an answer,
+    and "bad-effects" if an added effect fails.
     """
     if not any(effect.named for effect in library):
         raise DataError(
