@@ -36,7 +36,7 @@ from psfcore.gap.verdict.judge import LEAST_IMAGES, Judgement, Tried, judge
 from psfcore.gap.verdict.where import Axis, where
 from psfcore.gap.view import View
 from psfcore.psf import Psf
-from psfcore.scatter.inversion import Progress, Solution, invert
+from psfcore.scatter.inversion import Inverter, Progress, Solution, solution_of
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named
 from psfcore.transit.blocks import Fold
 from psfcore.transit.transit import Transit
@@ -100,13 +100,16 @@ def diagnose(
     refit: bool = True,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
+    solution: Solution | Inverter | None = None,
 ) -> Diagnosis:
     """Fit a transit and diagnose the residuals of the fit.
 
     start: the shape's coordinates from which the fit starts (None: the shape's own start). refit: whether to make full
-    refits with the answer's effects in the model. seed: of the simulation and of the intervals. Raises DataError as
-    `psfcore.scatter.inversion.invert` does, "bad-library" if no effect of the library can be an answer, and "bad-effects" if
-    an added effect fails.
+    refits with the answer's effects in the model. seed: of the simulation and of the intervals. solution: of this transit,
+    shape and start, made before, or a function that makes it; None: `invert`. If the images show another noise than the
+    transit states, it must be the solution with the noise that they show. Raises DataError as
+    `psfcore.scatter.inversion.solution_of` and `invert` do, "bad-library" if no effect of the library can be an answer,
+    and "bad-effects" if an added effect fails.
     """
     if not any(effect.named for effect in library):
         raise DataError(
@@ -116,10 +119,8 @@ def diagnose(
     noise = measured_noise(transit)
     if noise is not None and not noise.agrees:
         transit = replace(transit, noise=noise.noise)
-    solution = invert(transit, shape, start=start, threads=threads, progress=progress)
-    return diagnose_solution(
-        solution, noise=noise, library=library, seed=seed, refit=refit, progress=progress
-    )
+    made = solution_of(transit, shape, solution, start=start, threads=threads, progress=progress)
+    return diagnose_solution(made, noise=noise, library=library, seed=seed, refit=refit, progress=progress)
 
 
 def start_of(psf: Psf) -> tuple[Shape, Vector]:

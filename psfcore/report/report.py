@@ -27,7 +27,7 @@ from psfcore.evaluation.plot import sentence as evaluation_sentence
 from psfcore.evaluation.report import report as evaluation_json
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
-from psfcore.scatter.inversion import Progress, Solution
+from psfcore.scatter.inversion import Inverter, Progress, Solution
 from psfcore.scatter.report import fit_json
 from psfcore.scatter.validation.bands import Bands, bands
 from psfcore.scatter.validation.cross_validation import (
@@ -130,12 +130,13 @@ def make_report(
     seed: int = 1,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
+    solution: Solution | Inverter | None = None,
 ) -> PsfReport:
     """Fit a transit and evaluate the fit, or evaluate a given PSF.
 
     dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: of all random samples (bootstrap,
-    subsets of equations, noise realisations). Raises DataError "plate-scale-mismatch", and as `fit_transit` and
-    `evaluate` do.
+    subsets of equations, noise realisations). solution: as in `fit_transit`; not used if the PSF is given. Raises
+    DataError "plate-scale-mismatch", and as `fit_transit` and `evaluate` do.
     """
     wanted = [s for s in STAGES if psf is None or s in ("evaluating", "tables")]
     if not dark_offsets and psf is None:
@@ -145,7 +146,7 @@ def make_report(
         _check_scale(transit, psf)
         return _on_a_given(transit, prepared, psf, seed, threads, stages)
     missing: list[Missing] = []
-    fit = fit_transit(transit, seed=seed, threads=threads, progress=stages.of("fit"))
+    fit = fit_transit(transit, seed=seed, threads=threads, progress=stages.of("fit"), solution=solution)
     made = fitted_psf(
         fit, name=f"{transit.instrument or 'transit'}-fitted", version="this report", provenance={}
     )

@@ -45,7 +45,7 @@ from psfcore.scatter.as_published.published import (
 )
 from psfcore.scatter.as_published.ring_sums import segment_sums
 from psfcore.scatter.as_published.segments import Segments, shells_as_published
-from psfcore.scatter.inversion import Inversion, Progress, Solution, invert
+from psfcore.scatter.inversion import Inversion, Inverter, Progress, Solution, solution_of
 from psfcore.scatter.optics import Blur, pick
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
@@ -152,10 +152,12 @@ def fit_transit(
     seed: int = 1,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
+    solution: Solution | Inverter | None = None,
 ) -> TransitFit:
     """Fit a transit. as_published: also run the published recipe, and each correction of one bias alone.
 
-    Raises DataError "unknown-shape", and as `invert` does.
+    solution: of this transit and shape, made before, or a function that makes it; None: `invert`. Raises DataError
+    "unknown-shape", and as `solution_of` and `invert` do.
     """
     wanted = shape_named(shape)
     guess = first_guess(transit)
@@ -165,7 +167,7 @@ def fit_transit(
         compared=wanted is SOFTENED_POWER_LAW,
         published=1 + len(CORRECTED_ALONE) if as_published else 0,
     )
-    solution = invert(transit, wanted, threads=threads, progress=progress)
+    solution = solution_of(transit, wanted, solution, threads=threads, progress=progress)
     factor = overdispersion(solution.inversion)
     kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
     free = _free_shells(solution, seed, progress) if wanted.isotropic else None

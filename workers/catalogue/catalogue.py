@@ -33,11 +33,12 @@ from workers.catalogue.tables import (
     PsfContextRow,
     PsfRow,
     ReportRow,
+    SolutionRow,
     TransitRow,
 )
 from workers.catalogue.uws_jobs import UwsJobs
 
-Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow)
+Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 AnyRow = TypeVar(
     "AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow, PsfContextRow, BulkRow
 )
@@ -80,7 +81,8 @@ class Catalogue:
         """Insert a content-addressed row; returns the row of that identity, and whether it is new.
 
         quota_mib: the limit for owners without one of their own; None: no limit applies. Raises
-        ``workers.catalogue.owners.OverQuota`` and adds nothing if the row exceeds the limit.
+        ``workers.catalogue.owners.OverQuota`` and adds nothing if the row exceeds the limit even without the owner's
+        kept solutions. If it exceeds the limit with them, the oldest solutions are removed.
         """
         try:
             with self._database.writing.begin() as session:
@@ -88,7 +90,8 @@ class Catalogue:
                 session.flush()
                 add_bytes(session, row.owner, row.bytes)
                 if quota_mib is not None:
-                    hold_to_quota(session, row.owner, row.bytes, quota_mib)
+                    removable = isinstance(row, SolutionRow)
+                    hold_to_quota(session, row.owner, row.bytes, quota_mib, removable=removable)
             return row, True
         except IntegrityError:
             existing = self.get(type(row), row.id, row.owner)

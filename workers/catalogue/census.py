@@ -10,7 +10,16 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from workers.catalogue.database import Database
 from workers.catalogue.jobs import no_equal_at_work
-from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow, TransitRow, WorkerRow
+from workers.catalogue.tables import (
+    ImageRow,
+    JobRow,
+    ProductRow,
+    PsfRow,
+    ReportRow,
+    SolutionRow,
+    TransitRow,
+    WorkerRow,
+)
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 
@@ -92,7 +101,7 @@ class Census:
             query = select(PsfRow.origin, func.count(), func.sum(PsfRow.bytes)).group_by(PsfRow.origin)
             for origin, files, size in session.execute(query):
                 found.append(FileTally("psf", origin, int(files), int(size)))
-            for kind, made in (("product", ProductRow), ("report", ReportRow)):
+            for kind, made in (("product", ProductRow), ("report", ReportRow), ("solution", SolutionRow)):
                 files, size = session.execute(
                     select(func.count(), func.coalesce(func.sum(made.bytes), 0)).select_from(made)
                 ).one()

@@ -6,6 +6,7 @@ tables. It may find hashes that name no file, such as that of a key; it never mi
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 
@@ -13,7 +14,7 @@ from sqlalchemy import JSON, String, Table, cast, select
 
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.database import Database
-from workers.catalogue.tables import Base
+from workers.catalogue.tables import Base, SolutionRow
 
 BATCH = 1000
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -27,18 +28,24 @@ class NamedFiles:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def all(self) -> Iterator[str]:
-        """Every hash in the database, some of them more than once; rows are read in batches."""
+    def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
+        """Every hash in the database, some of them more than once; rows are read in batches.
+
+        solutions_from: without the kept solutions that were made before this time.
+        """
         for table in Base.metadata.sorted_tables:
             if table.name not in _SKIPPED:
-                yield from self._in(table)
+                yield from self._in(table, solutions_from)
 
-    def _in(self, table: Table) -> Iterator[str]:
+    def _in(self, table: Table, solutions_from: float) -> Iterator[str]:
         texts = [cast(one, String) for one in table.columns if isinstance(one.type, String | JSON)]
         if not texts:
             return
         with self._database.engine.execution_options(read_only=True).connect() as connection:
-            rows = connection.execution_options(stream_results=True, yield_per=BATCH).execute(select(*texts))
+            query = select(*texts)
+            if table is SolutionRow.__table__ and math.isfinite(solutions_from):
+                query = query.where(table.c.created_at >= solutions_from)
+            rows = connection.execution_options(stream_results=True, yield_per=BATCH).execute(query)
             for row in rows:
                 for text in row:
                     if text:

@@ -1,7 +1,10 @@
 """How many bytes each owner keeps, and the owner's quota.
 
-The files of the owner's uploads, PSFs, products and reports count; their pictures do not. The count changes in the
-transaction that adds the row.
+The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The count changes
+in the transaction that adds the row.
+
+A solution can be made again, so it never takes room from anything else: the oldest solutions are removed if an upload or
+another solution needs their room.
 """
 
 from __future__ import annotations
@@ -9,29 +12,44 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from sqlalchemy import func, select, update
+from sqlalchemy import delete, func, select, update
 from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session
 
 from workers.catalogue.database import Database
-from workers.catalogue.tables import ImageRow, OwnerRow, ProductRow, PsfRow, ReportRow, TransitRow
+from workers.catalogue.tables import (
+    ImageRow,
+    OwnerRow,
+    ProductRow,
+    PsfRow,
+    ReportRow,
+    SolutionRow,
+    TransitRow,
+)
 
-COUNTED = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow)
+COUNTED = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 MIB = 2**20
 NOT_KEPT = "the result of this job could not be kept"  # a reason for Usage.no_room
 
 
 @dataclass(frozen=True)
 class Usage:
-    """The bytes that an owner keeps, and the limit; limit_bytes None: no limit."""
+    """The bytes that an owner keeps, and the limit; limit_bytes None: no limit.
+
+    removable_bytes: the part of used_bytes that kept solutions take.
+    """
 
     owner: str
     used_bytes: int
     limit_bytes: int | None
+    removable_bytes: int = 0
 
     def allows(self, more_bytes: int = 0) -> bool:
-        """Whether this many more bytes fit."""
-        return self.limit_bytes is None or self.used_bytes + more_bytes <= self.limit_bytes
+        """Whether this many more bytes fit, if need be without the kept solutions."""
+        if self.limit_bytes is None:
+            return True
+        return self.used_bytes - self.removable_bytes + more_bytes <= self.limit_bytes
 
     @property
     def full(self) -> bool:
@@ -101,6 +119,20 @@ class Owners:
                 wrong.append(owner)
         return sorted(wrong)
 
+    def solutions_before(self, time: float) -> Sequence[SolutionRow]:
+        """The kept solutions of all owners that were made before this time."""
+        with self._database.reading() as session:
+            return session.scalars(select(SolutionRow).where(SolutionRow.created_at < time)).all()
+
+    def forget_solutions(self, rows: Sequence[SolutionRow]) -> None:
+        """Remove these kept solutions. Their files stay until ``workers.files.collection`` removes them."""
+        for row in rows:
+            with self._database.writing.begin() as session:
+                add_bytes(
+                    session, row.owner, 0
+                )  # locks the owner first, as `hold_to_quota` does: no deadlock
+                _forget(session, row)
+
 
 def add_bytes(session: Session, owner: str, count: int) -> None:
     """Add bytes to an owner's count, in the transaction that adds the row of the file."""
@@ -111,20 +143,55 @@ def add_bytes(session: Session, owner: str, count: int) -> None:
     )
 
 
-def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int) -> None:
-    """Raise OverQuota if ``count`` bytes, which are counted already, did not fit.
+def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, removable: bool) -> None:
+    """Raise OverQuota if ``count`` bytes, which are counted already, did not fit; remove solutions that are in the way.
 
-    Other transactions of the owner wait until this one ends. If several uploads fit one by one but not together, the
-    last ones are refused.
+    removable: whether they are the bytes of a solution. Other transactions of the owner wait until this one ends. If
+    several uploads fit one by one but not together, the last ones are refused.
     """
     counted = _usage(session, owner, quota_mib)
-    before = replace(counted, used_bytes=counted.used_bytes - count)
+    before = replace(
+        counted,
+        used_bytes=counted.used_bytes - count,
+        removable_bytes=counted.removable_bytes - (count if removable else 0),
+    )
     if not before.allows(count):
         raise OverQuota(before)
+    if counted.limit_bytes is not None:
+        _make_room(session, owner, counted.used_bytes - counted.limit_bytes)
+
+
+def _make_room(session: Session, owner: str, missing_bytes: int) -> None:
+    """Remove the owner's oldest solutions until this many bytes are free."""
+    if missing_bytes <= 0:
+        return
+    oldest = select(SolutionRow).where(SolutionRow.owner == owner).order_by(SolutionRow.created_at)
+    for row in session.scalars(oldest).all():
+        if missing_bytes <= 0:
+            return
+        missing_bytes -= row.bytes
+        _forget(session, row)
+
+
+def _forget(session: Session, row: SolutionRow) -> None:
+    """Remove a solution and its count, unless another transaction removed or replaced it."""
+    same = (
+        SolutionRow.owner == row.owner,
+        SolutionRow.id == row.id,
+        SolutionRow.created_at == row.created_at,
+    )
+    result = session.execute(delete(SolutionRow).where(*same))
+    assert isinstance(result, CursorResult)
+    if result.rowcount:
+        add_bytes(session, row.owner, -row.bytes)
 
 
 def _usage(session: Session, owner: str, quota_mib: int) -> Usage:
     row = session.get(OwnerRow, owner)
     own = None if row is None else row.quota_mib
     limit_mib = quota_mib if own is None else own
-    return Usage(owner, 0 if row is None else row.bytes, limit_mib * MIB if limit_mib else None)
+    removable = session.scalar(
+        select(func.coalesce(func.sum(SolutionRow.bytes), 0)).where(SolutionRow.owner == owner)
+    )
+    used = 0 if row is None else row.bytes
+    return Usage(owner, used, limit_mib * MIB if limit_mib else None, int(removable or 0))

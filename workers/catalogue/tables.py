@@ -300,6 +300,17 @@ class ReportRow(Base):
     __table_args__ = (_listed("reports"), _listed("reports", "transit_id"), _listed("reports", "about_id"))
 
 
+class SolutionRow(Base):
+    """The kept solution of a transit. It can be made again: it is removed when it is old or its room is needed."""
+
+    __tablename__ = "solutions"
+    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    created_at: Mapped[float]
+    file_sha256: Mapped[str] = mapped_column(String(64))
+    bytes: Mapped[int] = mapped_column(BigInteger)
+
+
 class PartRow(Base):
     """A part of a job that several workers share: open, taken under a token, or done with its result.
 

@@ -2,6 +2,8 @@
 
 Recent files stay, because an upload stores its file before its row. If a file is stored again at the moment of its
 removal, its row appears a little later: the rows are therefore read a second time before the file is deleted for good.
+
+Kept solutions of transits can be made again. Those that were made before the same time are removed with their rows.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ def collect(
     even_most: bool = False,
     second_look_after_s: float = SECOND_LOOK_AFTER_S,
 ) -> Collected:
-    """Remove files that were last stored more than ``older_than_s`` ago and to which no row refers.
+    """Remove files that were last stored more than ``older_than_s`` ago and to which no row, or only the row of an
+    old solution, refers.
 
     Run one collection at a time. Raises DataError "nothing-named" if no row refers to any file: then the database belongs
     to another store. Raises DataError "most-unnamed" if more than half of the files would be removed, unless
@@ -48,7 +51,8 @@ def collect(
     kept_before = time.time() - older_than_s
     there = {blob.digest: blob for blob in store.blobs()}
     left = dict(there)
-    for digest in catalogue.named_files.all():
+    solutions = catalogue.owners.solutions_before(kept_before)
+    for digest in catalogue.named_files.all(solutions_from=kept_before):
         left.pop(digest, None)
     if there and len(left) == len(there):
         raise DataError(
@@ -57,14 +61,17 @@ def collect(
             "that the settings name the right database",
         )
     old = [blob for blob in left.values() if blob.kept_at < kept_before]
-    if not dry_run and not even_most and 2 * len(old) > len(there):
+    made_again = {row.file_sha256 for row in solutions}
+    lost = [blob for blob in old if blob.digest not in made_again]
+    if not dry_run and not even_most and 2 * len(lost) > len(there):
         raise DataError(
             "most-unnamed",
             f"expected a database that refers to most of the {len(there)} files of the store; this one does not refer to "
-            f"{len(old)} old files: check that the settings name the right database. Nothing was removed; to remove them "
+            f"{len(lost)} old files: check that the settings name the right database. Nothing was removed; to remove them "
             "all, add --even-most",
         )
     if not dry_run:
+        catalogue.owners.forget_solutions(solutions)
         old = _removed(old, catalogue, store, kept_before, second_look_after_s)
     return Collected(len(there), sum(blob.bytes for blob in there.values()), tuple(old))
 

@@ -32,6 +32,7 @@ class Context:
     others_wait(): for a job of many pieces: True if the task should raise ``TurnOver``.
     lease: the lease under which a job takes its pieces.
     times: times the reported stages. A job whose pieces report their own stages times those instead.
+    anew: compute everything anew, as a rerun must: use no solution that an earlier job kept.
     """
 
     catalogue: Catalogue
@@ -45,6 +46,7 @@ class Context:
     others_wait: Callable[[], bool] = lambda: False
     lease: Lease | None = None
     times: StageTimer = field(default_factory=StageTimer)
+    anew: bool = False
 
     @property
     def limits(self) -> FitsLimits:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.inversion import Solution
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
 from psfcore.scatter.validation.bands import NEAR_CENTRE_PX, PARTING_SIGMAS, Bands, bands
@@ -32,6 +32,7 @@ from workers.contract.identities import psf_fit_identity
 from workers.contract.resolved import ResolvedCrossValidate
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
+from workers.tasks.solutions import solved
 from workers.tasks.transits import load_transit
 
 WAIT_S = 0.5
@@ -73,10 +74,8 @@ def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> 
 
 
 def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit) -> Solution:
-    """The fit of all images, from which every fold starts. Each worker makes its own, because the scenes are large."""
-    return invert(
-        transit, shape_named(request.shape), threads=context.settings.threads, progress=context.report
-    )
+    """The fit of all images, from which every fold starts. Workers that help read the one that the job's worker kept."""
+    return solved(context, request, transit, shape_named(request.shape), progress=context.report)
 
 
 def _exact(

@@ -27,6 +27,7 @@ from workers.contract.resolved import ResolvedGapDiagnose
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
 from workers.tasks.psfs import given_psf, psf_row
+from workers.tasks.solutions import solver
 from workers.tasks.transits import load_transit
 
 KIND = "gap"
@@ -50,6 +51,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
         seed=request.seed,
         threads=context.settings.threads,
         progress=context.report,
+        solution=solver(context, request),
     )
     provenance = _provenance(context, request, identity, parent, added)
     corrected = None

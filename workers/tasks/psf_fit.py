@@ -16,6 +16,7 @@ from workers.contract.resolved import ResolvedPsfFit
 from workers.tasks.context import Context
 from workers.tasks.keep_report import provenance_of, write_json
 from workers.tasks.psfs import psf_row
+from workers.tasks.solutions import solver
 from workers.tasks.transits import load_transit
 
 
@@ -33,6 +34,7 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
         seed=request.seed,
         threads=context.settings.threads,
         progress=context.report,
+        solution=solver(context, request),
     )
     _save(context, request, identity, fit, prepared)
     return identity

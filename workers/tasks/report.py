@@ -18,6 +18,7 @@ from workers.contract.resolved import ResolvedReport
 from workers.tasks.context import Context
 from workers.tasks.keep_report import keep_report, provenance_of, write_json
 from workers.tasks.psfs import given_psf
+from workers.tasks.solutions import solver
 from workers.tasks.transits import load_transit
 
 KIND = "report"
@@ -40,6 +41,7 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
         seed=request.seed,
         threads=context.settings.threads,
         progress=context.report,
+        solution=solver(context, request),
     )
     shapes = _shapes(context, request, made) if request.shapes else None
     _save(context, request, identity, made, shapes)

@@ -83,7 +83,9 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
     parameters = dict(request.parameters)
     if request.kind == "psf-build":
         parameters |= {"instrument": None, "instrument_file": _instrument_text(context, first)}
-    KINDS[request.kind].load_task()(dataclasses.replace(context, catalogue=rerun_catalogue), parameters)
+    KINDS[request.kind].load_task()(
+        dataclasses.replace(context, catalogue=rerun_catalogue, anew=True), parameters
+    )
     # Last comes what was asked for; before it what it needed and nobody has any more.
     made = [row for row in rerun_catalogue.made if isinstance(row, type(first))]
     if not made:

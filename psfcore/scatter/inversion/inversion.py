@@ -36,9 +36,11 @@ Differences from the paper; the benefit of each was measured on simulated transi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
+from psfcore.errors import DataError
 from psfcore.scatter.inversion.reconstruction import Progress, TransitScenes
 from psfcore.scatter.inversion.results import Solution, SolutionWithoutErrors
 from psfcore.scatter.inversion.solver import CONVERGED_POINTS, LEAST_FRAMES, Solver
@@ -47,8 +49,17 @@ from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.transit.transit import Transit
 
+ALGORITHM_VERSION = 1  # of `invert`: a change of its results needs a new number, because solutions are kept
 PILOT_FRAMES = 16
 PILOT_CONVERGED_POINTS = 0.3
+
+
+class Inverter(Protocol):
+    """A function that makes the solution of a transit and a shape, as `invert` with these arguments does."""
+
+    def __call__(
+        self, transit: Transit, shape: Shape, /, *, start: Vector | None, threads: int, progress: Progress
+    ) -> Solution: ...
 
 
 def invert(
@@ -93,6 +104,33 @@ def invert(
     sky.find(Optics(kernel, transit.shape, threads=threads), kernel)
     at = solver.solve(at, solver.taking_part(), CONVERGED_POINTS)
     return solver.solution(at)
+
+
+def solution_of(
+    transit: Transit,
+    shape: Shape,
+    given: Solution | Inverter | None,
+    *,
+    start: Vector | None = None,
+    threads: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> Solution:
+    """The given solution, or the one that the given function makes; None: that of `invert`.
+
+    Raises DataError "other-solution" if the given solution is of other images, noise, diffraction PSF or shape.
+    """
+    if not isinstance(given, Solution):
+        make: Inverter = invert if given is None else given
+        return make(transit, shape, start=start, threads=threads, progress=progress)
+    of = given.transit
+    same = of.frames is transit.frames and of.diffraction is transit.diffraction and of.noise == transit.noise
+    if not same or given.inversion.shape.name != shape.name:
+        raise DataError(
+            "other-solution",
+            f"expected a solution of the same transit, its noise and {shape.name}; got one of other images, of another "
+            f"noise, or of {given.inversion.shape.name}: leave the solution out, so that a new one is made",
+        )
+    return given
 
 
 def refit(

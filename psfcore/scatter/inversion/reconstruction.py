@@ -60,6 +60,22 @@ class TransitScenes:
         self.found: list[FoundPlace] = []
         self.dark: list[Pixels] = []
 
+    @classmethod
+    def restored(
+        cls,
+        transit: Transit,
+        optics: Optics,
+        *,
+        scenes: list[Lanes],
+        found: list[FoundPlace],
+        dark: list[Pixels],
+    ) -> TransitScenes:
+        """The scenes of an earlier reconstruction of a transit. optics: only for the order of the engine."""
+        sky = cls.__new__(cls)
+        sky.transit, sky.scenes, sky.found, sky.dark = transit, scenes, found, dark
+        sky.observed = [optics.lanes(frame.pixels) for frame in transit.frames]
+        return sky
+
     def copy(self) -> TransitScenes:
         """A second object with the same contents. Arrays are shared, because no code writes to them."""
         other = copy(self)

@@ -40,10 +40,9 @@ from tests.psfcore.small_transits import (
 
 def fit_of(patch: pytest.MonkeyPatch, solution: Solution, **asked: Any) -> TransitFit:
     """A fit with a known inversion, without the slow fits of free shells and other shapes."""
-    patch.setattr(fit_module, "invert", lambda *_, **__: solution)
     patch.setattr(fit_module, "_free_shells", lambda *_: fitted().free)
     patch.setattr(fit_module, "compare_shapes", lambda *_, **__: ())
-    return fit_transit(solution.transit, **asked)
+    return fit_transit(solution.transit, solution=lambda *_, **__: solution, **asked)
 
 
 def with_inversion(solution: Solution, **changes: Any) -> Solution:

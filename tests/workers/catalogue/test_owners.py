@@ -8,7 +8,7 @@ import pytest
 
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import MIB, OverQuota
-from workers.catalogue.tables import ImageRow
+from workers.catalogue.tables import ImageRow, SolutionRow
 
 
 def image(number: int, size_bytes: int) -> ImageRow:
@@ -47,3 +47,52 @@ def test_results_of_jobs_are_not_held_to_the_quota(catalogue: Catalogue, size_by
     assert send(catalogue, image(1, MIB))
     assert catalogue.add(image(2, size_bytes))[1]
     assert catalogue.owners.usage("o", 1).used_bytes == MIB + size_bytes
+
+
+def solution(number: int, size_bytes: int, owner: str = "o") -> SolutionRow:
+    identity = f"{number:064x}"
+    return SolutionRow(
+        owner=owner, id=identity, created_at=float(number), bytes=size_bytes, file_sha256=identity
+    )
+
+
+def kept(catalogue: Catalogue) -> list[str]:
+    """Owner and number of each kept solution."""
+    return sorted(f"{row.owner}{int(row.id, 16)}" for row in catalogue.owners.solutions_before(1e9))
+
+
+def test_the_oldest_solutions_make_room_for_an_upload(catalogue: Catalogue) -> None:
+    for number in (2, 1, 3):
+        assert catalogue.add(solution(number, MIB // 4), 1)[1]
+    assert catalogue.add(solution(1, MIB // 4, owner="p"), 1)[1]
+    usage = catalogue.owners.usage("o", 1)
+    assert (usage.used_bytes, usage.removable_bytes) == (3 * MIB // 4, 3 * MIB // 4)
+    assert usage.allows(MIB) and not usage.allows(MIB + 1)
+    assert send(catalogue, image(9, MIB // 2)) and kept(catalogue) == ["o2", "o3", "p1"]
+    assert not send(catalogue, image(8, MIB)) and kept(catalogue) == ["o2", "o3", "p1"]
+    assert send(catalogue, image(7, MIB // 2)) and kept(catalogue) == ["p1"]
+    assert catalogue.owners.usage("o", 1).full and catalogue.owners.recount() == []
+
+
+def test_a_new_solution_takes_the_room_of_older_ones_only(catalogue: Catalogue) -> None:
+    assert send(catalogue, image(1, MIB // 2))
+    for number in (1, 2):
+        assert catalogue.add(solution(number, MIB // 2), 1)[1]
+    assert kept(catalogue) == ["o2"] and catalogue.get(ImageRow, f"{1:064x}", "o") is not None
+    with pytest.raises(OverQuota):
+        catalogue.add(solution(3, MIB), 1)
+    assert kept(catalogue) == ["o2"] and catalogue.owners.recount() == []
+
+
+def test_jobs_run_if_only_solutions_fill_the_quota(catalogue: Catalogue) -> None:
+    assert catalogue.add(solution(1, MIB), 1)[1]
+    assert not catalogue.owners.usage("o", 1).full
+
+
+def test_a_solution_is_forgotten_once(catalogue: Catalogue) -> None:
+    catalogue.add(solution(1, 10))
+    rows = catalogue.owners.solutions_before(2.0)
+    assert catalogue.owners.solutions_before(1.0) == []
+    catalogue.owners.forget_solutions(rows)
+    catalogue.owners.forget_solutions(rows)
+    assert kept(catalogue) == [] and catalogue.owners.usage("o", 0).used_bytes == 0

@@ -17,7 +17,7 @@ from service.cli.main import main
 from service.local import LocalService
 from tests.s3 import opened_store
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ImageRow, ReportRow
+from workers.catalogue.tables import ImageRow, ReportRow, SolutionRow
 from workers.files import collection
 from workers.files import s3_store as remote_store
 from workers.files.opened import open_store
@@ -90,8 +90,8 @@ def test_an_old_orphan_that_is_being_uploaded_again_stays(
     os.utime(store.path(orphan), (long_ago, long_ago))
     real = type(catalogue.named_files).all
 
-    def sent_again(self: object) -> Iterator[str]:
-        yield from real(self)  # type: ignore[arg-type]
+    def sent_again(self: object, **how: float) -> Iterator[str]:
+        yield from real(self, **how)  # type: ignore[arg-type]
         kept(store, b"sent long ago")
 
     with monkeypatch.context() as patched:
@@ -330,3 +330,31 @@ def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
     assert "not at the revision of this version" in said(status=1)
     catalogue.close()
+
+
+def solution(digest: str, owner: str, created_at: float) -> SolutionRow:
+    return SolutionRow(owner=owner, id="1" * 64, created_at=created_at, file_sha256=digest, bytes=3)
+
+
+def test_old_solutions_go_with_their_files(store: Store, catalogue: Catalogue) -> None:
+    named, old, shared = kept(store, b"a"), kept(store, b"bb"), kept(store, b"ccc")
+    catalogue.add(image(named))
+    catalogue.add(solution(old, "o", 1.0))
+    catalogue.add(solution(shared, "p", 2.0))
+    catalogue.add(
+        solution(shared, "q", time.time() + 120.0)
+    )  # the same solution, made by another owner later
+    dry = collect(catalogue, store, -60.0, dry_run=True)
+    assert [blob.digest for blob in dry.removed] == [old]
+    assert len(catalogue.owners.solutions_before(1e12)) == 3, "nothing was removed"
+    assert collect(catalogue, store, -60.0) == dry
+    assert {blob.digest for blob in store.blobs()} == {named, shared}
+    assert [row.owner for row in catalogue.owners.solutions_before(1e12)] == ["q"]
+    assert catalogue.owners.recount() == []
+
+
+def test_old_solutions_do_not_count_as_lost_files(store: Store, catalogue: Catalogue) -> None:
+    catalogue.add(image(kept(store, b"a")))
+    for number, content in enumerate((b"bb", b"ccc", b"dddd")):
+        catalogue.add(solution(kept(store, content), f"o{number}", 1.0))
+    assert len(collect(catalogue, store, -60.0).removed) == 3

@@ -1,0 +1,181 @@
+"""Kept solutions: found again by their owner alone, only for the same inversion, and never needed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psfcore.noise import Noise
+from psfcore.scatter.inversion import Solution
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.transit.transit import Transit
+from tests.psfcore import small_transits
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import ImageRow, SolutionRow
+from workers.contract.requests import PsfBuild
+from workers.contract.resolved import ResolvedCrossValidate, ResolvedPsfFit, ResolvedReport
+from workers.files.store import Store, StoreAway
+from workers.settings import Settings
+from workers.tasks import solutions
+from workers.tasks.context import Context
+from workers.tasks.solutions import solution_identity, solved
+
+REQUEST = ResolvedPsfFit(transit_id="1" * 64)
+
+
+@pytest.fixture
+def catalogue(tmp_path: Path) -> Iterator[Catalogue]:
+    made = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
+    made.upgrade()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def context(catalogue: Catalogue, tmp_path: Path) -> Context:
+    settings = Settings(data_dir=tmp_path, database_url=None, broker_url="filesystem://")
+    return Context(catalogue, Store(tmp_path), settings, "o", "j", report=lambda *_: None)
+
+
+@pytest.fixture
+def inverted(monkeypatch: pytest.MonkeyPatch) -> list[Transit]:
+    """The transits that were inverted; the result was computed before."""
+    seen: list[Transit] = []
+
+    def invert(transit: Transit, *_: object, **__: object) -> Solution:
+        seen.append(transit)
+        return small_transits.solved()
+
+    monkeypatch.setattr(solutions, "invert", invert)
+    return seen
+
+
+def solve(context: Context, **how: Any) -> Solution:
+    request = how.pop("request", REQUEST)
+    transit = how.pop("transit", small_transits.solved().transit)
+    shape = how.pop("shape", SOFTENED_POWER_LAW)
+    return solved(context, request, transit, shape, progress=lambda *_: None, **how)
+
+
+def row(context: Context) -> SolutionRow:
+    (found,) = context.catalogue.owners.solutions_before(np.inf)
+    return found
+
+
+def test_a_second_job_does_not_invert_again(context: Context, inverted: list[Transit]) -> None:
+    first, second = solve(context), solve(dataclasses.replace(context, job_id="other"))
+    assert len(inverted) == 1
+    assert first.inversion.coordinates.tobytes() == second.inversion.coordinates.tobytes()
+    assert [s.tobytes() for s in first.sky.scenes] == [s.tobytes() for s in second.sky.scenes]
+
+
+def test_jobs_of_other_kinds_and_seeds_share_it(context: Context, inverted: list[Transit]) -> None:
+    for request in (
+        REQUEST,
+        ResolvedPsfFit(transit_id="1" * 64, seed=9, as_published=True),
+        ResolvedCrossValidate(transit_id="1" * 64, runs=2),
+        ResolvedReport(transit_id="1" * 64, dark_offsets=False),
+    ):
+        solve(context, request=request)
+    assert len(inverted) == 1
+
+
+def test_it_belongs_to_its_owner(context: Context, inverted: list[Transit]) -> None:
+    solve(context)
+    solve(dataclasses.replace(context, owner="p"))
+    assert len(inverted) == 2
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_a_rerun_neither_uses_nor_keeps_one(context: Context, inverted: list[Transit], first: bool) -> None:
+    if not first:
+        solve(context)
+    solve(dataclasses.replace(context, anew=True))
+    assert len(inverted) == (1 if first else 2)
+    assert len(context.catalogue.owners.solutions_before(np.inf)) == (0 if first else 1)
+
+
+def test_everything_that_determines_a_solution_is_in_its_identity(monkeypatch: pytest.MonkeyPatch) -> None:
+    transit, shape = small_transits.solved().transit, SOFTENED_POWER_LAW
+    noisy = dataclasses.replace(transit, noise=Noise(1.0, 9.0))
+    build = PsfBuild(instrument="hri_euv")
+    made = [
+        solution_identity(REQUEST, transit, shape, None),
+        solution_identity(ResolvedPsfFit(transit_id="2" * 64), transit, shape, None),
+        solution_identity(ResolvedPsfFit(transit_id="1" * 64, saturation_dn=9.0), transit, shape, None),
+        solution_identity(
+            ResolvedPsfFit(transit_id="1" * 64, diffraction_recipe=build), transit, shape, None
+        ),
+        solution_identity(REQUEST, noisy, shape, None),
+        solution_identity(REQUEST, transit, SHAPES["stretched"], None),
+        solution_identity(REQUEST, transit, shape, np.array([0.1, 0.2, 0.3])),
+        solution_identity(REQUEST, transit, shape, np.array([0.1, 0.2, np.nextafter(0.3, 1)])),
+    ]
+    for name, other in (
+        ("ALGORITHM_VERSION", 99),
+        ("software_version", lambda: "99"),
+        ("library_versions", dict),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(solutions, name, other)
+            made.append(solution_identity(REQUEST, transit, shape, None))
+    assert len(set(made)) == len(made) == 11
+    assert solution_identity(REQUEST, transit, shape, None) == made[0]
+
+
+def lose(path: Path) -> None:
+    path.unlink()
+
+
+def damage(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+@pytest.mark.parametrize("spoil", [lose, damage])
+def test_one_that_cannot_be_read_is_made_and_kept_again(
+    context: Context, inverted: list[Transit], spoil: Callable[[Path], None]
+) -> None:
+    solve(context)
+    spoil(context.store.path(row(context).file_sha256))
+    solve(context)
+    solve(context)
+    assert len(inverted) == 2
+    assert context.catalogue.owners.usage("o", 0).used_bytes == row(context).bytes
+    assert context.catalogue.owners.recount() == []
+
+
+def test_storage_that_does_not_answer_costs_time_only(
+    context: Context, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object) -> Path:
+        raise StoreAway("away")
+
+    solve(context)
+    for name in ("path", "keep"):
+        monkeypatch.setattr(context.store, name, away)
+    solve(context)
+    monkeypatch.undo()
+    assert row(context), "the row stays: the file may still be there"
+
+
+def test_without_room_it_is_not_kept_and_the_job_goes_on(context: Context, inverted: list[Transit]) -> None:
+    image = ImageRow(owner="o", id="2" * 64, created_at=1.0, bytes=2**19, summary={})
+    context.catalogue.owners.set_quota("o", 1)
+    context.catalogue.add(image)
+    solve(context)
+    assert context.catalogue.owners.solutions_before(np.inf) == []
+    assert context.catalogue.owners.usage("o", 0).used_bytes == 2**19
+
+
+def test_one_too_large_is_not_kept(
+    context: Context, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("psfcore.scatter.inversion.kept.MOST_BYTES", 1000)
+    solve(context)
+    assert context.catalogue.owners.solutions_before(np.inf) == []
+    assert list(context.store.blobs()) == []

@@ -1,0 +1,126 @@
+"""Solutions of transits, kept for later jobs on the same transit.
+
+Fit, cross-validation, report and gap of a transit begin with the same inversion. The first job keeps its solution, and
+later jobs of the same owner read it. It is the same bit for bit. The identity of a solution contains everything that
+determines it, and the versions of the software and its libraries, so that the provenance of a result stays true. It does
+not contain the number of threads, which changes no result.
+
+A kept solution only saves time. If it cannot be read or kept, the job inverts the transit and goes on.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from psfcore.errors import DataError
+from psfcore.scatter.inversion import (
+    ALGORITHM_VERSION,
+    Inverter,
+    Progress,
+    Solution,
+    invert,
+    read_solution,
+    write_solution,
+)
+from psfcore.scatter.shapes import Shape, Vector
+from psfcore.transit.transit import Transit
+from workers.catalogue.owners import OverQuota
+from workers.catalogue.tables import SolutionRow
+from workers.contract.identities import canonical_hash, diffraction_identity
+from workers.contract.resolved import ResolvedOnTransit
+from workers.settings import library_versions, software_version
+from workers.tasks.context import Context
+
+log = logging.getLogger(__name__)
+
+
+def solver(context: Context, request: ResolvedOnTransit) -> Inverter:
+    """``solved`` for one request, as a function that psfcore calls when it needs the solution."""
+
+    def solve(
+        transit: Transit, shape: Shape, /, *, start: Vector | None, threads: int, progress: Progress
+    ) -> Solution:
+        assert threads == context.settings.threads
+        return solved(context, request, transit, shape, start=start, progress=progress)
+
+    return solve
+
+
+def solved(
+    context: Context,
+    request: ResolvedOnTransit,
+    transit: Transit,
+    shape: Shape,
+    *,
+    start: Vector | None = None,
+    progress: Progress,
+) -> Solution:
+    """The solution of a transit: the owner's kept one, or a new one, which is then kept.
+
+    transit: as ``load_transit`` returns it for the request; only its noise may be replaced. A rerun computes anew and keeps
+    nothing. Raises DataError as ``psfcore.scatter.inversion.invert`` does.
+    """
+    identity = solution_identity(request, transit, shape, start)
+    kept = None if context.anew else _kept(context, identity, transit)
+    if kept is not None:
+        return kept
+    found = invert(transit, shape, start=start, threads=context.settings.threads, progress=progress)
+    if not context.anew:
+        _keep(context, identity, found)
+    return found
+
+
+def solution_identity(
+    request: ResolvedOnTransit, transit: Transit, shape: Shape, start: Vector | None
+) -> str:
+    """Identity of a solution: bytes of the transit, parameters, diffraction PSF, noise, shape, start and versions."""
+    return canonical_hash(
+        {
+            "kind": "solution",
+            "transit": request.transit_id,
+            "saturation_dn": request.saturation_dn,
+            "diffraction": diffraction_identity(request),
+            # Not the noise of the request: a diagnosis may replace it by the noise that the images show.
+            "noise": [float(transit.noise.photon_gain_dn), float(transit.noise.read_noise_dn)],
+            "shape": shape.name,
+            "start": None if start is None else [float(q) for q in start],
+            "algorithm_version": ALGORITHM_VERSION,
+            "software_version": software_version(),
+            "libraries": library_versions(),
+        }
+    )
+
+
+def _kept(context: Context, identity: str, transit: Transit) -> Solution | None:
+    """The owner's solution with this identity; None if there is none that can be read."""
+    row = context.catalogue.get(SolutionRow, identity, context.owner)
+    if row is None:
+        return None
+    try:
+        return read_solution(context.store.path(row.file_sha256), transit, threads=context.settings.threads)
+    except (DataError, FileNotFoundError) as error:
+        log.warning("job %s: removed the kept solution %s: %s", context.job_id, identity, error)
+        context.catalogue.owners.forget_solutions([row])
+    except OSError as error:
+        log.warning("job %s: could not read the kept solution %s: %s", context.job_id, identity, error)
+    return None
+
+
+def _keep(context: Context, identity: str, solution: Solution) -> None:
+    """Keep a solution if the owner has room for it."""
+    try:
+        with context.store.temporary() as file:
+            write_solution(file, solution)
+            size = file.stat().st_size
+            digest = context.store.keep(file)
+        context.catalogue.add(
+            SolutionRow(
+                owner=context.owner, id=identity, created_at=time.time(), file_sha256=digest, bytes=size
+            ),
+            context.settings.quota_mib,
+        )
+    except OverQuota:
+        log.info("job %s: no room to keep the solution %s", context.job_id, identity)
+    except (DataError, OSError) as error:
+        log.warning("job %s: could not keep the solution %s: %s", context.job_id, identity, error)
