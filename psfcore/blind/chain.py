@@ -2,7 +2,7 @@
 
     fine light = spread(P (S - h))  ->  light()  ->  binned  ->  expected()  ->  photons, read noise  ->  read_out()  ->  whole DN
 
-S is the scene, h is the part of S that the occulter hides, and P is the convolution with the PSF. "binned" sums the fine
+S is the scene, h is the part of S that the occulter hides, and P is the convolution with the PSF. "binned" averages the fine
 pixels of each detector pixel; the other names are methods of `effects.effect.Effect`. Because P is linear, the scene of a
 pointing is convolved only once. For each image, only the difference between its scene and that scene is convolved.
 """

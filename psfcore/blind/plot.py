@@ -86,7 +86,14 @@ def _power(axes: Axes, found: Score) -> None:
     at = np.arange(len(labels))
     for offset, count, hits, interval, colour, name in (
         (-0.08, "n", "noticed", "noticed_wilson95", "#1b4f91", "noticed (the verdict is not “none”)"),
-        (0.08, "n_known", "contains_truth", "contains_wilson95", "#2b8a6e", "the named effects include the true ones"),
+        (
+            0.08,
+            "n_known",
+            "contains_truth",
+            "contains_wilson95",
+            "#2b8a6e",
+            "the named effects include the true ones",
+        ),
     ):
         shown = [n for n, row in enumerate(found.power) if row[count]]
         share = np.array([found.power[n][hits] / found.power[n][count] for n in shown])

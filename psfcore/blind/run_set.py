@@ -72,7 +72,8 @@ def run_set(
     for number in numbers:
         if not made.is_made(number):
             raise DataError(
-                "not-sealed", f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the case again"
+                "not-sealed",
+                f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the case again",
             )
     missing = [number for number in numbers if not has_report(made, number)]
 

@@ -19,7 +19,7 @@ refit of the PSF. The answer of a report is the set of effects that the verdict 
 | one wrong effect named with confidence | all | the verdict is `attributed`, and names one effect that is not true. For clean cases and unknown effects every name is wrong. The verdicts `tie` and `inconclusive` express doubt and do not count |
 | mean number of named effects | cases of the 2 % row with an answer | number of effects in the answer |
 | unknown effects | unknown effects, 2 % or more | the verdict is `unknown` or `inconclusive` |
-| closure, first / true effect | single known effects, 2 % or more, with an answer | median of the closure by the first effect divided by the closure by the true effect. 1 if the first effect is the true one; cases in which the closure by the true effect is below 0.1 are left out |
+| closure by the first effect / by the true effect | single known effects, 2 % or more, with an answer | median of the closure by the first effect divided by the closure by the true effect. 1 if the first effect is the true one; cases in which the closure by the true effect is below 0.1 are left out |
 | 90 % interval contains the true closure | single known effects, 2 % or more, with an answer | the ci90 of the closure by the true effect contains the true closure |
 | strongest axis is right | single known effects that have axes in `scoring.AXES`, 2 % or more, verdict not `none` | the first axis of the report's `where` is an axis of the effect |
 | time | all | wall time of the slowest case, s |
@@ -212,7 +212,7 @@ def _answer_rows(known: Sequence[Judged], strong: Sequence[Judged]) -> tuple[Row
 def _closure_rows(answered: Sequence[Judged]) -> tuple[Row, ...]:
     return (
         _value(
-            "closure by the first / by the true effect",
+            "closure by the first effect / by the true effect",
             [share for share in map(closure_share, answered) if share is not None],
             median,
             ">= 0.95",

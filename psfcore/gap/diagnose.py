@@ -306,9 +306,7 @@ class _Refits:
             made = add_to_model(
                 self._view.solution, chosen, tried, self._model, view=self._view, progress=say
             )
-        except (
-            DataError
-        ) as error:  # the fit may fail if the subtracted effect is not in the images
+        except DataError as error:  # the fit may fail if the subtracted effect is not in the images
             self.failures.append(f"The full refit with {tried.label} in the model failed: {error}")
         self._made[tried.label] = made
         return made

@@ -21,7 +21,9 @@ from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, pat
 Field = NDArray[np.float32]
 Vector = NDArray[np.float64]
 DISC_MARGIN_PX = 2.0
-KEPT_BYTES = 2**25  # most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size
+KEPT_BYTES = (
+    2**25
+)  # most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size
 LEAST_KEPT = 4
 
 
@@ -49,8 +51,7 @@ class _LazyFields(Sequence[Field]):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The data from which effects are computed: the fit (`solution`), and fields that are derived from the fit.
-    """
+    """The data from which effects are computed: the fit (`solution`), and fields that are derived from the fit."""
 
     solution: Solution
 

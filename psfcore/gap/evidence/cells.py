@@ -39,7 +39,9 @@ RINGS = (
     (0.7, 1.0, 8),
 )  # inner and outer radius (fractions of the radius of the outermost dark pixel), number of sectors
 LEAST_PIXELS = 3
-LEAST_VARIANCE = 1e-12  # smallest eigenvalue of a covariance, relative to the largest: redundant cells would give 0
+LEAST_VARIANCE = (
+    1e-12  # smallest eigenvalue of a covariance, relative to the largest: redundant cells would give 0
+)
 
 
 @dataclass(frozen=True, eq=False)

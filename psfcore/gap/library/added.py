@@ -163,7 +163,11 @@ def _checked(
         with _theirs(source):
             field = np.asarray(change(n, images))
         if field.shape != shape or not np.isfinite(field).all():
-            got = "an image with NaN or infinite values" if field.shape == shape else f"an array of shape {field.shape}"
+            got = (
+                "an image with NaN or infinite values"
+                if field.shape == shape
+                else f"an array of shape {field.shape}"
+            )
             raise _bad(source, f"{name}: expected an image of shape {shape} [y, x]; got {got}")
         return field
 

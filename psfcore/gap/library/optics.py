@@ -20,7 +20,9 @@ from psfcore.scatter.total_psf import TotalPsf
 
 Kernel = NDArray[np.float64]
 Steps = tuple[tuple[int, int], ...]
-Halo = Callable[[int], Kernel]  # for a size: weights [y, x] with the centre at size // 2; their sum is 1 on an infinite plane
+Halo = Callable[
+    [int], Kernel
+]  # for a size: weights [y, x] with the centre at size // 2; their sum is 1 on an infinite plane
 HALO_SCALES_PX = (20.0, 40.0, 80.0, 160.0, 320.0)
 MOFFAT = 1.5  # exponent of the Moffat profile: the halo falls off as r^-3
 GHOST_TRIALS = 300  # about the number of distinguishable copies in a field of 512 px

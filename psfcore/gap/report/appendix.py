@@ -54,7 +54,9 @@ def psf_parts(found: Diagnosis) -> list[Part]:
     if not found.corrected:
         parts.append("No effect was added to the model, so this diagnosis has no corrected PSF.")
     elif found.judgement.verdict == "tie":
-        parts.append(f"“With the named effects” means with the best of the tied effects: {best_words(found)}.")
+        parts.append(
+            f"“With the named effects” means with the best of the tied effects: {best_words(found)}."
+        )
     return parts
 
 
@@ -100,7 +102,12 @@ def made_of(found: Diagnosis, report: Report) -> list[Part]:
     how = Values(
         [
             Value("images used", f"{len(report['images'])} of {len(found.solution.transit.frames)}"),
-            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN per detected photon; the value that the fit used"),
+            Value(
+                "photon gain",
+                noise.photon_gain_dn,
+                unit="DN",
+                meaning="DN per detected photon; the value that the fit used",
+            ),
             Value("read noise", noise.read_noise_dn, unit="DN", meaning="rms; the value that the fit used"),
             Value(
                 "residual of a fit to simulated images",

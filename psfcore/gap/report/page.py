@@ -75,7 +75,9 @@ def gap_page(found: Diagnosis, report: Report) -> Page:
         Section("What was found", _found(found, report)),
         Section("Where the gap lies", _where(found, report)),
         Section("Which effect causes the gap", _which(found, report)),
-        Section("The PSF, without and with the named effects" if found.corrected else "The PSF", psf_parts(found)),
+        Section(
+            "The PSF, without and with the named effects" if found.corrected else "The PSF", psf_parts(found)
+        ),
         Section("Reasons for caution", doubts(report)),
         Section("All images, settings and input files", made_of(found, report)),
     ]
@@ -187,7 +189,9 @@ def _map_figure(report: Report) -> Figure:
         "figure shows the errors of the residuals."
     )
     if after:
-        caption += " Left: the fitted model. Right: the model with the named effects, on the same colour scale."
+        caption += (
+            " Left: the fitted model. Right: the model with the named effects, on the same colour scale."
+        )
     return Figure(map_png(report), caption, "Map of the residuals of all discs on the detector")
 
 
@@ -198,7 +202,9 @@ def _where(found: Diagnosis, report: Report) -> list[Part]:
     strongest = report["where"][0]
     parts: list[Part] = []
     if report["verdict"] == "none":
-        parts.append("There is no gap to locate. The figures below show only noise: no axis should have a much larger share than the others.")
+        parts.append(
+            "There is no gap to locate. The figures below show only noise: no axis should have a much larger share than the others."
+        )
     else:
         at = strongest["at"]
         parts.append(

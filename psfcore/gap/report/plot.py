@@ -35,7 +35,10 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#8a6d00", "#56B4E9")
 _SYMBOLS = ("o", "s", "^", "D", "v", "P")
 _BEFORE, _AFTER, _OBSERVED = "#D55E00", "#0072B2", "#333333"
 _DARK = 0.55  # fraction of the colour scale above which numbers are white, because the colour is dark
-_SLICE_PX, SLICE_ROWS = 20, 2  # half width of a slice along x, px; number of rows on each side of the middle row
+_SLICE_PX, SLICE_ROWS = (
+    20,
+    2,
+)  # half width of a slice along x, px; number of rows on each side of the middle row
 _FITTED, _ANSWERED = "Fitted model", "With the named effects"
 
 
@@ -327,7 +330,9 @@ def _legend(pointings: Sequence[int], *, after: bool) -> list[Any]:
         handles.append(Line2D([], [], color="#555555", marker="o", ls="none", ms=6, label="fitted model"))
         style: dict[str, Any] = {"mfc": "white", "mew": 1.2}
         handles.append(
-            Line2D([], [], color="#555555", marker="o", ls="none", ms=6, label="with the named effects", **style)
+            Line2D(
+                [], [], color="#555555", marker="o", ls="none", ms=6, label="with the named effects", **style
+            )
         )
     return handles
 

@@ -42,7 +42,9 @@ Vector = NDArray[np.float64]
 RESAMPLES = 1000
 FORM_ERROR = 0.1  # relative error of an effect's template; the square of this error is a fraction of chi2
 INTERVAL = (5.0, 95.0)
-HIDDEN_SIGMA = 1.645  # a normal variable is below this number of standard deviations with a probability of 95 %
+HIDDEN_SIGMA = (
+    1.645  # a normal variable is below this number of standard deviations with a probability of 95 %
+)
 
 
 @dataclass(frozen=True)
@@ -120,9 +122,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
     images: list[int] = []
     deviance: dict[tuple[int, ...], float] = {}
     base = len(evidence.base)
-    free = base + len(
-        set(columns) - model.of_fields
-    )  # a prior constrains the parameters of a random field
+    free = base + len(set(columns) - model.of_fields)  # a prior constrains the parameters of a random field
     unocculted_noise = math.sqrt(model.unocculted_scale)
     for fold in scheme:
         fitted = [n for n in fold.fitted if n in by_index]

@@ -122,7 +122,9 @@ def add_to_model(
             taken, least = None, np.inf
             continue
         left_over = float(left_chi2(seen.model, seen.left.step).sum())
-        if left_over > least + max(WORSE, WORSE_SHARE * found.gain):  # the effect is too strong for first-order steps
+        if left_over > least + max(
+            WORSE, WORSE_SHARE * found.gain
+        ):  # the effect is too strong for first-order steps
             break
         least = min(least, left_over)
         taken = Corrected(

@@ -80,15 +80,19 @@ BEHIND = 0.85  # a rival is close if its score exceeds this fraction of the best
 # fits any gap to some degree.
 NEAR_BEHIND = 0.7
 UNRIVALLED = 0.1  # a measured effect is unrivalled if effects that were not measured stay below this fraction of its score
-MANY_PLACES = 100  # an effect with at least this number of trials searched for its position in the whole field
+MANY_PLACES = (
+    100  # an effect with at least this number of trials searched for its position in the whole field
+)
 MOST_SECONDS = 2  # no second effect is named if more than this number of effects could be the second one
 CLEAR = 12.0  # difference of scores by which a pair is clearly better than one effect, or a probe than all effects
 TEMPLATE_ERROR = 0.05  # relative error of an effect's template
-UNOCCULTED_WIDTH = 0.03  # chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap
-LENIENT = 5.0  # with the other two floors, the p-values of a gap and of its cause may be larger by this factor
-BY_CHANCE = (
-    0.01  # a probe explains more if noise gives its additional gain with a probability below this
+UNOCCULTED_WIDTH = (
+    0.03  # chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap
 )
+LENIENT = (
+    5.0  # with the other two floors, the p-values of a gap and of its cause may be larger by this factor
+)
+BY_CHANCE = 0.01  # a probe explains more if noise gives its additional gain with a probability below this
 MOST_AMISS = 2  # most effects that failed refits may exclude; also the most tied effects that are refitted
 LEAST_IMAGES = (
     6  # with fewer images no image can be held out, and a gap may exist although the images do not show it

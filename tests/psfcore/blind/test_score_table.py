@@ -101,7 +101,7 @@ EXPECTED = {
     "one wrong effect named with confidence": (13, 3 / 13, False),
     "mean number of named effects": (4, (1 + 1 + 2 + 2) / 4, True),
     "unknown effects called unknown or inconclusive": (2, 1 / 2, False),
-    "closure by the first / by the true effect": (3, 1.0, True),  # of 1, 0.6 / 0.8, 1
+    "closure by the first effect / by the true effect": (3, 1.0, True),  # of 1, 0.6 / 0.8, 1
     "90 % interval contains the true closure": (3, 2 / 3, False),
     "strongest axis is right": (3, 2 / 3, False),
     "time of the slowest case, s": (13, 22.0, True),
