@@ -1,7 +1,8 @@
 """The content of each case of a blind set, drawn at random from the seed of the set and the number of the case.
 
-The same seed and number always give the same case. Of 24 consecutive cases, 8 are clean (without an effect), 10 have one
-known effect, 2 have two known effects, and 4 have one unknown effect. An effect is known if the gap library contains it.
+The same seed and number always give the same case. Of 24 consecutive cases, 8 are clean: they have no effect. 10 cases
+have one known effect, 2 have two known effects, and 4 have one unknown effect. An effect is known if the gap library
+contains it.
 """
 
 from __future__ import annotations

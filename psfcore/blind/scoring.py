@@ -101,13 +101,13 @@ class Judged:
         return next(iter(self.entries), None)
 
     def closure(self, name: str | None) -> dict[str, Any] | None:
-        """The closure (value and ci90) that the report states for an effect; None if it states none."""
+        """The closure (value and ci90) that the report states for an effect; None if it states no closure."""
         found: dict[str, Any] | None = self.entries.get(name or "", {}).get("closure")
         return found
 
 
 def raises_alarm(case: Judged) -> bool:
-    """Whether the verdict is anything but `none`."""
+    """Whether the verdict is not `none`, so that the report claims or suspects a gap."""
     return case.verdict != NONE
 
 

@@ -69,7 +69,7 @@ class Diagnosis:
 
     Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
     effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. shrinking: by the
-    label of the effects. corrected: the full refits, that of the best effects first. residual, residual_after: held-out
+    label of the effects. corrected: the full refits; the refit with the best effects comes first. residual, residual_after: held-out
     images without and with the best effects. cautions: sentences on everything that weakens the result.
     """
 

@@ -1,9 +1,9 @@
 """An effect: a physical cause that the model leaves out. The same declaration serves to explain a gap and to correct for it.
 
 To first order, an effect changes the images in proportion to a few parameters: e(n), in DN/s, is the change of image n
-for one unit of a parameter. An effect of the optics changes the images by dH x, where dH is the change of the PSF H, and
-x is the scene with its occulter. A change of an image also changes the scene that is reconstructed from this image, and
-thereby the light that the model predicts in the disc (`evidence.cells`). The unocculted field shows a change only if it
+for one unit of a parameter. An effect of the optics changes the images by dH x: dH is the change of the PSF, and x is
+the scene with its occulter. The scene is reconstructed from the image. A change of the image therefore also changes the
+light that the model predicts in the disc (`evidence.cells`). The unocculted field shows a change only if it
 differs between the images of one pointing.
 
 The stage of an effect is the step of the light on which it acts: the scene, the optics or the detector.
@@ -57,8 +57,8 @@ class Effect:
     cause: a sentence for the report. settled_by: an observation that would confirm the effect, or exclude it. axes: names of
     the axes of the report along which the effect varies.
     changes(view): one change for each parameter. An effect that is fitted for each pointing may return fewer or more changes
-    than it has parameters: both are paired in order, and the rest is not fitted. why_not(view): the reason why these data cannot show the effect;
-    None if they can.
+    than it has parameters. Changes and parameters are then paired in order, and the rest is not fitted. why_not(view): the
+    reason why these data cannot show the effect; None if they can.
     trials: about how many positions or templates the effect searches; the search lowers its score. named: whether a verdict
     may name this effect as a cause. An effect that no verdict may name is a probe: a pattern that is typical of gaps of
     unknown cause. If a probe fits best, the cause is probably not in the library.

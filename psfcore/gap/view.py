@@ -21,9 +21,8 @@ from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, pat
 Field = NDArray[np.float32]
 Vector = NDArray[np.float64]
 DISC_MARGIN_PX = 2.0
-KEPT_BYTES = (
-    2**25
-)  # most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size
+# Most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size.
+KEPT_BYTES = 2**25
 LEAST_KEPT = 4
 
 

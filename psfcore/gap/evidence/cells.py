@@ -1,7 +1,7 @@
 """The cells of a disc: mean residuals in sectors of rings, and their response to any change of the image.
 
-Let y be an image, D the mask of its fully dark pixels, H the PSF, and G the inverse of H on the periodic plane. The
-reconstructed scene is x = (2 - G H) G y. The residual in the disc is r = D [y - H (1 - D) x]. A cell is a sector of a ring
+Let y be an image and D the mask of its fully dark pixels. H is the PSF, and G is the inverse of H on the periodic plane.
+The reconstructed scene is x = (2 - G H) G y. The residual in the disc is r = D [y - H (1 - D) x]. A cell is a sector of a ring
 of the disc. The mean of r over a cell is a linear function of the whole image. The adjoint of H and G gives the weights q
 of this function in one pass:
 
@@ -33,15 +33,11 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Planes = NDArray[np.float32]
 
-RINGS = (
-    (0.0, 0.38, 1),
-    (0.38, 0.7, 4),
-    (0.7, 1.0, 8),
-)  # inner and outer radius (fractions of the radius of the outermost dark pixel), number of sectors
+# Inner and outer radius (fractions of the radius of the outermost dark pixel), number of sectors.
+RINGS = ((0.0, 0.38, 1), (0.38, 0.7, 4), (0.7, 1.0, 8))
 LEAST_PIXELS = 3
-LEAST_VARIANCE = (
-    1e-12  # smallest eigenvalue of a covariance, relative to the largest: redundant cells would give 0
-)
+# Smaller eigenvalues of a covariance are raised to this fraction of the largest one: redundant cells would give 0.
+LEAST_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)

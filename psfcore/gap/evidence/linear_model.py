@@ -4,9 +4,9 @@
     C = noise of the cells + f^2 m m^T                                                                  Eq. (2)
 
 r are the residuals in the cells of a disc, J is their Jacobian, theta are the parameters, and m is the expected light in
-the cells. The floor f is a relative error common to all cells of a disc. It allows for causes that are in no model. An
-effect is tested while the coordinates of the PSF are refitted, so the effect gets no credit for residuals that a change
-of the PSF can absorb. The parameters of an effect have a Gaussian prior. Its width is UNLIKELY times their likely size;
+the cells. The floor f is a relative error common to all cells of a disc. It allows for causes that are in no model. While
+an effect is tested, the coordinates of the PSF are refitted. The effect therefore gets no credit for residuals that a
+change of the PSF can absorb. The parameters of an effect have a Gaussian prior. Its width is UNLIKELY times their likely size;
 an implausible offset of 200 DN can then explain nothing. The gain of an effect is the decrease of chi2, including the
 term of the prior.
 

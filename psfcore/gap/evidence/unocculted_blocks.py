@@ -167,7 +167,7 @@ class UnoccultedBlocks:
 class UnoccultedEquations:
     """Normal equations of some columns, with brightness and scene eliminated.
 
-    normal: the normal matrix. score: the right-hand side. chi2: with scene and brightness fitted, but none of the columns.
+    normal: the normal matrix. score: the right-hand side. chi2: after the fit of scene and brightness alone, without the columns.
     freedom: degrees of freedom of this chi2. gains: the fitted g_n of each image, without the columns.
     """
 

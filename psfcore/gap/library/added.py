@@ -1,8 +1,8 @@
 """Effects that are added to the library by a Python file, or a module, that defines EFFECTS.
 
 This module runs the code of that file. The name of the file comes from the person or service that runs the diagnosis,
-never with the data. If the code fails, during the import or when it computes a change, the error names the file and the
-line for the author of the code.
+never with the data. The code may fail during the import or when it computes a change. The error then names the file and
+the line, for the author of the code.
 """
 
 from __future__ import annotations

@@ -12,10 +12,8 @@ from scipy.ndimage import distance_transform_edt
 from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.view import Field, View
 
-FAINT_DN = (
-    30.0,
-    150.0,
-)  # decay levels of two losses; their sum approximates a loss with any decay level in between
+# Decay levels of two losses; their sum approximates a loss with any decay level in between.
+FAINT_DN = (30.0, 150.0)
 # Decay times, in units of the mean interval between images. Sums of these decays and of a fraction of the previous image
 # approximate charge traps.
 FADES_IN = {"one_wait": 1, "three_waits": 3}

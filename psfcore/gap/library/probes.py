@@ -30,9 +30,8 @@ from psfcore.transit.occulter import coverage
 
 Plane = NDArray[np.float64]
 
-PATCH_SHARE = (
-    0.08  # standard deviation of a patch of light or shadow, as a fraction of the shorter side of the field
-)
+# Standard deviation of a patch of light or shadow, as a fraction of the shorter side of the field.
+PATCH_SHARE = 0.08
 PATCH_TRIALS = 60
 LEAST_EXPOSURES = 2
 

@@ -18,10 +18,8 @@ Report = dict[str, Any]
 MOST_EFFECTS = 10
 CERTAIN_P = 1e-12  # a smaller p-value is written as "p < 1e-12"
 _ANSWER, _OTHER = "#0072B2", "#9a9a9a"
-_NO_CLOSURE, _MOST_CLOSURE = (
-    -0.35,
-    1.3,
-)  # smallest and largest closure that the chart shows; longer bars are cut
+# Smallest and largest closure that the chart shows; longer bars are cut.
+_NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3
 
 
 def draw_where(axes: Any, report: Report) -> None:

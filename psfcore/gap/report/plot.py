@@ -35,10 +35,8 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#8a6d00", "#56B4E9")
 _SYMBOLS = ("o", "s", "^", "D", "v", "P")
 _BEFORE, _AFTER, _OBSERVED = "#D55E00", "#0072B2", "#333333"
 _DARK = 0.55  # fraction of the colour scale above which numbers are white, because the colour is dark
-_SLICE_PX, SLICE_ROWS = (
-    20,
-    2,
-)  # half width of a slice along x, px; number of rows on each side of the middle row
+# Half width of a slice along x, px; number of rows on each side of the middle row.
+_SLICE_PX, SLICE_ROWS = 20, 2
 _FITTED, _ANSWERED = "Fitted model", "With the named effects"
 
 

@@ -16,8 +16,9 @@ them. The prediction includes the uncertainty of the fitted parameters: if a fit
 increases its deviance only a little.
 
 Images are held out in two ways: blocks of time with a guard, and one pointing at a time. chi2 is summed over the cells of
-the discs. The chi2 of the blocks of the unocculted field is added if these blocks show more of the gap than the discs do,
-and if the effect explains more than half of it. A gain that differs between images is an example.
+the discs. The chi2 of the blocks of the unocculted field is added under two conditions: these blocks show more of the gap
+than the discs do, and the effect explains more than half of what they show. A gain that differs between images is an
+example.
 
 The intervals are meant to contain the closure that the true cause would reach, not only our estimate. They combine four
 errors: a bootstrap over the images; the error of the noise scale in nu, which one simulation determines; the part of
@@ -42,9 +43,8 @@ Vector = NDArray[np.float64]
 RESAMPLES = 1000
 FORM_ERROR = 0.1  # relative error of an effect's template; the square of this error is a fraction of chi2
 INTERVAL = (5.0, 95.0)
-HIDDEN_SIGMA = (
-    1.645  # a normal variable is below this number of standard deviations with a probability of 95 %
-)
+# A normal variable is below this number of standard deviations with a probability of 95 %.
+HIDDEN_SIGMA = 1.645
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What a scheme of folds gives for each held-out image with a disc. Images that no fold holds out are missing.
+    """The results of a scheme of folds, for each held-out image with a disc. Images that no fold holds out are missing.
 
     chi2, unocculted_chi2: chi2 of the cells, and of the blocks of the unocculted field. expected, unocculted_expected: the
     values of the two chi2 without a gap. residual_pct: the mean of the disc, simulated minus observed, divided by the

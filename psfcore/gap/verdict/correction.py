@@ -1,7 +1,7 @@
 """A full refit: fit the PSF again to images from which the change by an effect was subtracted.
 
-Each round computes the change of the images by the effect from the current scene and PSF, subtracts it from the images,
-and fits the PSF again. Then it computes the change again at this fit, and fits what remains of the effect together with
+Each round computes the change of the images by the effect, from the current scene and PSF. It subtracts this change from
+the images and fits the PSF again. Then it computes the change again at this fit, and fits what remains of the effect together with
 the PSF. The rounds are Gauss-Newton steps. Two or three rounds converge, and the result is then more than a first-order
 approximation. A round is rejected if it leaves clearly more chi2 than an earlier round.
 """

@@ -24,8 +24,9 @@ The verdict follows these rules:
 - An effect is enough in two cases. Either the residuals after it have a p-value of at least ENOUGH, where its template
   may have a relative error TEMPLATE_ERROR; or less than LEFT_SHARE of the gap remains and no rival has a score close to
   that of the effect. The second case allows for an effect whose template is slightly wrong.
-- A second effect is named with the first one if its additional gain is larger than what a search in noise, and an error
-  of the first template, can give. It must also exceed what a full refit of the first effect explains by itself.
+- A second effect is named with the first one if its additional gain is large enough. It must exceed the gain that a
+  search in noise gives, and the gain that an error of the first template gives. The second effect gets no credit for what
+  a full refit of the first effect explains.
 - The linear model holds only for a small gap. If the best effect is not enough in the linear model, it is added to the
   model in a full refit, and the residuals of that refit are judged. If no single effect is enough, all pairs are tried.
 - Closing much of a gap does not identify its cause, because a wrong effect can do that too. The verdict is `unknown` if
@@ -39,7 +40,7 @@ The verdict follows these rules:
   is then made without this effect. If a pair fails this test, the verdict is `inconclusive`.
 - A measured effect fits the unocculted field whatever the cause. If an effect of few parameters gains nearly as much, it
   is preferred. If no other effect gains nearly as much, the measured effect is the answer, however much it leaves in the
-  unocculted field. A gap in the discs is then judged separately, with the measured effect in the model, and one or two
+  unocculted field. A gap in the discs is then judged separately, with the measured effect in the model. One or two
   effects can be named with it. If none can be named, and the positions of all occulters are reliable, the verdict is
   `inconclusive`.
 - Effects that could replace one member of a pair are named too. If there are many of them, only the other member is
@@ -80,23 +81,19 @@ BEHIND = 0.85  # a rival is close if its score exceeds this fraction of the best
 # fits any gap to some degree.
 NEAR_BEHIND = 0.7
 UNRIVALLED = 0.1  # a measured effect is unrivalled if effects that were not measured stay below this fraction of its score
-MANY_PLACES = (
-    100  # an effect with at least this number of trials searched for its position in the whole field
-)
+# An effect with at least this number of trials searched for its position in the whole field.
+MANY_PLACES = 100
 MOST_SECONDS = 2  # no second effect is named if more than this number of effects could be the second one
 CLEAR = 12.0  # difference of scores by which a pair is clearly better than one effect, or a probe than all effects
 TEMPLATE_ERROR = 0.05  # relative error of an effect's template
-UNOCCULTED_WIDTH = (
-    0.03  # chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap
-)
-LENIENT = (
-    5.0  # with the other two floors, the p-values of a gap and of its cause may be larger by this factor
-)
+# Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap.
+UNOCCULTED_WIDTH = 0.03
+# With the other two floors, the p-values of a gap and of its cause may be larger by this factor.
+LENIENT = 5.0
 BY_CHANCE = 0.01  # a probe explains more if noise gives its additional gain with a probability below this
 MOST_AMISS = 2  # most effects that failed refits may exclude; also the most tied effects that are refitted
-LEAST_IMAGES = (
-    6  # with fewer images no image can be held out, and a gap may exist although the images do not show it
-)
+# With fewer images no image can be held out, and a gap may exist although the images do not show it.
+LEAST_IMAGES = 6
 
 
 @dataclass(frozen=True)
@@ -338,7 +335,7 @@ def _judge(model: LinearModel, refit: Refitter, beyond: Refitter, lenient: float
     p_gap = _p_of_gap(before, named)
     if p_gap > lenient * ALARM or not named:
         return Judgement("none", (), p_gap, tuple(named), probes, named[0] if named else None)
-    # A measured effect fits the unocculted field whatever the cause: its score does not count as that of a rival.
+    # A measured effect fits the unocculted field whatever the cause, so it does not count as a rival.
     measured = {t.label for t in named if evidence.numbers_of(_own(model, t))}
     outdone = measured if _few_numbers_do(named, measured) else set()
     others, failed = _held_out_first(model, [t for t in named if t.label not in outdone])
@@ -448,8 +445,8 @@ def _beside(model: LinearModel, best: Tried, beyond: Refitter) -> Judgement | No
 
     None if this cannot be decided. The verdict names the best effect alone if more than MOST_SECONDS effects could be the
     second. `tried` contains only the fits of the answer.
-    This function also serves if the best effect is a measured effect that leaves much in the unocculted field, for example
-    if the Sun flickers faster than the cadence of the images. The discs do not show such an effect, so their residuals are
+    This function also serves if the best effect is a measured effect that leaves much in the unocculted field. An example is
+    a Sun that flickers faster than the cadence of the images. The discs do not show such an effect, so their residuals are
     judged separately: two further effects may act in the discs. If these cannot be identified, the verdict is
     `inconclusive`.
     """
@@ -510,8 +507,8 @@ def _unocculted_alone(model: LinearModel, tried: Tried) -> bool:
 def _explains_more(probe: Tried, best: Tried) -> bool:
     """Whether a probe has a higher score than the best effect and also explains more.
 
-    A probe does not explain more if its score is higher only because it has fewer parameters (a simpler template of the same
-    effect), or if noise could give its additional parameters the additional gain.
+    A probe may have a higher score only because it has fewer parameters, as a simpler template of the same effect. It then
+    does not explain more. The same holds if noise could give its additional parameters the additional gain.
     """
     more = probe.gain - best.gain
     numbers = max(len(probe.values) - len(best.values), 1)

@@ -5,9 +5,9 @@ confounded: a transit has few pointings and one track, so position, time and bri
 explain a decrease of chi2. The share of an axis is its contribution to this decrease, averaged over all orders in which
 the axes can be added (Shapley value).
 
-The p-value of an axis comes from random sign flips: each flip reverses the sign of the residuals of random images. It is
-the fraction of flips after which this axis alone decreases chi2 at least as much as it does for the true residuals, times
-the number of axes. If the brightness of the unocculted field gives a smaller p-value, this one is used.
+The p-value of an axis comes from random sign flips: each flip reverses the sign of the residuals of random images. A flip counts
+if this axis alone then decreases chi2 at least as much as for the true residuals. The p-value is the fraction of flips that
+count, times the number of axes. If the brightness of the unocculted field gives a smaller p-value, this one is used.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def where(
 ) -> tuple[Axis, ...]:
     """All axes, the strongest first. Significant axes come before the others; then the share decides.
 
-    favoured: the axes of the best effect. They come first if they explain at least AS_GOOD of what the best axis explains,
-    because more than the position on the track identified this effect. explained: the fit of an effect that explains the gap.
+    favoured: the axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the best axis
+    explains, because more data than the position on the track identified this effect. explained: the fit of an effect that explains the gap.
     If given, the shares are computed from the part of the residuals that this effect explains, which contains no noise.
     """
     designs = _designs(model.evidence)
