@@ -265,7 +265,7 @@ class _Refits:
             return None
 
         def say(stage: str, step: int, steps: int) -> None:
-            self._progress(f"beyond {tried.label}: {stage}", step, steps)
+            self._progress(f"further effects beside {tried.label}: {stage}", step, steps)
 
         return beyond(made, self._model.evidence.effects, self._model, progress=say)
 
@@ -297,7 +297,7 @@ class _Refits:
             return self._made[tried.label]
 
         def say(stage: str, step: int, steps: int) -> None:
-            self._progress(f"adding {tried.label}: {stage}", step, steps)
+            self._progress(f"full refit with {tried.label}: {stage}", step, steps)
 
         effects = {effect.name: effect for effect in self._model.evidence.effects}
         chosen = [effects[name] for name in tried.names]

@@ -21,9 +21,10 @@ The verdict follows these rules:
 - An effect is tied with the best one if the two scores differ by less than TIE, or by less than TIE_SHARE of the best
   gain. The limit is wider if the best effect searched for a position. An effect that predicts held-out images clearly
   worse is not tied.
-- An effect is enough in two cases. Either the residuals after it have a p-value of at least ENOUGH, where its template
-  may have a relative error TEMPLATE_ERROR; or less than LEFT_SHARE of the gap remains and no rival has a score close to
-  that of the effect. The second case allows for an effect whose template is slightly wrong.
+- An effect is called enough (it explains the gap) in two cases. In the first case, the residuals after the effect have a
+  p-value of at least ENOUGH, where the template may have a relative error TEMPLATE_ERROR. In the second case, less than
+  LEFT_SHARE of the gap remains, and no rival has a score close to that of the effect. The second case allows for an
+  effect whose template is slightly wrong.
 - A second effect is named with the first one if its additional gain is large enough. It must exceed the gain that a
   search in noise gives, and the gain that an error of the first template gives. The second effect gets no credit for what
   a full refit of the first effect explains.
@@ -39,10 +40,10 @@ The verdict follows these rules:
 - An effect is excluded if it explains in a full refit less than half of what it explains in the linear model. The verdict
   is then made without this effect. If a pair fails this test, the verdict is `inconclusive`.
 - A measured effect fits the unocculted field whatever the cause. If an effect of few parameters gains nearly as much, it
-  is preferred. If no other effect gains nearly as much, the measured effect is the answer, however much it leaves in the
-  unocculted field. A gap in the discs is then judged separately, with the measured effect in the model. One or two
-  effects can be named with it. If none can be named, and the positions of all occulters are reliable, the verdict is
-  `inconclusive`.
+  is preferred. If the scores of all other effects, except measured ones, are below UNRIVALLED times the best score, the
+  measured effect is the answer, however much it leaves in the unocculted field. A gap in the discs is then judged
+  separately, with the measured effect in the model. One or two effects can be named with it. If none can be named, and
+  the positions of all occulters are reliable, the verdict is `inconclusive`.
 - Effects that could replace one member of a pair are named too. If there are many of them, only the other member is
   named.
 """
