@@ -1,7 +1,9 @@
-"""The blind set: simulated transits with withheld effects, which test the gap diagnosis.
+"""The blind set: simulated transits that test the gap diagnosis. Their effects are withheld from the diagnosis.
 
-A case is made, its truth is sealed, a process that sees only the images diagnoses it, and the reports are scored.
+Each case is simulated, and its truth is sealed by a hash. A process that sees only the images diagnoses the case. Then the
+reports are compared with the truths.
 
-``psfcore.blind`` and ``psfcore.gap`` share no code, on purpose. The blind set judges the gap library: its effects are
-written independently, with other formulas and other parameters. Shared code would hide the same error on both sides.
+``psfcore.blind`` and ``psfcore.gap`` share no code, on purpose. The blind set tests the gap library, so its effects are
+written independently, with other formulas and other parameters. An error in shared code would remain undetected, because
+it would be the same on both sides.
 """

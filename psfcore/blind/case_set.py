@@ -1,11 +1,12 @@
-"""A blind set on disk: its folders, its seals, and how its cases are made.
+"""A blind set on disk: its folders, its seals, and the function that makes its cases.
 
-DIR/set.json                  how the set was made: seed, sizes, number of cases
-DIR/cases/NNNN/transit/       the input of a diagnosis
-DIR/cases/NNNN/report.json    its report (gap/1); run.json: time, memory, and the reason if there is no report
+DIR/set.json                  the plan of the set: seed, sizes, number of cases
+DIR/cases/NNNN/transit/       the input of the diagnosis of case NNNN
+DIR/cases/NNNN/report.json    the report of this diagnosis (gap/1)
+DIR/cases/NNNN/run.json       time and memory of the diagnosis, and the reason if it gave no report
 DIR/truth/NNNN.json           salt and truth
-DIR/seals.jsonl               {"case", "sha256"}, one line per case
-DIR/score.json, .txt, .png    the figures, the table, the picture; each run writes them again
+DIR/seals.jsonl               one line for each case: {"case", "sha256"}
+DIR/score.json, .txt, .png    the score as JSON, as a table and as a picture; each run writes them again
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SetPlan:
-    """How a set is made. first: the number of its first case; the other fields: see draw_case."""
+    """The plan of a set. cases: number of cases. first: the number of the first case. The other fields are those of `draw_case`."""
 
     cases: int
     seed: int
@@ -59,7 +60,7 @@ class SetPlan:
 
 @dataclass(frozen=True)
 class _Attempt:
-    """The attempt to make one case: its seal, or the reason why it could not be made."""
+    """The attempt to make one case. seal: empty if it failed. why_not: the reason of a failure."""
 
     case: int
     seconds: float
@@ -74,19 +75,19 @@ class BlindSet:
     folder: Path
 
     def case_folder(self, number: int) -> Path:
-        """The folder of a case: its transit, then its report."""
+        """The folder of a case, which contains its transit and, after the diagnosis, its report."""
         return self.folder / "cases" / f"{number:04d}"
 
     def transit(self, number: int) -> Path:
-        """The input of a diagnosis."""
+        """The folder with the transit of a case, the input of the diagnosis."""
         return self.case_folder(number) / "transit"
 
     def report(self, number: int) -> Path:
-        """The report of a diagnosis."""
+        """The file with the report of a case."""
         return self.case_folder(number) / "report.json"
 
     def truth_file(self, number: int) -> Path:
-        """The file with salt and truth."""
+        """The file with salt and truth of a case."""
         return self.folder / "truth" / f"{number:04d}.json"
 
     @property
@@ -95,11 +96,11 @@ class BlindSet:
         return self.folder / "seals.jsonl"
 
     def seals(self) -> dict[int, str]:
-        """The SHA-256 of each case. Raises DataError "bad-seals"."""
+        """The seal (SHA-256) of each case, by number. Raises DataError "bad-seals"."""
         if not self.seals_file.is_file():
             return {}
         found: dict[int, str] = {}
-        # A last line without an end was cut by a power failure. Its case is made again.
+        # If the last line has no line end, a power failure cut it. Its case is made again.
         for line in self.seals_file.read_text("utf-8").rpartition("\n")[0].splitlines():
             try:
                 entry = json.loads(line)
@@ -114,7 +115,7 @@ class BlindSet:
         return found
 
     def truth(self, number: int) -> dict[str, Any]:
-        """The truth of a case; checks its seal. Raises DataError "broken-seal", "bad-seals"."""
+        """The truth of a case, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
         seal = self.seals().get(number)
         try:
             kept = json.loads(self.truth_file(number).read_text("utf-8"))
@@ -125,14 +126,14 @@ class BlindSet:
             ) from error
         if seal is None or seal_of(salt, truth) != seal:
             message = (
-                f"case {number:04d}: expected a truth with the hash {seal}; it was changed after it was sealed, "
-                "or never sealed"
+                f"case {number:04d}: expected a truth with the hash {seal}; this truth was changed after it was sealed, "
+                "or it was never sealed"
             )
             raise DataError("broken-seal", message)
         return truth
 
     def is_made(self, number: int) -> bool:
-        """Whether a case was made and sealed. Its transit may have been deleted after the diagnosis.
+        """Whether a case was made and sealed. Its transit may be missing, because it is deleted after the diagnosis.
 
         Raises DataError "bad-seals".
         """
@@ -147,10 +148,11 @@ def make_set(
     processes: int = 1,
     progress: Progress = lambda line: None,
 ) -> tuple[BlindSet, dict[int, str]]:
-    """Make and seal the missing cases of a set; returns the set, and the reasons for the cases that failed, by number.
+    """Make and seal the missing cases of a set. Returns the set, and the reasons why cases could not be made, by number.
 
-    scenes: images [y, x] in DN/s from which scenes are taken. Raises DataError "other-set" if the folder holds a set
-    made with another plan or other scenes, "bad-seals", and the errors of draw_case, all before a case is made.
+    scenes: images [y, x] in DN/s, from which scenes are cut. Raises DataError "other-set" if the folder contains a set that
+    was made with another plan or other scenes, "bad-seals", and the errors of `draw_case`. All of these are raised before
+    the first case is made.
     """
     made = BlindSet(folder)
     _remember(made, plan, scenes)
@@ -159,7 +161,7 @@ def make_set(
     missing = [n for n in plan.numbers if not (n in sealed_before and made.truth_file(n).is_file())]
     cases = [_drawn(plan, number) for number in missing]
     for number in missing:
-        shutil.rmtree(made.case_folder(number), ignore_errors=True)  # left by an interrupted run
+        shutil.rmtree(made.case_folder(number), ignore_errors=True)  # an interrupted run may have left it
     not_made: dict[int, str] = {}
     for done, attempt in enumerate(_made(made, cases, scenes, processes), 1):
         so_far = f"in {attempt.seconds:.1f} s ({done} of {len(missing)})"
@@ -177,7 +179,7 @@ def make_set(
 
 
 def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
-    """Write how the set is made, or check that the set in the folder was made in the same way."""
+    """Write the plan of the set; if the folder contains a set, check that it has the same plan."""
     about = json.loads(json.dumps(asdict(plan) | {"scenes": [array_sha256(scene) for scene in scenes]}))
     file = made.folder / "set.json"
     if file.is_file():
@@ -186,7 +188,7 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
         if same != {key: value for key, value in about.items() if key != "cases"}:
             raise DataError(
                 "other-set",
-                f"expected an empty folder, or one with a set made with {about}; {made.folder} holds a set made "
+                f"expected an empty folder, or a set that was made with {about}; {made.folder} contains a set that was made "
                 f"with {before}. Choose another folder",
             )
     made.folder.mkdir(parents=True, exist_ok=True)
@@ -195,7 +197,7 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Lock the set in this folder against other processes. Raises DataError "set-in-use"."""
+    """Lock the set in this folder against other processes. Raises DataError "set-in-use" if another process uses it."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as held:
         try:
@@ -209,7 +211,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def _end_cut_line(file: Path) -> None:
-    """Remove an incomplete last line, which a power failure left."""
+    """Remove the last line of a file if a power failure left it incomplete."""
     if file.is_file() and not (text := file.read_text("utf-8")).endswith("\n"):
         file.write_text(text.rpartition("\n")[0] + "\n" if "\n" in text else "", "utf-8")
 
@@ -217,11 +219,11 @@ def _end_cut_line(file: Path) -> None:
 def _made(
     made: BlindSet, cases: Sequence[Case], scenes: Sequence[Plane], processes: int
 ) -> Iterator[_Attempt]:
-    """Make the cases; the attempts come in the order in which they end."""
+    """Make the cases. The attempts are yielded in the order in which they end."""
     if processes <= 1 or len(cases) <= 1:
         yield from (_make_one(made, case, scenes) for case in cases)
         return
-    # With "fork" the children would inherit locks that threads of this process hold.
+    # With the start method "fork", the child processes would inherit locks that threads of this process hold.
     with ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_end_with_parent
     ) as pool:
@@ -231,7 +233,7 @@ def _made(
 
 
 def _end_with_parent() -> None:
-    """End this process of the pool with its parent; otherwise it would continue after the parent was killed."""
+    """End this process of the pool when its parent ends. Otherwise it would continue after the parent was killed."""
 
     def wait() -> None:
         parent = parent_process()

@@ -1,7 +1,8 @@
-"""What each case of a blind set contains, drawn at random from the seed of the set and the number of the case.
+"""The content of each case of a blind set, drawn at random from the seed of the set and the number of the case.
 
-Equal seed and number give the same case. Of each 24 consecutive cases 8 are clean, 10 have one known effect, 2 have two
-known effects, and 4 have one effect that the gap library does not know.
+The same seed and number always give the same case. Of 24 consecutive cases, 8 are clean: they have no effect. 10 cases
+have one known effect, 2 have two known effects, and 4 have one unknown effect. An effect is known if the gap library
+contains it.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ CLEAN, SINGLE, PAIR, FOREIGN = "clean", "single", "pair", "unknown"
 KINDS = (CLEAN, SINGLE, PAIR, FOREIGN)
 _BLOCK = (CLEAN,) * 8 + (SINGLE,) * 10 + (PAIR,) * 2 + (FOREIGN,) * 4
 _TARGET_PCT = (0.5, 10.0)
-_BUILT_SHARE = 0.5  # of cases with the instrument's diffraction
-_SATURATING_SHARE = 0.25
+_BUILT_SHARE = 0.5  # fraction of cases with the diffraction PSF of the instrument
+_SATURATING_SHARE = 0.25  # fraction of cases with a saturation level
 _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 
 
@@ -39,8 +40,9 @@ _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 class Case:
     """One case before it is made.
 
-    effects: at their nominal strengths. target_pct: what each effect should leave in the discs after a refit.
-    headroom: saturation level over the brightest pixel; None: no saturation.
+    kind: one of KINDS. law, glass: the true scatter and the known part of the PSF. effects: at their nominal strengths.
+    target_pct: the residual that each effect should leave in the discs after a refit, percent. headroom: the saturation
+    level divided by the brightest pixel; None: no saturation.
     """
 
     number: int
@@ -54,7 +56,7 @@ class Case:
     headroom: float | None
 
     def as_json(self) -> dict[str, Any]:
-        """The part of the truth that tells how the case was drawn."""
+        """The part of the truth that describes how the case was drawn, as JSON."""
         return {
             "number": self.number,
             "seed": self.seed,
@@ -77,10 +79,10 @@ def draw_case(
 ) -> Case:
     """Case `number` (from 0) of a set.
 
-    only: names of effects; every case has one of them, in turn. clean_only: no case has an effect.
-    built_diffraction: half of the cases have the instrument's diffraction, the others a synthetic one; False: all have a
-    synthetic one. left_pct: what an effect should leave in the discs after a refit (percent), in turn, each value for
-    all names of `only`; empty: drawn at random. Raises DataError "unknown-effect", "bad-plan".
+    only: names of effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: half
+    of the cases have the diffraction PSF of the instrument, and the others a synthetic one; False: all have a synthetic one.
+    left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in turn,
+    each for all names of `only`; empty: drawn at random. Raises DataError "unknown-effect", "bad-plan".
     """
     kind, names = _what(seed, number, only, clean_only)
     rng = np.random.default_rng([seed, number, _TRUTH_STREAM])
@@ -109,7 +111,7 @@ def _what(seed: int, number: int, only: Sequence[str], clean_only: bool) -> tupl
     block, place = divmod(number, len(_BLOCK))
     kinds = _kinds(seed, block)
     kind = kinds[place]
-    count = block * _BLOCK.count(kind) + kinds[:place].count(kind)  # earlier cases of this kind
+    count = block * _BLOCK.count(kind) + kinds[:place].count(kind)  # number of earlier cases of this kind
     if kind == SINGLE:
         return kind, (_in_turn(seed, count, KNOWN, 0),)
     if kind == FOREIGN:
@@ -127,14 +129,14 @@ def _kinds(seed: int, block: int) -> list[str]:
 
 
 def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
-    """The names in random order; each occurs once before any occurs again."""
+    """Entry `count` of an endless list of the names. The order is random, but every name occurs once before any is repeated."""
     turn, place = divmod(count, len(names))
     order = np.random.default_rng([seed, turn, _KIND_STREAM, 3 + stream]).permutation(len(names))
     return names[order[place]]
 
 
 def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
-    """The default transit, upright or upside down, with shifted tracks and another brightness."""
+    """The default transit, with random changes: upside down or not, shifted tracks, another brightness and other noise."""
     plan = default_plan(
         images,
         size_px,
@@ -173,9 +175,9 @@ def _glass(size_px: int, rng: np.random.Generator, built: bool) -> Glass:
 
 
 def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
-    """Fine scenes [y, x], DN/s, by pointing: synthetic with varied statistics, or cut out of images [y, x] in DN/s.
+    """Fine scenes [y, x], DN/s, by pointing: cut from images, or synthetic with random statistics if there are no images.
 
-    images: used in turn; a single image is mirrored for the west limb. Raises DataError "bad-scene".
+    images: [y, x] in DN/s, used in turn. A single image is mirrored for the west limb. Raises DataError "bad-scene".
     """
     scenes = {}
     for pointing in case.plan.pointings:
@@ -190,18 +192,19 @@ def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
             )
         if scenes[pointing].max() <= 0:
             raise DataError(
-                "bad-scene", f"expected light in the scene of pointing {pointing}; all its pixels are 0"
+                "bad-scene",
+                f"expected light in the scene of pointing {pointing}; all pixels of this scene are 0: choose another image",
             )
     return scenes
 
 
 def _calm(scene: Plane) -> Plane:
-    """Smooth an image by half a detector pixel, because it contains the noise of its telescope."""
+    """Smooth a scene by half a detector pixel, because it is cut from an image with noise."""
     return np.asarray(gaussian_filter(scene, 0.5 * FINE))
 
 
 def _with_own_statistics(scene: Plane, case: Case, pointing: int) -> Plane:
-    """Add broad and fine modulation, compact brightenings with a power law of light, and a constant."""
+    """Add to a synthetic scene: broad and fine modulation, compact brightenings with power-law brightness, and a constant."""
     rng = np.random.default_rng([case.seed, pointing, 4])
     n = scene.shape[0]
     seed = int(rng.integers(2**31))

@@ -1,9 +1,10 @@
-"""From scenes to exposures, on fine pixels, with any effects on the way.
+"""Simulate exposures from scenes, on fine pixels, with any effects at each step.
 
     fine light = spread(P (S - h))  ->  light()  ->  binned  ->  expected()  ->  photons, read noise  ->  read_out()  ->  whole DN
 
-S is the scene, h what the occulter hides of it, P the convolution with the PSF. P is linear: the scene of a pointing is
-convolved once, and for each image only its difference from that scene is convolved.
+S is the scene, h is the part of S that the occulter hides, and P is the convolution with the PSF. "binned" averages the fine
+pixels of each detector pixel; the other names are methods of `effects.effect.Effect`. Because P is linear, the scene of a
+pointing is convolved only once. For each image, only the difference between its scene and that scene is convolved.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from psfcore.transit.transit import Place
 
 Plane = NDArray[np.float64]
 _SKY_STEPS = ("scene", "covered", "optics", "spread")
-_MOST_MOTION_PX = 5.0  # either way from the middle of an exposure
+_MOST_MOTION_PX = 5.0  # largest distance of a moving disc from its position in the middle of the exposure
 _REALISATIONS_STREAM, _NOISE_STREAM = 2001, 2002
 
 
 class EffectFree:
-    """The images of a plan without any effect, on fine pixels; every result is kept.
+    """The images of a plan without any effect, on fine pixels. Each result is computed once and kept.
 
-    scenes: fine [y, x] in DN/s by pointing, FINE pixels along a detector pixel.
+    scenes: fine scenes [y, x], DN/s, by pointing. Along each axis, FINE fine pixels cover one detector pixel.
     """
 
     def __init__(self, plan: Plan, optics: FineOptics, scenes: Mapping[int, Plane]) -> None:
@@ -37,7 +38,7 @@ class EffectFree:
         self._seen: dict[int, Plane] = {}
 
     def seen_scene(self, pointing: int) -> Plane:
-        """The scene of a pointing convolved with the PSF, fine, without an occulter."""
+        """The fine scene of a pointing, without an occulter, convolved with the PSF [y, x], DN/s."""
         if pointing not in self._seen:
             self._seen[pointing] = np.asarray(
                 self.optics.through.apply(self.scenes[pointing]), dtype=np.float64
@@ -45,7 +46,7 @@ class EffectFree:
         return self._seen[pointing]
 
     def clean_light(self, index: int) -> Plane:
-        """The fine light [y, x] of an image, DN/s."""
+        """The light of an image in the focal plane, on fine pixels [y, x], DN/s, without effects."""
         if index not in self._light:
             pointing = self.plan.shots[index].pointing
             lit = _lit(self, (), Moment(self.plan, index))
@@ -55,7 +56,7 @@ class EffectFree:
 
 
 class Chain:
-    """A set of effects, applied to effect-free images."""
+    """The simulation of the images of a plan with a set of effects."""
 
     def __init__(self, clean: EffectFree, effects: Sequence[Effect]) -> None:
         self.clean, self.plan, self.effects = clean, clean.plan, tuple(effects)
@@ -65,7 +66,7 @@ class Chain:
         self._seen: dict[int, Plane] = {}
 
     def expected(self, index: int) -> Plane:
-        """Light on detector pixels [y, x], DN/s: the mean of many exposures before the readout."""
+        """The expected light on detector pixels [y, x], DN/s, before the readout. It contains no noise."""
         moment = Moment(self.plan, index)
         light = self._focal_plane(moment) if self._changes_sky else self.clean.clean_light(index)
         for effect in self.effects:
@@ -76,7 +77,7 @@ class Chain:
         return np.maximum(rate, 0.0)
 
     def all_expected(self) -> list[Plane]:
-        """expected() of every image."""
+        """The result of `expected` for every image."""
         return [self.expected(index) for index in range(len(self.plan.shots))]
 
     def _focal_plane(self, moment: Moment) -> Plane:
@@ -107,7 +108,7 @@ class Chain:
         return self._optics
 
     def saturation_dn(self, expected: Sequence[Plane]) -> float | None:
-        """The level at which high-only images clip: that of the plan, unless an effect sets one."""
+        """The level (DN) at which high-only images clip. An effect may set it; otherwise it is the level of the plan."""
         exposures = [rate * shot.exposure_s for rate, shot in zip(expected, self.plan.shots, strict=True)]
         for effect in self.effects:
             level = effect.saturation_dn(exposures, self.plan)
@@ -116,7 +117,7 @@ class Chain:
         return self.plan.saturation_dn
 
     def read_out(self, expected: Sequence[Plane], seed: int) -> list[Plane]:
-        """Clipped exposures in whole DN [y, x], with the noise realisation of a seed."""
+        """The exposures in whole DN [y, x], with noise and clipping. seed: of the noise realisation."""
         level = self.saturation_dn(expected)
         noisy = self._through_readout(expected, self._noisy(expected, [seed, _NOISE_STREAM]))
         return [
@@ -125,9 +126,9 @@ class Chain:
         ]
 
     def mean_rate(self, expected: Sequence[Plane], seed: int) -> list[Plane]:
-        """Nearly the mean of many exposures: clipped images [y, x], DN/s.
+        """Clipped images [y, x], DN/s, that are approximately the mean of many exposures.
 
-        If the change that an effect makes at readout depends on noise, it is averaged over noise realisations.
+        If the change by an effect during the readout depends on noise, this change is averaged over noise realisations.
         """
         realisations = max((effect.noise_realisations for effect in self.effects), default=0)
         exposures = [rate * shot.exposure_s for rate, shot in zip(expected, self.plan.shots, strict=True)]
@@ -167,7 +168,7 @@ class Chain:
 
 
 def _lit(clean: EffectFree, effects: Sequence[Effect], moment: Moment) -> Plane:
-    """The fine scene of an image with its occulter."""
+    """The fine scene of an image, with its occulter in front [y, x], DN/s."""
     scene = clean.scenes[moment.shot.pointing]
     for effect in effects:
         scene = effect.scene(scene, moment)

@@ -1,13 +1,13 @@
-"""What an effect leaves in the discs: the residual of noise-free images, before and after the PSF is refitted.
+"""The residual that an effect leaves in the discs of noise-free images, before and after the PSF is refitted.
 
-    e_i = mean of the fully dark pixels of D [y_i - H (1 - D) x_i], in percent of their mean of y_i     Eq. (1)
-    left = rms over images of e_i with the effect minus e_i without                                      Eq. (2)
-    after a fit, to first order:  r - A (A^T W A)^-1 A^T W r                                             Eq. (3)
+    e_i = -100 mean(D [y_i - H (1 - D) x_i]) / mean(D y_i)                                               Eq. (1)
+    left = rms over images of (e_i with the effect - e_i without the effect)                             Eq. (2)
+    residual after a refit, to first order:  r - A (A^T W A)^-1 A^T W r                                  Eq. (3)
 
-y_i is image i, x_i its deconvolved scene, D the mask of the fully dark pixels. H is the convolution with the true PSF on
-detector pixels. A is the Jacobian of the dark pixels with respect to the three parameters of the scatter, W their
-weights, r their residuals. Eq. (3) is quick and serves to set the strength of an effect. The figures in the truth
-of a case come from a full inversion.
+y_i is image i, x_i is its deconvolved scene, and D is the mask of the fully dark pixels. Both means in Eq. (1) are over
+these pixels. H is the convolution with the true PSF on detector pixels. r are the residuals of the dark pixels, W their
+weights, and A their Jacobian with respect to the three parameters of the scatter. Eq. (3) is fast and serves to set the
+strength of an effect. The residuals in the truth of a case come from a full inversion.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ _LEAST_LEVEL = 0.2
 
 @dataclass(frozen=True)
 class _Discs:
-    """One image without the effect: its dark pixels, scene, residual, Jacobian (parameters, pixels) and weights."""
+    """One image without the effect: its dark pixels, its scene, and the residual, Jacobian and weight of the dark pixels.
+
+    residual, weight: (pixels,). jacobian: (parameters, pixels).
+    """
 
     dark: Pixels
     scene: Lanes
@@ -48,9 +51,10 @@ class _Discs:
 
 @dataclass(frozen=True)
 class Left:
-    """What an effect leaves, and what the sampling leaves without an effect (clean): percent, rms over images.
+    """The residual that an effect leaves in the discs, percent, rms over images.
 
-    by_image_pct: what the effect leaves after the refit in each image, signed.
+    The names with "clean" are the residual without any effect, which the sampling on pixels causes. by_image_pct: the
+    residual by image number that the effect leaves after the refit, with its sign.
     """
 
     before_refit_pct: float
@@ -61,7 +65,10 @@ class Left:
 
 
 class LinearEstimator:
-    """Eq. (1) to (3), linearised at images without effect. frames: these images, nearly noise-free, with exact places."""
+    """Compute Eq. (1) to (3), linearised at images without effects.
+
+    frames: the nearly noise-free images without effects, with the exact positions of the occulter.
+    """
 
     def __init__(self, frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> None:
         shape = (frames[0].pixels.shape[0], frames[0].pixels.shape[1])
@@ -73,7 +80,7 @@ class LinearEstimator:
         self._discs = [self._look(frame) for frame in frames]
 
     def left(self, images: Mapping[int, Plane]) -> Left:
-        """What an effect leaves. images: those with the effect [y, x], DN/s, by number; the fit uses only these."""
+        """The residual that an effect leaves. images: with the effect [y, x], DN/s, by number. The refit uses only these images."""
         residuals = {n: self._residual(n, pixels) for n, pixels in images.items()}
         changes = {n: residuals[n][0] - self._discs[n].residual for n in images}
         clean = {n: self._discs[n].residual for n in images}
@@ -87,7 +94,7 @@ class LinearEstimator:
         )
 
     def clean_left_pct(self) -> dict[int, float]:
-        """Eq. (1) of every image without effect after the refit, percent."""
+        """Eq. (1) for every image without effects, after the refit, percent, by image number."""
         fitted = self._refitted({n: disc.residual for n, disc in enumerate(self._discs)})
         return {n: self._percent(n, residual) for n, residual in fitted.items()}
 
@@ -109,7 +116,7 @@ class LinearEstimator:
         )
 
     def _column(self, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
-        """A column of A: the direct change of the dark pixels, and the one through the deconvolved scene."""
+        """One column of A: the direct change of the dark pixels, minus their change through the deconvolved scene."""
         changed = slope.convolve(lit)
         scene = _blanked(self._optics.invert_once(changed), dark)
         return pick(changed, dark) - pick(self._optics.convolve(scene), dark)
@@ -140,14 +147,17 @@ class LinearEstimator:
 
 @dataclass(frozen=True)
 class Refitted:
-    """A full inversion of nearly noise-free images: e_i of Eq. (1) and its noise per image, percent; fitted values."""
+    """The result of a full inversion of nearly noise-free images.
+
+    residual_pct: e_i of Eq. (1), by image number. noise_pct: the noise of e_i. values: the fitted parameters of the scatter.
+    """
 
     residual_pct: dict[int, float]
     noise_pct: dict[int, float]
     values: dict[str, float]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; the keys of images are their numbers."""
+        """Values for JSON. The keys of images are their numbers, as text."""
         return {
             "residual_pct": {str(n): value for n, value in self.residual_pct.items()},
             "noise_pct": {str(n): value for n, value in self.noise_pct.items()},
@@ -156,7 +166,7 @@ class Refitted:
 
 
 def refitted(frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> Refitted:
-    """Refit the PSF, starting at the truth. Raises the errors of psfcore.scatter.inversion.invert."""
+    """Refit the PSF. The fit starts at the true parameters. Raises the errors of psfcore.scatter.inversion.invert."""
     transit = Transit(frames=tuple(frames), diffraction=diffraction, noise=noise)
     inversion = invert(transit, start=true_coordinates(law)).inversion
     number = {frame.file: n for n, frame in enumerate(frames)}
@@ -168,13 +178,13 @@ def refitted(frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, no
 
 
 def rms_difference(with_effect: Mapping[int, float], without: Mapping[int, float]) -> float:
-    """Eq. (2) over the images that are in both; percent."""
+    """Eq. (2), percent, over the images that both arguments contain; 0 if there are none."""
     both = sorted(set(with_effect) & set(without))
     return float(np.sqrt(np.mean([(with_effect[n] - without[n]) ** 2 for n in both]))) if both else 0.0
 
 
 def true_coordinates(law: ScatterTruth) -> Vector:
-    """The parameters of the true power law in the coordinates of the fit."""
+    """The parameters of the true power law, as coordinates of the fit."""
     return SOFTENED_POWER_LAW.coordinates({"b_px": law.b_px, "c": law.c, "total": law.total})
 
 

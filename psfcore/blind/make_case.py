@@ -1,11 +1,12 @@
-"""Make a case: its transit in one folder, its truth in another, and a seal on the truth.
+"""Make a case: write its transit into one folder and its truth into another, and seal the truth.
 
-    DIR/cases/NNNN/transit/   only images, diffraction.fits and transit.json; nothing in them names an effect
+    DIR/cases/NNNN/transit/   the images, diffraction.fits and transit.json; none of these files names an effect
     DIR/truth/NNNN.json       salt and truth
-    DIR/seals.jsonl           one line per case: SHA-256 of the salt and the truth, made before any diagnosis
+    DIR/seals.jsonl           one line for each case: SHA-256 of salt and truth, computed before any diagnosis
 
-The strength of an effect is set so that the effect leaves about the target of the case in the discs, but not beyond the
-largest plausible strength. What the effect then leaves is measured and is part of the truth.
+Each case has a target for each effect: the residual (percent) that the effect should leave in the discs after a refit of
+the PSF. The strength of the effect is set to reach this target, but at most to the largest plausible strength. The
+residual that the effect then leaves is measured, and is a part of the truth.
 """
 
 from __future__ import annotations
@@ -35,13 +36,17 @@ from psfcore.transit.transit import Frame, Place
 Plane = NDArray[np.float64]
 SCHEMA = "transit/1"
 TRIALS = 2
-STRENGTH_WITHIN = 1.4  # factor from the target within which a strength is accepted
+STRENGTH_WITHIN = 1.4  # a strength is accepted if its residual is within this factor of the target
 _PLACE_STREAM = 2003
 
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """A case as made: exposures in whole DN, reported places, saturation level, known PSF, truth."""
+    """A case that was made.
+
+    exposures: [y, x] in whole DN. reported: the positions of the occulter, with errors. saturation_dn: the level at which
+    high-only images clip, None: no clipping. diffraction: the known PSF. truth: as in the truth file.
+    """
 
     exposures: list[Plane]
     reported: list[Place]
@@ -51,9 +56,9 @@ class Made:
 
 
 def make(case: Case, images: Sequence[Plane] = ()) -> Made:
-    """Make the scenes, set the strengths, simulate the exposures, measure what the effects leave.
+    """Make the scenes, set the strengths, simulate the exposures, and measure the residual that the effects leave.
 
-    images: [y, x] in DN/s, from which scenes are taken; empty: synthetic scenes.
+    images: [y, x] in DN/s; scenes are cut from them. Empty: synthetic scenes.
     Raises DataError "bad-scene", and the errors of `psfcore.scatter.inversion.invert`.
     """
     effect_free = EffectFree(
@@ -87,7 +92,10 @@ def make(case: Case, images: Sequence[Plane] = ()) -> Made:
 def _at_target(
     effect: Effect, target_pct: float, case: Case, effect_free: EffectFree, estimator: LinearEstimator
 ) -> tuple[Effect, Left]:
-    """The effect at the strength that leaves about target_pct, at most its largest strength; and what it leaves."""
+    """Two results: the effect with its strength set, and the residual that it leaves.
+
+    The strength is chosen to leave a residual of about target_pct, but is at most the largest plausible strength.
+    """
     tried, found = effect, _quick_left(effect, case, effect_free, estimator)
     for _ in range(TRIALS):
         short = target_pct / max(found.after_refit_pct, 1e-6)
@@ -95,7 +103,7 @@ def _at_target(
             break
         wanted = tried.strength * short ** (1 / tried.power)
         strength = float(min(wanted, tried.largest))
-        if strength == tried.strength:  # the largest strength leaves less than the target
+        if strength == tried.strength:  # even the largest strength leaves less than the target
             break
         tried = tried.at(strength)
         found = _quick_left(tried, case, effect_free, estimator)
@@ -103,7 +111,7 @@ def _at_target(
 
 
 def _quick_left(effect: Effect, case: Case, effect_free: EffectFree, estimator: LinearEstimator) -> Left:
-    """What an effect leaves in the discs, to first order."""
+    """The residual that one effect alone leaves in the discs, to first order."""
     chain = Chain(effect_free, (effect,))
     expected = chain.all_expected()
     rates = _rates(chain, case, expected, chain.saturation_dn(expected))
@@ -111,9 +119,10 @@ def _quick_left(effect: Effect, case: Case, effect_free: EffectFree, estimator: 
 
 
 def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
-    """What an effect leaves alone, without the other effects of the case, after a refit and to first order.
+    """The residual that an effect leaves without the other effects of the case, after a refit, to first order.
 
-    In percent, and as chi2 of the means of the discs: the sum of squares over their noise.
+    left_alone_pct: percent, rms over images. left_alone_chi2: the sum over images of (residual / noise)^2, for the means of
+    the discs.
     """
     noise = left["refitted"]["noise_pct"]
     shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)
@@ -121,7 +130,7 @@ def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
 
 
 def _rates(chain: Chain, case: Case, expected: Sequence[Plane], level: float | None) -> list[Plane]:
-    """Nearly noise-free images [y, x], DN/s, as the analysis gets them, with clipped pixels filled."""
+    """Nearly noise-free images [y, x], DN/s, prepared as for a fit: clipped pixels are filled."""
     return [
         np.asarray(frame.pixels, dtype=np.float64)
         for frame in _frames(case.plan, chain.mean_rate(expected, case.seed), level)
@@ -129,7 +138,7 @@ def _rates(chain: Chain, case: Case, expected: Sequence[Plane], level: float | N
 
 
 def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Frame, ...]:
-    """Frames with the exact places; clipped pixels are filled as they are when a transit is read."""
+    """Frames with the exact positions of the occulter. Clipped pixels are filled in the same way as when a transit is read."""
     exposures = []
     for n, (rate, shot) in enumerate(zip(rates, plan.shots, strict=True)):
         gaps = None
@@ -159,7 +168,10 @@ def _left(
     diffraction: Plane,
     level: float | None,
 ) -> dict[str, Any]:
-    """What the effects leave in the discs: percent, rms over images, and per image after the refit."""
+    """The residual that all effects of a case leave in the discs: percent, rms over images and for each image.
+
+    level: the level (DN) at which high-only images clip; None: no clipping.
+    """
     clean_after = estimator.clean_left_pct()
     clean_rms = float(np.sqrt(np.mean(np.square(list(clean_after.values())))))
     if not chain.effects:
@@ -179,7 +191,7 @@ def _left(
 
 
 def _level(case: Case, rates: Sequence[Plane]) -> float | None:
-    """The saturation level of a transit that has one, but whose brightest pixel is below it."""
+    """The saturation level (DN) of the case; it is above the brightest pixel. None: no saturation."""
     if case.headroom is None:
         return None
     brightest = max(
@@ -196,7 +208,7 @@ def _clipped(exposures: Sequence[Plane], plan: Plan, level: float | None) -> lis
 
 
 def _reported(case: Case) -> list[Place]:
-    """The places of the occulter from the ephemeris, to a tenth of a pixel."""
+    """The positions of the occulter as the transit states them: with an ephemeris error, rounded to 0.1 px."""
     rng = np.random.default_rng([case.seed, _PLACE_STREAM])
     plan = case.plan
     errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))
@@ -247,7 +259,7 @@ def _cards(values: dict[str, CardValue]) -> Cards:
 
 
 def sealed(truth: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The seal of a truth, and the content of its truth file: a random salt and the truth."""
+    """Two results: the seal of a truth, and the content of the truth file, which is a random salt and the truth."""
     salt = secrets.token_hex(16)
     return seal_of(salt, truth), {"salt": salt, "truth": truth}
 

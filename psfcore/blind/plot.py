@@ -1,4 +1,8 @@
-"""A picture of a blind set's score: the confusion matrix, and the power against what an effect leaves in the discs."""
+"""A picture of the score of a blind set: the confusion matrix, and the power.
+
+The power is the fraction of cases in which the diagnosis notices, or names, the effect. It is drawn against the residual
+that the effect leaves in the discs.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ _VERDICTS = (NONE, UNKNOWN_VERDICT, INCONCLUSIVE)
 
 
 def score_png(found: Score, path: str | Path) -> None:
-    """Two panels: truth against the first effect named, and the shares noticed and named with Wilson intervals."""
+    """Draw two panels: the truth against the first effect named, and the power with Wilson intervals. path: a PNG file."""
     figure = Figure(figsize=(17, 9.5), dpi=90, facecolor="white", layout="constrained")
     figure.suptitle(
         f"Blind set: {found.judged} cases judged, {len(found.failures)} failed",
@@ -41,14 +45,14 @@ def _matrix(axes: Axes, found: Score) -> None:
     columns += sorted(said - set(columns))
     counts = np.array([[found.confusion[row].get(column, 0) for column in columns] for row in rows])
     if not counts.size:
-        axes.text(0.5, 0.5, "no case judged", ha="center", transform=axes.transAxes)
+        axes.text(0.5, 0.5, "no case was judged", ha="center", transform=axes.transAxes)
         return
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     axes.imshow(shares, cmap="Blues", vmin=0, vmax=1.3, aspect="auto")
     for (row, column), count in np.ndenumerate(counts):
         if count:
             axes.text(column, row, str(count), ha="center", va="center", fontsize=9, color=INK)
-    for row, name in enumerate(rows):  # frame the columns that are right for a row
+    for row, name in enumerate(rows):  # frame the correct columns of each row
         right = _right_columns(name)
         for column in (n for n, label in enumerate(columns) if label in right):
             corner = (column - 0.5, row - 0.5)
@@ -58,7 +62,7 @@ def _matrix(axes: Axes, found: Score) -> None:
     axes.set(
         xlabel="first effect named, or verdict",
         ylabel="truth (* not in the library)",
-        title="Cases; framed: right",
+        title="Number of cases; frames mark correct verdicts",
     )
 
 
@@ -81,8 +85,15 @@ def _power(axes: Axes, found: Score) -> None:
         labels.append(f"{low:g} -\n{high:g}" if high is not None else f"> {low:g}")
     at = np.arange(len(labels))
     for offset, count, hits, interval, colour, name in (
-        (-0.08, "n", "noticed", "noticed_wilson95", "#1b4f91", "noticed (verdict other than none)"),
-        (0.08, "n_known", "contains_truth", "contains_wilson95", "#2b8a6e", "answer contains the truth"),
+        (-0.08, "n", "noticed", "noticed_wilson95", "#1b4f91", "noticed (the verdict is not “none”)"),
+        (
+            0.08,
+            "n_known",
+            "contains_truth",
+            "contains_wilson95",
+            "#2b8a6e",
+            "the named effects include the true ones",
+        ),
     ):
         shown = [n for n, row in enumerate(found.power) if row[count]]
         share = np.array([found.power[n][hits] / found.power[n][count] for n in shown])
@@ -100,8 +111,8 @@ def _power(axes: Axes, found: Score) -> None:
             )
     axes.set_xticks(at, labels)
     axes.set(
-        xlabel="left in the discs after the refit (%, rms over images)",
-        ylabel="share of cases (95 % Wilson)",
+        xlabel="residual left in the discs after the refit (%, rms over images)",
+        ylabel="fraction of cases, with 95 % Wilson interval",
         ylim=(-0.03, 1.08),
     )
     axes.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.03), ncols=2)

@@ -1,8 +1,8 @@
-"""Diagnose a blind set: each case in its own process, which sees only a copy of the transit.
+"""Diagnose a blind set. A separate process diagnoses each case and sees only a copy of its transit.
 
-The copy is in a temporary folder whose name does not contain the number of the case. The process runs there, and its
-report is copied back when it is complete. A case that has a report is not diagnosed again. A failure is written to
-run.json, and the next run tries the case again.
+The copy is in a temporary folder whose name does not contain the number of the case. The process runs in this folder. Its
+report is copied to the set when it is complete. A case that has a report is not diagnosed again. If a diagnosis fails, the
+failure is written to run.json, and the next run tries the case again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Run:
-    """One diagnosis: wall time, largest memory, exit status, and its last output if it failed."""
+    """One diagnosis: its wall time, its largest memory and its exit status. error: the reason if it gave no report."""
 
     case: int
     wall_s: float
@@ -59,10 +59,10 @@ def run_set(
     longest_s: float = LONGEST_S,
     progress: Progress = lambda line: None,
 ) -> list[Run]:
-    """Diagnose the cases that have no report yet; returns their runs in the order of the cases.
+    """Diagnose the cases that have no report yet. Returns one run for each of these cases, in the order of `numbers`.
 
-    command: a program and its arguments, with {transit} and {report} in place of the paths. keep: do not delete a
-    transit after its diagnosis. longest_s: a diagnosis that takes longer is killed.
+    command: a program and its arguments; {transit} and {report} stand for the paths. processes: number of diagnoses at the
+    same time. keep: whether to keep a transit after its diagnosis. longest_s: a diagnosis that takes longer is killed.
     Raises DataError "bad-command", "bad-seals", and "not-sealed" if a case has no seal.
     """
     if not all(any(mark in part for part in command) for mark in ("{transit}", "{report}")):
@@ -72,7 +72,8 @@ def run_set(
     for number in numbers:
         if not made.is_made(number):
             raise DataError(
-                "not-sealed", f"case {number:04d}: expected a sealed truth before the diagnosis; got no seal"
+                "not-sealed",
+                f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the case again",
             )
     missing = [number for number in numbers if not has_report(made, number)]
 
@@ -109,8 +110,9 @@ def run_of(made: BlindSet, number: int) -> Run | None:
 
 
 def judged_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[Judged], dict[int, str]]:
-    """The cases that have a report, with their truth, whose seal is checked; and why the other cases have no report.
+    """Two results: the cases that have a report; the reasons why the other cases have none, by number.
 
+    Each truth is read, and its seal is checked.
     Raises DataError "broken-seal", "bad-seals".
     """
     judged, failures = [], {}
@@ -169,7 +171,7 @@ def _watched(command: Sequence[str], folder: Path, longest_s: float) -> tuple[in
         child = subprocess.Popen(command, cwd=folder, stdout=said, stderr=subprocess.STDOUT)
         late = threading.Timer(longest_s, child.kill)
         late.start()
-        # wait4 tells what this child used; getrusage would tell the maximum over all children.
+        # wait4 returns the memory of this child; getrusage would return the maximum over all children.
         _, status, usage = os.wait4(child.pid, 0)
         late.cancel()
         child.returncode = os.waitstatus_to_exitcode(status)

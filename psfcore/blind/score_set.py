@@ -1,4 +1,4 @@
-"""Score a diagnosed blind set: open its seals, and write the score beside the cases."""
+"""Score a diagnosed blind set: open its seals, compare reports and truths, and write the score into the folder of the set."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from psfcore.blind.score_table import score, table
 
 
 def write_score(made: BlindSet, numbers: Sequence[int], not_made: Mapping[int, str]) -> str:
-    """Write score.json, score.txt and score.png to the set's folder; returns the table (text).
+    """Write score.json, score.txt and score.png into the folder of the set; return the table as text.
 
     numbers: the cases to score. not_made: the reason for each case that could not be made.
     """

@@ -1,24 +1,27 @@
-"""The score of a blind set: the table that judges the diagnosis, the confusion matrix, and the power.
+"""The score of a blind set: a table of figures that judge the diagnosis, the confusion matrix, and the power.
 
-    Wilson: (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)                     Eq. (1)
+The interval of a fraction p of n cases is the Wilson interval:
 
-Each row of the table counts its own cases. "Left" is what the effects leave in the discs after the refit. The answer of
-a report is the set of effects that the verdict `attributed` or `tie` names.
+    (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)                             Eq. (1)
+
+Each row of the table has its own selection of cases. "Left" is the residual that the effects leave in the discs after the
+refit of the PSF. The answer of a report is the set of effects that the verdict `attributed` or `tie` names. An effect is
+"known" if the gap library contains it, otherwise "unknown".
 
 | row | cases | counted |
 |---|---|---|
 | false alarms | clean | the verdict is not `none` |
-| inconclusive on clean data | clean | the verdict is `inconclusive`: a part of the row above |
-| answer contains the truth, >= 2 % | known effects and pairs with 2 % left or more | the answer names the true effect; of a pair both, but not one that leaves less than 1 % alone while the other leaves more |
-| the same, >= 1 % | with 1 % left or more | as above; `inconclusive` counts one half |
-| the same, shown by the discs | cases of the 2 % row with chi2 of SHOWN_CHI2 or more in the means of their discs, without any fit of an effect; of a pair each required effect alone, to first order | as above |
-| first place is the truth | single known effects, 2 % or more | the first of the report's `effects` is the true one |
-| one wrong effect named | all | the verdict is `attributed` with one effect, which is not true. For clean cases and unknown effects every name is wrong. A `tie` or `inconclusive` admits doubt and does not count |
-| mean size of the answer | cases of the 2 % row with an answer | effects in the answer |
+| inconclusive on clean data | clean | the verdict is `inconclusive`; these cases are also false alarms |
+| answer contains the truth, >= 2 % | known effects and pairs with 2 % left or more | the answer contains the true effect. For a pair it must contain both effects; an effect that leaves less than 1 % alone is not required if the other leaves more |
+| the same, >= 1 % | known effects and pairs with 1 % left or more | as above; a case with the verdict `inconclusive` counts one half |
+| the same, shown by the discs | cases of the 2 % row in which chi2 of the means of the discs is SHOWN_CHI2 or more, without a fit of an effect; for a pair this also holds for each required effect alone, to first order | the answer contains the truth |
+| first effect is the true one | single known effects, 2 % or more | the first entry of the report's `effects` is the true effect |
+| one wrong effect named with confidence | all | the verdict is `attributed`, and names one effect that is not true. For clean cases and unknown effects every name is wrong. The verdicts `tie` and `inconclusive` express doubt and do not count |
+| mean number of named effects | cases of the 2 % row with an answer | number of effects in the answer |
 | unknown effects | unknown effects, 2 % or more | the verdict is `unknown` or `inconclusive` |
-| closure as a share | single known effects, 2 % or more, with an answer | median of the first effect's closure over the true effect's, if that is 0.1 or more; 1 if the first is the true one |
-| 90 % interval | as above | the true effect's ci90 contains the true closure |
-| strongest axis | single known effects with AXES, 2 % or more, verdict not `none` | the first of `where` belongs to the effect |
+| closure by the first effect / by the true effect | single known effects, 2 % or more, with an answer | median of the closure by the first effect divided by the closure by the true effect. 1 if the first effect is the true one; cases in which the closure by the true effect is below 0.1 are left out |
+| 90 % interval contains the true closure | single known effects, 2 % or more, with an answer | the ci90 of the closure by the true effect contains the true closure |
+| strongest axis is right | single known effects that have axes in `scoring.AXES`, 2 % or more, verdict not `none` | the first axis of the report's `where` is an axis of the effect |
 | time | all | wall time of the slowest case, s |
 """
 
@@ -62,7 +65,11 @@ POWER_EDGES_PCT = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table. interval95: Eq. (1), for a share of cases; None otherwise."""
+    """A row of the table.
+
+    interval95: Eq. (1), if the value is a fraction of cases; otherwise None. met: whether the value reaches the goal; None if
+    there is no goal or no case.
+    """
 
     figure: str
     cases: int
@@ -72,7 +79,7 @@ class Row:
     met: bool | None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """The row as JSON."""
         return {
             "figure": self.figure,
             "n": self.cases,
@@ -85,7 +92,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Score:
-    """The table, the confusion matrix, the power, and why the failed cases failed, by number."""
+    """The score of a blind set.
+
+    rows: the table. confusion, power: see `_confusion` and `_power`. judged: number of cases with a report. failures: the
+    reason why a case has no report, by number. cases: one entry for each case.
+    """
 
     rows: tuple[Row, ...]
     confusion: dict[str, dict[str, int]]
@@ -95,7 +106,7 @@ class Score:
     cases: tuple[dict[str, Any], ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Schema gap-blind/1."""
+        """The score as JSON, schema gap-blind/1."""
         return {
             "schema": SCHEMA,
             "judged": self.judged,
@@ -108,7 +119,7 @@ class Score:
 
 
 def wilson(hits: float, cases: int, z: float = Z95) -> tuple[float, float]:
-    """Eq. (1); (0, 1) if there is no case."""
+    """Eq. (1) for hits / cases; (0, 1) if there is no case."""
     if cases == 0:
         return 0.0, 1.0
     p, spread = hits / cases, z**2 / cases
@@ -118,7 +129,7 @@ def wilson(hits: float, cases: int, z: float = Z95) -> tuple[float, float]:
 
 
 def score(judged: Sequence[Judged], failures: dict[int, str] | None = None) -> Score:
-    """The score of the cases that have a report. failures: why the other cases have no report, by number."""
+    """Score the cases that have a report. failures: the reasons why the other cases have no report, by number."""
     return Score(
         rows=_rows(judged),
         confusion=_confusion(judged),
@@ -138,7 +149,7 @@ def _rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
         *_alarm_rows([case for case in judged if case.kind == CLEAN]),
         *_answer_rows(known, strong),
         _share(
-            "first place is the truth",
+            "first effect is the true one",
             single,
             lambda case: case.first == case.true_names[0],
             ">= 0.85",
@@ -148,7 +159,7 @@ def _rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
             "one wrong effect named with confidence", judged, names_one_wrong, "<= 0.02", lambda p: p <= 0.02
         ),
         _value(
-            "mean size of the answer",
+            "mean number of named effects",
             [float(len(case.answer)) for case in strong if case.answer],
             mean,
             "<= 1.5",
@@ -201,7 +212,7 @@ def _answer_rows(known: Sequence[Judged], strong: Sequence[Judged]) -> tuple[Row
 def _closure_rows(answered: Sequence[Judged]) -> tuple[Row, ...]:
     return (
         _value(
-            "closure over that of the true effect",
+            "closure by the first effect / by the true effect",
             [share for share in map(closure_share, answered) if share is not None],
             median,
             ">= 0.95",
@@ -253,7 +264,7 @@ def _value(
 
 
 def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
-    """Number of cases by truth (row) and by first effect named, or verdict (column)."""
+    """The number of cases by truth (row) and by the first effect named (column); without such an effect, by the verdict."""
     table: dict[str, Counter[str]] = {}
     for case in judged:
         table.setdefault(true_label(case), Counter())[said_label(case)] += 1
@@ -262,7 +273,7 @@ def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
 
 
 def _power(judged: Sequence[Judged]) -> tuple[dict[str, Any], ...]:
-    """In bins of what is left in the discs: how many effects were noticed, and how many known ones were named."""
+    """For each bin of the residual left in the discs: how many effects were noticed, and how many known effects were named."""
     found = []
     for low, high in pairwise(POWER_EDGES_PCT):
         here = [

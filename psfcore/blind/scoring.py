@@ -1,11 +1,11 @@
-"""One case of a blind set: what was true, what the report says, and whether the report is right.
+"""One case of a blind set: its truth, its report, and whether the report is right.
 
     true closure = 1 - (sum of (s_i / n_i)^2) / (sum of (e_i / n_i)^2)                                Eq. (1)
 
 Eq. (1) is the closure that a perfect model of the true effect would reach on noise-free images. e_i is the residual of
-image i with the effect, after the PSF was refitted; s_i is the residual that the sampling alone causes, without the
-effect; n_i is the noise. It is below 1, because the residual of the sampling stays. The library models an effect in
-another form than the blind set; the difference counts as an error of the diagnosis.
+image i with the effect, after the PSF was refitted. s_i is the residual without the effect, which the sampling on pixels
+causes. n_i is the noise. The true closure is below 1, because the residual s_i stays in the images. The library and the
+blind set describe the same effect by different formulas; this difference counts as an error of the diagnosis.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import Any
 from psfcore.blind.cases import CLEAN, PAIR
 
 LOWER_LEVEL_PCT = 1.0
-SHOWN_CHI2 = 30.0  # 5.5 sigma for a search for one known pattern
-LEAST_CLOSURE = 0.1  # a ratio to a smaller closure has no meaning
+SHOWN_CHI2 = 30.0  # corresponds to 5.5 sigma, if one known pattern is searched for
+LEAST_CLOSURE = 0.1  # if the closure by the true effect is smaller, the ratio of closures has no meaning
 NONE, ATTRIBUTED, TIE, UNKNOWN_VERDICT, INCONCLUSIVE = "none", "attributed", "tie", "unknown", "inconclusive"
 
 _DETECTOR = ("detector_x", "detector_y")
-# The axes on which each effect shows. `saturation_fill` has none: it follows exposure and the brightness of the Sun.
+# The axes along which each effect varies. `saturation_fill` has no entry: it depends on exposure and on the Sun's brightness.
 AXES: dict[str, tuple[str, ...]] = {
     "dark_offset": ("exposure", "intensity"),
     "nonlinearity": ("intensity",),
@@ -54,19 +54,19 @@ class Judged:
 
     @property
     def kind(self) -> str:
-        """Clean, single, pair or unknown."""
+        """The kind of the case: "clean", "single", "pair" or "unknown"."""
         return str(self.truth["kind"])
 
     @property
     def true_names(self) -> tuple[str, ...]:
-        """The withheld effects."""
+        """The names of the withheld effects."""
         return tuple(effect["name"] for effect in self.truth["effects"])
 
     @property
     def required_names(self) -> tuple[str, ...]:
-        """The withheld effects that an answer must name: those that leave at least LOWER_LEVEL_PCT alone.
+        """The withheld effects that an answer must contain: those that leave at least LOWER_LEVEL_PCT alone.
 
-        All of them if none leaves that much.
+        If no effect leaves at least LOWER_LEVEL_PCT alone, the answer must contain all withheld effects.
         """
         required = [
             effect["name"]
@@ -77,7 +77,7 @@ class Judged:
 
     @property
     def left_pct(self) -> float:
-        """Percent that the effects leave in the discs after the refit, rms over images."""
+        """The residual that the effects leave in the discs after the refit, percent, rms over images."""
         return float(self.truth["left_after_refit_pct"])
 
     @property
@@ -87,27 +87,27 @@ class Judged:
 
     @property
     def answer(self) -> tuple[str, ...]:
-        """The effects that the verdict names; empty unless the verdict is `attributed` or `tie`."""
+        """The answer of the report: the effects that the verdict names. Empty unless it is `attributed` or `tie`."""
         return tuple(self.report.get("answer", ())) if self.verdict in (ATTRIBUTED, TIE) else ()
 
     @property
     def entries(self) -> dict[str, dict[str, Any]]:
-        """The report's effects by name, best first."""
+        """The entries of the report's `effects`, by name, best effect first."""
         return {effect["name"]: effect for effect in self.report.get("effects", ())}
 
     @property
     def first(self) -> str | None:
-        """The report's best effect."""
+        """The name of the first effect in the report; None if the report has no effects."""
         return next(iter(self.entries), None)
 
     def closure(self, name: str | None) -> dict[str, Any] | None:
-        """The closure that the report gives for an effect: value and ci90."""
+        """The closure (value and ci90) that the report states for an effect; None if it states no closure."""
         found: dict[str, Any] | None = self.entries.get(name or "", {}).get("closure")
         return found
 
 
 def raises_alarm(case: Judged) -> bool:
-    """Whether the verdict is anything but `none`."""
+    """Whether the verdict is not `none`, so that the report claims or suspects a gap."""
     return case.verdict != NONE
 
 
@@ -122,7 +122,10 @@ def names_one_wrong(case: Judged) -> bool:
 
 
 def is_shown(case: Judged) -> bool:
-    """Whether the means of the discs exceed their noise by SHOWN_CHI2; of a pair each required effect alone, too."""
+    """Whether chi2 of the residuals in the means of the discs is at least SHOWN_CHI2.
+
+    For a pair, this must also hold for each required effect alone.
+    """
     chi2 = [shown_chi2(case.truth) or 0.0]
     if case.kind == PAIR:
         required = (effect for effect in case.truth["effects"] if effect["name"] in case.required_names)
@@ -131,7 +134,7 @@ def is_shown(case: Judged) -> bool:
 
 
 def shown_chi2(truth: dict[str, Any]) -> float | None:
-    """Chi2 of what the effects leave in the means of the discs after the refit; None if it was not measured."""
+    """chi2 of the residuals that the effects leave in the means of the discs after the refit; None if they were not measured."""
     if "refitted" not in truth:
         return None
     left, noise, clean = (
@@ -143,7 +146,10 @@ def shown_chi2(truth: dict[str, Any]) -> float | None:
 
 
 def closure_share(case: Judged) -> float | None:
-    """Closure of the first effect over the closure of the true one; None if a closure is missing or too small."""
+    """The closure by the first effect divided by the closure by the true effect; 1 if both are the same effect.
+
+    None if one of the closures is missing, or if that of the true effect is below LEAST_CLOSURE.
+    """
     first, true = case.closure(case.first), case.closure(case.true_names[0])
     if case.first == case.true_names[0]:
         return 1.0
@@ -153,12 +159,12 @@ def closure_share(case: Judged) -> float | None:
 
 
 def has_interval(case: Judged) -> bool:
-    """Whether the report gives a closure for the true effect, and the true closure is known."""
+    """Whether the report states a closure for the true effect, and the true closure is known."""
     return case.closure(case.true_names[0]) is not None and true_closure(case.truth) is not None
 
 
 def interval_holds(case: Judged) -> bool:
-    """Whether the true effect's interval ci90 contains the true closure."""
+    """Whether the ci90 of the closure by the true effect contains the true closure."""
     closure, true = case.closure(case.true_names[0]), true_closure(case.truth)
     if closure is None or true is None:
         return False
@@ -167,7 +173,7 @@ def interval_holds(case: Judged) -> bool:
 
 
 def true_closure(truth: dict[str, Any]) -> float | None:
-    """Eq. (1) of a truth; None if it was not measured."""
+    """Eq. (1) for a truth; None if the residuals were not measured."""
     if "refitted" not in truth:
         return None
     with_effect, noise = truth["refitted"]["residual_pct"], truth["refitted"]["noise_pct"]
@@ -184,14 +190,14 @@ def axis_is_right(case: Judged) -> bool:
 
 
 def true_label(case: Judged) -> str:
-    """The case's row in the confusion matrix."""
+    """The row of the case in the confusion matrix."""
     return case.kind if case.kind in (CLEAN, PAIR) else case.true_names[0]
 
 
 def said_label(case: Judged) -> str:
-    """The case's column in the confusion matrix: the first effect of the answer, or the verdict if there is no answer.
+    """The column of the case in the confusion matrix: the first effect of the answer; the verdict if the answer is empty.
 
-    In an answer to a pair the order has no meaning: a true effect, if there is one, counts as the first.
+    If the case is a pair, the order of the answer has no meaning: a true effect in the answer counts as the first.
     """
     if not case.answer:
         return case.verdict

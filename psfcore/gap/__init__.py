@@ -1,9 +1,9 @@
-"""The gap between the fitted model and the images: where it lies, which effect causes it, how far it shrinks.
+"""Diagnose the gap between the fitted model and the images: where it lies, which effect causes it, how far it shrinks.
 
 This package and `psfcore.blind` share no code on purpose: the blind set tests this library, so its effects are written
 independently.
 
-An effect is declared once, as an `effect.Effect`. To add your own, write a Python file that defines EFFECTS, like this one:
+Each effect is one `effect.Effect`. To add an effect of your own, write a Python file that defines EFFECTS, like this one:
 
     import numpy as np
     from psfcore.gap.effect import Change, Effect, EffectParameter
@@ -16,6 +16,6 @@ An effect is declared once, as an `effect.Effect`. To add your own, write a Pyth
     EFFECTS = (Effect("edge_glow", "detector", (EffectParameter("height", "DN/s", 5.0),),
         "A lamp beside the detector lights its right edge.", "a dark exposure", ("detector_x",), glow),)
 
-`heliopsf gap TRANSIT --local --effects FILE.py` tests it together with the library. A service tests the effects of the
-modules that its operator names in HELIOPSF_GAP_EFFECTS.
+`heliopsf gap TRANSIT --local --effects FILE.py` tests your effects together with the library. A service also tests the
+effects of the modules that its operator names in HELIOPSF_GAP_EFFECTS.
 """

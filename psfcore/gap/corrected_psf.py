@@ -1,13 +1,13 @@
-"""The PSF that is fitted together with the answer's effects; it contains those effects that belong to the optics.
+"""The corrected PSF: it is fitted together with the effects that the verdict names, and contains those of the optics.
 
-H is the PSF fitted together with the effects, theta_k are their parameters, and dH_k is the change of a point source's
-image for one unit of parameter k:
+H is the PSF fitted together with the effects. theta_k is parameter k of the effects of the optics. dH_k is the change of
+the image of a point source for one unit of theta_k. To first order, the corrected PSF is
 
-    H' = H + sum over effects of the optics of theta_k dH_k        Eq. (1)
+    H' = H + sum over k of theta_k dH_k        Eq. (1)
 
-to first order, with negative values set to zero and scaled to the sum of H. An effect of the detector or of the scene is
-not part of a PSF. It changes the PSF only because the fit no longer takes it for scatter. An effect that varies across
-the field has dH_k of the field's centre.
+Negative values of H' are set to zero, and H' is scaled to the sum of H. An effect of the detector or of the scene is not
+part of a PSF: it changes H only because the fit no longer mistakes its light for scatter. For an effect that varies
+across the field, dH_k is the change at the centre of the field.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ Kernel = NDArray[np.float64]
 
 
 def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[str, Any]) -> Psf:
-    """The PSF with the answer's effects in the model, on the full reach, with the components DIFFRACTION and SCATTER.
+    """The corrected PSF of a diagnosis, on the full reach, with the components DIFFRACTION and SCATTER.
 
-    provenance: what made the PSF, and its parents; this function adds the effects, their parameters, the gap and the
-    inputs. Raises DataError "no-answer" if no effect was added to the model, "bad-effects" if an added effect fails, and the
-    errors of `Psf`.
+    provenance: the software and the parents of the PSF. This function adds the effects, their parameters, the gap and the
+    input files. Raises DataError "no-answer" if the diagnosis made no full refit, "bad-effects" if an added effect fails,
+    and the errors of `Psf`.
     """
     if not found.corrected:
         raise DataError(
             "no-answer",
-            "expected a diagnosis whose answer was fitted together with the PSF; got the verdict "
-            f"{found.judgement.verdict}: there is no corrected PSF",
+            "expected a diagnosis that names an effect and fitted it together with the PSF; got the verdict "
+            f"{found.judgement.verdict}: this diagnosis has no corrected PSF",
         )
     added = found.corrected[0]
     transit, inversion = added.solution.transit, added.solution.inversion
@@ -69,7 +69,7 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
 
 
 def _history(found: Diagnosis, added: Corrected) -> dict[str, Any]:
-    """The added effects, their parameters with errors, the gap before and after, and the input files."""
+    """For the provenance: the added effects, their parameters with errors, the gap without and with them, and the input files."""
     return {
         "effects": [effect.name for effect in added.effects],
         "effect_in_kernel": [effect.name for effect in added.effects if effect.stage == "optics"],
@@ -85,7 +85,7 @@ def _history(found: Diagnosis, added: Corrected) -> dict[str, Any]:
 
 
 def _kernel(added: Corrected) -> Kernel:
-    """Eq. (1) [y, x] on the full reach."""
+    """The kernel H' of Eq. (1) [y, x], on the full reach."""
     solution = added.solution
     grid = (REACH_GRID_PX, REACH_GRID_PX)
     total = TotalPsf(solution.transit.diffraction, solution.inversion.shape, grid, threads=solution.threads)
@@ -105,37 +105,37 @@ def _kernel(added: Corrected) -> Kernel:
 
 
 class _Point(View):
-    """A point source in the centre of a field as large as the full reach, convolved with the PSF."""
+    """The view of one image: a point source in the centre of a field as large as the full reach, convolved with the PSF."""
 
     @cached_property
     def scenes(self) -> Sequence[Field]:
-        """The point source: one unit of light."""
+        """The scene: one unit of light in the central pixel."""
         point = np.zeros(self.solution.transit.shape, np.float32)
         point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
         return [point]
 
     @cached_property
     def expected(self) -> Sequence[Field]:
-        """The PSF."""
+        """The image of the point source, which is the PSF."""
         return [frame.pixels for frame in self.solution.transit.frames]
 
     @cached_property
     def pointing_means(self) -> list[Field]:
-        """The PSF."""
+        """The mean image of the only pointing, which is the PSF."""
         return list(self.expected)
 
     def occulted_scene(self, n: int) -> Lanes:
-        """The point source, in the engine's memory order."""
+        """The scene, in the memory order of the convolution engine. No occulter covers the point source."""
         return self.solution.optics.lanes(self.scenes[n])
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
-        """dH of the point source, times the weight at its place."""
+        """The point source, times `weight` at its position, convolved with dH (`slope`)."""
         point = slope.lanes(self.scenes[n] if weight is None else self.scenes[n] * weight)
         return slope.field(slope.convolve(point))
 
 
 def _point(added: Corrected, total: TotalPsf, kernel: Kernel) -> View:
-    """The view of a solution whose only image is that of a point source."""
+    """The view of a solution whose only image is the image of a point source."""
     solution = added.solution
     middle = REACH_GRID_PX // 2
     frame = replace(

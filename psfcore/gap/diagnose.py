@@ -1,9 +1,16 @@
 """The diagnosis of a transit: noise, fit, expected gap, evidence, verdict, full refits, location and closure of the gap.
 
-In this order: the noise that the images show; the fit of the PSF; the residuals of the same fit on its own simulation;
-the response of discs and unocculted field to every effect; the verdict; full refits with the answer's effects in the
-model and, for a tie, with each of the tied effects, at most MOST_REFITS (the verdict may also request refits; each is
-made once); closure and gap on held-out images.
+The steps, in this order:
+
+1. Measure the noise of the images.
+2. Fit the PSF.
+3. Simulate the transit from this fit, fit the simulation, and keep its residuals: the expected gap.
+4. Compute how the discs and the unocculted field respond to every effect.
+5. Judge which effect causes the gap. The effects that the verdict names are called "the named effects" here
+   (`Judgement.answer`, "answer" in the report).
+6. Make full refits with the named effects in the model. For a tie, refit with each tied effect, at most MOST_REFITS
+   fits. The verdict may also request refits; each refit is made only once.
+7. Locate the gap, and compute gap and closure on held-out images.
 """
 
 from __future__ import annotations
@@ -47,7 +54,9 @@ SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Shrinking:
-    """How far an effect closes the gap, by both ways of holding out images; closure is None if there is no gap."""
+    """How far an effect closes the gap. closure: with blocks of time held out. closure_by_pointing: with one pointing at a time
+    held out. Both are None if there is no gap. held_out_fall: `closure.fall` of the blocks of time.
+    """
 
     closure: Interval | None
     closure_by_pointing: Interval | None
@@ -56,11 +65,12 @@ class Shrinking:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What a transit shows of the gap between it and the model fitted to it.
+    """The diagnosis of one transit.
 
-    before_refit, rms, after: the gap before the PSF is refitted (with the PSF fitted together with the answer, but without
-    the answer's effects), after the refit, and with the answer in the model. cautions: what weakens the result. corrected: the
-    full refits, the answer's first.
+    Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
+    effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. shrinking: by the
+    label of the effects. corrected: the full refits; the refit with the best effects comes first. residual, residual_after: held-out
+    images without and with the best effects. cautions: sentences on everything that weakens the result.
     """
 
     judgement: Judgement
@@ -81,12 +91,12 @@ class Diagnosis:
 
     @property
     def evidence(self) -> Evidence:
-        """The data that it uses."""
+        """The discs, blocks and Jacobians that the diagnosis uses."""
         return self.model.evidence
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """The answer's effects."""
+        """The named effects."""
         return tuple(e for e in self.evidence.effects if e.name in self.judgement.answer)
 
 
@@ -104,17 +114,17 @@ def diagnose(
 ) -> Diagnosis:
     """Fit a transit and diagnose the residuals of the fit.
 
-    start: the shape's coordinates from which the fit starts (None: the shape's own start). refit: whether to make full
-    refits with the answer's effects in the model. seed: of the simulation and of the intervals. solution: of this transit,
-    shape and start, made before, or a function that makes it; None: `invert`. If the images show another noise than the
-    transit states, it must be the solution with the noise that they show. Raises DataError as
-    `psfcore.scatter.inversion.solution_of` and `invert` do, "bad-library" if no effect of the library can be an answer,
-    and "bad-effects" if an added effect fails.
+    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether to
+    make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of the intervals.
+    solution: a solution of this transit, shape and start that was made before, or a function that makes it; None: `invert`.
+    If the images show other noise than the transit states, it must be the solution with the noise that they show. Raises
+    the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError "bad-library" if the library contains only
+    probes, and "bad-effects" if an added effect fails.
     """
     if not any(effect.named for effect in library):
         raise DataError(
             "bad-library",
-            "expected a library with at least one effect that is not a probe; got none: add an effect",
+            "expected a library with at least one effect that is not a probe; got only probes: add an effect",
         )
     noise = measured_noise(transit)
     if noise is not None and not noise.agrees:
@@ -124,7 +134,7 @@ def diagnose(
 
 
 def start_of(psf: Psf) -> tuple[Shape, Vector]:
-    """The shape with which a PSF was fitted, and its coordinates, from which `diagnose` may start.
+    """The shape with which a PSF was fitted, and the fitted coordinates. `diagnose` can start from these coordinates.
 
     Raises DataError "psf-not-fitted" if the PSF was not fitted to a transit, "unknown-shape" if its shape is not known here.
     """
@@ -132,7 +142,7 @@ def start_of(psf: Psf) -> tuple[Shape, Vector]:
         raise DataError(
             "psf-not-fitted",
             "expected a PSF that was fitted to a transit, because the fit starts from its shape; "
-            f"{psf.name} {psf.version} has no fitted shape: choose another PSF, or none",
+            f"{psf.name} {psf.version} has no fitted shape: choose another PSF, or start without a PSF",
         )
     return shape_named(psf.fitted.shape), np.array(psf.fitted.coordinates, dtype=np.float64)
 
@@ -146,7 +156,7 @@ def diagnose_solution(
     refit: bool = True,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Diagnosis:
-    """The diagnosis of an existing fit; arguments and errors as in `diagnose`."""
+    """Diagnose an existing fit. noise: the measured noise, if any. The other arguments and the errors are those of `diagnose`."""
     view = View(solution)
     expected = expected_gap(view, seed=seed, floor=FLOOR, progress=progress)
     evidence = gather(solution, library, view=view, progress=progress)
@@ -188,20 +198,20 @@ def diagnose_solution(
 
 
 def _likely(found: Judgement) -> tuple[str, ...]:
-    """The effects that explain most of a gap; for a tie the best of the tied effects."""
+    """The effects that explain most of the gap; for a tie, the best of the tied effects."""
     return () if found.verdict == "none" or found.best is None else found.best.names
 
 
 def _shrinking(
     model: LinearModel, found: Judgement, fits: Sequence[Corrected], rng: np.random.Generator
 ) -> tuple[dict[str, Shrinking], HeldOut | None, HeldOut | None]:
-    """Closure of every effect tried; held-out residuals without an effect, and with the best effect.
+    """Three results: the closure of every fit in `found.tried`; held-out residuals without any effect; those with the best effect.
 
-    An effect with a full refit is judged by the model of that refit.
+    If an effect has a full refit, its closure is computed with the model of that refit.
     """
     schemes = (time_blocks(model), pointings(model))
     before = [hold_out(model, (), scheme) for scheme in schemes]
-    real = {fit.label: fit.model for fit in fits}  # also those that were rejected later
+    real = {fit.label: fit.model for fit in fits}  # including refits that the verdict rejected
     out: dict[str, Shrinking] = {}
     best: HeldOut | None = None
     base = len(model.evidence.base)
@@ -226,18 +236,18 @@ def _shrinking(
 
 
 def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
-    """Hold out images with a model that contains effects; all of them are fitted."""
+    """Hold out images with the model of a full refit; all effects of that refit are fitted."""
     return hold_out(model, model.evidence.of_effects, scheme)
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
-    """The result of the full refit, unless it does not cover the same images as the linear model."""
+    """The result of the full refit if it covers the same images as the linear model; otherwise that of the linear model."""
     same = real is not None and linear is not None and real.images == linear.images
     return real if same else linear
 
 
 class _Refits:
-    """Full refits with effects in the model, each made once."""
+    """Full refits with effects in the model. Each refit is made only once."""
 
     def __init__(self, view: View, model: LinearModel, progress: Progress) -> None:
         self._view, self._model, self._progress = view, model, progress
@@ -245,18 +255,18 @@ class _Refits:
         self.failures: list[str] = []
 
     def model(self, tried: Tried) -> LinearModel | None:
-        """The model of the full refit with an effect, or with several; None if this fit failed."""
+        """The linear model at the full refit with these effects; None if the refit failed."""
         made = self._fit(tried)
         return None if made is None else made.model
 
     def beyond(self, tried: Tried) -> LinearModel | None:
-        """The model of the same refit, with the rest of the library added."""
+        """The linear model at the same refit, with the rest of the library added; None if the refit failed."""
         made = self._fit(tried)
         if made is None:
             return None
 
         def say(stage: str, step: int, steps: int) -> None:
-            self._progress(f"beyond {tried.label}: {stage}", step, steps)
+            self._progress(f"further effects beside {tried.label}: {stage}", step, steps)
 
         return beyond(made, self._model.evidence.effects, self._model, progress=say)
 
@@ -266,7 +276,10 @@ class _Refits:
         return tuple(fit for fit in self._made.values() if fit is not None)
 
     def of(self, found: Judgement) -> tuple[Corrected, ...]:
-        """The refits of the answer, the best first; for a tie, of each tied effect, with the certain ones if there are any."""
+        """The refits with the named effects, the best first; at most MOST_REFITS.
+
+        For a tie: one refit with each tied effect, together with the certain effects if there are any.
+        """
         if found.verdict not in ("attributed", "tie") or found.best is None:
             return ()
         chosen: list[Tried] = [found.best]
@@ -285,7 +298,7 @@ class _Refits:
             return self._made[tried.label]
 
         def say(stage: str, step: int, steps: int) -> None:
-            self._progress(f"adding {tried.label}: {stage}", step, steps)
+            self._progress(f"full refit with {tried.label}: {stage}", step, steps)
 
         effects = {effect.name: effect for effect in self._model.evidence.effects}
         chosen = [effects[name] for name in tried.names]
@@ -294,16 +307,17 @@ class _Refits:
             made = add_to_model(
                 self._view.solution, chosen, tried, self._model, view=self._view, progress=say
             )
-        except (
-            DataError
-        ) as error:  # a fit may fail after an effect is subtracted that the images do not contain
+        except DataError as error:  # the fit may fail if the subtracted effect is not in the images
             self.failures.append(f"The full refit with {tried.label} in the model failed: {error}")
         self._made[tried.label] = made
         return made
 
 
 def _before_refit(model: LinearModel, found: Judgement, rng: np.random.Generator) -> Interval | None:
-    """The gap with the PSF of the effect's fit but without the effect: what a refit of the PSF would then partly absorb."""
+    """The gap with the PSF that was fitted together with the best effects, but without these effects.
+
+    A refit of the PSF without the effects absorbs a part of this gap. None if the verdict names no effect.
+    """
     if found.best is None or found.verdict not in ("attributed", "tie"):
         return None
     step = found.best.step
@@ -323,29 +337,29 @@ def _noise_pct(evidence: Evidence) -> float:
 
 def _rejected(found: Judgement) -> tuple[str, ...]:
     return tuple(
-        f"To first order {label.replace('_', ' ')} explains much of the gap, but the full refit explains less than half of that: "
-        "it was excluded in spite of its score."
+        f"In the linear model {label.replace('_', ' ')} explains much of the gap, but the full refit with this effect explains less than "
+        "half of that. The effect was therefore excluded, in spite of its score."
         for label in found.amiss
     )
 
 
 def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidence) -> tuple[str, ...]:
-    """What a reader should know before trusting a verdict."""
+    """Sentences on everything in these data that weakens the verdict."""
     out = []
     if noise is None:
         out.append(
-            "The stated noise could not be checked: too few consecutive images have the same pointing, gain mode and "
+            "The stated noise could not be checked. Either too few consecutive images have the same pointing, gain mode and "
             "exposure, or their differences do not look like noise."
         )
     elif not noise.agrees:
         out.append(
-            f"The images are {noise.ratio:.2f} times as noisy (in variance) as stated. The measured noise was used: "
+            f"The variance of the noise in the images is {noise.ratio:.2f} times the stated variance. The measured noise was used: "
             f"{noise.noise.photon_gain_dn:.2f} DN per photon, read noise {noise.noise.read_noise_dn:.2f} DN."
         )
     left_out = solution.inversion.left_out
     if left_out:
         out.append(
-            f"{len(left_out)} images were not used: "
+            f"{len(left_out)} images were not used. Examples: "
             + "; ".join(f"{k}: {v}" for k, v in list(left_out.items())[:3])
         )
     unmatched = [
@@ -356,26 +370,26 @@ def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidenc
     if unmatched:
         out.append(
             f"In {len(unmatched)} images ({', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}) the scene around the "
-            "occulter differs from that in the neighbouring images, or no neighbour shows it. The occulter's position may be wrong there, and this "
-            "may cause the residuals in these discs."
+            "occulter differs from the scene in the neighbouring images, or no neighbouring image shows it. The fitted position of the "
+            "occulter may be wrong in these images, and the wrong position may cause the residuals in their discs."
         )
     images = len(evidence.discs)
     if images < LEAST_IMAGES:
         out.append(
-            f"With only {images} images none can be held out, so closure and the held-out gap are not given."
+            f"With only {images} images, no image can be held out. Closure and the gap on held-out images are therefore missing."
         )
     aimed = len({taken.pointing for taken in evidence.image_info})
     if aimed > MOST_POINTINGS:
         out.append(
-            f"Light from outside the field was tested only in the first {MOST_POINTINGS} of {aimed} pointings."
+            f"Light from outside the field was tested only in the first {MOST_POINTINGS} of the {aimed} pointings."
         )
     if aimed == 1:
         out.append(
-            "There is only one pointing: effects that differ between pointings cannot be detected, and no pointing can be held out."
+            "All images have the same pointing: effects that differ between pointings cannot be detected, and no pointing can be held out."
         )
     exposures = {taken.exposure_s for taken in evidence.image_info}
     if len(exposures) == 1:
         out.append(
-            "There is only one exposure time: an error per readout and an error per second look the same."
+            "All images have the same exposure time: an error of every readout (in DN) and an error of the rate (in DN/s) look the same."
         )
     return tuple(out)

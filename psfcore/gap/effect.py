@@ -1,10 +1,12 @@
-"""An effect that the model does not contain: declared once, then used to explain a gap and to correct for it.
+"""An effect: a physical cause that the model leaves out. The same declaration serves to explain a gap and to correct for it.
 
-An effect changes the images, to first order, in proportion to a few parameters: e(n), in DN/s, is the change of image n
-for one unit of a parameter. An effect of the optics changes the images by dH x, where H is the PSF and x the scene with
-its occulter. The discs respond to a change through the whole estimate (`evidence.cells`), because the scene is
-reconstructed from the same image. The unocculted field shows only differences between images of one pointing, and it
-shows them directly.
+To first order, an effect changes the images in proportion to a few parameters: e(n), in DN/s, is the change of image n
+for one unit of a parameter. An effect of the optics changes the images by dH x: dH is the change of the PSF, and x is
+the scene with its occulter. The scene is reconstructed from the image. A change of the image therefore also changes the
+light that the model predicts in the disc (`evidence.cells`). The unocculted field shows a change only if it
+differs between the images of one pointing.
+
+The stage of an effect is the step of the light on which it acts: the scene, the optics or the detector.
 """
 
 from __future__ import annotations
@@ -22,8 +24,8 @@ Stage = Literal["scene", "optics", "detector"]
 class EffectParameter:
     """A parameter of an effect.
 
-    likely: its largest plausible size, in its unit; ten times this value is hardly credible. positive: whether it cannot be
-    negative, like a share of light.
+    likely: the largest plausible size of the parameter, in its unit; ten times this size is hardly credible. positive:
+    whether the parameter cannot be negative, for example because it is a share of light.
     """
 
     name: str
@@ -34,12 +36,12 @@ class EffectParameter:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What one unit of one parameter does: change(n, images) is the change of image n, [y, x] in DN/s.
+    """The change of the images by one unit of one parameter: change(n, images) is the change of image n, [y, x] in DN/s.
 
-    images: for the discs, all images as the model expects them, each with its own brightness; for the unocculted field, the
-    mean image of each pointing. unocculted: whether the change differs between images of one pointing, so that the
-    unocculted field shows it. disc: whether the discs show it. numbers: how many numbers were measured in the unocculted
-    field to build this change; the effect's score is reduced for them.
+    images: for the discs, the model images of the transit, each with its own brightness; for the unocculted field, the mean
+    image of the pointing, for each image. unocculted: whether the change differs between images of one pointing, so that
+    the unocculted field shows it. disc: whether the discs show the change. numbers: how many numbers were measured in the
+    unocculted field to build this change; each of them costs the effect as much as a parameter.
     """
 
     change: Callable[[int, Sequence[Field]], Field]
@@ -50,15 +52,19 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """One effect: its physical cause, the observation that would confirm it, and the axes along which it shows.
+    """One effect: its physical cause, the observation that would confirm it, and the axes along which the gap varies.
 
-    changes(view): one change for each parameter. An effect that is fitted per pointing may return fewer or more changes;
-    then they belong to the first parameters. why_not(view): why these data cannot show the effect, or None. trials: about
-    how many places were searched; the score is reduced for them. named: whether the effect may be an answer. If not, it is
-    a probe: a pattern typical of gaps of unknown cause, which suggests that the cause is not in the library. held(view): for
-    an effect that searches for a place, the same effect with that place fixed. field: whether its parameters describe a
-    random field in which each parameter is about as large as `likely`; the score is then reduced for the information gained
-    about the parameters, not for their number.
+    cause: a sentence for the report. settled_by: an observation that would confirm the effect, or exclude it. axes: names of
+    the axes of the report along which the effect varies.
+    changes(view): one change for each parameter. An effect that is fitted for each pointing may return fewer or more changes
+    than it has parameters. Changes and parameters are then paired in order, and the rest is not fitted. why_not(view): the
+    reason why these data cannot show the effect; None if they can.
+    trials: about how many positions or templates the effect searches; the search lowers its score. named: whether a verdict
+    may name this effect as a cause. An effect that no verdict may name is a probe: a pattern that is typical of gaps of
+    unknown cause. If a probe fits best, the cause is probably not in the library.
+    held(view): for an effect that searches for a position or a template, the same effect with the result of the search
+    fixed. field: whether the parameters describe a random field, in which each parameter is about as large as `likely`. The
+    score of a random field is reduced by the information gained about the parameters, not by their number.
     """
 
     name: str

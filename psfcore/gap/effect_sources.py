@@ -1,4 +1,4 @@
-"""The source text that defines added effects: a Python file or a module. This module never runs that text."""
+"""The source text that defines added effects, in a Python file or a module: find and hash it, without running it."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from psfcore.errors import DataError
 
 
 def is_file(source: str) -> bool:
-    """Whether a source is the name of a file; otherwise it is the name of a module."""
+    """Whether a source is a file name (it ends in .py); otherwise it is the name of a module."""
     return source.endswith(".py")
 
 
 def sha256_of_source(source: str) -> str:
-    """SHA-256 (hex) of the text of a file (path ending in .py) or of a module. Raises DataError "bad-effects".
+    """SHA-256 (hex) of the source text of a file (path ending in .py) or of a module. Raises DataError "bad-effects".
 
-    The hash does not cover what that text imports. To find a module, its parent packages are imported.
+    The hash does not cover other files that the text imports. To find a module, Python imports its parent packages.
     """
     try:
         text = _file_of(source).read_bytes()

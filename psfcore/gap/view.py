@@ -1,6 +1,7 @@
-"""The view of a solution from which effects are computed: its scenes, its images and its PSF.
+"""The view of a fit from which effects are computed: its scenes, its images and its PSF.
 
-The images are the expected ones, not the observed ones: a template made of a pixel's own noise would fit that noise.
+Effects are computed from the model images, not from the observed images. A template that contains the noise of a pixel
+would fit this noise.
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, pat
 Field = NDArray[np.float32]
 Vector = NDArray[np.float64]
 DISC_MARGIN_PX = 2.0
-KEPT_BYTES = 2**25  # of one kind of field; a few fields are kept however large they are
+# Most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size.
+KEPT_BYTES = 2**25
 LEAST_KEPT = 4
 
 
 class _LazyFields(Sequence[Field]):
-    """Fields of all images, each computed when it is first used. Read-only.
+    """One field per image. A field is computed when it is first used. Read-only.
 
-    At most KEPT_BYTES are kept (thirty images of 512 px), but always the last LEAST_KEPT.
+    Computed fields are kept up to KEPT_BYTES (about thirty images of 512 px), but always the last LEAST_KEPT fields.
     """
 
     def __init__(self, count: int, field: Callable[[int], Field]) -> None:
@@ -48,16 +50,13 @@ class _LazyFields(Sequence[Field]):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The data from which effects are computed: the solution, and the images that the model expects.
-
-    The images are the expected ones, not the observed ones: a template made of a pixel's own noise would fit that noise.
-    """
+    """The data from which effects are computed: the fit (`solution`), and fields that are derived from the fit."""
 
     solution: Solution
 
     @cached_property
     def kept(self) -> dict[type, Any]:
-        """Results that are computed once per view, such as searches, by their type."""
+        """Results that are computed once for each view, for example a search. The key is the type of the result."""
         return {}
 
     @cached_property
@@ -67,12 +66,12 @@ class View:
 
     @cached_property
     def slope_kernels(self) -> tuple[Vector, ...]:
-        """The derivative of the kernel along each coordinate of the PSF's shape [y, x]."""
+        """The derivatives [y, x] of the total PSF with respect to each coordinate of the shape."""
         return tuple(self.solution.total.slopes(self.solution.inversion.coordinates))
 
     @cached_property
     def slopes(self) -> tuple[Blur, ...]:
-        """The derivatives of the kernel, ready to be convolved with fields."""
+        """The same derivatives, each prepared for the convolution with fields."""
         solution = self.solution
         return tuple(
             Blur(slope, solution.transit.shape, threads=solution.threads) for slope in self.slope_kernels
@@ -80,14 +79,17 @@ class View:
 
     @cached_property
     def expected(self) -> Sequence[Field]:
-        """Every image as the model predicts it [y, x], DN/s."""
+        """The model image of every image [y, x], DN/s."""
         optics = self.solution.optics
         return _LazyFields(
             len(self.solution.transit.frames), lambda n: optics.field(optics.convolve(self.occulted_scene(n)))
         )
 
     def behind(self, n: int) -> Field | None:
-        """The scene that the occulter of image n hides [y, x], DN/s, from neighbouring images in time; None if no neighbour shows it."""
+        """The scene behind the occulter of image n [y, x], DN/s: the mean scene of the neighbouring images in time.
+
+        None if no neighbouring image shows this part of the scene.
+        """
         solution = self.solution
         places = [found.place for found in solution.sky.found]
         chosen = neighbours_of(n, solution.transit.frames, places, solution.transit.noise)
@@ -99,7 +101,7 @@ class View:
 
     @cached_property
     def unocculted(self) -> Sequence[Field]:
-        """Every image as observed, with the light restored that its occulter hides [y, x], DN/s."""
+        """Every observed image [y, x], DN/s, plus the light that its occulter hides."""
         return _LazyFields(len(self.solution.transit.frames), self._put_back)
 
     def _put_back(self, n: int) -> Field:
@@ -113,9 +115,10 @@ class View:
 
     @cached_property
     def pointing_means(self) -> list[Field]:
-        """For every image the mean unocculted image of its pointing [y, x], DN/s: what all these images show, up to their brightness.
+        """For every image, the mean of `unocculted` over the images of its pointing [y, x], DN/s.
 
-        All images of a pointing get the same array. A template made from it differs between images only where the effect does.
+        All images of a pointing share one array. A template made from this array differs between images only if the effect
+        itself differs between them.
         """
         pointing = [frame.pointing for frame in self.solution.transit.frames]
         mean: dict[int, Field] = {}
@@ -129,7 +132,7 @@ class View:
 
     @cached_property
     def _scene_sums(self) -> dict[int, tuple[Vector, Vector]]:
-        """For each pointing: the sum of its scenes without the pixels around each disc, and the number of scenes in each pixel."""
+        """For each pointing: the sum of its scenes, without the pixels around each disc, and the number of scenes summed in each pixel."""
         solution = self.solution
         sums: dict[int, tuple[Vector, Vector]] = {}
         for n, frame in enumerate(solution.transit.frames):
@@ -146,16 +149,17 @@ class View:
         return solution.optics.field(solution.sky.scenes[n]), away
 
     def pointing_scene(self, n: int) -> Field:
-        """The mean scene of frame n's pointing, from all its images without their discs [y, x], DN/s."""
+        """The mean scene of the pointing of frame n [y, x], DN/s. Each image contributes only the pixels away from its disc."""
         total, count = self._scene_sums[self.solution.transit.frames[n].pointing]
         own, _ = self._own(n)
         return np.asarray(np.where(count > 0, total / np.maximum(count, 1), own), dtype=np.float32)
 
     @cached_property
     def scenes(self) -> Sequence[Field]:
-        """The scene of every image, from the other images of its pointing, scaled to its own brightness, with nothing hidden [y, x], DN/s.
+        """The scene of every image without its occulter [y, x], DN/s: the mean scene of the other images of the pointing.
 
-        A template made from the image's own scene would contain the noise of its residual, and would fit that noise.
+        This mean is scaled to the brightness of the image. A template that is made from the scene of the same image would
+        contain the noise of its residual, and would fit this noise.
         """
         return _LazyFields(len(self.solution.transit.frames), self._scene)
 
@@ -165,14 +169,15 @@ class View:
         others = count - away
         mean = (total - own * away) / np.maximum(others, 1)
         both = (others > 0) & away
-        # Shutter and Sun vary by about a percent: without this scaling an effect would keep that error of brightness.
+        # Shutter and Sun vary by about one percent. Without this scaling, the template of an effect would have this error.
         brightness = _ratio(float(own[both].sum(dtype=np.float64)), float(mean[both].sum()))
         return np.asarray(np.where(others > 0, mean * brightness, own), dtype=np.float32)
 
     def uncovered(self, n: int) -> Field:
-        """The share of each pixel [y, x] that frame n's occulter leaves open.
+        """The fraction of each pixel [y, x] that the occulter of frame n does not cover.
 
-        It is 1 where no other image shows the scene: there the scene is the image's own, in which the occulter is already dark.
+        The fraction is set to 1 where no image of the pointing shows the scene behind the disc. There, `scenes` contains the
+        scene of frame n itself, in which the occulter is already dark.
         """
         solution = self.solution
         shape, place = solution.transit.shape, solution.sky.found[n].place
@@ -183,7 +188,7 @@ class View:
         return out
 
     def occulted_scene(self, n: int) -> Lanes:
-        """The scene of image n with its occulter in front, in the engine's memory order. Read-only."""
+        """The scene of image n with its occulter in front, in the memory order of the convolution engine. Read-only."""
         return self._occulted_scenes[n]
 
     @cached_property
@@ -197,7 +202,7 @@ class View:
 
     @cached_property
     def places(self) -> tuple[Field, Field]:
-        """Detector x and y of each pixel, from -0.5 to 0.5 across the image."""
+        """Position of each pixel on the detector: x and y [y, x], each from -0.5 to 0.5 across the image."""
         ny, nx = self.solution.transit.shape
         x = ((np.arange(nx) + 0.5) / nx - 0.5).astype(np.float32)
         y = ((np.arange(ny) + 0.5) / ny - 0.5).astype(np.float32)
@@ -208,7 +213,10 @@ class View:
         return self.solution.transit.frames[n].exposure_s
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
-        """dH x for frame n [y, x], DN/s. weight: multiplies the scene, by where its light comes from."""
+        """The scene of frame n, with its occulter, convolved with dH (`slope`) [y, x], DN/s.
+
+        weight: a factor [y, x] for the light of each scene pixel before the convolution (None: 1).
+        """
         scene = self.occulted_scene(n)
         if weight is not None:
             scene = scene * slope.lanes(weight)
@@ -216,5 +224,5 @@ class View:
 
 
 def _ratio(one: float, other: float) -> float:
-    """Ratio of two sums of light, not negative; 1 if the second is not positive."""
+    """The ratio one / other of two sums of light, at least 0; 1 if `other` is not positive."""
     return max(one, 0.0) / other if other > 0 else 1.0

@@ -28,8 +28,8 @@ from workers.files.store import sha256_of, sync
 from workers.intake import estimates
 from workers.intake.requests import resolved_deconvolution
 from workers.tasks import deconvolve as deconvolve_task
-from workers.tasks import product
 from workers.tasks.context import Context
+from workers.tasks.data import product
 from workers.tasks.psf_build import requested_psf
 
 # The structures that summarise the changes of an image: blocks of 4 px, tails of 1 %.

@@ -31,9 +31,9 @@ from workers.catalogue.tables import ReportRow
 from workers.contract.identities import psf_fit_identity
 from workers.contract.resolved import ResolvedCrossValidate
 from workers.tasks.context import Context
-from workers.tasks.keep_report import keep_report, provenance_of, write_json
-from workers.tasks.solutions import solved
-from workers.tasks.transits import load_transit
+from workers.tasks.data.reports import keep_report, provenance_of, write_json
+from workers.tasks.data.solutions import solved
+from workers.tasks.data.transits import load_transit
 
 WAIT_S = 0.5
 MOST_HELPERS = 16

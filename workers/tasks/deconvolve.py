@@ -31,8 +31,8 @@ from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.identities import product_identity
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.tasks.context import Context
-from workers.tasks.prepared_psfs import PreparedPsfs
-from workers.tasks.product import Inputs, Made, details_of, keep, save_preview, write
+from workers.tasks.data.prepared_psfs import PreparedPsfs
+from workers.tasks.data.product import Inputs, Made, details_of, keep, save_preview, write
 from workers.tasks.psf_build import requested_psf
 
 # Fields of a request's method that go into Conditions; all other fields are arguments of the method itself.

@@ -25,10 +25,10 @@ from workers.catalogue.tables import ReportRow
 from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
 from workers.contract.resolved import ResolvedGapDiagnose
 from workers.tasks.context import Context
-from workers.tasks.keep_report import keep_report, provenance_of, write_json
-from workers.tasks.psfs import given_psf, psf_row
-from workers.tasks.solutions import solver
-from workers.tasks.transits import load_transit
+from workers.tasks.data.psfs import given_psf, psf_row
+from workers.tasks.data.reports import keep_report, provenance_of, write_json
+from workers.tasks.data.solutions import solver
+from workers.tasks.data.transits import load_transit
 
 KIND = "gap"
 

@@ -22,7 +22,7 @@ from workers.contract.requests import PsfBuild
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
-from workers.tasks.psfs import no_such_psf, psf_row
+from workers.tasks.data.psfs import no_such_psf, psf_row
 from workers.versions.series import TOTAL
 
 

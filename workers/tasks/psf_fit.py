@@ -14,10 +14,10 @@ from workers.catalogue.tables import PsfRow
 from workers.contract.identities import diffraction_identity, psf_fit_identity
 from workers.contract.resolved import ResolvedPsfFit
 from workers.tasks.context import Context
-from workers.tasks.keep_report import provenance_of, write_json
-from workers.tasks.psfs import psf_row
-from workers.tasks.solutions import solver
-from workers.tasks.transits import load_transit
+from workers.tasks.data.psfs import psf_row
+from workers.tasks.data.reports import provenance_of, write_json
+from workers.tasks.data.solutions import solver
+from workers.tasks.data.transits import load_transit
 
 
 def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:

@@ -16,10 +16,10 @@ from workers.catalogue.tables import ReportRow
 from workers.contract.identities import report_identity
 from workers.contract.resolved import ResolvedReport
 from workers.tasks.context import Context
-from workers.tasks.keep_report import keep_report, provenance_of, write_json
-from workers.tasks.psfs import given_psf
-from workers.tasks.solutions import solver
-from workers.tasks.transits import load_transit
+from workers.tasks.data.psfs import given_psf
+from workers.tasks.data.reports import keep_report, provenance_of, write_json
+from workers.tasks.data.solutions import solver
+from workers.tasks.data.transits import load_transit
 
 KIND = "report"
 POINT_PX = 17

@@ -24,8 +24,8 @@ from workers.contract.kinds import KINDS
 from workers.contract.resolved import ResolvedRerun
 from workers.lineage import Made, lineage
 from workers.tasks.context import Context
-from workers.tasks.keep_report import keep_report, write_json
-from workers.tasks.psfs import named_psf
+from workers.tasks.data.psfs import named_psf
+from workers.tasks.data.reports import keep_report, write_json
 
 KIND = "rerun"
 SCHEMA = 1

@@ -9,7 +9,7 @@ from psfcore.drawing.plots import psf_png
 from psfcore.fits.psfs import read_psf
 from workers.contract.requests import PsfTables
 from workers.tasks.context import Context
-from workers.tasks.psfs import keep_tables, named_psf
+from workers.tasks.data.psfs import keep_tables, named_psf
 
 
 def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:

@@ -1,1 +1,1 @@
-"""The withheld effects of the blind set, and the optics on fine pixels that they act on."""
+"""The withheld effects of the blind set, and the simulated optics on fine pixels."""

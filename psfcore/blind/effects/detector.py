@@ -1,4 +1,4 @@
-"""Effects on the light that reaches the detector, and on how its pixels collect it."""
+"""Effects of the detector: changes of the light that reaches it, and of the charge that its pixels collect."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class IntensityGradient(Effect):
-    """Stray light that increases to one side: a plane with a small curvature, 0 in its darkest corner."""
+    """Stray light that increases towards one side: a plane with a small curvature. It is 0 in its darkest corner."""
 
     angle_deg: float = 0.0
     curvature: float = 0.3
@@ -45,7 +45,7 @@ class IntensityGradient(Effect):
 
 @dataclass(frozen=True)
 class Glow(Effect):
-    """A glow at a fixed place of the detector. Not in the library."""
+    """A glow at a fixed position on the detector. Not in the library."""
 
     x: float = 0.0
     y: float = 0.5
@@ -72,7 +72,7 @@ class Glow(Effect):
 
 @dataclass(frozen=True)
 class DustShadow(Effect):
-    """Specks with a soft rim that block light, on the track of the occulter. Not in the library."""
+    """Specks with a soft rim block light on the track of the occulter. Not in the library."""
 
     specks: tuple[tuple[float, float, float], ...] = ((0.5, 0.5, 6.0),)
 
@@ -109,7 +109,10 @@ class DustShadow(Effect):
 
 @dataclass(frozen=True)
 class FlatFieldResidual(Effect):
-    """Uneven sensitivity: broad patches, and pixel-to-pixel variation of half their rms. strength: rms of the patches."""
+    """Uneven sensitivity: broad patches, and a pixel-to-pixel variation with half the rms of the patches.
+
+    strength: rms of the patches.
+    """
 
     seed: int = 0
     patch: float = 0.1
@@ -137,7 +140,10 @@ def _grain(size: int, seed: int) -> Plane:
 
 @dataclass(frozen=True)
 class ShutterGradient(Effect):
-    """One side of the field is exposed longer; strength: the difference between the edges, s. Not in the library."""
+    """One side of the field is exposed longer than the other. Not in the library.
+
+    strength: the difference of the exposure times at the two edges, s.
+    """
 
     angle_deg: float = 0.0
 
@@ -159,7 +165,7 @@ class ShutterGradient(Effect):
 
 @dataclass(frozen=True)
 class DarkCurrentDrift(Effect):
-    """A dark current that grows during the transit, to `strength` at its end. Not in the library."""
+    """A dark current that grows during the transit and reaches `strength` at its end. Not in the library."""
 
     steepness: float = 2.0
 
@@ -179,9 +185,9 @@ class DarkCurrentDrift(Effect):
 
 @dataclass(frozen=True)
 class BrighterFatter(Effect):
-    """Collected charge repels new charge, which then lands in fainter neighbours. Not in the library.
+    """Collected charge repels new charge into fainter neighbouring pixels. Not in the library.
 
-    strength: share of the difference between two neighbours that flows if they hold 1000 DN.
+    strength: the fraction of the difference between two neighbouring pixels that moves if their mean is 1000 DN.
     """
 
     name: ClassVar[str] = "brighter_fatter"

@@ -1,8 +1,8 @@
-"""The base of the effects of the blind set: a strength, a cause, and the steps of the light's path on which it acts.
+"""The base class of the effects of the blind set: a strength, a cause, and the steps of the simulation that it changes.
 
     scene -> occulter -> optics -> light on fine pixels -> light on detector pixels -> photons -> readout
 
-An effect changes one or two of these steps and no other. Strength 0 changes nothing.
+An effect changes one or two of these steps. With strength 0 it changes nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Moment:
-    """One image of a plan."""
+    """One image of a plan: the image number `index`."""
 
     plan: Plan
     index: int
@@ -35,7 +35,7 @@ class Moment:
 
     @property
     def elapsed(self) -> float:
-        """Elapsed share of the transit: 0 at the first image, 1 at the last."""
+        """The elapsed fraction of the transit: 0 at the first image, 1 at the last image."""
         first, last = self.plan.shots[0].time_s, self.plan.shots[-1].time_s
         return (self.shot.time_s - first) / max(last - first, 1e-9)
 
@@ -50,12 +50,12 @@ class Earlier:
 
 @dataclass(frozen=True)
 class Effect:
-    """The base class, which changes no step.
+    """The base class of all effects. It changes no step of the simulation.
 
-    name, stage, unit (of the strength), cause: in words. nominal: a strength that shows in the discs. largest: the
-    largest plausible strength. power: what an effect leaves grows as strength to this power. varies: its optics differ
-    from image to image. noise_realisations: number over which its mean change is computed; 0 if the change does not
-    depend on noise.
+    unit: of the strength. cause: the physical cause, as text. nominal: a strength that the discs show. largest: the largest
+    plausible strength. power: the residual that the effect leaves is proportional to strength**power. varies: whether its
+    optics differ from image to image. noise_realisations: number of noise realisations over which its change is averaged; 0
+    if the change does not depend on noise.
     """
 
     strength: float
@@ -72,15 +72,15 @@ class Effect:
 
     @classmethod
     def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        """This effect at a given strength, with its other parameters drawn at random."""
+        """This effect with a given strength. The other parameters are drawn at random."""
         return cls(strength)
 
     def at(self, strength: float) -> Self:
-        """The same effect at another strength."""
+        """The same effect with another strength."""
         return dataclasses.replace(self, strength=strength)
 
     def as_json(self) -> dict[str, Any]:
-        """Name, strength and parameters, plain values."""
+        """Name, strength and parameters of the effect, as JSON."""
         values = {key: value for key, value in dataclasses.asdict(self).items() if key != "strength"}
         return {"name": self.name, "strength": self.strength, "unit": self.unit, "parameters": values}
 
@@ -96,7 +96,11 @@ class Effect:
         shape: tuple[int, int],
         moment: Moment,
     ) -> Plane | None:
-        """Change the share of each fine pixel of a window that the occulter hides; None: the disc at rest."""
+        """Change the fraction of each fine pixel [y, x] of a window that the occulter covers.
+
+        share: this fraction; None: that of a disc that does not move. place: the position of the disc. first, shape: the first
+        detector pixel (y, x) and the size of the window. The default returns `share`.
+        """
         return share
 
     def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
@@ -104,7 +108,7 @@ class Effect:
         return optics
 
     def spread(self, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment) -> Plane:
-        """Change the fine light [y, x], DN/s, of the fine scene `lit`, for a PSF that varies over the field."""
+        """Change the fine light `seen` [y, x], DN/s, if the PSF varies across the field. lit: the fine scene with its occulter."""
         return seen
 
     def light(self, seen: Plane, moment: Moment) -> Plane:
@@ -116,21 +120,21 @@ class Effect:
         return rate
 
     def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        """Change the DN of one exposure [y, x], which contain noise. earlier: the images read before it."""
+        """Change the values of one exposure [y, x], in DN with noise. earlier: the images that were read before."""
         return dn
 
     def saturation_dn(self, exposures: list[Plane], plan: Plan) -> float | None:
-        """The level in DN at which high-only images clip; None if the effect sets none."""
+        """The level in DN at which high-only images clip; None if the effect sets no level."""
         return None
 
 
 def acts_on(effect: Effect, *steps: str) -> bool:
-    """Whether an effect changes at least one of these steps."""
+    """Whether an effect changes at least one of these steps (names of methods)."""
     return any(getattr(type(effect), step) is not getattr(Effect, step) for step in steps)
 
 
 def unit_coordinates(shape: tuple[int, int]) -> tuple[Plane, Plane]:
-    """u (1, nx) and v (ny, 1): coordinates along x and y, -0.5 to 0.5."""
+    """Coordinates of the pixels: u (1, nx) along x and v (ny, 1) along y, each from -0.5 to 0.5 across the field."""
     ny, nx = shape
     return (np.arange(nx)[None, :] + 0.5) / nx - 0.5, (np.arange(ny)[:, None] + 0.5) / ny - 0.5
 

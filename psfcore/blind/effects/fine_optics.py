@@ -1,15 +1,19 @@
-"""The PSF on fine pixels, FINE of them along a detector pixel; it is binned only at the detector.
+"""The simulated PSF on fine pixels. Along each axis, FINE fine pixels cover one detector pixel.
 
-    K[o] = mean over fine pixels s of a source pixel, sum over fine pixels t of a target pixel, of k[FINE o + t - s]   Eq. (1)
-    s_fine(r) = a / FINE^2 / (b + r)^c off the centre                                                    Eq. (2)
+    K[o] = mean over s of ( sum over t of k[FINE o + t - s] )                                            Eq. (1)
+    s_fine(r) = a / FINE^2 / (b + r)^c          for r > 0                                                Eq. (2)
 
-k is the fine kernel. K is the share of light that an evenly lit detector pixel sends to another. The fine central pixel
-is set such that the binned centre is 1 - total. Then the binned scatter follows the power law on detector pixels,
-except for its curvature within a pixel.
+k is the fine kernel, and K is the kernel on detector pixels: the fraction of the light of a uniformly bright detector
+pixel that reaches another detector pixel at the offset o. In Eq. (1), s are the fine pixels of the source pixel, and t
+the fine pixels of the target pixel. s_fine is the fine scatter kernel. Its central pixel is set so that the central pixel
+of the binned kernel is 1 - total. The binned scatter then follows the power law on detector pixels, except for the
+curvature of the law within a pixel.
+
+The simulation bins the light only at the detector.
 
 | symbol | name | unit |
 |---|---|---|
-| a, b, c, total | law: a ScatterTruth | px^c, px, -, - |
+| a, b, c, total | parameters of the scatter: a `ScatterTruth`, called law | px^c, px, -, - |
 | r | distance between fine pixels | detector px |
 """
 
@@ -30,18 +34,18 @@ from psfcore.simulate.scatter_truth import ScatterTruth
 Kernel = NDArray[np.float64]
 FINE = 2
 SYNTHETIC, INSTRUMENT = "synthetic", "hri_euv"
-_ORDERS = 40  # of a synthetic mesh, in each direction
+_ORDERS = 40  # number of orders of a synthetic mesh in each direction
 _LARGEST_BUILT_PX = 2048
 
 
 @dataclass(frozen=True)
 class Glass:
-    """The known part of the PSF: the pattern of a pupil and the orders of a mesh, sum 1 on size_px detector pixels.
+    """The known part of the PSF: the diffraction by a pupil and the orders of a mesh. Its sum is 1.
 
-    kind: SYNTHETIC, or the name of the instrument whose mount and meshes are built. The other fields are for a
-    synthetic one. core_px, wing_px: scales of its core, far below a pixel as for a telescope at this wavelength,
-    and of its wing. wing_share, arm_share: light in the wing and in the orders of the mesh. pitch_px: spacing of
-    the orders.
+    kind: SYNTHETIC, or the name of an instrument whose mount and meshes are built. size_px: size of the array in detector
+    pixels. The other fields describe a synthetic pattern. core_px, wing_px: exponential scales of its core, which is far
+    narrower than a pixel as for a telescope at this wavelength, and of its wing. wing_share, arm_share: the fractions of the
+    light in the wing and in the orders of the mesh. pitch_px: the spacing of the orders.
     """
 
     kind: str
@@ -53,7 +57,7 @@ class Glass:
     pitch_px: float = 5.7
 
     def fine(self, turn_deg: float = 0.0, pitch_factor: float = 1.0) -> Kernel:
-        """Fine weights [y, x], sum 1, with the mesh rotated and the spacing of its orders multiplied by pitch_factor."""
+        """The fine kernel [y, x], sum 1, with the mesh rotated by turn_deg and its order spacing multiplied by pitch_factor."""
         size = FINE * self.size_px
         if self.kind == SYNTHETIC:
             kernel = self._drawn(size, turn_deg, pitch_factor)
@@ -62,7 +66,7 @@ class Glass:
         return np.asarray(kernel / kernel.sum())
 
     def _drawn(self, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
-        """A core with wings, and orders along two axes whose light decreases with their number."""
+        """A synthetic pattern: a core with wings, and orders along two axes. The light of an order decreases with its number."""
         d = (np.arange(size) - size // 2) / FINE
         x, y = d[None, :], d[:, None]
         core, wing = (np.exp(-np.hypot(x, y) / scale) for scale in (self.core_px, self.wing_px))
@@ -79,7 +83,7 @@ class Glass:
 
 
 def _add_spot(plane: Kernel, x_px: float, y_px: float, light: float) -> None:
-    """Add an order: a Gaussian of 0.45 px at an offset from the centre."""
+    """Add one mesh order: a Gaussian with a standard deviation of 0.45 px, at an offset from the centre."""
     size = plane.shape[0]
     column, row = (round(at * FINE) + size // 2 for at in (x_px, y_px))
     reach = 3 * FINE
@@ -94,10 +98,10 @@ def _add_spot(plane: Kernel, x_px: float, y_px: float, light: float) -> None:
 
 
 def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
-    """Mount, entrance mesh and filter-wheel mesh of an instrument, convolved; the entrance mesh may be changed.
+    """The convolved patterns of mount, entrance mesh and filter-wheel mesh of an instrument, with a changed entrance mesh.
 
-    The pattern of the entrance mesh is computed alone, so that the mesh can be rotated against the rest. Its orders are
-    therefore blurred by the pupil a second time; the known PSF of the case contains this blur, too.
+    The pattern of the entrance mesh is computed separately, so that only this mesh is rotated. The convolution therefore
+    blurs its orders by the pupil a second time. The known PSF of the case contains the same blur.
     """
     instrument = load_instrument(name)
     entrance = next(mesh for mesh in instrument.meshes if mesh.place == "entrance")
@@ -116,7 +120,7 @@ def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel
 
 @cache
 def _pupil(name: str, size: int) -> Kernel:
-    """An instrument's diffraction without its entrance mesh, on fine pixels. It takes seconds, so it is kept."""
+    """The diffraction PSF of an instrument without its entrance mesh, on fine pixels. The result is kept: it takes seconds."""
     fine = _with_fine_pixels(load_instrument(name))
     built = min(size, _LARGEST_BUILT_PX)
     parts = [build_psf(fine, size=built, component=part).kernel for part in ("MOUNT", "FILTER_WHEEL")]
@@ -134,9 +138,9 @@ def _with_fine_pixels(instrument: Instrument) -> Instrument:
 
 @dataclass(frozen=True, eq=False)
 class FineOptics:
-    """A telescope: fine scatter and fine diffraction, kernels [y, x] with centre at [n // 2, n // 2].
+    """A telescope: its scatter kernel and its diffraction PSF on fine pixels [y, x], each with the centre at [n // 2, n // 2].
 
-    law, glass: what the two were made from, for effects that make them again.
+    law, glass: the parameters of the two kernels; effects use them to compute changed kernels.
     """
 
     law: ScatterTruth
@@ -146,18 +150,18 @@ class FineOptics:
 
     @cached_property
     def total(self) -> Kernel:
-        """The fine total PSF, on the array of the scatter."""
+        """The fine total PSF; its array has the size of the scatter kernel."""
         n = self.scatter.shape[0]
         return linear_convolve(self.scatter, self.diffraction, (n, n))
 
     @cached_property
     def through(self) -> Convolver:
-        """The convolution with the total PSF, on a fine field of half the scatter's array."""
+        """The convolution with the total PSF, for a fine field of half the size of the scatter kernel."""
         return Convolver(self.total, self.field, dtype=np.float64)
 
     @cached_property
     def more_scatter(self) -> Convolver:
-        """The change if the scatter were doubled: light moves from the core to the wings."""
+        """The convolution with the change of the PSF if the scatter is doubled: light moves from the core to the wings."""
         moved, middle = self.scatter.copy(), self.scatter.shape[0] // 2
         moved[middle, middle] = 0.0
         moved[middle, middle] = self.scatter[middle, middle] - 1  # minus all scattered light, at any distance
@@ -166,12 +170,12 @@ class FineOptics:
 
     @property
     def field(self) -> tuple[int, int]:
-        """Shape of the largest fine field that the kernels cover."""
+        """The shape of the largest fine field that the kernels cover."""
         return self.scatter.shape[0] // 2, self.scatter.shape[1] // 2
 
     @property
     def offsets_px(self) -> tuple[Kernel, Kernel]:
-        """x (1, n) and y (n, 1) of each fine pixel of the scatter's array, in detector px from its centre."""
+        """x (1, n) and y (n, 1) of the fine pixels of the scatter kernel, in detector px from its centre."""
         d = (np.arange(self.scatter.shape[0]) - self.scatter.shape[0] // 2) / FINE
         return d[None, :], d[:, None]
 
@@ -185,7 +189,10 @@ def fine_optics(law: ScatterTruth, glass: Glass, size_px: int) -> FineOptics:
 
 
 def scaled_scatter(falloff: Kernel, law: ScatterTruth, amplitude: float) -> Kernel:
-    """Eq. (2) for a falloff [y, x], with the central pixel that makes the binned centre 1 - total."""
+    """The fine scatter kernel, as Eq. (2), for a falloff [y, x].
+
+    The central pixel is set so that the central pixel of the binned kernel is 1 - total.
+    """
     scatter = amplitude * falloff
     middle = scatter.shape[0] // 2
     scatter[middle, middle] = 0.0
@@ -195,7 +202,7 @@ def scaled_scatter(falloff: Kernel, law: ScatterTruth, amplitude: float) -> Kern
 
 
 def binned_kernel(fine: Kernel) -> Kernel:
-    """Eq. (1): a fine kernel [y, x] of even size on detector pixels; the sum is conserved, except at the edges."""
+    """Eq. (1): bin a fine kernel [y, x] of even size to detector pixels. Light is lost only at the edges of the array."""
     n = fine.shape[0]
     columns = sum(
         weight * _shifted(fine, shift, 1)[:, ::FINE]
@@ -209,18 +216,18 @@ def binned_kernel(fine: Kernel) -> Kernel:
 
 
 def binned_glass(glass: Glass) -> Kernel:
-    """The known PSF as a transit's folder contains it: on detector pixels, sum 1."""
+    """The known PSF on detector pixels, sum 1: the content of diffraction.fits of a transit."""
     kernel = binned_kernel(glass.fine())
     return np.asarray(kernel / kernel.sum())
 
 
 def _triangle() -> NDArray[np.float64]:
-    """Eq. (1) along one axis: the share of pairs of fine pixels of two detector pixels that have a given fine offset."""
+    """The weights in Eq. (1) along one axis: the fraction of pairs of fine pixels, of two detector pixels, with a given offset."""
     return np.asarray(1 - np.abs(np.arange(1 - FINE, FINE)) / FINE)
 
 
 def _shifted(plane: Kernel, by: int, axis: int) -> Kernel:
-    """Element n of the result is element n + by; 0 beyond the edge."""
+    """A shifted plane: element n of the result is element n + by of the plane; 0 beyond the edge."""
     moved = np.roll(plane, -by, axis=axis)
     lost = [slice(None), slice(None)]
     lost[axis] = slice(-by, None) if by > 0 else slice(0, -by)
@@ -230,7 +237,7 @@ def _shifted(plane: Kernel, by: int, axis: int) -> Kernel:
 
 
 def turned_offsets(optics: FineOptics, angle_deg: float) -> tuple[Kernel, Kernel]:
-    """Offsets along and across an angle (from +x towards +y), in detector px."""
+    """The offsets of the fine pixels along and across a direction, in detector px. angle_deg: from +x towards +y."""
     x, y = optics.offsets_px
     cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
     return x * cos + y * sin, y * cos - x * sin

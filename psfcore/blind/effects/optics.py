@@ -1,4 +1,4 @@
-"""Effects of the optics: light that goes where the fitted PSF does not send it."""
+"""Effects of the optics: changes of the true PSF that the fitted PSF does not contain, and ghosts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AnisotropicScatter(Effect):
-    """Scatter stretched along an angle; the stretch grows with distance as r / (r + b)."""
+    """Scatter that is stretched along a direction. The stretch grows with the distance r as r / (r + b)."""
 
     angle_deg: float = 0.0
 
@@ -49,7 +49,7 @@ class AnisotropicScatter(Effect):
 
 @dataclass(frozen=True)
 class OneSidedScatter(Effect):
-    """More scatter to one side than to the other, as by coma, out to some tens of pixels. Not in the library."""
+    """More scatter to one side than to the other, similar to coma, up to some tens of pixels. Not in the library."""
 
     angle_deg: float = 0.0
     reach_px: float = 40.0
@@ -77,14 +77,14 @@ class OneSidedScatter(Effect):
 
 
 def _rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
-    """The telescope with another falloff and the same scattered light."""
+    """The telescope with another falloff of the scatter; the total of the scatter stays the same. before: the old falloff."""
     amplitude = optics.law.a / FINE**2 * float(before.sum() / falloff.sum())
     return dataclasses.replace(optics, scatter=scaled_scatter(falloff, optics.law, amplitude))
 
 
 @dataclass(frozen=True)
 class WideHalo(Effect):
-    """A share of the light in a halo, exponential or Moffat, tens to hundreds of pixels wide."""
+    """A fraction of the light is in a halo, exponential or Moffat, that is tens to hundreds of pixels wide."""
 
     scale_px: float = 100.0
     moffat: bool = False
@@ -107,7 +107,7 @@ class WideHalo(Effect):
             return optics
         x, y = optics.offsets_px
         r = np.hypot(x, y)
-        if self.moffat:  # half of the light within 0.88 scales
+        if self.moffat:  # half of the light is within 0.88 scale_px
             halo = (1 + (r / self.scale_px) ** 2) ** -2.2 * 1.2 / (np.pi * self.scale_px**2)
         else:
             halo = np.exp(-r / self.scale_px) / (2 * np.pi * self.scale_px**2)
@@ -117,7 +117,7 @@ class WideHalo(Effect):
 
 @dataclass(frozen=True)
 class CoreBlur(Effect):
-    """A wider core: blurred by a Moffat profile (defocus, figure), or spread along a straight line (jitter)."""
+    """A wider core. A Moffat profile blurs it (defocus, figure errors), or it is spread along a straight line (jitter)."""
 
     angle_deg: float = 0.0
     jitter: bool = False
@@ -143,7 +143,7 @@ class CoreBlur(Effect):
 
 @dataclass(frozen=True)
 class FocusDrift(Effect):
-    """Blur by a uniform disc whose diameter grows from 0 to `strength` at the last image. Not in the library."""
+    """Blur by a uniform disc. Its diameter grows from 0 at the first image to `strength` at the last. Not in the library."""
 
     name: ClassVar[str] = "focus_drift"
     stage: ClassVar[str] = "optics"
@@ -165,7 +165,7 @@ def _blurred(optics: FineOptics, blur: Plane) -> FineOptics:
 
 
 def _square(reach_px: float, finer: int) -> tuple[Plane, Plane]:
-    """x and y of samples within fine pixels, `finer` per axis, in detector px, out to reach_px."""
+    """x (1, n) and y (n, 1) of samples up to reach_px, in detector px. Each fine pixel has `finer` samples along each axis."""
     half = int(np.ceil(reach_px * FINE)) + 1
     at = (np.arange((2 * half + 1) * finer) + 0.5) / finer - half - 0.5
     return at[None, :] / FINE, at[:, None] / FINE
@@ -184,14 +184,14 @@ def _moffat(width_px: float) -> Plane:
 
 
 def _pillbox(diameter_px: float) -> Plane:
-    """A uniform disc."""
+    """A kernel that is a uniform disc."""
     x, y = _square(diameter_px / 2 + 0.5, 9)
     inside = np.clip((diameter_px / 2 - np.hypot(x, y)) * 9 * FINE + 0.5, 0.0, 1.0)
     return _collected(inside if inside.sum() > 0 else np.exp(-((x**2 + y**2) * 400.0)), 9)
 
 
 def _line(length_px: float, angle_deg: float) -> Plane:
-    """Light spread evenly along a straight line."""
+    """A kernel that spreads light evenly along a straight line."""
     half = int(np.ceil(length_px / 2 * FINE)) + 2
     plane = np.zeros((2 * half + 1, 2 * half + 1))
     for s in (np.arange(200) + 0.5) / 200 - 0.5:
@@ -206,7 +206,7 @@ def _line(length_px: float, angle_deg: float) -> Plane:
 
 @dataclass(frozen=True)
 class MeshRotation(Effect):
-    """The mesh is rotated against its assumed angle."""
+    """The mesh is rotated with respect to its assumed angle."""
 
     sign: int = 1
 
@@ -229,7 +229,7 @@ class MeshRotation(Effect):
 
 @dataclass(frozen=True)
 class MeshPitch(Effect):
-    """The orders of the mesh are farther out, or nearer, than assumed."""
+    """The distances of the mesh orders are larger, or smaller, than assumed."""
 
     sign: int = 1
 
@@ -253,7 +253,10 @@ class MeshPitch(Effect):
 
 @dataclass(frozen=True)
 class FieldDependentScatter(Effect):
-    """The amount of scatter depends on the field position of its source: a tilt of `strength` at the edge, and a bowl."""
+    """The total scatter depends on the position of the source in the field.
+
+    Its relative change is the sum of a linear term, which is `strength` at the edge of the field, and a quadratic term.
+    """
 
     angle_deg: float = 0.0
     bowl: float = 0.5
@@ -280,7 +283,7 @@ class FieldDependentScatter(Effect):
 
 @dataclass(frozen=True)
 class Ghost(Effect):
-    """A faint copy of the image: displaced, out of focus, slightly rotated and magnified."""
+    """A faint copy of the image that is displaced, out of focus, slightly rotated and slightly magnified."""
 
     shift_x: float = 0.1
     shift_y: float = 0.0

@@ -1,4 +1,4 @@
-"""Effects of the readout: what becomes of an exposure after its photons were counted."""
+"""Effects of the readout: changes of an exposure after its photons were detected."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DarkOffset(Effect):
-    """A constant left in every image, of either sign, that varies by 5 % from image to image."""
+    """A constant that remains in every image. It is positive or negative, and varies by 5 % from image to image."""
 
     sign: int = 1
     seed: int = 0
 
     name: ClassVar[str] = "dark_offset"
     unit: ClassVar[str] = "DN"
-    cause: ClassVar[str] = "the bias that was subtracted is not that of the day"
+    cause: ClassVar[str] = "the subtracted bias was measured on another day"
     nominal: ClassVar[float] = 1.0
     largest: ClassVar[float] = 12.0
 
@@ -45,7 +45,7 @@ class GainMismatch(Effect):
 
     name: ClassVar[str] = "gain_mismatch"
     unit: ClassVar[str] = "share"
-    cause: ClassVar[str] = "the ratio of the two gains differs from the one that the combination assumes"
+    cause: ClassVar[str] = "the ratio of the two gains differs from the assumed ratio"
     nominal: ClassVar[float] = 0.1
     largest: ClassVar[float] = 0.25
 
@@ -56,13 +56,13 @@ class GainMismatch(Effect):
     def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
         if moment.shot.gain_mode != COMBINED:
             return dn
-        # Faint pixels too, as in the library, although a combined image takes them from the high gain.
+        # As in the library, this also changes faint pixels, although a combined image takes them from the high-gain image.
         return dn * (1 + self.sign * self.strength)
 
 
 @dataclass(frozen=True)
 class Nonlinearity(Effect):
-    """Faint signals are reduced: by a power law below a knee, or by charge that a trap keeps."""
+    """Faint signals are read too low: by a power law below a knee, or because a trap keeps charge."""
 
     knee_dn: float = 60.0
     trap: bool = False
@@ -85,14 +85,14 @@ class Nonlinearity(Effect):
         if self.trap:
             kept = self.strength * self.knee_dn * (1 - np.exp(-size / self.knee_dn))
             return np.asarray(np.sign(dn) * (size - kept))
-        # A power 1 + p below the knee. The strength is the share lost at a twentieth of the knee.
+        # Below the knee the signal is raised to the power 1 + p. The strength is the fraction lost at 1/20 of the knee.
         power = -np.log1p(-self.strength) / np.log(20)
         return np.asarray(dn * np.minimum(np.maximum(size, 1e-3) / self.knee_dn, 1.0) ** power)
 
 
 @dataclass(frozen=True)
 class ColumnSmear(Effect):
-    """Every pixel gets a share of the light of its column, and of the pixels that it passes during the readout."""
+    """Every pixel gets a fraction of the mean of its column, and of the light of the pixels that it passes in the readout."""
 
     passed: float = 0.5
 
@@ -114,7 +114,7 @@ class ColumnSmear(Effect):
 
 @dataclass(frozen=True)
 class Persistence(Effect):
-    """A share of the last four images, of any pointing, remains and decays with time."""
+    """A fraction of each of the last four images, of any pointing, remains in an image and decays with time."""
 
     decay_s: float = 300.0
 
@@ -138,7 +138,7 @@ class Persistence(Effect):
 
 @dataclass(frozen=True)
 class RowCrosstalk(Effect):
-    """Bright pixels leave an echo at a fixed distance in their row, a few pixels wide. Not in the library."""
+    """Bright pixels cause an echo in their row, at a fixed distance and a few pixels wide. Not in the library."""
 
     lag: float = 0.2
     above: float = 0.5
@@ -167,7 +167,7 @@ class RowCrosstalk(Effect):
 
 @dataclass(frozen=True)
 class Stripes(Effect):
-    """A periodic pattern of the readout, wider than the disc, the same in all images. Not in the library."""
+    """A periodic pattern that is the same in all images. Its period is longer than the disc. Not in the library."""
 
     period_px: float = 60.0
     angle_deg: float = 0.0
@@ -193,9 +193,9 @@ class Stripes(Effect):
 
 @dataclass(frozen=True)
 class FaintRounding(Effect):
-    """Values are truncated towards zero, in steps that grow as the square root of the signal. Not in the library.
+    """Values are truncated towards zero, to steps that grow as the square root of the signal. Not in the library.
 
-    strength: the step in units of sqrt(6 signal), which is the photon noise.
+    strength: the step divided by sqrt(6 signal), which is the photon noise for a gain of 6 DN.
     """
 
     name: ClassVar[str] = "faint_rounding"
@@ -208,7 +208,7 @@ class FaintRounding(Effect):
     def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
         if self.strength == 0:
             return dn
-        # Equal steps q of sqrt(|D|) are steps 2 q sqrt(|D|) of D.
+        # Steps of q in sqrt(|D|) are steps of 2 q sqrt(|D|) in D.
         q = self.strength * np.sqrt(6.0) / 2
         return np.asarray(np.sign(dn) * (q * np.floor(np.sqrt(np.abs(dn)) / q)) ** 2)
 

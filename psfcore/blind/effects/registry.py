@@ -1,4 +1,4 @@
-"""All effects of the blind set: those that the gap library should know, by the same names, and unknown ones."""
+"""All effects of the blind set. KNOWN: effects that the gap library also contains, by the same names. UNKNOWN: the others."""
 
 from __future__ import annotations
 

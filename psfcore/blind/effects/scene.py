@@ -21,7 +21,7 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OcculterMotion(Effect):
-    """The disc moves along a straight line during the exposure, in steps of at most a fifth of a pixel."""
+    """The disc moves along a straight line during the exposure. It is simulated in steps of at most a fifth of a pixel."""
 
     angle_deg: float = 0.0
 
@@ -56,7 +56,7 @@ class OcculterMotion(Effect):
 
 @dataclass(frozen=True)
 class SceneEvolution(Effect):
-    """Patches brighten and fade, each with its own phase, all with the same period."""
+    """Patches of the Sun brighten and fade with the same period, but with different phases."""
 
     seed: int = 0
     patch: float = 0.05
@@ -88,10 +88,11 @@ class SceneEvolution(Effect):
 
 @dataclass(frozen=True)
 class OutOfFieldLight(Effect):
-    """Scattered light of a bright band beyond one edge of each pointing, half as wide as the field.
+    """In each pointing, a bright band beyond one edge of the field scatters light into the field.
 
-    strength: brightness of the band. It begins a twelfth of the field beyond the edge. edges: 0 left, 1 right, 2 below,
-    3 above. b_px, c, a: the power law that scatters its light.
+    strength: brightness of the band, times the entry of `levels` for the pointing. The band is half as wide as the field,
+    and begins a twelfth of the field beyond the edge. edges: the edge of each pointing; 0 left, 1 right, 2 below, 3 above.
+    b_px, c, a: parameters of the power law that scatters the light of the band.
     """
 
     edges: tuple[int, ...] = (0, 1, 1)
@@ -103,7 +104,7 @@ class OutOfFieldLight(Effect):
     name: ClassVar[str] = "out_of_field_light"
     stage: ClassVar[str] = "scene"
     unit: ClassVar[str] = "DN/s"
-    cause: ClassVar[str] = "light of the Sun beyond the edge of the detector is scattered into the field"
+    cause: ClassVar[str] = "light from the Sun beyond the edge of the detector is scattered into the field"
     nominal: ClassVar[float] = 400.0
     largest: ClassVar[float] = 4000.0
 
@@ -130,7 +131,7 @@ class OutOfFieldLight(Effect):
 
 @cache
 def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
-    """Scattered light of a band of 1 DN/s beyond one edge; computed on a coarse grid, because it is smooth."""
+    """The scattered light [y, x] of a band of 1 DN/s beyond one edge. It is smooth, so it is computed on a coarse grid."""
     size = fine_size // FINE
     step = size / 32
     at = (np.arange(32) + 0.5) * step
@@ -148,7 +149,7 @@ def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
 
 @dataclass(frozen=True)
 class LimbGlint(Effect):
-    """Extra light in one pointing: rays that spread from a point beyond its edge. Not in the library."""
+    """Additional light in one pointing: rays that spread from a point beyond the edge of the field. Not in the library."""
 
     pointing: int = 1
     angle_deg: float = 0.0
@@ -179,9 +180,9 @@ class LimbGlint(Effect):
 
 @dataclass(frozen=True)
 class SaturationFill(Effect):
-    """High-only images clip, and the clipped pixels flicker, so that other images show other values there.
+    """High-only images clip bright pixels. These pixels also flicker, so other images show other values in them.
 
-    strength: share of light lost by clipping.
+    strength: the fraction of the light that is lost by clipping.
     """
 
     seed: int = 0
@@ -222,7 +223,7 @@ class SaturationFill(Effect):
 
 @cache
 def patches(size: int, seed: int, patch: float) -> Plane:
-    """A smooth random plane [y, x], mean 0, rms 1; patch: size of its patches over that of the field."""
+    """A smooth random plane [y, x] with mean 0 and rms 1. patch: the size of its patches, as a fraction of the field."""
     rng = np.random.default_rng(seed)
     coarse = max(8, int(np.ceil(4 / patch)))
     drawn = gaussian_filter(rng.standard_normal((coarse, coarse)), 1.5)

@@ -1,1 +1,1 @@
-"""The evidence of a diagnosis: cells of the discs, blocks of the unocculted field, and the linear model of both."""
+"""The evidence of a diagnosis: the cells of the discs, the blocks of the unocculted field, and a linear model of both."""

@@ -1,21 +1,22 @@
-"""What the discs show: means over cells of radius and azimuth, and their response to any change of the image.
+"""The cells of a disc: mean residuals in sectors of rings, and their response to any change of the image.
 
-With y an image, D its fully dark pixels, H the PSF, G the inverse on the periodic plane and x = (2 - G H) G y the
-scene, the unexplained light in the disc is r = D [y - H (1 - D) x]. The mean of r over a cell is a linear function of
-the whole image. The adjoint gives its weights in one pass:
+Let y be an image and D the mask of its fully dark pixels. H is the PSF, and G is the inverse of H on the periodic plane.
+The reconstructed scene is x = (2 - G H) G y. The residual in the disc is r = D [y - H (1 - D) x]. A cell is a sector of a ring
+of the disc. The mean of r over a cell is a linear function of the whole image. The adjoint of H and G gives the weights q
+of this function in one pass:
 
     a . r = q . y,   q = a - (2 - G^T H^T) G^T (1 - D) H^T a        Eq. (1)
 
-An effect that changes the image by e therefore changes the cell by q . e, a sum over pixels, whatever the effect. A
-global gain error has q . e close to 0. The noise of two cells contains the disc's own noise and the noise of the scene
-that scatters into the disc:
+An effect that changes the image by e therefore changes the cell by q . e, a sum over pixels. For an error of the gain
+common to all pixels, q . e is close to 0. The noise of a cell has two parts: the noise of the disc itself, and the noise
+of the scene that scatters into the disc. The covariance of two cells contains both parts:
 
     cov(a_1 . r, a_2 . r) = sum over all pixels of q_1 q_2 var(y)    Eq. (2)
 
 | symbol | name | unit |
 |---|---|---|
-| a | weights of a cell: 1 / number of its pixels | - |
-| q | sensitivity | - |
+| a | weights of a cell: 1 / (number of its pixels) | - |
+| q | sensitivity: the derivative of the mean of a cell with respect to each pixel | - |
 """
 
 from __future__ import annotations
@@ -32,18 +33,20 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Planes = NDArray[np.float32]
 
-RINGS = (
-    (0.0, 0.38, 1),
-    (0.38, 0.7, 4),
-    (0.7, 1.0, 8),
-)  # inner and outer radius (in units of the outermost dark pixel's radius), number of sectors
+# Inner and outer radius (fractions of the radius of the outermost dark pixel), number of sectors.
+RINGS = ((0.0, 0.38, 1), (0.38, 0.7, 4), (0.7, 1.0, 8))
 LEAST_PIXELS = 3
-LEAST_VARIANCE = 1e-12  # of the largest eigenvalue: redundant cells have directions without any noise
+# Smaller eigenvalues of a covariance are raised to this fraction of the largest one: redundant cells would give 0.
+LEAST_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The cells of one disc: weights (cells, dark pixels), number of pixels, mean radius over the disc's, and azimuth (rad)."""
+    """The cells of one disc.
+
+    weights: (cells, dark pixels). pixels: number of pixels of each cell. radius: mean radius of each cell, divided by the
+    radius of the outermost dark pixel. azimuth: mean azimuth of each cell, rad.
+    """
 
     weights: Matrix
     pixels: Vector
@@ -52,7 +55,10 @@ class Cells:
 
 
 def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
-    """Divide the dark pixels around a disc's centre into cells; cells of fewer than LEAST_PIXELS pixels are left out."""
+    """Divide the dark pixels of a disc into cells. Cells with fewer than LEAST_PIXELS pixels are left out.
+
+    x_px, y_px: the centre of the disc.
+    """
     rows, columns = dark
     dx, dy = columns - x_px, rows - y_px
     r = np.hypot(dx, dy)
@@ -75,7 +81,7 @@ def cells_of(dark: Pixels, x_px: float, y_px: float) -> Cells:
 
 
 def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
-    """Eq. (1): the derivative of each cell's mean with respect to every pixel of the image, (cells, ny, nx)."""
+    """q of Eq. (1): the derivative of the mean of each cell with respect to every pixel of the image, (cells, ny, nx)."""
     out = []
     for weight in weights:
         cell = np.zeros(optics.engine.lanes_shape, np.float32)
@@ -90,7 +96,7 @@ def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
 
 
 def whitening(covariance: Matrix) -> Matrix:
-    """The matrix that gives numbers with this covariance (n, n) unit noise; zeros if they have no noise."""
+    """The whitening matrix of a covariance (n, n): it scales values with this covariance to unit noise. Zeros for no noise."""
     values, vectors = np.linalg.eigh(covariance)
     if values[-1] <= 0:
         return np.zeros_like(covariance)
@@ -99,11 +105,12 @@ def whitening(covariance: Matrix) -> Matrix:
 
 @dataclass(frozen=True, eq=False)
 class DiscCells:
-    """The cells of frame `index` (its position among all frames): residuals (observed minus expected) and their derivatives.
+    """The cells of one disc: their residuals and the derivatives of these residuals.
 
-    residual, expected: (cells,) in DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of a parameter.
-    pixels, radius, azimuth: as in `Cells`. observed: the disc's mean. level_before: `level` before the light of an effect
-    was subtracted from the image, DN/s; None if nothing was subtracted.
+    index: the number of the frame among all frames. residual: observed minus expected (cells,), DN/s. expected: the light that
+    the model predicts (cells,), DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of a parameter.
+    pixels, radius, azimuth: as in `Cells`. level_before: `level` before the light of an effect was subtracted from the
+    image, DN/s; None if nothing was subtracted.
     """
 
     index: int
@@ -118,32 +125,35 @@ class DiscCells:
 
     @property
     def share(self) -> Vector:
-        """Each cell's fraction of the disc's pixels."""
+        """The fraction of the pixels of the disc that each cell contains (cells,)."""
         return np.asarray(self.pixels / self.pixels.sum())
 
     @property
     def observed(self) -> float:
-        """The disc's mean, DN/s."""
+        """The observed mean of the disc, DN/s."""
         return float(self.share @ (self.expected + self.residual))
 
     @property
     def level(self) -> float:
-        """Reference of percentages of this disc, DN/s: the absolute mean as observed, before any effect was subtracted."""
+        """The reference for percentages of this disc, DN/s: the absolute value of its observed mean.
+
+        The reference is the mean before any effect was subtracted.
+        """
         return abs(self.observed if self.level_before is None else self.level_before)
 
     @property
     def mean_expected(self) -> float:
-        """The disc's expected mean, DN/s."""
+        """The mean of the disc that the model predicts, DN/s."""
         return float(self.share @ self.expected)
 
     @property
     def mean_noise(self) -> float:
-        """The noise of the disc's mean, DN/s."""
+        """The noise of the mean of the disc, DN/s."""
         return float(np.sqrt(self.share @ self.covariance @ self.share))
 
 
 def disc_cells(solution: Solution, n: int) -> tuple[DiscCells, Planes]:
-    """The cells of frame n, with an empty Jacobian, and their sensitivities."""
+    """The cells of frame n, with an empty Jacobian, and the sensitivities of these cells (cells, ny, nx)."""
     place = solution.sky.found[n].place
     dark = solution.sky.dark[n]
     cells = cells_of(dark, place.x_px, place.y_px)

@@ -1,8 +1,9 @@
-"""What the discs and the unocculted field show of all effects at once: small arrays that answer all later questions.
+"""The evidence: how the discs and the unocculted field respond to the PSF and to every effect.
 
-The columns are the coordinates of the PSF, then the parameters of the effects. Everything is linear in them near the
-solution. One pass over the images gives the Jacobian of their cells (`cells`) and of their blocks in the unocculted
-field (`unocculted_blocks`).
+The evidence consists of small arrays; the later steps of a diagnosis need nothing else. Each column of the Jacobian
+belongs to one parameter: first the coordinates of the PSF, then the parameters of the effects. Near the fit, the images
+are a linear function of these parameters. One pass over the images gives the Jacobian of the cells of the discs (`cells`)
+and of the blocks of the unocculted field (`unocculted_blocks`).
 """
 
 from __future__ import annotations
@@ -32,14 +33,15 @@ from psfcore.transit.transit import Frame
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
-AT_ONCE = 16  # fields that are processed together
+AT_ONCE = 16  # number of fields that are processed together
 
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """The circumstances of one image: its coordinates on the axes.
+    """The circumstances of one image, which are its values on the axes.
 
-    described: whether its neighbours in time show the scene around its occulter, so that the occulter's place is reliable.
+    described: whether the neighbouring images in time show the scene around the occulter; the fitted position of the occulter
+    is then reliable.
     """
 
     file: str
@@ -57,7 +59,9 @@ class ImageInfo:
 class Evidence:
     """All the data that a diagnosis uses.
 
-    discs: of the images that were used. image_info: of all images. numbers: `Change.numbers` of each column.
+    effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
+    every fit contains. discs: one for each image that the fit used. image_info: one for every image. untestable: the reasons
+    why effects cannot be tested, by name. numbers: `Change.numbers` by column.
     """
 
     effects: tuple[Effect, ...]
@@ -70,26 +74,26 @@ class Evidence:
     numbers: dict[int, int] = field(default_factory=dict)
 
     def numbers_of(self, columns: Sequence[int]) -> int:
-        """How many numbers were measured in the unocculted field to build the changes of these columns."""
+        """The number of values that were measured in the unocculted field to compute the changes of these columns."""
         return sum(self.numbers.get(column, 0) for column in columns)
 
     @cached_property
     def images(self) -> tuple[int, ...]:
-        """Positions, among all images, of the images with a disc."""
+        """The index, among all images, of each image with a disc."""
         return tuple(disc.index for disc in self.discs)
 
     def unocculted_equations(self, images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """The normal equations of all columns from the blocks of some images (None: all images)."""
+        """The normal equations of all columns, from the unocculted blocks of some images (None: all images)."""
         return self.all_unocculted if images is None else self.unocculted.equations(range(self.size), images)
 
     @cached_property
     def all_unocculted(self) -> UnoccultedEquations:
-        """`unocculted_equations` of all images."""
+        """The result of `unocculted_equations` for all images."""
         return self.unocculted.equations(range(self.size))
 
     @cached_property
     def steady_unocculted(self) -> UnoccultedEquations:
-        """`all_unocculted` with flickering blocks down-weighted by their observed variance; used to judge what remains."""
+        """As `all_unocculted`, but flickering blocks have a low weight, from their observed variance. Used to judge residuals."""
         return self.unocculted.with_flickering_blocks().equations(range(self.size))
 
     @property
@@ -99,7 +103,7 @@ class Evidence:
 
     @property
     def of_effects(self) -> range:
-        """The columns after the base. In the evidence of a full refit these are the parameters of the effects in that refit."""
+        """The columns after the base. For a full refit, these belong to the effects of that refit."""
         return range(len(self.base), self.size)
 
 
@@ -110,7 +114,7 @@ def gather(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """The evidence of a solution on all effects of a library that these data can show. view: the view of the solution, if any.
+    """Compute the evidence of a solution for a library of effects. view: the view of the solution, if it exists already.
 
     Raises DataError "bad-effects" if an added effect fails.
     """
@@ -154,7 +158,7 @@ def gather(
 def _changes(
     view: View, library: Sequence[Effect]
 ) -> tuple[list[Change], dict[str, tuple[int, ...]], dict[str, str]]:
-    """All effects' changes in one list, the positions of each effect's changes, and the reasons why some effects cannot be tested."""
+    """Three results: the changes of all effects in one list; the indices in this list by effect; the reasons by untestable effect."""
     changes: list[Change] = []
     columns: dict[str, tuple[int, ...]] = {}
     untestable: dict[str, str] = {}
@@ -170,7 +174,7 @@ def _changes(
 
 
 def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
-    """The cells of one image with the Jacobian of all columns."""
+    """The cells of image n, with the Jacobian of all columns."""
     solution = view.solution
     cells, planes = disc_cells(solution, n)
     flat = planes.reshape(planes.shape[0], -1)
@@ -181,14 +185,14 @@ def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
     rows = [*range(len(view.slopes)), *(len(view.slopes) + k for k in shown)]
     jacobian = np.zeros((len(view.slopes) + len(changes), flat.shape[0]))
     for first in range(0, len(rows), AT_ONCE):
-        # Several fields at a time: the cells' planes are then read from memory once for all of them.
+        # Several fields are processed together, so that the large planes of the cells are read from memory only once for them.
         some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
         jacobian[rows[first : first + AT_ONCE]] = some @ flat.T
     return replace(cells, jacobian=jacobian)
 
 
 class _Distance:
-    """The mean distance from which light scatters into a disc: the mean of r, weighted by the light that arrives from there."""
+    """The mean distance r from which light scatters into a disc. The weight of a distance is the light that arrives from it."""
 
     def __init__(self, view: View) -> None:
         kernel, solution = view.kernel, view.solution
@@ -220,7 +224,7 @@ def _image_info(frame: Frame, found: FoundPlace, distance_px: float) -> ImageInf
 
 
 def _testable(evidence: Evidence) -> Evidence:
-    """The evidence without effects that change no image."""
+    """The evidence without those effects that change neither a disc nor a block; they become untestable."""
     untestable, columns = dict(evidence.untestable), dict(evidence.columns)
     for name, here in evidence.columns.items():
         cells = max(float(np.abs(disc.jacobian[list(here)]).max()) for disc in evidence.discs)

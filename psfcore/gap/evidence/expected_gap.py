@@ -1,9 +1,9 @@
-"""The expected gap: the residuals that the estimator leaves on data simulated from the fitted model itself.
+"""The expected gap: the residuals of a fit to images that are simulated from the fitted model itself.
 
-Each pointing's mean scene is occulted where the occulter was found, convolved with the fitted PSF, and observed again
-with photon and read noise. The same fit and the same cells then tell by how much chi2 exceeds its degrees of freedom if
-the model is right. It does, because an occulter's place is never found exactly, and the light near the field's edge is
-never restored completely.
+The simulation takes the mean scene of each pointing and puts the occulter where it was found. It convolves this scene
+with the fitted PSF and adds photon and read noise. The same fit is then made to the simulated images. In their cells,
+chi2 exceeds its degrees of freedom although the model is right: the position of an occulter is never found exactly, and
+the light near the edge of the field is never restored completely. The expected gap states this excess.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ from psfcore.transit.transit import Transit
 
 @dataclass(frozen=True)
 class ExpectedGap:
-    """disc_scale, unocculted_scale: chi2 per degree of freedom of the cells and of the blocks. scale_error: relative error
-    of disc_scale. residual_pct: rms residual of the discs' means, in percent.
+    """The residuals that remain if the model is right.
+
+    disc_scale: chi2 of the cells, per degree of freedom. unocculted_scale: chi2 of the unocculted blocks, per degree of
+    freedom. scale_error: relative error of disc_scale. residual_pct: rms residual of the discs' means, in percent.
     """
 
     disc_scale: float
@@ -32,7 +34,7 @@ class ExpectedGap:
 
 
 def simulated(view: View, seed: int) -> Transit:
-    """The transit simulated from the fitted model and its own scenes, with noise."""
+    """The transit, with images simulated from the fitted model and its scenes, with noise. seed: of the noise."""
     solution = view.solution
     transit, optics = solution.transit, solution.optics
     frames = []
@@ -48,9 +50,9 @@ def simulated(view: View, seed: int) -> Transit:
 def expected_gap(
     view: View, *, seed: int = 1, floor: float, progress: Progress = lambda stage, step, steps: None
 ) -> ExpectedGap:
-    """The residuals of the estimator on one simulation of the fitted model. view: of the fit.
+    """The expected gap from one simulation. view: the view of the fit. floor: as in `LinearModel`.
 
-    Raises DataError as `psfcore.scatter.inversion.invert` does.
+    Raises the errors of `psfcore.scatter.inversion.invert`.
     """
     solution = view.solution
 

@@ -1,20 +1,23 @@
-"""The model near its solution: linear in the PSF's coordinates and in the parameters of every effect.
+"""The linear model: chi2 near the fit, as a function of the coordinates of the PSF and the parameters of every effect.
 
     chi2(theta) = sum over discs of (r - J theta)^T C^-1 (r - J theta) + chi2 of the unocculted blocks  Eq. (1)
     C = noise of the cells + f^2 m m^T                                                                  Eq. (2)
 
-m is the expected light in a disc's cells. The floor f is a relative error common to all cells of a disc; it stands for
-errors that nobody has thought of. An effect is tested together with the PSF's coordinates, which are refitted; what they
-absorb is not credited to the effect. Its parameters have a Gaussian prior of width UNLIKELY times their likely size, so
-that an offset of 200 DN explains nothing. The gain of an effect is the decrease of chi2, prior included.
+r are the residuals in the cells of a disc, J is their Jacobian, theta are the parameters, and m is the expected light in
+the cells. The floor f is a relative error common to all cells of a disc. It allows for causes that are in no model. While
+an effect is tested, the coordinates of the PSF are refitted. The effect therefore gets no credit for residuals that a
+change of the PSF can absorb. The parameters of an effect have a Gaussian prior. Its width is UNLIKELY times their likely size;
+an implausible offset of 200 DN can then explain nothing. The gain of an effect is the decrease of chi2, including the
+term of the prior.
 
-The many parameters of a random field have a prior of width S, their likely size. Let N be the normal matrix of these
-parameters with all others refitted, and l the eigenvalues of S N S. The cost of what was learned about them, and what
-they gain from noise alone, are
+A random field has many parameters, for example the cosines of a flat-field error. Their prior has the width S, their
+likely size. Let N be the normal matrix of these parameters with all other parameters refitted, and l the eigenvalues of
+S N S. The cost of the information gained about the parameters, and the gain from noise alone, are
 
     cost = sum of ln(1 + l)                     gain = sum of l / (1 + l) chi2_1                     Eq. (3)
 
-so that gain minus cost is twice the log of the likelihood ratio of the data with and without the field.
+where chi2_1 is a random variable with one degree of freedom. Gain minus cost is then twice the logarithm of the
+likelihood ratio of the data with and without the random field.
 
 | symbol | name | unit |
 |---|---|---|
@@ -39,14 +42,14 @@ from psfcore.least_squares import scaled_inverse
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
-FLOOR = 0.003  # f of Eq. (2), the value that the verdict is first made with
-UNLIKELY = 10.0
-WEAKEST = 1e-9  # smallest eigenvalue of a normal matrix scaled to a unit diagonal
+FLOOR = 0.003  # f of Eq. (2): the verdict is first made with this value
+UNLIKELY = 10.0  # width of the prior of a parameter, in units of its likely size
+WEAKEST = 1e-9  # eigenvalues of a scaled normal matrix below this fraction of the largest one count as zero
 
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """One disc scaled to unit noise: residual (cells,), jacobian (columns, cells), and the whitening matrix."""
+    """One disc, scaled to unit noise. residual: (cells,). jacobian: (columns, cells). white: the whitening matrix."""
 
     index: int
     residual: Vector
@@ -56,7 +59,10 @@ class Whitened:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A fit of some columns: values, covariance, and the decrease of chi2 by all of them together."""
+    """A linear fit of some columns (parameters).
+
+    values: the fitted parameters. covariance: of the values. fall: the decrease of chi2 by all columns together.
+    """
 
     columns: tuple[int, ...]
     values: Vector
@@ -66,10 +72,10 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """Eq. (1) for some evidence.
+    """Eq. (1) for the evidence of a transit.
 
-    floor: f of Eq. (2). disc_scale, unocculted_scale: chi2 per degree of freedom of the discs and of the blocks if there is
-    no gap. scale_error: relative error of disc_scale.
+    floor: f of Eq. (2). disc_scale, unocculted_scale: chi2 per degree of freedom that the discs and the unocculted blocks
+    have without a gap. scale_error: relative error of disc_scale.
     """
 
     evidence: Evidence
@@ -91,7 +97,7 @@ class LinearModel:
         return Whitened(disc.index, white @ disc.residual, disc.jacobian @ white, white)
 
     def equations(self, images: Sequence[int] | None = None) -> tuple[Matrix, Vector]:
-        """Normal matrix and score of all columns from some images (None: all images); computed once."""
+        """Normal matrix and right-hand side (`score`) of all columns, from some images (None: all images). Results are kept."""
         key = None if images is None else tuple(images)
         if key not in self._equations:
             self._equations[key] = self._equations_of(images)
@@ -116,16 +122,16 @@ class LinearModel:
 
     @cached_property
     def patterns(self) -> tuple[Matrix, ...]:
-        """`patterns.patterns` of the evidence."""
+        """The result of `patterns.patterns` for the evidence."""
         return patterns(self.evidence)
 
     @cached_property
     def means(self) -> tuple[Matrix, ...]:
-        """`patterns.means` of the evidence."""
+        """The result of `patterns.means` for the evidence."""
         return means(self.evidence)
 
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
-        """Fit the PSF's coordinates and these columns, with some equations (None: those of all images)."""
+        """Fit the coordinates of the PSF and these columns. equations: as from `equations` (None: of all images)."""
         here = [*self.evidence.base, *columns]
         normal, score = self.equations() if equations is None else equations
         normal, score = normal[np.ix_(here, here)] + np.diag(self._prior[here]), score[here]
@@ -135,7 +141,7 @@ class LinearModel:
 
     @cached_property
     def _prior(self) -> Vector:
-        """1 / variance of the prior of each column; 0 for the PSF's coordinates."""
+        """1 / variance of the prior of each column; 0 for the coordinates of the PSF, which have no prior."""
         out = np.zeros(self.evidence.size)
         for effect in self.evidence.effects:
             wide = 1.0 if effect.field else UNLIKELY
@@ -150,11 +156,14 @@ class LinearModel:
         return frozenset(column for name in fields for column in self.evidence.columns[name])
 
     def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
-        """By how much the prior would reduce a step's columns if it included the amounts that were subtracted beforehand."""
+        """The amount by which the prior reduces the fitted values if it also applies to amounts that were subtracted before.
+
+        taken_out: the subtracted amounts, by column of the fit.
+        """
         return np.asarray(step.covariance @ (self._prior[list(step.columns)] * taken_out))
 
     def learned(self, columns: Sequence[int]) -> Vector:
-        """l of Eq. (3) for those columns that belong to a random field, with the others and the PSF's coordinates refitted."""
+        """l of Eq. (3) for those columns that belong to a random field. The other columns and the PSF are refitted."""
         field = [column for column in columns if column in self.of_fields]
         if not field:
             return np.zeros(0)
@@ -169,19 +178,19 @@ class LinearModel:
 
     @cached_property
     def base(self) -> Step:
-        """The fit of the PSF's coordinates alone."""
+        """The fit of the coordinates of the PSF alone, without any effect."""
         return self.fit(())
 
     def gain(self, step: Step) -> float:
-        """The decrease of chi2 by a step's columns, compared with the PSF's coordinates alone."""
+        """The decrease of chi2 by a fit, compared with the fit of the PSF alone."""
         return max(step.fall - self.base.fall, 0.0)
 
     def left(self, step: Step) -> tuple[Vector, ...]:
-        """The whitened residuals of every disc after a step."""
+        """The whitened residuals of every disc after a fit."""
         return tuple(d.residual - d.jacobian[list(step.columns)].T @ step.values for d in self.discs)
 
     def left_unocculted(self, step: Step) -> float:
-        """chi2 of the unocculted blocks after a step, over unocculted_scale, with flickering blocks down-weighted."""
+        """chi2 of the unocculted blocks after a fit, divided by unocculted_scale. Flickering blocks have a low weight."""
         here, unocculted = list(step.columns), self.evidence.steady_unocculted
         theta = step.values
         fall = 2 * theta @ unocculted.score[here] - theta @ unocculted.normal[np.ix_(here, here)] @ theta
@@ -190,10 +199,10 @@ class LinearModel:
     def gain_of_patterns(
         self, step: Step, patterns: Sequence[Matrix], left: Sequence[Vector]
     ) -> tuple[float, int]:
-        """The further decrease of the discs' chi2 by patterns of the cells, and the number of independent patterns.
+        """The decrease of the chi2 of the discs by patterns that are added to a fit, and the number of independent patterns.
 
-        patterns: (patterns, cells) in DN/s for each disc. left: whitened residuals after the step; the step's own columns are
-        refitted together with the patterns.
+        patterns: for each disc (patterns, cells), DN/s. left: whitened residuals of each disc after the fit. The columns of the
+        fit are refitted together with the patterns.
         """
         here = list(step.columns)
         design = np.concatenate(

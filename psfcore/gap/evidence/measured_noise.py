@@ -1,11 +1,13 @@
-"""The noise measured in the images, to check the stated noise.
+"""Measure the noise of the images, to check the noise that the transit states.
 
-Two consecutive images of one pointing show the same scene. Let d be their difference. The mixed second difference
+Two consecutive images of one pointing show the same scene. Let d be the difference of these images, and d_00 to d_11 its
+values in a square of 2 x 2 px. The mixed second difference
 
     h = (d_00 - d_01 - d_10 + d_11) / 2          Eq. (1)
 
-removes everything smooth. If the noise of the pixels is independent, h has the variance of d. Blocks of h give the
-variance as a function of the level; the fitted line is g D + r^2 (`psfcore.noise`, Eq. (1)).
+removes everything smooth. If the noise of the pixels is independent, h has the same variance as d. Blocks of h give the
+variance as a function of the level D (DN). The line g D + r^2 is fitted to them, with the photon gain g and the read
+noise r (`psfcore.noise`, Eq. (1)).
 """
 
 from __future__ import annotations
@@ -22,17 +24,21 @@ from psfcore.transit.transit import Frame, Transit
 
 Vector = NDArray[np.float64]
 
-BLOCK = 16  # px of h, which has half the image's pixels along each axis
+BLOCK = 16  # edge of a block of h, in values of h: there is one value for 2 x 2 px of the image
 FREE_OF_DISC_PX = 20.0
 NORMAL_MAD = 1.4826
 LEAST_BLOCKS = 20
 ROUNDS = 5
-TRUSTED = 0.15  # the stated noise stands if the ratio of variances is closer to 1 than this
+TRUSTED = 0.15  # the stated noise is used if the ratio of variances differs from 1 by at most this amount
 
 
 @dataclass(frozen=True)
 class MeasuredNoise:
-    """noise: as fitted. ratio: measured variance over the stated one, the median of all blocks. blocks: their number."""
+    """The noise that the images show.
+
+    noise: from the fitted line. ratio: measured variance divided by stated variance, the median over all blocks. blocks: the
+    number of blocks.
+    """
 
     noise: Noise
     ratio: float
@@ -45,7 +51,7 @@ class MeasuredNoise:
 
 
 def measured_noise(transit: Transit) -> MeasuredNoise | None:
-    """The noise of a transit's images; None if too few consecutive images show the same scene, or if no line fits."""
+    """Measure the noise of a transit. None if too few consecutive images show the same scene, or if no line can be fitted."""
     levels, variances = [], []
     frames = transit.frames
     for one, other in itertools.pairwise(frames):
@@ -69,7 +75,7 @@ def measured_noise(transit: Transit) -> MeasuredNoise | None:
 
 
 def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
-    """Level (DN) and variance (DN^2) of an exposure, in blocks away from both discs."""
+    """Level (DN) and variance (DN^2) of one exposure, for each block away from both discs: two arrays (blocks,)."""
     a, b = (frame.pixels.astype(np.float64) * frame.exposure_s for frame in (one, other))
     difference = a - b * (a.mean() / b.mean())
     ny, nx = (n // 2 * 2 for n in difference.shape)
@@ -92,7 +98,7 @@ def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
 
 
 def _line(level: Vector, variance: Vector) -> tuple[float, float]:
-    """Slope and intercept of variance against level, each block weighted by the precision of its variance."""
+    """Slope and intercept of the line of variance against level. The weight of a block is 1 / (expected variance)^2."""
     expected = np.full(level.shape, float(np.median(variance)))
     slope = intercept = 0.0
     for _ in range(ROUNDS):

@@ -1,13 +1,13 @@
-"""What the cells of the discs show of a form, apart from the discs' means: computed in small patches around the discs.
+"""The response of the cells of the discs to a template, computed in small patches around the discs.
 
-A wider core hardly changes a disc's mean; it shows in the outermost cells. So does the exact place of a copy of the
-image. Let q_k be the sensitivity of cell k (`cells`), computed in a patch around the disc. A form f of the image changes
-the cell by the sum of q_k f over the patch, and a change K of the PSF changes it by
+A wider core hardly changes the mean of a disc, but it changes the outermost cells. The exact displacement of a copy of
+the image also shows mainly there. Let q_k be the sensitivity of cell k (`cells`), computed in a patch around the disc. A
+template f changes the cell by the sum of q_k f over the patch. A change K of the PSF changes the cell by
 
     T_k = sum over displacements of K(d) C_k(d),   C_k(d) = sum over the patch of q_k(x) scene(x - d)    Eq. (1)
 
-The brightness of the disc as a whole is removed from every response: `search` gets it from the whole field. Light that
-scatters in from outside the patch is nearly uniform over a disc, and is left out.
+The mean brightness of the disc is removed from every response, because `search` computes it from the whole field. Light
+that scatters into the disc from outside the patch is nearly uniform over the disc, so this module neglects it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from psfcore.scatter.optics import Optics
 Plane = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
-MARGIN_PX = 28  # of a patch around the disc
-REACH_PX = 64  # of Eq. (1)
+MARGIN_PX = 28  # distance from the edge of the disc to the edge of its patch
+REACH_PX = 64  # largest displacement in Eq. (1), along each axis
 
 
 class NearDiscs:
-    """The patches of all discs that are used, added one at a time."""
+    """The patches around the discs. The caller adds one disc at a time."""
 
     def __init__(self, view: View) -> None:
         solution = self._solution = view.solution
@@ -49,7 +49,7 @@ class NearDiscs:
         self._to_displacements: list[NDArray[np.floating]] = []
 
     def add(self, n: int, scene: Field) -> None:
-        """Add the disc of image n. scene: with its occulter in front [y, x], DN/s."""
+        """Add the disc of image n. scene: the scene of the image with the occulter in front [y, x], DN/s."""
         solution, size = self._solution, self._size
         place, (rows, columns) = solution.sky.found[n].place, solution.sky.dark[n]
         ny, nx = solution.transit.shape
@@ -72,17 +72,20 @@ class NearDiscs:
 
     @property
     def residual(self) -> Vector:
-        """The residuals of the cells of all discs in units of their noise, without each disc's mean (cells,)."""
+        """The residuals of the cells of all discs (cells,), in units of their noise, without the mean of each disc."""
         return np.concatenate(self._residuals)
 
     def of_kernel(self, change: Plane) -> Vector:
-        """Eq. (1): the response of the cells to a change of the PSF [y, x] with its centre at n // 2, in units of the noise (cells,)."""
+        """T of Eq. (1) for all cells (cells,), in units of their noise. change: of the PSF [y, x], with its centre at n // 2."""
         near = crop_or_pad(change, 2 * REACH_PX + 1).astype(np.float32)
         responses = [np.tensordot(disc, near, axes=2) for disc in self._to_displacements]
         return np.concatenate(responses, dtype=np.float64)
 
     def of_copies(self, n: int, image: Field, displacements: Sequence[tuple[int, int]]) -> Plane:
-        """The response of the cells of disc n to an image [y, x] displaced by whole pixels (x, y), over their noise (cells, k)."""
+        """The response of the cells of disc n to copies of an image [y, x], in units of their noise (cells, copies).
+
+        displacements: of each copy, whole pixels (x, y).
+        """
         (top, left), planes = self._corners[n], self._planes[n]
         copies = [cut(image, top - dy, left - dx, self._size).ravel() for dx, dy in displacements]
         return np.asarray(
@@ -91,7 +94,7 @@ class NearDiscs:
 
 
 def _without(covariance: Plane, level: Vector) -> Plane:
-    """The matrix that whitens the noise of some cells and removes the component proportional to a level."""
+    """The matrix that whitens cells with this covariance and removes the component proportional to `level` (cells,)."""
     white = whitening(covariance)
     along = white @ level
     along /= max(float(np.linalg.norm(along)), 1e-300)
@@ -99,7 +102,7 @@ def _without(covariance: Plane, level: Vector) -> Plane:
 
 
 def cut(plane: Any, top: int, left: int, size: tuple[int, int]) -> Any:
-    """A window of a plane [y, x]; zero outside the plane."""
+    """A window of a plane [y, x]; its pixels outside the plane are 0."""
     out = np.zeros(size, plane.dtype)
     low_y, high_y = (min(max(at, 0), plane.shape[0]) for at in (top, top + size[0]))
     low_x, high_x = (min(max(at, 0), plane.shape[1]) for at in (left, left + size[1]))

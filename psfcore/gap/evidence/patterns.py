@@ -1,7 +1,7 @@
-"""Patterns that any gap produces, whatever its cause; the residuals after an effect are tested along them.
+"""Patterns that a gap of any cause produces. The residuals after an effect are tested with these patterns.
 
-A gap of unknown cause is smooth in time within a pointing; within a disc it varies with radius or azimuth. Along these
-few directions it stands out, while chi2 of all cells, most of which are noise, would not show it.
+A gap of unknown cause is usually smooth in time within a pointing, and varies within a disc with radius or azimuth. The
+test with these few patterns detects such a gap more easily than chi2 of all cells, because most of that chi2 is noise.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ DEGREES = 4  # number of polynomials in time: degrees 0 to 3
 
 
 def patterns(evidence: Evidence) -> tuple[Matrix, ...]:
-    """For each disc the patterns (patterns, cells), as fractions of the expected light, DN/s."""
+    """For each disc, all patterns (patterns, cells), DN/s: each is scaled by the mean expected light of the disc."""
     pointings = sorted({taken.pointing for taken in evidence.image_info})
     times = {
         pointing: [t.time_s for t in evidence.image_info if t.pointing == pointing] for pointing in pointings
@@ -39,13 +39,16 @@ def _of_disc(
 
 
 def means(evidence: Evidence) -> tuple[Matrix, ...]:
-    """For each disc one pattern per disc (discs, cells): only its own is not zero, and is proportional to the expected light."""
+    """Patterns that change the mean of one disc only: for each disc an array (discs, cells), DN/s.
+
+    Row k is zero in all discs but disc k. There it is the expected light.
+    """
     own = np.eye(len(evidence.discs))
     return tuple(np.outer(row, disc.expected) for row, disc in zip(own, evidence.discs, strict=True))
 
 
 def in_disc(disc: DiscCells) -> Matrix:
-    """Radius, dipole and quadrupole of a disc's cells, each with mean zero: (5, cells)."""
+    """Five patterns in the cells of a disc, each with mean zero (5, cells): the radius, two dipoles and two quadrupoles."""
     r, t = disc.radius, disc.azimuth
     out = np.array([r**2, r * np.cos(t), r * np.sin(t), r**2 * np.cos(2 * t), r**2 * np.sin(2 * t)])
     return np.asarray(out - (out @ disc.share)[:, None])

@@ -1,21 +1,22 @@
-"""The search for the place where a form fits best, over a coarse grid and all places at once.
+"""Search for the position or the template that explains most of the residuals.
 
-A form f at place or displacement d changes the mean of disc n by
+A template f, displaced by d, changes the mean of disc n by
 
     T_n(d) = sum over pixels of q_n(x) f_n(x - d)          Eq. (1)
 
-where q_n is the disc's sensitivity (`cells`): a correlation. Of the residuals r that the PSF's own parameters leave, a
-place explains
+where q_n is the sensitivity of the disc (`cells`). This is a correlation, so one correlation gives all displacements of a
+coarse grid. Let r be the residuals of the discs that remain after the fit of the PSF. The template at d decreases chi2 by
 
-    gain(d) = (sum r T)^2 / sum T^2     where sum r T has the sign of the form        Eq. (2)
+    gain(d) = (sum r T)^2 / sum T^2                        Eq. (2)
 
-with r and T in units of the noise, and with the component that the PSF absorbs removed. In the same way a change K of
-the PSF changes disc n's mean by
+if sum r T has the sign that the amplitude of the template must have; otherwise the gain is 0. Here r and T are in units
+of the noise, without the component that a change of the PSF can absorb. In the same way, a change K of the PSF changes
+the mean of disc n by
 
     T_n = sum over displacements of K(d) C_n(d),   C_n(d) = sum over pixels of q_n(x) scene_n(x - d)     Eq. (3)
 
-so that any number of kernels costs one correlation per disc. Copies and changes of the core also show within the discs.
-For them r and T also contain the cells (`near_discs`).
+One correlation for each disc therefore serves any number of kernels K. Copies of the image and changes of the core also
+change the distribution of light within the discs. For them, r and T also contain the cells (`near_discs`).
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ STEP_PX = 8
 FINE_PX = 2
 COARSE_BLUR_PX = 8.0
 BLURS_PX = (2.0, 4.0, 8.0, 16.0)
-NEAREST_RADII = 1.8  # of the disc: a closer copy could not be told from the disc's own surroundings
-KERNEL_REACH_PX = 255  # the mesh's orders have little light beyond
-SEEN = 1e-4  # of the largest sum T^2: places to which the discs respond less are skipped
+NEAREST_RADII = 1.8  # smallest displacement of a copy, in radii of the disc: a closer copy looks like the disc's surroundings
+KERNEL_REACH_PX = 255  # the orders of the mesh contain little light beyond this distance
+SEEN = 1e-4  # positions whose sum T^2 is below this fraction of the largest sum T^2 are skipped
 UNSEEN = 1e-300
 
 
 def place_search(view: View) -> PlaceSearch:
-    """The search of a view; made once."""
+    """The search of a view. It is created once for each view."""
     if PlaceSearch not in view.kept:
         view.kept[PlaceSearch] = PlaceSearch(view)
     found = view.kept[PlaceSearch]
@@ -58,7 +59,7 @@ def place_search(view: View) -> PlaceSearch:
 
 
 class PlaceSearch:
-    """The sensitivities of the discs and of their cells, on a coarse grid and to displacements, for any number of searches."""
+    """The sensitivities of the discs and of their cells, computed once for any number of searches."""
 
     def __init__(self, view: View) -> None:
         solution, self._expected = view.solution, view.expected
@@ -89,15 +90,16 @@ class PlaceSearch:
         )
 
     def kernel(self, kernels: Sequence[Plane]) -> int:
-        """Index of the change of the PSF [y, x], centred at n//2, that explains most of the residuals, Eq. (2) and (3).
+        """The index of the change of the PSF that explains most of the residuals, Eq. (2) and (3).
 
-        It uses the discs' means, and their cells for light that moves near them.
+        kernels: changes of the PSF [y, x], with the centre at n // 2. The search uses the means of the discs and, for light
+        that moves near a disc, also its cells.
         """
         cells = np.array([self._near.of_kernel(kernel) for kernel in kernels]).T
         return self._best(self._to_displacements, kernels, cells)
 
     def wide_kernel(self, kernels: Sequence[Plane]) -> int:
-        """As `kernel`, for changes that are smooth and may reach across the field; computed on coarse pixels."""
+        """As `kernel`, for smooth changes of the PSF that may reach across the field. It uses the means, on coarse pixels."""
         return self._best(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
 
     def _best(
@@ -113,10 +115,10 @@ class PlaceSearch:
 
     @cached_property
     def copy(self) -> tuple[float, int, int]:
-        """Blur (px) and displacement (whole pixels x, y) of the copy of each image that explains most of the residuals.
+        """The blur (px) and the displacement (whole pixels x, y) of the copy of the image that explains most of the residuals.
 
-        The copy is at least NEAREST_RADII of the disc away. The search runs on a coarse grid with a medium blur, then around the
-        best place on a fine grid with several blurs.
+        A copy is displaced by at least NEAREST_RADII times the radius of the disc. The search uses a coarse grid with one blur,
+        then a fine grid around the best displacement with several blurs.
         """
         dx, dy = self._coarse_displacement(COARSE_BLUR_PX)
         best = (-1.0, COARSE_BLUR_PX, dx, dy)
@@ -139,7 +141,10 @@ class PlaceSearch:
         return int(dx[at % columns]), int(dy[at // columns])
 
     def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:
-        """The best gain within one coarse step of a displacement, on a grid of FINE_PX, from all cells of the discs."""
+        """The best gain and its displacement (x, y), among displacements within one coarse step of (dx, dy).
+
+        The grid has a step of FINE_PX, and the gain contains the means and the cells of the discs.
+        """
         reach = STEP_PX // FINE_PX
         steps = [(j, k) for j in range(-reach, reach + 1) for k in range(-reach, reach + 1)]
         places = [(dx + k * FINE_PX, dy + j * FINE_PX) for j, k in steps]
@@ -157,9 +162,10 @@ class PlaceSearch:
         return float(gain[best]), *places[best]
 
     def place(self, width_px: float, *, of_image: bool, sign: float) -> tuple[float, float]:
-        """Pixel (x, y) where a Gaussian patch explains most: of light (of_image false), or proportional to the image (true).
+        """The position (x, y) in px of the Gaussian patch that explains most of the residuals.
 
-        sign: +1 for added light, -1 for lost light.
+        width_px: standard deviation of the patch. of_image: whether the patch is proportional to the image; otherwise it is
+        the same light in every image. sign: +1 for added light, -1 for lost light.
         """
 
         def response(n: int, q: Plane) -> Plane:
@@ -171,7 +177,7 @@ class PlaceSearch:
         return (float(column) + 0.5) * STEP_PX - 0.5, (float(row) + 0.5) * STEP_PX - 0.5
 
     def _gains(self, response: Callable[[int, Plane], Plane], sign: float) -> Plane:
-        """Eq. (2) at every place."""
+        """Eq. (2) at every position of the coarse grid [y, x]."""
         responses = np.array(
             [response(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
         )
@@ -179,9 +185,11 @@ class PlaceSearch:
         return np.asarray(gain.reshape(responses.shape[1:]))
 
     def _gain(self, means: Plane, sign: float, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
-        """Eq. (2) of some forms (forms,). means: response of the discs' means (discs, forms), in units of the noise; cells: of the cells.
+        """Eq. (2) of some templates (templates,).
 
-        sign: of the form's amplitude. least: fraction of the largest sum T^2 below which a form gains nothing.
+        means: T of the means of the discs (discs, templates), in units of the noise. cells: T of the cells (cells, templates);
+        None: use the means alone. sign: the sign that the amplitude of a template must have. least: a template gains 0 if its
+        sum T^2 is below this fraction of the largest sum T^2.
         """
         left, responses = (
             (self._of_means, means) if cells is None else (self._of_all, np.concatenate([means, cells]))
@@ -193,9 +201,9 @@ class PlaceSearch:
 
 
 class _Unabsorbed:
-    """What the PSF's parameters cannot absorb of a residual (n,) and of responses to forms (n, forms), in units of the noise.
+    """The component of residuals and responses that a change of the PSF cannot absorb, in units of the noise.
 
-    absorbed: the responses to those parameters (n, parameters).
+    absorbed: the responses to the coordinates of the PSF (n, coordinates). residual: (n,).
     """
 
     def __init__(self, absorbed: Plane, residual: Vector) -> None:
@@ -203,18 +211,18 @@ class _Unabsorbed:
         self.residual: Vector = self.of(residual)
 
     def of(self, responses: Plane) -> Plane:
-        """The component of the responses that is not absorbed."""
+        """The component of the responses (n, templates) that a change of the PSF cannot absorb."""
         return np.asarray(responses - self._absorbed @ (self._absorbed.T @ responses))
 
 
 def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int) -> Plane:
-    """C of Eq. (3) for displacements up to reach_px along each axis: (2 reach + 1, 2 reach + 1), zero in the middle."""
+    """C of Eq. (3) for displacements up to reach_px along each axis: (2 reach + 1, 2 reach + 1), with d = 0 in the middle."""
     around = np.pad(scene.astype(np.float64), reach_px)
     return np.asarray(correlations(plane[None].astype(np.float64), around, reach_px)[0])
 
 
 def coarse_kernel(kernel: Plane, step: int) -> Plane:
-    """A kernel summed over squares of `step` px, with its centre in the middle of a coarse pixel."""
+    """A kernel [y, x], summed over squares of `step` px. Its centre is in the middle of a coarse pixel."""
     middle = kernel.shape[0] // 2
     reach = (middle + step // 2) // step
     at = (np.arange(kernel.shape[0]) - middle + step // 2) // step + reach
@@ -225,19 +233,19 @@ def coarse_kernel(kernel: Plane, step: int) -> Plane:
 
 
 def _displacements(count: int) -> NDArray[np.intp]:
-    """Displacement (px) at each index of a full correlation of two rows of (count + 1) / 2."""
+    """The displacement (px) at each index of the full correlation of two rows; each row has (count + 1) / 2 elements."""
     line = (count + 1) // 2
     zero = line - 1 - (2 * (line // 2) - count // 2)
     return (np.arange(count) - zero) * STEP_PX
 
 
 def displaced(plane: Any, dx: int, dy: int) -> Any:
-    """A plane [y, x] moved by whole pixels; zero where nothing moved in."""
+    """A plane [y, x], moved by whole pixels. Pixels to which no pixel of the plane moves are 0."""
     return cut(plane, -dy, -dx, plane.shape)
 
 
 def _binned(plane: NDArray[np.floating], step: int) -> Plane:
-    """Means over squares of `step` px; an incomplete square at the far edges is dropped."""
+    """The means of a plane [y, x] over squares of `step` px. Incomplete squares in the last rows and columns are dropped."""
     rows, columns = (n // step for n in plane.shape)
     cut = plane[: rows * step, : columns * step].astype(np.float64)
     return np.asarray(cut.reshape(rows, step, columns, step).mean(axis=(1, 3)))

@@ -1,14 +1,18 @@
-"""What the unocculted field shows: images of one pointing show the same scene, so their blocks are compared.
+"""The blocks of the unocculted field: square means, compared between the images of one pointing.
 
-The light that the occulter hides is restored first. In block b of image n
+All images of a pointing show the same scene, so differences between their blocks show an effect. First, the light that
+the occulter hides is added to each image. Then the level of block b in image n is
 
     U_nb = mu_b (1 + g_n) + sum over parameters of theta e_nb + noise            Eq. (1)
 
-The scene mu_b is free in every block. The brightness g_n is free in every image, because the Sun and the shutter vary by
-about a percent. The prior of g_n has the width observed among images of the same pointing, gain mode and exposure, so
-that a difference between modes can be separated from it. A bright block that varies between images far more than the
-other blocks is a change of the Sun, such as a flickering brightening. When the remaining residuals are judged, such a
-block gets its observed variance.
+The scene mu_b is a free parameter of every block. The relative brightness g_n is a free parameter of every image, because
+the Sun and the shutter vary by about one percent. e_nb is the change of the block by one unit of the parameter theta.
+
+g_n has a Gaussian prior. The width of the prior is the spread of g_n among images of the same pointing, gain mode and
+exposure; a difference between gain modes can then be separated from g_n.
+
+If a bright block varies between images far more than the other blocks do, the Sun has changed there, for example by a
+flickering brightening. When residuals are judged, the variance of such a block is raised to the observed variance.
 """
 
 from __future__ import annotations
@@ -28,23 +32,24 @@ Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 BLOCK_PX = 32
-LEAST_BLOCKS = 5  # along the shorter side: small images get smaller blocks
-FREE_OF_DISC_PX = 20.0  # beyond its edge
-WIDEST_GAIN = 0.05
-LEAST_GAIN = 1e-5
-FLOOR = 5e-4  # relative error of a block's level: no template is more exact
+LEAST_BLOCKS = 5  # least number of blocks along the shorter side: small images get smaller blocks
+FREE_OF_DISC_PX = 20.0  # pixels up to this distance from the edge of the disc are not compared
+WIDEST_GAIN = 0.05  # width of the prior of g_n if the images do not show its spread
+LEAST_GAIN = 1e-5  # smallest width of the prior of g_n
+FLOOR = 5e-4  # relative error of the level of a block, because no template is more exact
 LEAST_IMAGES = 3
-FLICKERING = 4.0  # a flickering block has more than this times the median chi2 per degree of freedom
+FLICKERING = 4.0  # a block flickers if its chi2 per degree of freedom exceeds this multiple of the median
 
 
 @dataclass(frozen=True, eq=False)
 class UnoccultedBlocks:
-    """Blocks of all images: arrays (images, blocks) in DN/s.
+    """The blocks of all images. Arrays have the shape (images, blocks) and the unit DN/s, if not stated otherwise.
 
-    levels: means, with the hidden light restored. variance: of noise, and of a floor. free: whether a block is away from
-    the disc and from filled pixels. means: of the pointing's mean image. errors: (columns, images, blocks), the change by
-    one unit of each column. pointing: of each image. kind: one number for each combination of pointing, gain mode and
-    exposure. part: whether an image is used.
+    levels: the mean of each block, with the hidden light added. variance: the variance of the noise plus that of the floor,
+    (DN/s)^2. free: whether a block is away from the disc and from filled pixels. means: the mean of each block in the mean
+    image of the pointing. errors: (columns, images, blocks), the change by one unit of the parameter of each column.
+    pointing: (images,). kind: (images,), one number for each combination of pointing, gain mode and exposure. part:
+    (images,), whether an image is used.
     """
 
     levels: Matrix
@@ -57,7 +62,7 @@ class UnoccultedBlocks:
     part: NDArray[np.bool_]
 
     def with_flickering_blocks(self) -> UnoccultedBlocks:
-        """The same blocks, with the variance of flickering blocks raised to the observed one."""
+        """The same blocks, with the variance of flickering blocks raised to their observed variance."""
         variance = self.variance.copy()
         gains = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
         steady = self.levels / (1 + gains[:, None])
@@ -71,14 +76,14 @@ class UnoccultedBlocks:
             mean = (steady[here] * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
             spread = (weight * (steady[here] - mean) ** 2).sum(axis=0) / np.maximum(images - 1, 1)
             usual = max(float(np.median(spread[used])), 1.0)
-            # Faint blocks stay as they are: they show what the detector does to faint signals.
+            # The variance of faint blocks is not changed: they show how the detector changes faint signals.
             bright = used & (mean > float(np.median(mean[used])))
             variance[here] *= np.where(bright & (spread > FLICKERING * usual), spread / usual, 1.0)
         return replace(self, variance=variance)
 
     @cached_property
     def gain_width(self) -> float:
-        """The relative spread of the brightness of images of one kind."""
+        """The rms spread of g_n among images of one kind: the width of the prior of g_n."""
         free = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
         spread: list[float] = []
         for kind in np.unique(self.kind[self.part]):
@@ -88,7 +93,7 @@ class UnoccultedBlocks:
         return max(float(np.sqrt(np.mean(spread))), LEAST_GAIN) if spread else WIDEST_GAIN
 
     def equations(self, columns: Sequence[int], images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """Normal equations of these columns from some images (None: all images), with free scene and brightness."""
+        """Normal equations of these columns from some images (None: all images). Scene and brightness are free parameters."""
         chosen = (
             np.flatnonzero(self.part) if images is None else np.array([n for n in images if self.part[n]])
         )
@@ -124,9 +129,11 @@ class UnoccultedBlocks:
     def held_out(
         self, columns: Sequence[int], images: Sequence[int], fitted: Sequence[int]
     ) -> tuple[Vector, Matrix]:
-        """Held-out images minus the scene of the fitted ones, in units of the noise, and the Jacobian of this difference.
+        """Held-out images minus the scene of the fitted images, and the Jacobian of this difference, in units of the noise.
 
-        (n,) and (columns, n): the blocks of each image, then its brightness in units of `gain_width`.
+        images: the held-out images. fitted: the images that give the scene. The two results have the shapes (n,) and
+        (columns, n). For each held-out image they contain the values of its blocks, followed by its brightness in units of
+        `gain_width`.
         """
         errors = self.errors[list(columns)]
         residuals, jacobians = [np.zeros(0)], [np.zeros((len(columns), 0))]
@@ -158,9 +165,10 @@ class UnoccultedBlocks:
 
 @dataclass(frozen=True, eq=False)
 class UnoccultedEquations:
-    """Normal equations of some columns, with brightness and scene eliminated; chi2 and gains without any of the columns.
+    """Normal equations of some columns, with brightness and scene eliminated.
 
-    freedom: degrees of freedom. gains: brightness of each image.
+    normal: the normal matrix. score: the right-hand side. chi2: after the fit of scene and brightness alone, without the columns.
+    freedom: degrees of freedom of this chi2. gains: the fitted g_n of each image, without the columns.
     """
 
     normal: Matrix
@@ -187,12 +195,12 @@ def _without_gains(
 
 
 def block_px(shape: tuple[int, int]) -> int:
-    """Edge length of a block, px: BLOCK_PX, or less in small images."""
+    """The edge length of a block, px: BLOCK_PX, or less in small images."""
     return max(1, min(BLOCK_PX, min(shape) // LEAST_BLOCKS))
 
 
 def blocks(plane: NDArray[np.floating]) -> Vector:
-    """Means of a plane's blocks; an incomplete block at the far edges is dropped."""
+    """The mean of each block of a plane [y, x]: (blocks,). Incomplete blocks in the last rows and columns are dropped."""
     edge = block_px((plane.shape[0], plane.shape[1]))
     rows, columns = (n // edge for n in plane.shape)
     cut = plane[: rows * edge, : columns * edge]
@@ -200,14 +208,17 @@ def blocks(plane: NDArray[np.floating]) -> Vector:
 
 
 def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:
-    """Mask [y, x] of the pixels of image n that cannot be compared with other images: around its disc, and filled pixels."""
+    """Mask [y, x] of the pixels of image n that cannot be compared with other images.
+
+    These are the pixels in and around its disc, and filled pixels.
+    """
     place, filled = solution.sky.found[n].place, solution.transit.frames[n].filled
     near = disc_distance(solution.transit.shape, place) < place.radius_px + FREE_OF_DISC_PX
     return near if filled is None else near | filled
 
 
 def unocculted_blocks(view: View, columns: int, progress: Progress) -> UnoccultedBlocks:
-    """Blocks of all images, with zeros for the errors of some columns; the caller fills them in."""
+    """The blocks of all images. columns: the number of columns; their `errors` are zero, and the caller sets them."""
     solution = view.solution
     transit = solution.transit
     levels, variance, free, means = [], [], [], []

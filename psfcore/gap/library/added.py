@@ -1,7 +1,8 @@
-"""Effects that are added to the library: a Python file, or a module, that defines EFFECTS.
+"""Effects that are added to the library by a Python file, or a module, that defines EFFECTS.
 
-This code is run. Its name comes from whoever runs the diagnosis, never with the data. If the code fails, when it is
-imported or when it computes a change, the error names the source and the line, for its author.
+This module runs the code of that file. The name of the file comes from the person or service that runs the diagnosis,
+never with the data. The code may fail during the import or when it computes a change. The error then names the file and
+the line, for the author of the code.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ NAME = "EFFECTS"
 
 @dataclass(frozen=True)
 class Added:
-    """Effects of one file or module, and the hash of the text that defines them."""
+    """The effects of one file or module. sha256: hash of the source text that defines them."""
 
     source: str
     sha256: str
@@ -70,19 +71,19 @@ def _added(source: str) -> Added:
 
 
 def _of_name(name: str) -> ModuleType:
-    """The module of this name, reloaded: a worker that imported it before would otherwise run an old version."""
+    """The module of this name, reloaded. Otherwise a worker that imported the module before would run an old version."""
     before = sys.modules.get(name)
     return importlib.import_module(name) if before is None else importlib.reload(before)
 
 
 def _of_file(path: Path) -> ModuleType:
-    """The module in a file, reloaded, under a name that no other module has."""
+    """The module in a file, imported again, under a name that no other module has."""
     name = "heliopsf_effects_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be imported")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses need their module there
+    sys.modules[name] = module  # dataclasses look up their module in sys.modules
     spec.loader.exec_module(module)
     return module
 
@@ -99,27 +100,27 @@ def _check(effect: Effect, source: str) -> None:
 
 @contextmanager
 def _theirs(source: str) -> Iterator[None]:
-    """Turn every error that the code of a source raises into a DataError that names the line."""
+    """Turn every error that the added code raises into a DataError that names the line."""
     try:
         yield
     except DataError:
         raise
-    # Added code may raise any error, and a full traceback would show this software instead of that code.
+    # Added code may raise any error. A full traceback would mainly show the code of this software.
     except Exception as error:
         raise _bad(source, f"{type(error).__name__}: {error}{_line(error, source)}") from error
 
 
 def _line(error: Exception, source: str) -> str:
-    """The line of the source at which an error arose, as text; empty if it is not known."""
+    """The line of the added code that raised an error, as text; empty if the line is unknown."""
     if isinstance(error, SyntaxError):
-        return ""  # its message contains the line
+        return ""  # the message of a SyntaxError contains the line
     name = Path(source).name if is_file(source) else f"{source.rpartition('.')[2]}.py"
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name == name]
     return f" (line {lines[-1]})" if lines else ""
 
 
 def _guarded(effect: Effect, source: str) -> Effect:
-    """The effect with its results checked: one change for each parameter, each finite and of the image's shape."""
+    """The effect with checks: it must return one Change for each parameter, and finite images of the right shape."""
 
     def changes(view: View) -> list[Change]:
         with _theirs(source):
@@ -162,7 +163,11 @@ def _checked(
         with _theirs(source):
             field = np.asarray(change(n, images))
         if field.shape != shape or not np.isfinite(field).all():
-            got = "one with NaN or infinite values" if field.shape == shape else f"one of shape {field.shape}"
+            got = (
+                "an image with NaN or infinite values"
+                if field.shape == shape
+                else f"an array of shape {field.shape}"
+            )
             raise _bad(source, f"{name}: expected an image of shape {shape} [y, x]; got {got}")
         return field
 
@@ -175,8 +180,8 @@ def _bad(source: str, what: str) -> DataError:
 
 def _words(found: object) -> str:
     if found is None:
-        return "no such name"
+        return "no variable of this name"
     if isinstance(found, (tuple, list)):
         kinds = sorted({type(one).__name__ for one in found})
-        return f"a tuple or list of {', '.join(kinds)}" if kinds else "an empty one"
+        return f"a tuple or list of {', '.join(kinds)}" if kinds else "an empty tuple or list"
     return type(found).__name__

@@ -1,4 +1,4 @@
-"""Effects of the detector and its electronics: changes of the image as it is read."""
+"""Effects of the detector and its electronics: changes of the image by detection and readout."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from scipy.ndimage import distance_transform_edt
 from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.view import Field, View
 
-FAINT_DN = (30.0, 150.0)  # a mixture of both approximates a loss at any faint level between them
-# In mean intervals between images: mixtures of these and of a share of the last image decay like charge traps.
+# Decay levels of two losses; their sum approximates a loss with any decay level in between.
+FAINT_DN = (30.0, 150.0)
+# Decay times, in units of the mean interval between images. Sums of these decays and of a fraction of the previous image
+# approximate charge traps.
 FADES_IN = {"one_wait": 1, "three_waits": 3}
-LEAST_LEFT = 0.01  # a smaller remaining fraction of an image is too small to see
-DEEP_PX = 9.0  # at this depth inside a filled area the error is the parameter's value
-FINEST = 5  # half waves across the field of the finest cosines of a smooth field
+LEAST_LEFT = 0.01  # a smaller remaining fraction of an earlier image is neglected
+DEEP_PX = 9.0  # depth inside a filled area at which the relative error equals the parameter
+FINEST = 5  # number of half waves across the field for the finest cosines
 
 
 def flat(view: View) -> Field:
@@ -26,12 +28,12 @@ def flat(view: View) -> Field:
 
 
 def fixed(plane: Field) -> Change:
-    """The same plane in every image."""
+    """A change that adds the same plane [y, x], DN/s, to every image."""
     return Change(lambda n, images: plane, unocculted=False)
 
 
 def times_image(pattern: Field) -> Change:
-    """Every image times one pattern."""
+    """A change that adds to every image the image times a pattern [y, x]."""
     return Change(lambda n, images: np.asarray(images[n] * pattern), unocculted=False)
 
 
@@ -67,13 +69,13 @@ def _nonlinearity(view: View) -> Sequence[Change]:
 
 
 def half_waves() -> list[tuple[int, int]]:
-    """The numbers of half waves along x and y of the cosines of a smooth field, without the constant."""
+    """The numbers of half waves along x and y, for each cosine of a smooth field. The constant is not included."""
     every = range(FINEST + 1)
     return [(kx, ky) for ky in every for kx in every if 0 < kx * kx + ky * ky <= FINEST * FINEST]
 
 
 def cosines(view: View) -> list[Field]:
-    """The cosines of these half waves [y, x], rms 1: a basis of smooth fields without a slope at the edges."""
+    """The cosines of `half_waves` [y, x], each with rms 1. They are a basis of smooth fields without a slope at the edges."""
     x, y = (np.pi * (place + 0.5) for place in view.places)
 
     def along(waves: int, at: Field) -> Field:
@@ -83,7 +85,7 @@ def cosines(view: View) -> list[Field]:
 
 
 def cosine_parameters(unit: str, likely: float) -> tuple[EffectParameter, ...]:
-    """One parameter for each cosine."""
+    """One parameter for each cosine of `cosines`."""
     return tuple(EffectParameter(f"cos_{kx}x_{ky}y", unit, likely) for kx, ky in half_waves())
 
 
@@ -92,10 +94,10 @@ def _flat_field(view: View) -> Sequence[Change]:
 
 
 def _column_smear(view: View) -> Sequence[Change]:
-    """Every pixel receives shares of the light of the pixels below it and above it in its column.
+    """Every pixel receives a fraction of the light of the pixels below it, and a fraction of that of the pixels above it.
 
-    Its charge passes the ones while it is read, and the others before the exposure. If both shares are equal, it receives a
-    share of the column's mean.
+    The charge of a pixel passes the pixels on one side during the readout, and the pixels on the other side before the
+    exposure. If both fractions are equal, the pixel receives a fraction of the mean of its column.
     """
 
     def passed(n: int, images: Sequence[Field], way: int) -> Field:
@@ -107,7 +109,7 @@ def _column_smear(view: View) -> Sequence[Change]:
 
 
 def _persistence(view: View) -> Sequence[Change]:
-    """A share of the previous image, and of all earlier images as they decay over some intervals: traps empty slowly."""
+    """A fraction of the previous image, and fractions of all earlier images that decay with time, as charge traps empty slowly."""
     frames = view.solution.transit.frames
     waits = [later.time_s - earlier.time_s for earlier, later in pairwise(frames)]
     mean_s = max(float(np.mean(waits)), 1e-9) if waits else 1.0
@@ -130,8 +132,9 @@ def _persistence(view: View) -> Sequence[Change]:
 
 
 def _filled(view: View) -> Sequence[Change]:
-    """Filled or clipped pixels are wrong by a fraction, and by another that grows from the rim of their area inwards, as
-    clipping of a brightening does.
+    """Errors of filled or clipped pixels. Two changes: a relative error that is constant, and one that grows inwards.
+
+    The second error is zero at the rim of a filled area and grows towards its middle, as for a clipped brightening.
     """
     frames = view.solution.transit.frames
     nothing = np.zeros(view.solution.transit.shape, np.float32)
@@ -142,11 +145,11 @@ def _filled(view: View) -> Sequence[Change]:
             return nothing
         if not inside:
             return np.asarray(images[n] * filled)
-        # 0 in the pixels at the rim, whose distance is 1 px.
+        # The pixels at the rim have a distance of 1 px, and a depth of 0.
         depth = (np.sqrt(distance_transform_edt(filled)) - 1) / (math.sqrt(DEEP_PX) - 1)
         return np.asarray(images[n] * np.maximum(depth, 0.0), dtype=np.float32)
 
-    # Blocks with such a pixel are not compared in the unocculted field.
+    # In the unocculted field, blocks with a filled pixel are not compared.
     return [Change(lambda n, images, k=k: change(n, images, k), unocculted=False) for k in (False, True)]  # type: ignore[misc]
 
 
@@ -172,7 +175,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("nonlinearity", "detector", (_p("loss", "", 0.05), _p("loss_beyond", "", 0.05)), "The detector reads faint signals too low.",
            "a series of exposure times at one pointing", ("intensity",), _nonlinearity),
     Effect("flat_field_residual", "detector", cosine_parameters("", 0.02),
-           "The flat field leaves a smooth error of the detector's sensitivity.", "images of the same scene at several places on the detector",
+           "The flat field leaves a smooth error of the detector's sensitivity.", "images of the same scene at several positions on the detector",
            ("detector_x", "detector_y"), _flat_field, field=True),
     Effect("column_smear", "detector", (_p("share_below", "", 0.01, True), _p("share_above", "", 0.01, True)),
            "The readout smears charge along the columns.",

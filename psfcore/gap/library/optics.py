@@ -20,36 +20,41 @@ from psfcore.scatter.total_psf import TotalPsf
 
 Kernel = NDArray[np.float64]
 Steps = tuple[tuple[int, int], ...]
-Halo = Callable[[int], Kernel]  # size -> weights [y, x], sum 1 on the infinite plane, centre at size // 2
+Halo = Callable[
+    [int], Kernel
+]  # for a size: weights [y, x] with the centre at size // 2; their sum is 1 on an infinite plane
 HALO_SCALES_PX = (20.0, 40.0, 80.0, 160.0, 320.0)
-MOFFAT = 1.5  # exponent of a halo that falls off as r^-3
+MOFFAT = 1.5  # exponent of the Moffat profile: the halo falls off as r^-3
 GHOST_TRIALS = 300  # about the number of distinguishable copies in a field of 512 px
 ANGLES_DEG = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
 PITCHES_PCT = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 38.0)
 DIRECTIONS: tuple[Steps, ...] = (((1, 0), (0, 1)), ((1, 0),), ((0, 1),), ((1, 1),), ((1, -1),))
-# Directions between those have longer steps, so they serve only for wider blurs.
+# Directions between those of DIRECTIONS need longer steps, so they serve only for wider blurs.
 BETWEEN_THEM: tuple[Steps, ...] = (((1, 2),), ((2, 1),), ((1, -2),), ((2, -1),))
 BLURS = (
     *((width, steps) for width in (0.4, 0.8, 1.5, 2.5) for steps in DIRECTIONS),
     *((width, steps) for width in (1.5, 2.5) for steps in BETWEEN_THEM),
 )
-BETWEEN = 6  # the interval between the neighbours of the best step is divided into so many parts
-SPLINE = 3  # a linear interpolation would blur the pattern that it turns
+BETWEEN = 6  # number of parts into which the interval between the neighbours of the best step is divided
+SPLINE = 3  # order of the interpolation; a linear interpolation (order 1) would blur a rotated pattern
 AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate of the total scatter
 
 
 def by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
-    """A change of the PSF, applied to the scene times a weight of each place."""
+    """The change of the images by a change of the PSF (`blur`). weight: a factor for the light of each scene pixel [y, x]."""
     return Change(lambda n, images: view.blurred(n, blur, weight), unocculted=False)
 
 
 def by_psf_in_time(view: View, blur: Blur, factor: Callable[[int], float]) -> Change:
-    """A change of the PSF, times a factor of each image."""
+    """The change of the images by a change of the PSF (`blur`), times factor(n) for image n."""
     return Change(lambda n, images: view.blurred(n, blur) * np.float32(factor(n)), unocculted=False)
 
 
 def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Blur]:
-    """Derivatives of the total PSF along coordinates of a shape, at the solution."""
+    """Derivatives of the total PSF with respect to coordinates of another shape, evaluated at the fit.
+
+    parameters: the indices of these coordinates. The other parameters have the fitted values.
+    """
     transit, solution = view.solution.transit, view.solution
     total = TotalPsf(transit.diffraction, SHAPES[shape], transit.shape, threads=solution.threads)
     at = SHAPES[shape].coordinates(solution.inversion.values)
@@ -57,17 +62,17 @@ def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Bl
 
 
 def not_a_power_law(view: View) -> str | None:
-    """Why a change of the power law cannot be tested, or None."""
+    """The reason why changes of the softened power law cannot be tested; None if they can."""
     name = view.solution.inversion.shape.name
     return (
         None
         if name == SOFTENED_POWER_LAW.name
-        else f"it needs the softened power law; the fitted shape is {name}"
+        else f"this effect needs the softened power law; the fitted shape is {name}"
     )
 
 
 def core_slope(view: View) -> Blur:
-    """A Gaussian blur of variance 1 px^2 along each axis: half the Laplacian of the PSF."""
+    """The change of the PSF by a Gaussian blur with variance 1 px^2 along each axis: half the Laplacian of the PSF."""
     kernel = view.kernel
     neighbours = sum(np.roll(kernel, step, axis) for axis in (0, 1) for step in (-1, 1))
     return _blur(view, (neighbours - 4 * kernel) / 2)
@@ -78,7 +83,7 @@ def _blur(view: View, kernel: Kernel) -> Blur:
 
 
 def _ghost(view: View) -> Sequence[Change]:
-    """A blurred copy, displaced to the place that the discs fit best, by a search over the field."""
+    """A blurred, displaced copy of the image. A search over the field finds the displacement that explains the discs best."""
     return _copy(*place_search(view).copy)
 
 
@@ -90,7 +95,7 @@ def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
 
 
 def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
-    """The effect of this name with a fixed form."""
+    """The effect of this name, with the result of its search fixed. changes: the changes for this result."""
     sought = next(effect for effect in EFFECTS if effect.name == name)
     return replace(sought, changes=changes, held=None)
 
@@ -129,7 +134,7 @@ HALOS: tuple[Halo, ...] = tuple(form(scale) for scale in HALO_SCALES_PX for form
 
 
 def _as_halo(view: View, halo: Halo) -> Sequence[Change]:
-    """A share of the scattered light moved into a halo."""
+    """The change of the images if a fraction of the scatter kernel is replaced by a halo."""
     total, inversion = view.solution.total, view.solution.inversion
     scatter = inversion.shape.kernel(inversion.coordinates, total.size)
     return [by_psf(view, _blur(view, total.diffracted(halo(total.size) - scatter)))]
@@ -159,21 +164,21 @@ def _core_blur(view: View) -> Sequence[Change]:
 
 
 def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
-    """A blur of that width, per variance of 1 px^2."""
+    """The change of the images by a blur of width `width_px`, divided by its variance, width_px^2."""
     change = (_blurred(view.kernel, width_px, steps) - view.kernel) / width_px**2
     return [by_psf(view, _blur(view, change))]
 
 
 def _best_blur(view: View) -> tuple[float, Steps]:
-    """Width (px) and directions of the blur that explains most of the residuals."""
+    """The width (px) and the directions of the blur that explains most of the residuals."""
     near = crop_or_pad(view.kernel, 2 * KERNEL_REACH_PX + 1)
     return BLURS[place_search(view).kernel([_blurred(near, *blur) - near for blur in BLURS])]
 
 
 def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
-    """A kernel [y, x] blurred to that width along each of some directions: a random walk of these steps (y, x).
+    """The kernel [y, x], blurred by a random walk with steps (y, x); width_px: rms length of the walk along each direction.
 
-    A sampled Gaussian narrower than a pixel would ring. The random walk is never negative and has the exact variance.
+    A sampled Gaussian that is narrower than a pixel would ring. A random walk is never negative and has the exact variance.
     """
     fy, fx = np.fft.fftfreq(kernel.shape[0])[:, None], np.fft.rfftfreq(kernel.shape[1])[None, :]
     walk = sum((np.cos(2 * np.pi * (y * fy + x * fx)) - 1) / (y * y + x * x) for y, x in steps)
@@ -187,7 +192,7 @@ def _held_blur(view: View) -> Effect:
 
 
 def _mesh(view: View, changed: Kernel) -> list[Change]:
-    """A change of the diffraction pattern, convolved with the scatter kernel."""
+    """The change of the images by a change of the diffraction PSF (`changed`), convolved with the scatter kernel."""
     solution = view.solution
     size = solution.total.size
     scatter = solution.inversion.shape.kernel(solution.inversion.coordinates, size)
@@ -196,7 +201,7 @@ def _mesh(view: View, changed: Kernel) -> list[Change]:
 
 
 def _odd(view: View) -> Kernel:
-    """The diffraction pattern with its centre in the middle pixel."""
+    """The diffraction PSF, cut to an odd size, so that its centre is the middle pixel."""
     pattern = view.solution.transit.diffraction
     return np.asarray(pattern[1 - pattern.shape[0] % 2 :, 1 - pattern.shape[1] % 2 :])
 
@@ -214,10 +219,10 @@ def _stretched(pattern: Kernel, percent: float) -> Kernel:
 
 
 def _best_amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> float:
-    """The change of the diffraction pattern that explains most of the residuals.
+    """The amount of change of the diffraction PSF that explains most of the residuals.
 
-    A search is needed because the orders move by more than their width. form(pattern, amount): the changed pattern. steps:
-    sizes of the amounts that are tried with both signs; then amounts between the neighbours of the best one are tried.
+    A search is needed because the mesh orders move by more than their width. form(pattern, amount): the changed pattern.
+    steps: absolute amounts; each is tried with both signs. Then amounts between the neighbours of the best one are tried.
     """
     search, pattern = place_search(view), _near(_odd(view))
     tried = sorted(sign * step for step in steps for sign in (-1, 1))
@@ -229,12 +234,12 @@ def _best_amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Seq
 
 
 def _near(pattern: Kernel) -> Kernel:
-    """The centre of a pattern, which is all that a search uses."""
+    """The central part of a pattern. The search uses only this part."""
     return crop_or_pad(pattern, min(2 * KERNEL_REACH_PX + 1, pattern.shape[0]))
 
 
 def _changed_mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: float) -> list[Change]:
-    """The mesh changed by an amount, per unit of it."""
+    """The change of the images if form(pattern, amount) replaces the diffraction PSF, divided by the amount."""
     pattern = _odd(view)
     change = (form(pattern, amount) - pattern) / amount
     return _mesh(view, crop_or_pad(change, view.solution.transit.diffraction.shape[0]))
@@ -266,17 +271,17 @@ def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectPar
 
 EFFECTS: tuple[Effect, ...] = (
     Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection adds a displaced, defocused copy of the image.",
-           "images of a bright source at several places in the field", ("detector_x", "detector_y", "intensity"), _ghost,
+           "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"), _ghost,
            trials=GHOST_TRIALS, held=_held_ghost),
     Effect("anisotropic_scatter", "optics", (_p("p", "", 0.1), _p("q", "", 0.1)),
-           "Scatter reaches farther along one direction: p and q are ln(1 + stretch) times cos and sin of twice its angle.",
+           "Scatter reaches farther along one direction. p and q are ln(1 + stretch) times the cosine and the sine of twice the angle of this direction.",
            "a transit along a second track that crosses the first", ("azimuth_in_disc", "detector_x", "detector_y"),
            _anisotropic, not_a_power_law),
     Effect("field_dependent_scatter", "optics",
            (_p("x", "/field", 0.1), _p("y", "/field", 0.1), _p("outwards", "/field2", 0.2)),
            "The total scatter varies across the detector, linearly or from its centre outwards.", "a transit across another part of the detector",
            ("detector_x", "detector_y"), _field_dependent, not_a_power_law),
-    Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "There is a second, wide component of scatter.",
+    Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "The scatter has a second, wide component.",
            "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,
            trials=len(HALOS), held=_held_halo),
     Effect("core_blur", "optics", (_p("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",

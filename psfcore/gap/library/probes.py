@@ -1,7 +1,7 @@
 """Probes: patterns that are typical of gaps of unknown cause.
 
-A probe is never an answer. If a probe explains a gap clearly better than every effect of the library, the cause is not
-in the library, and the probe tells what it looks like.
+No verdict names a probe as the cause of a gap. If a probe explains a gap clearly better than every effect of the library,
+the cause is probably not in the library. The report then says which probes the gap resembles.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from psfcore.transit.occulter import coverage
 
 Plane = NDArray[np.float64]
 
-PATCH_SHARE = 0.08  # width of a patch of light or shadow, as a fraction of the field
+# Standard deviation of a patch of light or shadow, as a fraction of the shorter side of the field.
+PATCH_SHARE = 0.08
 PATCH_TRIALS = 60
 LEAST_EXPOSURES = 2
 
@@ -129,16 +130,17 @@ def _shutter(view: View) -> Sequence[Change]:
 
 
 def _read_pattern(view: View) -> Sequence[Change]:
-    """The pattern that is the same in every readout at all pointings, as measured in the unocculted field, for 1 DN rms.
+    """A pattern that is the same in every readout at all pointings, scaled to 1 DN rms.
 
-    In DN/s it is proportional to 1 / exposure, so it shows where the images of a pointing differ in exposure.
+    The pattern is measured in the unocculted field. In DN/s it is proportional to 1 / exposure time, so it can be measured
+    where the images of a pointing differ in exposure time.
     """
     frames = view.solution.transit.frames
     readouts = np.array([1 / frame.exposure_s for frame in frames])
     over, under, shown = (sum(some) for some in zip(*_in_pointings(view, readouts), strict=True))
-    least = max(RIDGE * float(np.max(under)), 1e-300)  # damps places that few images show
+    least = max(RIDGE * float(np.max(under)), 1e-300)  # damps pixels that few images show
     pattern = gaussian_filter(over / (under + least), STRUCTURE_PX / COARSE_PX)
-    pattern -= pattern.mean()  # its mean is the effect dark_offset
+    pattern -= pattern.mean()  # the effect dark_offset describes the mean
     plane = on_pixels(pattern / max(float(pattern.std()), 1e-9), view.solution.transit.shape)
     return [
         Change(lambda n, _: plane * np.float32(readouts[n]), disc=False, numbers=int(np.count_nonzero(shown)))
@@ -146,8 +148,10 @@ def _read_pattern(view: View) -> Sequence[Change]:
 
 
 def _in_pointings(view: View, readouts: Plane) -> Iterator[tuple[Plane, Plane, Plane]]:
-    """For each pointing with several exposures, on coarse pixels: the sums over its images of the part that is proportional to
-    1 / exposure and of its weight, with a free scene; and whether each block contributes.
+    """The terms of a fit of the readout pattern, with a free scene, for each pointing with several exposure times.
+
+    Yields for each pointing: the numerator and the denominator of the pattern on coarse pixels [y, x], summed over the
+    images; and whether each block contributes (blocks,). readouts: 1 / exposure time of each image, 1/s.
     """
     frames = view.solution.transit.frames
     for pointing in _pointings_of_exposures(view):
@@ -165,7 +169,7 @@ def _in_pointings(view: View, readouts: Plane) -> Iterator[tuple[Plane, Plane, P
 
 
 def _pointings_of_exposures(view: View) -> list[int]:
-    """Pointings whose images differ in exposure."""
+    """The pointings whose images differ in exposure time."""
     frames = view.solution.transit.frames
     kinds = {(frame.pointing, frame.exposure_s) for frame in frames}
     return [
@@ -176,16 +180,16 @@ def _pointings_of_exposures(view: View) -> list[int]:
 
 
 def _no_pointing_of_exposures(view: View) -> str | None:
-    return None if _pointings_of_exposures(view) else "no pointing has images of different exposures"
+    return None if _pointings_of_exposures(view) else "no pointing has images with different exposure times"
 
 
 def _one_exposure(view: View) -> str | None:
     exposures = {frame.exposure_s for frame in view.solution.transit.frames}
-    return None if len(exposures) >= LEAST_EXPOSURES else "all images have the same exposure"
+    return None if len(exposures) >= LEAST_EXPOSURES else "all images have the same exposure time"
 
 
 def _lit_occulter(view: View) -> Sequence[Change]:
-    """An occulter that is not dark: light on its disc, DN/s, uniform and increasing towards its rim."""
+    """An occulter that is not dark. Two changes: uniform light on its disc, and light that increases towards its rim."""
     optics, shape = view.solution.optics, view.solution.transit.shape
 
     def disc(n: int, power: int) -> Field:
@@ -223,7 +227,7 @@ PROBES: tuple[Effect, ...] = (
            ("azimuth_in_disc",), _one_sided, not_a_power_law),
     _probe("bent_scatter", "optics", _p("bend"), "scatter that falls off faster or more slowly at large distances",
            ("scattering_distance",), _bent, not_a_power_law),
-    _probe("light_along_rows", "detector", _p("share"), "a share of each row's light spread along the row",
+    _probe("light_along_rows", "detector", _p("share"), "a fraction of the light of each row, spread along the row",
            ("detector_y", "intensity"), _rows),
     _probe("bright_loss", "detector", _p("loss"), "bright pixels that are read too low", ("intensity",), _bright),
     _probe("uneven_shutter", "detector", _p("x", "y"), "an exposure time that varies across the field",

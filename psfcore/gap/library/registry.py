@@ -1,4 +1,4 @@
-"""All effects that are tested, and the probes. To add an effect, add it to EFFECTS in the file of its stage."""
+"""The library: all effects that a diagnosis tests, and the probes. A new effect goes into EFFECTS in the file of its stage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects of the scene: light from outside the field, motion of the occulter, and a Sun that changes."""
+"""Effects of the scene: light from outside the field, motion of the occulter, and changes of the Sun."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from psfcore.transit.transit import Place
 
 Planes = NDArray[np.float64]
 
-# In the longest exposure. Two lengths, because the change is not proportional to the length.
+# Lengths of the track in the longest exposure. There are two, because the change is not proportional to the length.
 MOTIONS_PX = (1.0, 5.0)
-MOTION_PARTS = 5  # an exposure is divided into so many parts
+MOTION_PARTS = 5  # number of parts into which an exposure is divided
 STRUCTURE_PX = 6.0
 LEAST_TO_EVOLVE = 5
 MOST_TERMS = 4
-RIDGE = 1e-3  # of an image's weight: damps places that few images show
+RIDGE = 1e-3  # in units of the weight of one image: damps pixels that few images show
 COARSE_PX = 4
 SIDES = ("left", "right", "bottom", "top")
-MOST_POINTINGS = 8  # each of these has its own surroundings
+MOST_POINTINGS = 8  # light from outside the field is tested for this number of pointings
 
 
 def _beyond_field(view: View) -> Sequence[Change]:
-    """The mirror image of the field beyond each of its edges, convolved with the PSF.
+    """Light from beyond each edge of the field: the mirror image of the scene there, convolved with the PSF.
 
-    The light that enters from there is smooth except in the outermost pixels, so it is computed on coarse pixels.
+    The light that scatters into the field from there is smooth, except in the outermost pixels. It is therefore computed on
+    coarse pixels.
     """
     solution = view.solution
     ny, nx = (-(-n // COARSE_PX) for n in solution.transit.shape)
@@ -43,7 +44,7 @@ def _beyond_field(view: View) -> Sequence[Change]:
     through = Convolver(kernel, (ny + 2 * pad_y, nx + 2 * pad_x), dtype=np.float32, threads=solution.threads)
     y, x = np.indices((ny + 2 * pad_y, nx + 2 * pad_x))
     low_y, high_y, low_x, high_x = y < pad_y, y >= pad_y + ny, x < pad_x, x >= pad_x + nx
-    # Left and right include the corners, so that the four sides cover all that is outside the field.
+    # The left and the right side include the corners, so that the four sides cover the whole surroundings of the field.
     sides = (low_x, high_x, low_y & ~low_x & ~high_x, high_y & ~low_x & ~high_x)
 
     def change(n: int, side: NDArray[np.bool_]) -> Field:
@@ -60,7 +61,7 @@ def _beyond_field(view: View) -> Sequence[Change]:
             lambda n, _: change(n, side) if frames[n].pointing == pointing else nothing, unocculted=False
         )
 
-    # Each pointing has its own surroundings.
+    # The surroundings differ between pointings, so each pointing has separate parameters.
     return [
         one(pointing, side)
         for pointing in sorted({f.pointing for f in frames})[:MOST_POINTINGS]
@@ -69,7 +70,7 @@ def _beyond_field(view: View) -> Sequence[Change]:
 
 
 def _coarse(plane: Field) -> Field:
-    """Means of squares of COARSE_PX; incomplete squares are completed by repeating the edge."""
+    """The means of a plane over squares of COARSE_PX px. Repeated edge pixels complete incomplete squares."""
     ny, nx = plane.shape
     whole = np.pad(plane, ((0, -ny % COARSE_PX), (0, -nx % COARSE_PX)), mode="edge")
     rows, columns = (n // COARSE_PX for n in whole.shape)
@@ -77,7 +78,7 @@ def _coarse(plane: Field) -> Field:
 
 
 def _motion(view: View) -> Sequence[Change]:
-    """The disc blurred along its track: light where it was dark for a fraction of the exposure, and the reverse."""
+    """The change of the images if the disc moves along its track during an exposure, so that its edge is blurred."""
     solution = view.solution
     frames = solution.transit.frames
     places = [found.place for found in solution.sky.found]
@@ -106,9 +107,10 @@ def _motion(view: View) -> Sequence[Change]:
 
 
 def _evolution(view: View) -> Sequence[Change]:
-    """The change of a pointing's unocculted field that is linear in time, and the smooth change beyond that, per unit of rms.
+    """The changes of the Sun within each pointing, measured in the unocculted field. Each is scaled to a relative rms of 1.
 
-    The discs do not show it, because each image has its own scene.
+    Two changes: one that is linear in time, and the rest of the change that is smooth in time. The discs do not show these
+    changes, because the scene of each image is reconstructed from the image itself.
     """
     frames = view.solution.transit.frames
     evolving = [
@@ -135,10 +137,10 @@ def _evolution(view: View) -> Sequence[Change]:
 
 @dataclass(frozen=True, eq=False)
 class _Evolving:
-    """The change of one pointing on coarse pixels.
+    """The change of the Sun in one pointing, on coarse pixels: a sum of maps times polynomials in time.
 
-    basis: polynomials in time (images, terms). terms: the maps that they multiply, DN/s (terms, y, x). level: mean of the
-    pointing's mean image. free: the number of images that show each of its blocks.
+    basis: the polynomials (images, terms). terms: the maps (terms, y, x), DN/s. level: the mean of the mean image of the
+    pointing, DN/s. free: for each block, the number of images that show it (blocks,).
     """
 
     images: tuple[int, ...]
@@ -148,13 +150,16 @@ class _Evolving:
     free: NDArray[np.int64]
 
     def planes(self, terms: slice) -> dict[int, Planes]:
-        """The difference of each image from the mean over time, by some of the terms."""
+        """The difference of each image from the mean over time, from some of the terms, by image number [y, x], DN/s."""
         # The mean over time belongs to the scene, not to its change.
         basis = self.basis[:, terms] - self.basis[:, terms].mean(axis=0)
         return dict(zip(self.images, np.tensordot(basis, self.terms[terms], axes=1), strict=True))
 
     def numbers(self, terms: slice) -> int:
-        """How many numbers were measured in the blocks for some of the terms: for each block at most the number of its images."""
+        """The number of values that were measured in the blocks for some of the terms.
+
+        A block counts with at most the number of images that show it.
+        """
         last = np.minimum(self.basis.shape[1] if terms.stop is None else terms.stop, self.free)
         return int(np.maximum(last - terms.start, 0).sum())
 
@@ -180,8 +185,11 @@ def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
 
 
 def unocculted_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
-    """Images of one pointing on coarse pixels, with the hidden light restored and scaled to their mean, DN/s (images, y, x);
-    their weights, 1 where they can be compared; and the number of images that show each of the blocks.
+    """The unocculted field of images of one pointing, on coarse pixels. Three results:
+
+    - the images (images, y, x), DN/s, with the hidden light added, all scaled to the same brightness;
+    - their weights (images, y, x): 1 where a pixel can be compared with other images, otherwise 0;
+    - the number of images that show each block (blocks,).
     """
     planes, weights, free = [], [], []
     for n in images:
@@ -199,7 +207,7 @@ def unocculted_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Pla
 
 
 def on_pixels(plane: Field, shape: tuple[int, ...]) -> Field:
-    """A coarse plane on the pixels of the images."""
+    """A plane on coarse pixels, expanded to the pixels of the images. shape: of the images."""
     fine = np.repeat(np.repeat(plane, COARSE_PX, axis=0), COARSE_PX, axis=1)
     return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
 
@@ -209,7 +217,7 @@ def _too_few_to_evolve(view: View) -> str | None:
     most = max(sum(f.pointing == pointing for f in frames) for pointing in {f.pointing for f in frames})
     if most >= LEAST_TO_EVOLVE:
         return None
-    return f"it needs a pointing with {LEAST_TO_EVOLVE} images; the largest has {most}"
+    return f"this effect needs a pointing with {LEAST_TO_EVOLVE} images; the largest pointing has {most}"
 
 
 def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
@@ -224,5 +232,5 @@ EFFECTS: tuple[Effect, ...] = (
            "Light from the Sun outside the field scatters into the field.",
            "full-Sun images taken at the same time", ("scattering_distance", "pointing", "intensity"), _beyond_field),
     Effect("scene_evolution", "scene", (_p("rms", "", 0.3, True), _p("rms_uneven", "", 0.3, True)), "The Sun changes while the occulter crosses the field of a pointing.",
-           "images closer together in time", ("time", "pointing"), _evolution, _too_few_to_evolve),
+           "images that are closer together in time", ("time", "pointing"), _evolution, _too_few_to_evolve),
 )  # fmt: skip

@@ -1,1 +1,1 @@
-"""The gap report: its JSON form (schema gap/1), its HTML page and its figures."""
+"""The gap report: as JSON (schema gap/1), as an HTML page, and as figures."""

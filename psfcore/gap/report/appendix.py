@@ -1,4 +1,7 @@
-"""The last sections of the gap page: the PSF, what weakens the result, every image and every input."""
+"""The last sections of the gap page: the PSF, reasons for caution, all images and all input files.
+
+The named effects are those that the verdict names as the cause of the gap ("answer" in the report).
+"""
 
 from __future__ import annotations
 
@@ -36,21 +39,24 @@ def psf_parts(found: Diagnosis) -> list[Part]:
     columns = [(before, found.model.base.covariance)]
     if found.corrected:
         columns.append((found.corrected[0].solution.inversion, found.corrected[0].covariance))
-    header = ["", "fitted", *(["with the answer", "change (sigma)"] if found.corrected else [])]
+    header = ["", "fitted", *(["with the named effects", "change (sigma)"] if found.corrected else [])]
     rows = [_parameter_row(k, columns) for k in range(len(before.shape.parameters))]
     rows += [_curve_row(k, radius, columns) for k, radius in enumerate(before.radii_px)]
     caption = (
-        f"Parameters of the shape “{before.shape.name}”, and 1 - encircled energy of the total PSF (the light beyond R, in percent). Errors of the parameters: noise and "
-        f"a floor of {100 * FLOOR:g} % of a disc's light; with the answer, its parameters are free as well. Errors of the encircled energy: noise only."
+        f"Parameters of the shape “{before.shape.name}”, and 1 - encircled energy of the total PSF (the percentage of the light beyond the radius). The errors of the parameters "
+        f"contain noise and an error of {100 * FLOOR:g} % of the light of a disc for unknown causes. In the column “with the named effects”, the parameters of these effects were fitted as well. "
+        "The errors of the encircled energy contain only noise."
     )
     optical = [words(e.name) for c in found.corrected[:1] for e in c.effects if e.stage == "optics"]
     if optical:
-        caption += f" The change of the PSF by {' and '.join(optical)} itself is not included in these numbers; it is in the file of the corrected PSF."
+        caption += f" These numbers do not include the change of the PSF by {' and '.join(optical)} itself; the file of the corrected PSF includes it."
     parts: list[Part] = [Table(header, rows, caption)]
     if not found.corrected:
-        parts.append("No effect was added to the model, so there is no corrected PSF.")
+        parts.append("No effect was added to the model, so this diagnosis has no corrected PSF.")
     elif found.judgement.verdict == "tie":
-        parts.append(f"“With the answer” means with the best of the tied effects: {best_words(found)}.")
+        parts.append(
+            f"“With the named effects” means with the best of the tied effects: {best_words(found)}."
+        )
     return parts
 
 
@@ -72,7 +78,7 @@ def _curve_row(k: int, radius: float, columns: list[tuple[Inversion, Any]]) -> l
 
 
 def _compared(values: list[float], sigma: list[float]) -> list[str]:
-    """Values with errors; for two values also the change in units of the first error."""
+    """The values with their errors; for two values also their difference, in units of the error of the first value."""
     cells = [with_error(value, s) for value, s in zip(values, sigma, strict=True)]
     if len(values) == 2:
         cells.append(f"{(values[1] - values[0]) / sigma[0]:+.1f}" if sigma[0] > 0 else DASH)
@@ -96,28 +102,34 @@ def made_of(found: Diagnosis, report: Report) -> list[Part]:
     how = Values(
         [
             Value("images used", f"{len(report['images'])} of {len(found.solution.transit.frames)}"),
-            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN per detected photon, as used"),
-            Value("read noise", noise.read_noise_dn, unit="DN", meaning="rms, as used"),
             Value(
-                "residual of the fit on its own simulation",
+                "photon gain",
+                noise.photon_gain_dn,
+                unit="DN",
+                meaning="DN per detected photon; the value that the fit used",
+            ),
+            Value("read noise", noise.read_noise_dn, unit="DN", meaning="rms; the value that the fit used"),
+            Value(
+                "residual of a fit to simulated images",
                 f"{expected['residual_pct']:.2f}",
                 unit="%",
-                meaning="rms of the discs' means, from noise and the error of the estimator alone",
+                meaning="rms over the means of the discs; the fit leaves this residual if the model is right",
             ),
             Value(
-                "chi2 per cell in this simulation",
+                "chi2 per cell of the simulated images",
                 f"{expected['disc_chi2_a_cell']:.3f}",
-                meaning="1 if there is only noise",
+                meaning="1 would mean that noise is the only error",
             ),
             Value(
                 "floor",
                 f"{100 * FLOOR:g}",
                 unit="%",
-                meaning="relative error common to all cells of a disc; the verdict is repeated with half and twice this value",
+                meaning="relative error, common to all cells of a disc, that allows for unknown causes; the verdict is made again with half and with twice this value",
             ),
             Value(
-                "smallest p-value of the residuals after an effect that explains the gap",
+                "limit of the p-value of residuals",
                 f"{ENOUGH:g}",
+                meaning="an effect explains the gap if the residuals after it have a larger p-value",
             ),
             *(
                 Value("rounds of the full refit", str(one.rounds), meaning=f"at most {ROUNDS}")
@@ -128,7 +140,7 @@ def made_of(found: Diagnosis, report: Report) -> list[Part]:
     files = Table(
         ["file", "SHA-256"],
         list(report["inputs_sha256"].items()),
-        "Input files and the hashes of their bytes.",
+        "The input files, with the SHA-256 of their bytes.",
     )
     return [
         how,
@@ -153,7 +165,7 @@ def _images(report: Report) -> Table:
         "residual (%)",
     ]
     return Table(
-        [*header, "with the answer (%)"],
+        [*header, "residual with the named effects (%)"],
         [
             [
                 row["file"],
@@ -168,7 +180,7 @@ def _images(report: Report) -> Table:
             ]
             for row in report["images"]
         ],
-        "Every image used: position of its occulter, brightness of its disc, and the held-out residual.",
+        "All images that the fit used: the position of the occulter, the mean brightness of its disc, and the residual from a fit without this image.",
     )
 
 

@@ -1,4 +1,7 @@
-"""The bar charts of a gap diagnosis: the share of the gap along each axis, and the closure by each effect."""
+"""Two bar charts of a gap report: the share of the gap along each axis, and the closure by each effect.
+
+The named effects are those that the verdict names as the cause of the gap ("answer" in the report).
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,12 @@ Report = dict[str, Any]
 MOST_EFFECTS = 10
 CERTAIN_P = 1e-12  # a smaller p-value is written as "p < 1e-12"
 _ANSWER, _OTHER = "#0072B2", "#9a9a9a"
-_NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3  # bars and intervals are cut at these closures
+# Smallest and largest closure that the chart shows; longer bars are cut.
+_NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3
 
 
 def draw_where(axes: Any, report: Report) -> None:
-    """Horizontal bars, the strongest axis at the top, with p-values."""
+    """Draw one horizontal bar for each axis, with its p-value. The strongest axis is at the top."""
     rows = report["where"]
     at = np.arange(len(rows))[::-1]
     shares = np.array([100 * row["share"] for row in rows])
@@ -35,12 +39,12 @@ def draw_where(axes: Any, report: Report) -> None:
 
 
 def p_words(p_value: float) -> str:
-    """A p-value as written beside a bar."""
+    """A p-value as text, for the label of a bar."""
     return f"p < {CERTAIN_P:.0e}" if p_value < CERTAIN_P else f"p = {p_value:.2g}"
 
 
 def draw_effects(axes: Any, report: Report) -> None:
-    """Closure with its 90 % interval and score; the answer, or the tied effects, stand out."""
+    """Draw the closure by each effect, with its 90 % interval and its score. The named or tied effects are blue."""
     rows = fits_of(report)[:MOST_EFFECTS]
     at = np.arange(len(rows))[::-1]
     names = []
@@ -49,7 +53,7 @@ def draw_effects(axes: Any, report: Report) -> None:
         colour = _ANSWER if chosen else _OTHER
         _draw_closure(axes, float(y), row["closure"], colour)
         axes.text(1.52, y, f"{row['score']:.1f}", va="center", ha="right", fontsize=9)
-        mark = {"attributed": "answer", "tie": "tie"}.get(report["verdict"], "") if chosen else ""
+        mark = {"attributed": "named", "tie": "tied"}.get(report["verdict"], "") if chosen else ""
         names.append(row["name"].replace("_", " ") + (f"  ({mark})" if mark else ""))
     axes.text(1.52, at.max(initial=0) + 0.75, "score", va="center", ha="right", fontsize=9, color="#555555")
     axes.set_yticks(at, names)
@@ -59,12 +63,12 @@ def draw_effects(axes: Any, report: Report) -> None:
     axes.axvline(0, color="#555555", linewidth=1.0)
     axes.axvline(1, color="#555555", linewidth=1.0, linestyle=(0, (4, 3)))
     axes.set(xlim=(_NO_CLOSURE, 1.56), ylim=(-0.7, len(rows) + 0.2), xticks=(0, 0.25, 0.5, 0.75, 1.0))
-    axes.set_xlabel("Closure of the gap on held-out images (0: none, 1: all)", x=0.45)
+    axes.set_xlabel("Closure of the gap on held-out images (0: no closure, 1: full closure)", x=0.45)
     tidy([axes])
 
 
 def _chosen(row: Report, report: Report) -> bool:
-    """Whether an effect, or several together, are the answer, or belong to a tie."""
+    """Whether a row of the report is the fit of the named effects or, for a tie, of one of the tied effects."""
     names, answer = set(row["name"].split(" + ")), set(report["answer"])
     if report["verdict"] != "tie":
         return names == answer

@@ -1,4 +1,7 @@
-"""A gap diagnosis as one page that a person reads in a minute: the summary, then numbers and figures by importance."""
+"""The page of a gap diagnosis: first the summary sentence, then numbers and figures, the most important ones first.
+
+The named effects are those that the verdict names as the cause of the gap ("answer" in the report).
+"""
 
 from __future__ import annotations
 
@@ -45,11 +48,11 @@ from psfcore.gap.verdict.where import SIGN_FLIPS
 Report = dict[str, Any]
 
 VERDICTS = {
-    "none": "no gap: the residuals agree with noise and the error of the fit",
-    "attributed": "a gap whose cause is identified",
-    "tie": "a gap that several effects explain about equally well",
-    "unknown": "a gap that no effect of the library explains",
-    "inconclusive": "these data do not decide whether there is a gap, or what causes it",
+    "none": "there is no gap: noise and the error of the fit explain the residuals",
+    "attributed": "there is a gap, and its cause is identified",
+    "tie": "there is a gap, and several effects explain it about equally well",
+    "unknown": "there is a gap, and no effect of the library explains it",
+    "inconclusive": "these data do not show whether there is a gap, or which effect causes it",
 }
 AXIS_UNITS = {
     "detector_x": "px",
@@ -62,17 +65,20 @@ AXIS_UNITS = {
 
 
 def gap_page(found: Diagnosis, report: Report) -> Page:
-    """The page of a diagnosis and its report (schema gap/1).
+    """The page of a diagnosis. report: its report (schema gap/1).
 
-    The report's "provenance", if it has one, tells what made it: software, libraries, seed, and the PSF that it started from.
+    The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the fit
+    started.
     """
     of = found.solution.transit.instrument or "a transit"
     sections = [
         Section("What was found", _found(found, report)),
         Section("Where the gap lies", _where(found, report)),
-        Section("Which effect", _which(found, report)),
-        Section("The PSF, before and with the answer" if found.corrected else "The PSF", psf_parts(found)),
-        Section("What weakens this result", doubts(report)),
+        Section("Which effect causes the gap", _which(found, report)),
+        Section(
+            "The PSF, without and with the named effects" if found.corrected else "The PSF", psf_parts(found)
+        ),
+        Section("Reasons for caution", doubts(report)),
         Section("All images, settings and input files", made_of(found, report)),
     ]
     version = report.get("provenance", {}).get("software_version", "")
@@ -90,11 +96,11 @@ def _found(found: Diagnosis, report: Report) -> list[Part]:
     unsure = report["verdict"] == "inconclusive" and bool(report["answer"])
     values = [
         Value("verdict", report["verdict"], meaning=VERDICTS[report["verdict"]]),
-        Value("best so far" if unsure else "answer", answer, meaning=_answer_meaning(report)),
+        Value("best effect so far" if unsure else "named effects", answer, meaning=_answer_meaning(report)),
         Value(
-            "p-value without a gap",
+            "p-value of the gap",
             f"{gap['p_value']:.2g}",
-            meaning=f"probability of such residuals if there is no gap; below {ALARM:g} a gap is claimed",
+            meaning=f"probability of residuals at least as large as these if there is no gap; below {ALARM:g}, the report claims a gap",
         ),
     ]
     answered = report["verdict"] in ("attributed", "tie")
@@ -103,22 +109,22 @@ def _found(found: Diagnosis, report: Report) -> list[Part]:
             _gap(
                 "gap before the refit",
                 gap["before_refit_pct"],
-                "with the PSF fitted together with the answer, but without the answer's effects",
+                "the PSF was fitted together with the named effects; then these effects were left out",
             )
         )
     values.append(
         _gap(
             "gap, PSF refitted",
             gap["rms_pct"],
-            "rms residual of held-out images, noise subtracted in quadrature",
+            "rms residual of held-out images without any effect; the noise is subtracted in quadrature",
         )
     )
     if answered:
         values.append(
             _gap(
-                "gap with the answer in the model",
+                "gap with the named effects in the model",
                 gap["after_pct"],
-                "the same on the same images; 0 if only noise and the error of the fit remain",
+                "rms residual of the same images, with these effects added; 0 if only noise and the error of the fit remain",
             )
         )
     values.append(
@@ -126,24 +132,24 @@ def _found(found: Diagnosis, report: Report) -> list[Part]:
             "noise",
             f"{gap['noise_pct']:.2g}",
             unit="%",
-            meaning="rms of a disc's mean: photon noise, read noise and the error of the fit",
+            meaning="rms error of the mean of a disc, from photon noise, read noise and the error of the fit",
         )
     )
     parts: list[Part] = [Values(values)]
     if report["would_separate"]:
-        parts.append(f"To tell them apart, take {report['would_separate']}.")
+        parts.append(f"To separate the tied effects, take {report['would_separate']}.")
     elif report["verdict"] == "attributed":
         settled = [e.settled_by for e in found.effects if e.settled_by]
-        parts.append(f"To confirm the answer, take {'; '.join(dict.fromkeys(settled))}.")
+        parts.append(f"To confirm the named effects, take {'; '.join(dict.fromkeys(settled))}.")
     if report["verdict"] == "tie" and found.corrected:
         parts.append(
-            f"Below, “with the answer” means with the best of the tied effects: {best_words(found)}. With another of them the PSF and the "
+            f"Below, “with the named effects” means with the best of the tied effects: {best_words(found)}. With another tied effect, the PSF and the "
             "residuals would differ."
         )
     if report["looks_like"]:
         parts += _looks_like(report)
     if found.residual is None:
-        parts.append("No image could be held out, so there are no held-out residuals to show.")
+        parts.append("No image could be held out, so this report has no residuals of held-out images.")
     else:
         parts.append(_map_figure(report))
     return parts
@@ -170,7 +176,7 @@ def _looks_like(report: Report) -> list[Part]:
         Table(
             ["pattern", "score", "p-value"],
             rows,
-            "What the gap resembles: patterns typical of causes outside the library, best first. They do not identify a cause.",
+            "Patterns that the gap resembles, best first. They are typical of causes that the library does not contain, and do not identify a cause. The score is the decrease of chi2 by the pattern, minus the decrease that noise alone could give.",
         )
     ]
 
@@ -178,12 +184,14 @@ def _looks_like(report: Report) -> list[Part]:
 def _map_figure(report: Report) -> Figure:
     after = has_after(report)
     caption = (
-        "Every disc at its place on the detector. The colour is the residual of its mean: simulated minus observed, over the "
-        "observed mean, from a fit without this image and its neighbours. Symbols distinguish the pointings. The next figure shows the "
-        "errors."
+        "Every disc at its position on the detector. The colour shows the residual of its mean: simulated minus observed, divided by the "
+        "observed mean. Each residual comes from a fit without this image and its neighbours. The symbols distinguish the pointings. The next "
+        "figure shows the errors of the residuals."
     )
     if after:
-        caption += " Left: the fitted model. Right: with the answer's effects in it, on the same scale."
+        caption += (
+            " Left: the fitted model. Right: the model with the named effects, on the same colour scale."
+        )
     return Figure(map_png(report), caption, "Map of the residuals of all discs on the detector")
 
 
@@ -194,7 +202,9 @@ def _where(found: Diagnosis, report: Report) -> list[Part]:
     strongest = report["where"][0]
     parts: list[Part] = []
     if report["verdict"] == "none":
-        parts.append("There is no gap to locate. The figures below show noise, and no axis should stand out.")
+        parts.append(
+            "There is no gap to locate. The figures below show only noise: no axis should have a much larger share than the others."
+        )
     else:
         at = strongest["at"]
         parts.append(
@@ -210,18 +220,19 @@ def _where(found: Diagnosis, report: Report) -> list[Part]:
     parts.append(
         Figure(
             where_png(report),
-            "The share of each axis in what all axes explain together, averaged over all orders in which the axes can be added, "
-            "because they vary together in a transit. The p-value is the probability that noise alone explains as much, times the number "
-            f"of axes; with {SIGN_FLIPS} random sign flips it cannot be below {len(report['where']) / (SIGN_FLIPS + 1):.2g} for the discs.",
+            "The share of the gap that varies along each axis. All axes together explain a decrease of chi2; the share is the contribution of one axis to it. "
+            "In a transit the axes vary together, so the share is averaged over all orders in which the axes can be added. "
+            "The p-value is the probability that the axis explains at least as much in noise alone, times the number of axes. It comes from "
+            f"{SIGN_FLIPS} random sign flips of the residuals, so for the discs it cannot be below {len(report['where']) / (SIGN_FLIPS + 1):.2g}.",
             "Bars of the share of the gap along each axis",
         )
     )
-    after = " Right: with the answer's effects in the model and the PSF refitted." if found.corrected else ""
+    after = " Right: with the named effects in the model and the PSF refitted." if found.corrected else ""
     parts.append(
         Figure(
             cells_png(found),
-            "Where in the disc the gap lies: the mean residual (%) of each cell over all images, with its error from noise, for the fit "
-            f"to all images.{after} The unit of radius is that of the outermost dark pixels.",
+            "Where the gap lies in the disc. The disc is divided into cells. Each number is the residual (%) of a cell, averaged over all images, with its "
+            f"error from noise. The fit used all images.{after} Distances are in units of the radius of the outermost dark pixels.",
             "Map of mean residuals by radius and azimuth in the disc",
         )
     )
@@ -229,7 +240,7 @@ def _where(found: Diagnosis, report: Report) -> list[Part]:
 
 
 def _range_words(axis: str, at: dict[str, Any]) -> str:
-    """The range of an axis in the pointings where the gap is largest."""
+    """The range of an axis in the pointings with the largest gap, as text."""
     if "range" not in at:
         return ""
     low, high = at["range"]
@@ -238,11 +249,11 @@ def _range_words(axis: str, at: dict[str, Any]) -> str:
 
 def _residuals_caption(report: Report) -> str:
     caption = (
-        "Residuals of the discs' means on held-out images, against place and time. Bars: one standard deviation of noise and the error "
-        "of the fit. Without a gap about one bar in three misses zero."
+        "Residuals of the discs' means in held-out images, against the position of the disc and against time. Each bar is one standard deviation of "
+        "noise and of the error of the fit. If there is no gap, about one bar in three does not reach zero."
     )
     return caption + (
-        " Full symbols: the fitted model. Open symbols: with the answer's effects; their bars include the errors of these effects."
+        " Full symbols: the fitted model. Open symbols: the model with the named effects; these bars include the errors of the effects."
         if has_after(report)
         else ""
     )
@@ -252,27 +263,27 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
     parts: list[Part] = []
     if report["verdict"] == "none":
         parts.append(
-            "There is no gap, so no effect is needed. All were tested, and none gains more than noise would."
+            "There is no gap, so no effect is needed. All effects were tested, and no effect decreases chi2 significantly more than noise would."
         )
     elif report["verdict"] == "unknown":
         parts.append(
-            "No effect is the answer, and no pair of effects is: the residuals after the best one are still significant, or a pattern "
-            "typical of causes outside the library fits clearly better."
+            "No effect and no pair of effects explains the gap. Either the residuals after the best fit are still significant, or a pattern "
+            "that is typical of causes outside the library fits clearly better."
         )
     elif found.judgement.discs_unexplained:
         parts.append(
-            f"No effect is the answer: {discs_unexplained_words(found.judgement)}. The positions of all occulters are reliable, so wrong positions do not cause this gap."
+            f"The report names no effect: {discs_unexplained_words(found.judgement)}. The positions of all occulters are reliable, so wrong positions do not cause this gap."
         )
     elif report["verdict"] == "inconclusive":
         parts.append(
-            "These data do not decide which effect is the answer, if any. Either the answer changes with the assumed floor (the error, as a "
-            "fraction of a disc's light, allowed for unknown causes), or it fails on held-out images, or a pattern of unknown cause fits as "
-            "well, or there are too few images."
+            "These data do not show which effect causes the gap, or whether there is a gap. There are four possible reasons. The best effect changes with the assumed floor, which is the error that is "
+            "allowed for unknown causes, as a fraction of the light of a disc. Or the best effect does not improve the prediction of held-out images. Or a pattern of unknown cause fits about as "
+            "well. Or there are too few images."
         )
     elif report["ties"]:
         parts.append(
-            f"Tied: {tied_words(found.judgement)}. Their scores differ by less than {TIE:g}, or by less than {100 * TIE_SHARE:g} % of the best gain (more "
-            "if a place was searched for), or their order changes with the assumed floor."
+            f"Tied: {tied_words(found.judgement)}. Either the scores of these effects differ by less than {TIE:g}, or by less than {100 * TIE_SHARE:g} % of the best gain (the limit is wider "
+            "if an effect searched for its position). Or their order changes with the assumed floor, which is the error that is allowed for unknown causes."
         )
     if report["verdict"] != "none":
         parts.append(_effects_figure(report))
@@ -285,10 +296,10 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
 def _effects_figure(report: Report) -> Figure:
     return Figure(
         effects_png(report),
-        f"Effects of the library, best first (at most {MOST_EFFECTS}); effects that fail in a full refit come last. Bars: the fraction of the gap that each closes on "
-        "held-out images, with its 90 % interval; those that leave the chart are cut, with an arrow. Blue: the answer, or the tied effects. A wrong effect may also close much of a gap, so the score decides: "
-        "the decrease of chi2, minus what the effect's parameters and the search for its place gain from noise. Effects whose score is within "
-        f"{TIE:g}, or {100 * TIE_SHARE:g} % of the best gain, of the best effect are tied with it.",
+        f"The effects of the library, best first (at most {MOST_EFFECTS}). Effects that fail in a full refit come last. Each bar is the closure by one effect: the fraction of the gap in "
+        "held-out images that disappears when the effect is added to the model. The line is its 90 % interval; an arrow marks where the chart cuts it. Blue: the named effects, or the tied effects. A wrong effect may also close much of a gap, so the score decides. "
+        "The score is the decrease of chi2 (the gain), minus the decrease that noise alone could give through the parameters of the effect and the search for its position. Effects are tied with the best effect if their scores differ by less than "
+        f"{TIE:g}, or by less than {100 * TIE_SHARE:g} % of the best gain.",
         "Bars of held-out closure by effect",
     )
 
@@ -297,8 +308,8 @@ def _effects_table(report: Report) -> Table:
     return Table(
         ["effect", "parameters", "score", "delta chi2, held out", "closure (%)", "90 % interval", "p-value"],
         [_effect_row(effect) for effect in fits_of(report)],
-        "Every effect that was tested, fitted together with the PSF: first those that act together, then each alone. Errors are one standard deviation. The parameters of the answer are those of "
-        "the full refit. Delta chi2: the decrease of -2 ln likelihood of the held-out images, errors of the parameters included.",
+        "Every effect that was tested. Each was fitted together with the PSF. First come effects that act together, then single effects. Errors are one standard deviation. For the named effects, the parameters are those of "
+        "the full refit. Delta chi2, held out: the decrease of -2 ln likelihood of the held-out images, including the errors of the parameters.",
     )
 
 
@@ -319,7 +330,7 @@ def _effect_row(effect: Report) -> list[str]:
 
 
 def unit_words(unit: str) -> str:
-    """A unit as a person writes it, "px²"."""
+    """A unit as text for the page, for example "px²"."""
     return re.sub(r"(?<=[a-z])2\b", "²", unit)
 
 
@@ -335,9 +346,9 @@ def _slices(found: Diagnosis) -> list[Part]:
     return [
         Figure(
             slices_png(found),
-            f"The mean of {2 * SLICE_ROWS + 1} rows through the centre of the occulter of {taken.file} (pointing {taken.pointing}), whose disc differs most from the model in units of its "
-            "noise. Points: observed, with noise. Line: simulated. Grey: fully dark pixels, where all light is scattered. Outside them the scene is "
-            "reconstructed from this image, so the line follows the points. Left: the fitted model. Right: with the answer's effects.",
-            "Observed and simulated light along x through an occulter, before and with the answer",
+            f"The mean of {2 * SLICE_ROWS + 1} rows through the centre of the occulter in {taken.file} (pointing {taken.pointing}). Of all discs, this one differs most from the model, in units of the "
+            "noise. Points: observed, with noise. Line: simulated. Grey: fully dark pixels, where all light is scattered light. Outside the grey area the scene is "
+            "reconstructed from this image, so the line follows the points. Left: the fitted model. Right: the model with the named effects.",
+            "Observed and simulated light along x through an occulter, without and with the named effects",
         )
     ]

@@ -1,7 +1,8 @@
-"""The figures of a gap diagnosis, each a PNG for a page about ten inches wide, and one picture with all of them.
+"""The figures of a gap diagnosis: each as a PNG for a page about ten inches wide, and all of them in one picture.
 
-Residuals are simulated minus observed, in percent of the observed mean of a disc. Full symbols: the fitted model; open
-symbols: with the answer's effects in it. Pointings differ in colour and symbol.
+Residuals are simulated minus observed, in percent of the observed mean of a disc. The named effects are those that the
+verdict names as the cause of the gap ("answer" in the report). Full symbols show the fitted model without effects, open
+symbols the model with the named effects. Each pointing has a colour and a symbol.
 """
 
 from __future__ import annotations
@@ -33,20 +34,21 @@ WIDTH_IN = 9.9
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#8a6d00", "#56B4E9")
 _SYMBOLS = ("o", "s", "^", "D", "v", "P")
 _BEFORE, _AFTER, _OBSERVED = "#D55E00", "#0072B2", "#333333"
-_DARK = 0.55  # of the colour scale: numbers on stronger colours are white
-_SLICE_PX, SLICE_ROWS = 20, 2  # on either side of the centre along x, and of the middle row
-_FITTED, _ANSWERED = "Fitted model", "With the answer"
+_DARK = 0.55  # fraction of the colour scale above which numbers are white, because the colour is dark
+# Half width of a slice along x, px; number of rows on each side of the middle row.
+_SLICE_PX, SLICE_ROWS = 20, 2
+_FITTED, _ANSWERED = "Fitted model", "With the named effects"
 
 
 def residuals_png(report: Report) -> bytes:
-    """Residuals of the discs' means against detector x, y and time, before and with the answer."""
+    """Residuals of the discs' means against detector x, y and time, without and with the named effects."""
     figure = _figure(WIDTH_IN, 3.7)
     draw_residuals(figure, list(figure.subplots(1, 3, sharey=True)), report)
     return _png(figure)
 
 
 def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
-    """Draw the residuals on three charts; their legend goes on the figure."""
+    """Draw the residuals on three charts, and one legend on the figure."""
     rows = report["images"]
     before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
     noise, noise_after = _column(rows, "noise_pct"), _column(rows, "noise_after_pct")
@@ -80,7 +82,7 @@ def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
 
 
 def map_png(report: Report) -> bytes:
-    """Every disc at its place on the detector, coloured by its residual, before and with the answer."""
+    """Every disc at its position on the detector. The colour shows its residual, without and with the named effects."""
     panels = 2 if has_after(report) else 1
     figure = _figure(4.95 * panels + 0.6, 4.6)
     charts = list(np.ravel(figure.subplots(1, panels, squeeze=False)))
@@ -89,7 +91,7 @@ def map_png(report: Report) -> bytes:
 
 
 def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
-    """One chart: before. A second chart: with the answer, on the same scale."""
+    """Draw the map without effects on the first chart; with the named effects, on the same scale, on the second chart, if any."""
     rows = report["images"]
     before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
     top = _scale(before, _column(rows, "noise_pct"))
@@ -122,7 +124,7 @@ def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
 
 
 def cells_png(found: Diagnosis) -> bytes:
-    """The mean residual of each cell over all images, before and with the answer."""
+    """The residual of each cell, averaged over all images, without and with the named effects."""
     panels = 2 if found.corrected else 1
     figure = _figure(4.2 * panels + 0.9, 4.2)
     draw_cells(figure, list(np.ravel(figure.subplots(1, panels, squeeze=False))), found)
@@ -130,7 +132,7 @@ def cells_png(found: Diagnosis) -> bytes:
 
 
 def draw_cells(figure: Any, charts: Sequence[Any], found: Diagnosis) -> None:
-    """Sectors of rings, like the cells; the second chart, if there is one, is with the answer."""
+    """Draw each cell as a sector of a ring. The second chart, if there is one, shows the model with the named effects."""
     maps = [cell_means(found.evidence.discs)]
     if found.corrected:
         maps.append(cell_means(found.corrected[0].evidence.discs))
@@ -167,7 +169,10 @@ def draw_cells(figure: Any, charts: Sequence[Any], found: Diagnosis) -> None:
 
 
 def cell_means(discs: Sequence[DiscCells]) -> tuple[Vector, Vector]:
-    """Mean residual of each cell over the discs and its error from noise, percent; nan if no disc has the cell."""
+    """The residual of each cell, averaged over the discs, and its error from noise: two arrays (cells,), percent.
+
+    NaN if no disc has the cell.
+    """
     places = _places()
     sums, variance, count = (np.zeros(len(places)) for _ in range(3))
     for disc in discs:
@@ -181,18 +186,21 @@ def cell_means(discs: Sequence[DiscCells]) -> tuple[Vector, Vector]:
 
 
 def _scale(values: Vector, noise: Vector) -> float:
-    """The end of the colour scale: the largest value, but at least three times the noise, which would otherwise look like a gap."""
+    """The end of the colour scale: the largest absolute value, but at least three times the noise.
+
+    On a shorter scale, noise would look like a gap.
+    """
     typical = float(np.sqrt(np.nanmean(noise**2))) if np.isfinite(noise).any() else 0.0
     return max(float(np.nanmax(np.abs(values), initial=0.0)), 3 * typical, 1e-3)
 
 
 def _places() -> list[tuple[float, float, int, int]]:
-    """For every cell: inner and outer radius (of the dark disc), its sector, and the number of sectors in its ring."""
+    """For every cell: its inner and outer radius (in radii of the dark disc), its sector, and the number of sectors in its ring."""
     return [(low, high, k, sectors) for low, high, sectors in RINGS for k in range(sectors)]
 
 
 def _numbers(disc: DiscCells) -> list[int]:
-    """The index in `_places` of each cell of a disc; a disc lacks cells of too few pixels."""
+    """For each cell of a disc, its index in `_places`. A disc has no cells with too few pixels."""
     out = []
     for radius, azimuth in zip(disc.radius, disc.azimuth, strict=True):
         ring = next(k for k, (_, high, _) in enumerate(RINGS) if radius < high or k == len(RINGS) - 1)
@@ -210,14 +218,14 @@ def where_png(report: Report) -> bytes:
 
 
 def effects_png(report: Report) -> bytes:
-    """How far each effect closes the gap on held-out images, best first."""
+    """The closure by each effect on held-out images, best effect first."""
     figure = _figure(WIDTH_IN, 1.1 + 0.34 * min(len(fits_of(report)), MOST_EFFECTS))
     draw_effects(figure.subplots(), report)
     return _png(figure)
 
 
 def slices_png(found: Diagnosis) -> bytes:
-    """Light along x through the occulter with the largest residual: observed, and simulated before and with the answer."""
+    """Light along x through the occulter with the largest residual: observed, and simulated without and with the named effects."""
     panels = 2 if found.corrected else 1
     figure = _figure(4.95 * panels + 0.1, 3.7)
     draw_slices(list(np.ravel(figure.subplots(1, panels, squeeze=False, sharey=True))), found)
@@ -225,12 +233,12 @@ def slices_png(found: Diagnosis) -> bytes:
 
 
 def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
-    """One chart: before. A second chart: with the answer."""
+    """Draw the slice without effects on the first chart; with the named effects on the second chart, if there is one."""
     n = largest_residual(found)
     solution = found.solution
     frame, place = solution.transit.frames[n], solution.sky.found[n].place
     rows, columns = solution.sky.dark[n]
-    # The centre of a disc at the field's edge may be outside the field; the middle of its dark pixels is not.
+    # The centre of a disc at the edge of the field may be outside the field, but its dark pixels are inside.
     middle, centre = int(np.median(rows)), place.x_px
     band = slice(max(middle - SLICE_ROWS, 0), middle + SLICE_ROWS + 1)
     first, last = max(int(centre) - _SLICE_PX, 0), min(int(centre) + _SLICE_PX + 1, frame.pixels.shape[1])
@@ -241,7 +249,7 @@ def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
     simulated = [(_BEFORE, simulated_of(found, n))]
     if found.corrected:
         simulated.append((_AFTER, simulated_of(found, n, with_answer=True)))
-    # Scale to the disc: the light around it may be a hundred times as bright.
+    # The scale shows the light in the disc: the light around the disc may be a hundred times as bright.
     dark = np.isin(np.arange(first, last), columns[rows == middle])
     inner = [seen.mean(axis=0)[dark], *(plane[band, first:last].mean(axis=0)[dark] for _, plane in simulated)]
     top = 2.2 * float(np.max(inner, initial=1e-9))
@@ -264,17 +272,17 @@ def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
 
 
 def largest_residual(found: Diagnosis) -> int:
-    """Position, among all images, of the image whose disc has the largest residual in units of its noise."""
+    """The index, among all images, of the image whose disc has the largest residual in units of its noise."""
     size = [abs(disc.share @ disc.residual) / max(disc.mean_noise, 1e-12) for disc in found.evidence.discs]
     return found.evidence.discs[int(np.argmax(size))].index
 
 
 def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> NDArray[np.float64]:
-    """Image n as the model predicts it [y, x], DN/s; with_answer: with the change by the added effects."""
+    """The model image of image n [y, x], DN/s. with_answer: whether to add the change by the named effects."""
     raw = found.solution.transit.frames[n].pixels
     solution = found.corrected[0].solution if with_answer else found.solution
     seen = solution.optics.field(solution.optics.convolve(solution.blanked_scene(n)))
-    # The difference between the original and the corrected images is the change by the effects.
+    # The original image minus the corrected image is the change by the effects.
     return np.asarray(seen, np.float64) + (raw - solution.transit.frames[n].pixels)
 
 
@@ -298,12 +306,12 @@ def gap_png(found: Diagnosis, report: Report) -> bytes:
 
 
 def has_after(report: Report) -> bool:
-    """Whether the report has residuals with the answer's effects in the model."""
+    """Whether the report has residuals of the model with the named effects."""
     return any(row["residual_after_pct"] is not None for row in report["images"])
 
 
 def _column(rows: Sequence[dict[str, Any]], name: str) -> Vector:
-    """One number of every image; nan if it is missing."""
+    """One number of every image (images,); NaN if the number is missing."""
     return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
 
 
@@ -320,7 +328,9 @@ def _legend(pointings: Sequence[int], *, after: bool) -> list[Any]:
         handles.append(Line2D([], [], color="#555555", marker="o", ls="none", ms=6, label="fitted model"))
         style: dict[str, Any] = {"mfc": "white", "mew": 1.2}
         handles.append(
-            Line2D([], [], color="#555555", marker="o", ls="none", ms=6, label="with the answer", **style)
+            Line2D(
+                [], [], color="#555555", marker="o", ls="none", ms=6, label="with the named effects", **style
+            )
         )
     return handles
 

@@ -1,4 +1,7 @@
-"""The gap report: schema gap/1, and the summary sentence that a person reads first."""
+"""The gap report as JSON (schema gap/1), and its summary sentence.
+
+The named effects are those that the verdict names as the cause of the gap. The report lists them under "answer".
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from psfcore.gap.verdict.judge import ALARM, LEAST_IMAGES, TIE, Judgement, Tried
 from psfcore.scatter.inversion import Inversion
 
 SCHEMA = "gap/1"
-MOST_READ = 12  # an effect with more parameters is summarised
+MOST_READ = 12  # if an effect has more parameters, the report summarises them
 PROBE_NAMES = {probe.name for probe in PROBES}
 AXIS_WORDS = {
     "detector_x": "along detector x",
@@ -89,8 +92,10 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
 
 
 def _place(found: Diagnosis, tried: Tried) -> tuple[bool, bool]:
-    """Sort key: the effects of the answer come first, because each may explain little without the other. Of those, an effect
-    that was measured in the unocculted field comes second, because it fits that field whatever else acts on it.
+    """Sort key of a fit. The named effects come first, because each may explain little without the other.
+
+    Among the named effects, an effect that was measured in the unocculted field comes last, because it fits that field
+    whatever the cause.
     """
     best = found.judgement.best
     together = best is not None and len(best.names) > 1
@@ -99,12 +104,12 @@ def _place(found: Diagnosis, tried: Tried) -> tuple[bool, bool]:
 
 
 def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """All fits of a report in the order of display: of several effects together, if any, then of each alone."""
+    """All fits of a report, in the order of display: first the fits of several effects together, then the fits of single effects."""
     return [*report["together"], *report["effects"]]
 
 
 def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, Any]:
-    """A shape's parameters, with the errors of the fit that judges the effects, floor included."""
+    """The parameters of the shape. covariance: of its coordinates, from the linear model; the errors therefore contain the floor."""
     values, sigma = inversion.values, np.sqrt(np.diag(covariance))
     return {
         p.name: {
@@ -145,7 +150,7 @@ def _interval(interval: Interval | None) -> dict[str, Any] | None:
 
 
 def _images(found: Diagnosis) -> list[dict[str, Any]]:
-    """Every image's disc: place, brightness, and held-out residuals before and after the answer is added."""
+    """The disc of every image: its position, its brightness, and its held-out residuals without and with the named effects."""
     before, after = found.residual, found.residual_after
     at_before = {} if before is None else dict(zip(before.images, before.residual_pct, strict=True))
     noise = {} if before is None else dict(zip(before.images, before.noise_pct, strict=True))
@@ -178,7 +183,7 @@ def _number(value: Any) -> float | None:
 
 
 def would_separate(found: Diagnosis) -> str:
-    """The observations that would separate tied effects; empty for other verdicts."""
+    """The observations that would separate the tied effects, as text; empty for other verdicts."""
     if found.judgement.verdict != "tie":
         return ""
     said = [_by_name(found, name).settled_by for name in found.judgement.tied]
@@ -186,55 +191,55 @@ def would_separate(found: Diagnosis) -> str:
 
 
 def sentence(found: Diagnosis) -> str:
-    """The summary that a person reads first: one to three sentences."""
+    """The summary of a diagnosis: one to four sentences."""
     judged = found.judgement
     images = len(found.evidence.discs)
     if judged.verdict == "inconclusive" and judged.p_value > ALARM:
         return (
-            f"No gap is visible in these {images} images (p = {judged.p_value:.2g}), but they may hide one. With fewer than "
-            f"{LEAST_IMAGES} images none can be held out, and so few images exclude little."
+            f"No gap is visible in these {images} images (p = {judged.p_value:.2g}), but a gap may exist. With fewer than "
+            f"{LEAST_IMAGES} images, no image can be held out, and only a large gap can be excluded."
         )
     left = f"{found.rms.value:.1f} % ({found.rms.low:.1f} to {found.rms.high:.1f})"
     if judged.verdict == "none" and found.residual is None:
         return (
-            f"No gap is visible in these {images} images (p = {judged.p_value:.2g}). They are too few to hold any out, so the "
-            "size of a gap that they may hide is unknown."
+            f"No gap is visible in these {images} images (p = {judged.p_value:.2g}). There are too few images to hold any of them out, so the "
+            "largest gap that noise could hide is unknown."
         )
     if judged.verdict == "none":
         return (
-            f"No gap beyond noise and the error of the fit: on held-out images the gap is {left}, the noise is "
+            f"No gap beyond noise and the error of the fit was found: on held-out images the gap is {left}, the noise is "
             f"{found.noise_pct:.1f} %, and p = {judged.p_value:.2g}."
         )
     strongest = found.where[0]
-    lead = f"A gap of {left} varies most {AXIS_WORDS[strongest.name]} and is largest in {_pointings(strongest.at)}."
+    lead = f"There is a gap of {left}. It varies most {AXIS_WORDS[strongest.name]} and is largest in {_pointings(strongest.at)}."
     if found.rms.value < found.noise_pct and _unocculted_alone(found):
         lead = (
-            f"A gap in the unocculted field varies most {AXIS_WORDS[strongest.name]}; the discs do not show it "
-            f"(their gap is {left})."
+            f"There is a gap in the unocculted field, and it varies most {AXIS_WORDS[strongest.name]}. The discs do not show it "
+            f"(the gap in the discs is {left})."
         )
     best = judged.best
     if judged.verdict == "unknown" or best is None:
         like = _by_name(found, judged.probes[0].names[0]).cause if judged.probes else ""
-        close = f"; it most resembles {like}" if like and judged.probes[0].score > 0 else ""
-        return f"{lead} No effect of the library explains it{close}."
+        close = f"; the gap most resembles {like}" if like and judged.probes[0].score > 0 else ""
+        return f"{lead} No effect of the library explains the gap{close}."
     if judged.verdict == "tie":
         return (
-            f"{lead} These data cannot tell which effect causes it: {tied_words(judged)}. To tell them apart, take "
+            f"{lead} These data cannot show which effect causes the gap: {tied_words(judged)}. To separate these effects, take "
             f"{would_separate(found)}."
         )
     if judged.discs_unexplained:
         return f"{lead} {_capital(discs_unexplained_words(judged))}."
     if judged.verdict == "inconclusive":
         return (
-            f"{lead} This gap is likely (p = {judged.p_value:.2g}), but its cause is uncertain: the answer changes with the "
-            "assumed floor, fails on held-out images, or fits no better than a pattern of unknown cause. "
+            f"{lead} This gap is likely (p = {judged.p_value:.2g}), but its cause is uncertain: the best effect changes with the "
+            "assumed floor, does not improve the prediction of held-out images, or fits no better than a pattern of unknown cause. "
             f"The best effect so far is {words(best.label)}."
         )
     return f"{lead} {_explained(found, best)}.{_excluded(found, best)}"
 
 
 def _unocculted_alone(found: Diagnosis) -> bool:
-    """Whether the blocks of the unocculted field show a gap that the discs' cells do not."""
+    """Whether the blocks of the unocculted field show a gap, but the cells of the discs do not."""
     model = found.model
     left = model.left(model.base)
     cells = sum(float(one @ one) for one in left)
@@ -255,20 +260,20 @@ def _explained(found: Diagnosis, best: Tried) -> str:
     ]
     in_short = in_short_if_many([value for value, _, _ in values.values()])
     return (
-        f"It is explained by {words(best.label)} ({in_short or ', '.join(numbers)}): on held-out images the gap falls from "
-        f"{found.rms.value:.1f} % to {found.after.value:.1f} %, with {found.noise_pct:.1f} % noise"
+        f"The gap is explained by {words(best.label)} ({in_short or ', '.join(numbers)}): on held-out images it falls from "
+        f"{found.rms.value:.1f} % to {found.after.value:.1f} %, and the noise is {found.noise_pct:.1f} %"
     )
 
 
 def tied_words(judged: Judgement) -> str:
-    """The tied effects, and the certain ones that act with them."""
+    """The tied effects, and the certain effects that act together with them, as text."""
     among = " or ".join(words(name) for name in judged.tied)
     beside = " and ".join(words(name) for name in judged.certain)
     return f"{beside}, together with {among}" if beside else among
 
 
 def discs_unexplained_words(judged: Judgement) -> str:
-    """That an effect explains the unocculted field but not the gap in the discs."""
+    """The statement that an effect explains the unocculted field, but not the gap in the discs."""
     shown = words(judged.best.label) if judged.best is not None else "an effect"
     return (
         f"{shown} explains the unocculted field, but the cause of the gap in the discs cannot be identified"
@@ -276,22 +281,22 @@ def discs_unexplained_words(judged: Judgement) -> str:
 
 
 def in_short_if_many(values: Sequence[float]) -> str | None:
-    """A summary of more than MOST_READ parameters; None for fewer."""
+    """A summary of parameters if there are more than MOST_READ; otherwise None."""
     if len(values) <= MOST_READ:
         return None
     return f"{len(values)} parameters, root sum of squares {float(np.linalg.norm(values)):.2g}"
 
 
 def _excluded(found: Diagnosis, best: Tried) -> str:
-    """The next best effect and why it was excluded; empty if there is none."""
-    gone = found.judgement.amiss  # these are named in the cautions
+    """A sentence that says why the next best effect was excluded; empty if there is no such effect."""
+    gone = found.judgement.amiss  # the cautions name these effects
     others = [t for t in found.judgement.tried if not set(t.names) & set(best.names) and t.label not in gone]
     if not others:
         return ""
     next_best = max(others, key=lambda t: t.score)
     name = words(next_best.label)
-    if best.score - next_best.score < TIE:  # it was excluded by the held-out images
-        return f" {_capital(name)} fits equally well, but fails on images held out of its fit."
+    if best.score - next_best.score < TIE:  # the held-out images excluded it
+        return f" {_capital(name)} fits about equally well, but predicts held-out images clearly worse."
     sigmas = (best.score - next_best.score) ** 0.5
     shrunk = found.shrinking[next_best.label].closure
     closes = "" if shrunk is None else f" closes {100 * max(shrunk.value, 0.0):.0f} % of the gap and"
@@ -308,10 +313,10 @@ def _capital(text: str) -> str:
 
 
 def words(name: str) -> str:
-    """The name of an effect or parameter as a person writes it."""
+    """The name of an effect or parameter, with spaces, for text."""
     return name.replace("_", " ")
 
 
 def best_words(found: Diagnosis) -> str:
-    """The effects of the first full refit."""
+    """The effects of the first full refit, as text."""
     return " + ".join(words(effect.name) for effect in found.corrected[0].effects)

@@ -1,18 +1,28 @@
-"""How far an effect closes the gap, on images that were held out of its fit.
+"""Closure: how much of the gap in held-out images disappears when an effect is added to the model.
 
     closure = 1 - (chi2_after - nu) / (chi2_before - nu)                                 Eq. (1)
-    nu = cells + trace(J Cov J^T)      noise, and the error of the fit from which the images were held out  Eq. (2)
-    gap = sqrt(mean(residual^2 - noise^2))     of the discs' means, in percent                Eq. (3)
-    deviance = r^T S^-1 r + ln det S,  S = 1 + J Cov J^T       r in units of the noise          Eq. (4)
+    nu = cells + trace(J Cov J^T)                                                             Eq. (2)
+    gap = sqrt(mean(residual^2 - noise^2))                                                    Eq. (3)
+    deviance = r^T S^-1 r + ln det S,  S = 1 + J Cov J^T                                      Eq. (4)
 
-Eq. (4), for all images of a fold at once, is -2 ln of their likelihood as predicted by the fit, including the
-uncertainty of its own parameters: a fit with large stated errors is not punished for a large deviation.
+chi2_before and chi2_after are the chi2 of held-out images, without and with the effect in the model. nu is the value that
+chi2 would have without a gap. The first term of nu is the noise of the cells. The second term is the error of the fit, to
+which the held-out images did not contribute: Cov is the covariance of the fitted parameters, and J is the Jacobian of the
+held-out cells. In Eq. (3), residual and noise are those of the discs' means, in percent. In Eq. (4), the residuals r are
+in units of their noise.
 
-There are two ways of holding out: blocks of time with a guard, and one pointing at a time. chi2 is that of the discs'
-cells. If the unocculted blocks show more of the gap, and the effect explains it (like a gain that differs between
-images), their chi2 is added. The intervals are for the closure by the true cause, not only for our estimate of it. They
-combine four errors: a bootstrap over the images; the scale of the noise in nu, with the uncertainty from one simulation;
-the part of chi2_after that comes from errors of the effect's parameters; and an error FORM_ERROR of its form.
+Eq. (4) is computed for all images of a fold at once. It is -2 ln of the likelihood of these images, as the fit predicts
+them. The prediction includes the uncertainty of the fitted parameters: if a fit states large errors, a large deviation
+increases its deviance only a little.
+
+Images are held out in two ways: blocks of time with a guard, and one pointing at a time. chi2 is summed over the cells of
+the discs. The chi2 of the blocks of the unocculted field is added under two conditions: these blocks show more of the gap
+than the discs do, and the effect explains more than half of what they show. A gain that differs between images is an
+example.
+
+The intervals are meant to contain the closure that the true cause would reach, not only our estimate. They combine four
+errors: a bootstrap over the images; the error of the noise scale in nu, which one simulation determines; the part of
+chi2_after that comes from errors of the effect's parameters; and a relative error FORM_ERROR of the effect's template.
 """
 
 from __future__ import annotations
@@ -31,9 +41,10 @@ from psfcore.transit.blocks import Fold, folds
 Vector = NDArray[np.float64]
 
 RESAMPLES = 1000
-FORM_ERROR = 0.1  # of an effect's amplitude; its square is a fraction of chi2
+FORM_ERROR = 0.1  # relative error of an effect's template; the square of this error is a fraction of chi2
 INTERVAL = (5.0, 95.0)
-HIDDEN_SIGMA = 1.645  # 95 % of a normal distribution lies below
+# A normal variable is below this number of standard deviations with a probability of 95 %.
+HIDDEN_SIGMA = 1.645
 
 
 @dataclass(frozen=True)
@@ -45,16 +56,18 @@ class Interval:
     high: float
 
     def to_json(self) -> dict[str, Any]:
-        """The value and interval in the form of the gap report."""
+        """The value and the interval as JSON, for the gap report."""
         return {"value": self.value, "ci90": [self.low, self.high]}
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Every held-out image with a disc: chi2 of its cells and of its unocculted blocks, their expected values, its residual.
+    """The results of a scheme of folds, for each held-out image with a disc. Images that no fold holds out are missing.
 
-    residual_pct, noise_pct: of the disc's mean, simulated minus observed over observed; the noise includes the error of the
-    fit. Images that no fold holds out are missing. deviance: Eq. (4) of each fold, by its held-out images.
+    chi2, unocculted_chi2: chi2 of the cells, and of the blocks of the unocculted field. expected, unocculted_expected: the
+    values of the two chi2 without a gap. residual_pct: the mean of the disc, simulated minus observed, divided by the
+    observed mean. noise_pct: the error of this residual, including the error of the fit. deviance: Eq. (4) of each fold; the
+    key is the tuple of its held-out images.
     """
 
     images: tuple[int, ...]
@@ -67,7 +80,7 @@ class HeldOut:
     deviance: Mapping[tuple[int, ...], float] = field(default_factory=dict)
 
     def of(self, images: Sequence[int]) -> HeldOut:
-        """Some of the images, without the deviance of the folds."""
+        """The same results for some of the images, without the deviance of the folds."""
         at = {image: k for k, image in enumerate(self.images)}
         here = [at[image] for image in images]
         return HeldOut(
@@ -82,12 +95,12 @@ class HeldOut:
 
 
 def time_blocks(model: LinearModel) -> tuple[Fold, ...]:
-    """Sequential blocks of all images with a guard; empty if there are fewer than six images."""
+    """Folds that hold out one block of consecutive images each, with a guard; empty if there are fewer than six images."""
     return folds(len(model.evidence.image_info))
 
 
 def pointings(model: LinearModel) -> tuple[Fold, ...]:
-    """One fold per pointing; empty if there are fewer than two pointings."""
+    """Folds that hold out one pointing each; empty if there are fewer than two pointings."""
     fovs = [taken.pointing for taken in model.evidence.image_info]
     if len(set(fovs)) < 2:
         return ()
@@ -99,16 +112,17 @@ def pointings(model: LinearModel) -> tuple[Fold, ...]:
 
 
 def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold]) -> HeldOut | None:
-    """Predict every image from a fit of the PSF and these columns to the other images; None if no fold can be fitted."""
+    """Predict the held-out images of every fold from a fit to its other images. None if no fold can be fitted.
+
+    columns: the parameters of effects that are fitted together with the PSF (columns of the Jacobian).
+    """
     evidence = model.evidence
     by_index = {disc.index: k for k, disc in enumerate(evidence.discs)}
     rows: list[tuple[float, ...]] = []
     images: list[int] = []
     deviance: dict[tuple[int, ...], float] = {}
     base = len(evidence.base)
-    free = base + len(
-        set(columns) - model.of_fields
-    )  # the parameters of a random field are constrained by their prior
+    free = base + len(set(columns) - model.of_fields)  # a prior constrains the parameters of a random field
     unocculted_noise = math.sqrt(model.unocculted_scale)
     for fold in scheme:
         fitted = [n for n in fold.fitted if n in by_index]
@@ -130,7 +144,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             of_unocculted = max(of_blocks.size - 1, 0) + float(
                 np.einsum("kb,kl,lb->", jacobian, errors, jacobian)
             )
-            of_all = np.zeros((len(here), of_blocks.size))  # the unocculted blocks do not depend on the PSF
+            of_all = np.zeros((len(here), of_blocks.size))  # the blocks do not depend on the PSF
             of_all[base:] = jacobian / unocculted_noise
             everything += [(left, white.jacobian[here]), (of_blocks, of_all)]
             answer = disc.jacobian[here] @ disc.share
@@ -158,7 +172,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
 
 
 def _deviance(left: Vector, jacobian: Vector, covariance: Vector) -> float:
-    """Eq. (4): left (n,) in units of the noise, jacobian (parameters, n), covariance of the parameters."""
+    """Eq. (4). left: residuals (n,) in units of the noise. jacobian: (parameters, n). covariance: of the parameters."""
     values, vectors = np.linalg.eigh(covariance)
     along = (np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ jacobian
     inner = np.eye(values.size) + along @ along.T
@@ -167,7 +181,10 @@ def _deviance(left: Vector, jacobian: Vector, covariance: Vector) -> float:
 
 
 def _in_both(before: HeldOut, after: HeldOut) -> tuple[HeldOut, HeldOut] | None:
-    """The images that both hold out; None if there are none. With more parameters, folds with few images are dropped."""
+    """Restrict both results to the images that both contain; None if they share no image.
+
+    The two can differ, because a fold is skipped if it has too few images for the number of fitted parameters.
+    """
     common = sorted(set(before.images) & set(after.images))
     if not common:
         return None
@@ -177,7 +194,7 @@ def _in_both(before: HeldOut, after: HeldOut) -> tuple[HeldOut, HeldOut] | None:
 def closure(
     before: HeldOut, after: HeldOut, rng: np.random.Generator, scale_error: float = 0.0
 ) -> Interval | None:
-    """Eq. (1) with its interval; None if there is no gap to close. scale_error: relative error of the noise's variance."""
+    """Eq. (1) with its 90 % interval; None if there is no gap. scale_error: relative error of the scale of chi2 (noise variance)."""
     both = _in_both(before, after)
     if both is None:
         return None
@@ -204,19 +221,22 @@ def closure(
     value = 1 - float((chi2_after - nu).sum()) / total
     low, high = np.percentile(resampled, INTERVAL)
     high = max(high, np.percentile(without_errors, INTERVAL[1]))
-    # No cause closes more than the whole gap.
+    # No effect can close more than the whole gap.
     return Interval(value, float(low) - FORM_ERROR**2, max(value, min(float(high), 1.0)) + FORM_ERROR**2)
 
 
 def fall(before: HeldOut, after: HeldOut) -> float:
-    """The decrease of Eq. (4), for discs and blocks, in the folds of both: how much better `after` predicts the images."""
+    """The deviance of `before` minus that of `after`, Eq. (4), summed over the folds that both contain.
+
+    It is positive if `after` predicts the held-out images better.
+    """
     return sum(
         before.deviance[one] - after.deviance[one] for one in before.deviance.keys() & after.deviance.keys()
     )
 
 
 def gap(held_out: HeldOut, rng: np.random.Generator) -> Interval:
-    """Eq. (3) with its interval; its upper end is at least the gap that the noise could hide."""
+    """Eq. (3) with its 90 % interval. The upper end is at least as large as a gap that the noise could hide."""
     squares = held_out.residual_pct**2 - held_out.noise_pct**2
     chosen = rng.integers(0, squares.size, (RESAMPLES, squares.size))
     resampled = np.sqrt(np.maximum(squares[chosen].mean(axis=1), 0.0))

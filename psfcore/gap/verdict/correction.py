@@ -1,9 +1,9 @@
-"""The model with an effect added: a full refit of the PSF to the images without the effect.
+"""A full refit: fit the PSF again to images from which the change by an effect was subtracted.
 
-The change by the effect is computed from the current scene and PSF and subtracted from the images. The PSF is fitted
-again, the change is computed again from that fit, and the remaining effect is fitted together with the PSF. Two or three
-rounds converge, as Gauss-Newton steps do; the result is then no longer limited to first order. A round that leaves
-clearly more chi2 than an earlier one is rejected.
+Each round computes the change of the images by the effect, from the current scene and PSF. It subtracts this change from
+the images and fits the PSF again. Then it computes the change again at this fit, and fits what remains of the effect together with
+the PSF. The rounds are Gauss-Newton steps. Two or three rounds converge, and the result is then more than a first-order
+approximation. A round is rejected if it leaves clearly more chi2 than an earlier round.
 """
 
 from __future__ import annotations
@@ -27,16 +27,18 @@ from psfcore.transit.transit import Transit
 Vector = NDArray[np.float64]
 
 ROUNDS = 3
-SETTLED = 0.3  # of a parameter's error: smaller steps end the rounds
-WORSE = 9.0  # a round may leave so much more chi2 than the best round,
-WORSE_SHARE = 0.05  # or, if larger, this fraction of the effect's gain
+SETTLED = 0.3  # the rounds end when every parameter changes by less than this fraction of its error
+# A round may leave more chi2 than the best round by WORSE or, if larger, by WORSE_SHARE times the gain of the effect.
+WORSE = 9.0
+WORSE_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
     """A full refit with effects in the model.
 
-    values: the effects' parameters, summed over all rounds, with errors and units. model: the linear model at that fit.
+    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. model: the linear
+    model at the refit. rounds: number of rounds made.
     """
 
     effects: tuple[Effect, ...]
@@ -48,25 +50,25 @@ class Corrected:
 
     @property
     def label(self) -> str:
-        """The effects' names as in a report."""
+        """The names of the effects, as the report writes them."""
         return label_of([effect.name for effect in self.effects])
 
     @property
     def covariance(self) -> Vector:
-        """Covariance of the PSF's coordinates, with the effects' parameters free (coordinates, coordinates)."""
+        """Covariance of the coordinates of the PSF, with the parameters of the effects free (coordinates, coordinates)."""
         columns = tuple(c for effect in self.effects for c in self.evidence.columns[effect.name])
         base = len(self.evidence.base)
         return self.model.fit(columns).covariance[:base, :base]
 
 
 def images_without(transit: Transit, view: View, effects: Sequence[Effect], theta: Vector) -> Transit:
-    """The transit with the changes by these effects subtracted from its images."""
+    """The transit, with the changes by these effects subtracted from its images. theta: the parameters, in order."""
     changes = [change for effect in effects for change in effect.changes(view)]
     frames = []
     for n, frame in enumerate(transit.frames):
         error = np.zeros(transit.shape)
         for value, change in zip(theta, changes, strict=True):
-            if change.disc:  # a change that the discs do not show belongs to each image's own scene
+            if change.disc:  # a change that the discs do not show is a change of the scene
                 error += value * change.change(n, view.expected)
         frames.append(replace(frame, pixels=(frame.pixels - error).astype(np.float32)))
     return replace(transit, frames=tuple(frames))
@@ -83,11 +85,11 @@ def add_to_model(
 ) -> Corrected:
     """Fit the PSF and effects together, starting from the linear fit `found`.
 
-    view: of the solution, if there is one. Raises the errors of `invert` if the first round fails, DataError
-    "effect-unseen" if nothing of an effect remains, and "bad-effects" if an added effect fails.
+    view: the view of the solution, if it exists already. Raises the errors of `invert` if the first round fails, DataError
+    "effect-unseen" if the images do not constrain the effects, and "bad-effects" if an added effect fails.
     """
     transit = solution.transit
-    # An effect that searches for a place keeps the place found first.
+    # An effect that searches for a position keeps the position that it found first.
     view = view or View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
     names, theta = list(found.values), np.array([value for value, _, _ in found.values.values()])
@@ -109,9 +111,9 @@ def add_to_model(
         except DataError:
             if taken is None:
                 raise
-            break  # the step was too long: the fit failed, or nothing of the effect remains
+            break  # the step was too long: the fit failed, or the images no longer constrain the effect
         steps, theta, start = seen.theta - theta, seen.theta, seen.start
-        # An effect that can only add light is dropped if it would remove light.
+        # A parameter that must be positive is dropped if its fitted value is not positive.
         acts = ~(_positive(held) & (theta <= 0))
         if not acts.all() and rounds < ROUNDS:
             held = _those_that_act(held, acts)
@@ -120,7 +122,9 @@ def add_to_model(
             taken, least = None, np.inf
             continue
         left_over = float(left_chi2(seen.model, seen.left.step).sum())
-        if left_over > least + max(WORSE, WORSE_SHARE * found.gain):  # too strong for first-order steps
+        if left_over > least + max(
+            WORSE, WORSE_SHARE * found.gain
+        ):  # the effect is too strong for first-order steps
             break
         least = min(least, left_over)
         taken = Corrected(
@@ -142,10 +146,10 @@ def add_to_model(
 
 @dataclass(frozen=True, eq=False)
 class _Remaining:
-    """What a fit shows of effects that were partly subtracted from its images.
+    """A fit to images from which a part of the effects was subtracted.
 
-    model: at that fit. left: the remaining effects there. theta: the total parameters. start: the PSF's coordinates for the
-    next round, as in `_stepped`.
+    model: the linear model at this fit. left: the linear fit of what remains of the effects. theta: the parameters,
+    subtracted and remaining parts added. start: the coordinates of the PSF for the next round, as in `_stepped`.
     """
 
     model: LinearModel
@@ -167,7 +171,7 @@ def _fit_remaining(
     model: LinearModel,
     progress: Progress,
 ) -> _Remaining:
-    """Fit the remaining effects. out: the current parameters; those with in_images were subtracted from the images."""
+    """Fit what remains of the effects. out: the current parameters. in_images: whether the parameter was subtracted."""
     evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
     again = replace(model, evidence=evidence)
     left = fitted(again, evidence.effects, any_sign=True)
@@ -175,25 +179,28 @@ def _fit_remaining(
     if found.size != out.size:
         raise DataError(
             "effect-unseen",
-            f"expected the images to constrain all {out.size} parameters of {label_of([e.name for e in held])} after its "
-            f"subtraction; they constrain {found.size}: the images may not contain this effect",
+            f"expected the images to constrain all {out.size} parameters of {label_of([e.name for e in held])} after this effect "
+            f"was subtracted; the images constrain {found.size} of them: they may not contain this effect",
         )
     base = len(evidence.base)
     out_already = np.concatenate([np.zeros(base), np.where(in_images, out, 0.0)])
     found -= again.pull_of_prior(left.step, out_already)[base:]
-    # A subtracted effect shows only its remainder, the others show all of their amount.
+    # For a subtracted parameter the fit gives only the remainder; for the other parameters it gives the full value.
     theta = np.where(in_images, out + found, found)
     return _Remaining(again, left, theta, _stepped(view.solution, left.step.values[:base]))
 
 
 def _stepped(current: Solution, step: Vector) -> Vector | None:
-    """The coordinates of a fit after a step; None if the step is too long to be trusted, so that the next fit starts anew."""
+    """The coordinates of a fit after a step.
+
+    None if the step is too long to be trusted; the next fit then starts from the default start of the shape.
+    """
     step, whole = current.inversion.shape.shortened(step)
     return current.inversion.coordinates + step if whole else None
 
 
 def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:
-    """Which of the effects' changes the discs show."""
+    """For each change of the effects, in order: whether the discs show the change."""
     return np.array([change.disc for effect in effects for change in effect.changes(view)], dtype=np.bool_)
 
 
@@ -204,7 +211,10 @@ def _positive(effects: Sequence[Effect]) -> NDArray[np.bool_]:
 
 
 def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[Effect]:
-    """The effects with only those parameters that act, in order. Raises DataError "effect-unseen" if an effect has none left."""
+    """The effects, each with only those parameters for which `acts` is true.
+
+    Raises DataError "effect-unseen" if an effect keeps no parameter.
+    """
     out, first = [], 0
     for effect in effects:
         count = len(effect.parameters)
@@ -226,7 +236,7 @@ def beyond(
     *,
     progress: Progress = lambda stage, step, steps: None,
 ) -> LinearModel:
-    """The model of a full refit with its effects, which are always fitted, and with the other effects of a library.
+    """The linear model at a full refit, with all effects of a library; the effects of the refit are always fitted.
 
     Raises DataError "bad-effects" if an added effect fails.
     """
@@ -240,14 +250,15 @@ def beyond(
 
 
 def hold(effect: Effect, view: View) -> Effect:
-    """The effect with everything it searches for, such as a place, fixed to the result for these images."""
+    """The effect with the result of its search, for example a position, fixed for these images."""
     return effect if effect.held is None else effect.held(view)
 
 
 def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
-    """The evidence `after` an effect was subtracted, with the noise and the blocks' variance from `before`.
+    """The evidence `after` an effect was subtracted, with the noise of cells and blocks from `before` the subtraction.
 
-    The subtracted light has left its noise in the images. The reference level of percentages also stays.
+    The subtraction removes the light of the effect from the images, but not the photon noise of this light. Percentages also
+    keep their reference level.
     """
     were = {disc.index: disc for disc in before.discs}
     discs = []
@@ -265,7 +276,7 @@ def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
 
 
 def _acting(effect: Effect, found: Tried, effects: int) -> Effect:
-    """The effect with only those parameters that a fit contains."""
+    """The effect with only those parameters that the fit `found` contains. effects: the number of effects in the fit."""
     labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
     return _with_part(effect, [k for k, label in enumerate(labels) if label in found.values])
 

@@ -1,34 +1,51 @@
-"""The verdict: is there a gap, and which effect causes it.
+"""The verdict: whether there is a gap, and which effect causes it.
 
-Effects are compared by their gain (the decrease of chi2), minus what their parameters and a search over many places gain
-from noise:
+Terms:
+
+- floor: a relative error, common to all cells of a disc, that allows for unknown causes (`linear_model`, Eq. (2)).
+- gain of an effect: the decrease of chi2 when its parameters are fitted together with the PSF.
+- rival of an effect: any other effect or probe that is tested on the same data.
+- probe: a pattern that is typical of gaps of unknown cause (`library.probes`). No verdict names a probe.
+- measured effect: an effect whose change of the images was measured in the unocculted field itself (`Change.numbers`).
+- answer: the effects that the verdict names as the cause of the gap.
+
+Effects are compared by their score: the gain, minus what their parameters and a search over many positions would gain
+from noise alone:
 
     score = gain - PENALTY parameters - cost of a random field - 2 ln trials       Eq. (1)
 
-- There is a gap if the patterns that any gap makes (`patterns`), the discs' means, all cells, the unocculted blocks or an
-  effect's gain have a p-value below ALARM, corrected for the number of tests.
-- An effect is tied with the best one if its score is within TIE, or within TIE_SHARE of the best gain (more if a place
-  was searched for), unless it predicts held-out images clearly worse.
-- An effect is enough if its residuals have a p-value of at least ENOUGH, with an error TEMPLATE_ERROR of its form
-  allowed; or if less than LEFT_SHARE of the gap remains and no rival comes near, because its form may be slightly wrong.
-- A second effect is named together with it if it gains more than a search and the error of form allow, and more than a
-  full refit of the first explains by itself, if one was made.
-- The linear model holds only for a small gap. If the best effect is not enough in it, the effect is added to the model
-  in a full refit, and the residuals of that refit are judged. Pairs are searched exhaustively if no single effect is
-  enough.
-- Closing much of a gap does not identify its cause, because a wrong effect does that too. The verdict is `unknown` if no
-  effect and no pair is enough, or if a probe (a pattern of unknown cause) does clearly better. It is `inconclusive` if a
-  probe does slightly better and explains more, or if the effect's own gain is not significant enough.
-- The verdict is repeated with half and twice the floor, where gap and effect may be LENIENT times more probable by
-  chance. If it changes, the answer holds both results, or the verdict is `inconclusive`. It is also `inconclusive` if
-  the answer predicts held-out images worse than no effect does.
-- An effect that explains in a full refit less than half of what it explains to first order is excluded, and the verdict
-  is made without it. If a pair fails so, the verdict is `inconclusive`.
-- An effect that was measured in the unocculted field fits that field whatever the cause. An effect of few parameters that
-  gains nearly as much takes precedence. If nothing else comes near, the measured effect is the answer, however much it
-  leaves in that field. A gap in the discs is then judged separately, with that effect in the model: one or two effects
-  are named with it. If none can be named and all occulters' places are reliable, the verdict is `inconclusive`.
-- Effects that could replace one member of a pair are named too. If many could, only the other member is named.
+The verdict follows these rules:
+
+- There is a gap if a p-value, corrected for the number of tests, is below ALARM. The tests are: the patterns that any gap
+  produces (`patterns`), the means of the discs, all cells, the unocculted blocks, and the gains of the effects.
+- An effect is tied with the best one if the two scores differ by less than TIE, or by less than TIE_SHARE of the best
+  gain. The limit is wider if the best effect searched for a position. An effect that predicts held-out images clearly
+  worse is not tied.
+- An effect is called enough (it explains the gap) in two cases. In the first case, the residuals after the effect have a
+  p-value of at least ENOUGH, where the template may have a relative error TEMPLATE_ERROR. In the second case, less than
+  LEFT_SHARE of the gap remains, and no rival has a score close to that of the effect. The second case allows for an
+  effect whose template is slightly wrong.
+- A second effect is named with the first one if its additional gain is large enough. It must exceed the gain that a
+  search in noise gives, and the gain that an error of the first template gives. The second effect gets no credit for what
+  a full refit of the first effect explains.
+- The linear model holds only for a small gap. If the best effect is not enough in the linear model, it is added to the
+  model in a full refit, and the residuals of that refit are judged. If no single effect is enough, all pairs are tried.
+- Closing much of a gap does not identify its cause, because a wrong effect can do that too. The verdict is `unknown` if
+  no effect and no pair is enough, or if a probe has a clearly higher score. It is `inconclusive` if a probe has a slightly
+  higher score and explains more, or if the gain of the effect is not significant enough.
+- The verdict is made again with half the floor and with twice the floor. These repetitions accept p-values that are larger
+  by the factor LENIENT. If they name other effects, the answer contains the effects of all three verdicts, or the verdict
+  is `inconclusive`. It is also `inconclusive` if the model with the answer predicts held-out images worse than the model
+  without any effect.
+- An effect is excluded if it explains in a full refit less than half of what it explains in the linear model. The verdict
+  is then made without this effect. If a pair fails this test, the verdict is `inconclusive`.
+- A measured effect fits the unocculted field whatever the cause. If an effect of few parameters gains nearly as much, it
+  is preferred. If the scores of all other effects, except measured ones, are below UNRIVALLED times the best score, the
+  measured effect is the answer, however much it leaves in the unocculted field. A gap in the discs is then judged
+  separately, with the measured effect in the model. One or two effects can be named with it. If none can be named, and
+  the positions of all occulters are reliable, the verdict is `inconclusive`.
+- Effects that could replace one member of a pair are named too. If there are many of them, only the other member is
+  named.
 """
 
 from __future__ import annotations
@@ -51,43 +68,45 @@ from psfcore.gap.verdict.closure import fall, hold_out, time_blocks
 Vector = NDArray[np.float64]
 Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 
-FLOORS = (0.5, 2.0)  # factors of the floor with which the verdict is repeated
-ALARM = 0.005
-CONFIDENT = 1e-3  # largest p-value of a named effect, corrected for the number of effects
-ENOUGH = 1e-3
-PENALTY = 2.0
-TIE = 9.0
-HELD_OUT_SIGMA = 1.0  # by so many standard errors an effect is clearly worse on held-out images
-TIE_SHARE = 0.03  # of the best gain: no effect's form is exact enough to separate two effects by less
-LEFT_SHARE = 0.15
-BEHIND = 0.85  # of the best score: the most that a rival may reach
-NEAR_BEHIND = 0.7  # the same for an effect whose place was searched for: it fits any gap to some degree
-UNRIVALLED = 0.1  # of the best score: the most of any other effect if the best is unrivalled
+FLOORS = (0.5, 2.0)  # factors by which the floor is multiplied to repeat the verdict
+ALARM = 0.005  # a gap is claimed below this p-value, corrected for the number of tests
+CONFIDENT = 1e-3  # largest p-value of an effect that the verdict names, corrected for the number of effects
+ENOUGH = 1e-3  # smallest p-value of the residuals after an effect that is enough
+PENALTY = 2.0  # cost of one parameter in the score
+TIE = 9.0  # effects whose scores differ by less are tied
+HELD_OUT_SIGMA = 1.0  # an effect is clearly worse on held-out images beyond this number of standard errors
+TIE_SHARE = 0.03  # effects are tied within this fraction of the best gain: no template is more exact
+LEFT_SHARE = 0.15  # an effect explains the gap if less than this fraction of the gap remains
+BEHIND = 0.85  # a rival is close if its score exceeds this fraction of the best score
+# If the best effect searched for its position, effects above this fraction of its score are tied with it: such an effect
+# fits any gap to some degree.
+NEAR_BEHIND = 0.7
+UNRIVALLED = 0.1  # a measured effect is unrivalled if effects that were not measured stay below this fraction of its score
+# An effect with at least this number of trials searched for its position in the whole field.
 MANY_PLACES = 100
-MOST_SECONDS = 2  # candidates for a second effect; if there are more, none is named
-CLEAR = 12.0  # a pair must beat a single insufficient effect by this score, and a probe must beat all effects by it
-TEMPLATE_ERROR = 0.05
-UNOCCULTED_WIDTH = 0.03  # tolerance of chi2 per degree of freedom of the unocculted field without a gap
-LENIENT = 5.0  # under the other floors, p-values of a gap and of its cause may be larger by this factor
-BY_CHANCE = (
-    0.01  # a probe explains more if noise gives its further parameters such a gain less often than this
-)
-MOST_AMISS = 2  # answers that may fail in a full refit before the search stops; also the tied effects that are refitted
-LEAST_IMAGES = (
-    6  # with fewer images none can be held out, and no visible gap does not mean that there is none
-)
+MOST_SECONDS = 2  # no second effect is named if more than this number of effects could be the second one
+CLEAR = 12.0  # difference of scores by which a pair is clearly better than one effect, or a probe than all effects
+TEMPLATE_ERROR = 0.05  # relative error of an effect's template
+# Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap.
+UNOCCULTED_WIDTH = 0.03
+# With the other two floors, the p-values of a gap and of its cause may be larger by this factor.
+LENIENT = 5.0
+BY_CHANCE = 0.01  # a probe explains more if noise gives its additional gain with a probability below this
+MOST_AMISS = 2  # most effects that failed refits may exclude; also the most tied effects that are refitted
+# With fewer images no image can be held out, and a gap may exist although the images do not show it.
+LEAST_IMAGES = 6
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """How much noise alone gains: the largest of `trials` chi2 variables with this mean and half variance."""
+    """The gain of an effect from noise alone: the largest of `trials` chi2 variables with this mean and half variance."""
 
     mean: float
     half_variance: float
     trials: float
 
     def beside(self, first: Freedom) -> Freedom:
-        """The additional freedom compared with a first that is contained in this one."""
+        """The distribution of the additional gain from noise, compared with the fit `first`, whose effects this fit contains."""
         return Freedom(
             max(self.mean - first.mean, 1.0),
             max(self.half_variance - first.half_variance, 1.0),
@@ -95,7 +114,7 @@ class Freedom:
         )
 
     def p_value(self, gain: float) -> float:
-        """The probability that noise gains as much, from a chi2 distribution with the same mean and variance."""
+        """The probability that noise alone gains at least `gain`; from a chi2 distribution with this mean and variance."""
         if self.half_variance <= 0:
             return 1.0
         share = self.mean / self.half_variance
@@ -104,13 +123,15 @@ class Freedom:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """One effect, or several together, fitted together with the PSF.
+    """The linear fit of one effect, or of several effects, together with the PSF.
 
-    values: value, error and unit by "parameter", or "effect.parameter" if there are several effects. gain: the decrease of
-    chi2. p_value: of the gain. left_p_value: p-value of the residuals in patterns, cells and unocculted blocks. left_share:
-    the largest fraction of the original excess that remains there; both are None if they were not needed. explains:
-    whether little remains of the strongest excess. left_for_real: `left_chi2` of a full refit; None if there was no refit,
-    or if it has other images.
+    named: whether a verdict may name all these effects; false for a probe. values: value, error and unit of each parameter;
+    the key is "parameter", or "effect.parameter" if there are several effects. gain: the decrease of chi2. score: Eq. (1).
+    p_value: of the gain. freedom: the gain from noise alone. step: the fit.
+    The others are set only where the residuals were judged. left_p_value: p-value of the residuals in patterns, means, cells
+    and unocculted blocks. left_share: excess of chi2 over its degrees of freedom that remains there, as a fraction of the
+    excess without the effect; the largest of the significant ones. explains: whether less than LEFT_SHARE remains of the
+    strongest excess. left_for_real: `left_chi2` of the full refit; None without a refit, or if its images differ.
     """
 
     names: tuple[str, ...]
@@ -128,24 +149,25 @@ class Tried:
 
     @property
     def label(self) -> str:
-        """The names as in a report."""
+        """The names of the effects, as the report writes them."""
         return label_of(self.names)
 
 
 def label_of(names: Sequence[str]) -> str:
-    """Names of effects as in a report."""
+    """Names of effects, as the report writes them."""
     return " + ".join(names)
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """A verdict under one floor.
+    """A verdict with one floor, or the final verdict.
 
-    tried: named effects, best first; the answer's pairs come before them, and those that failed in a full refit come last,
-    with their labels in amiss. probes: best first. answer: for `inconclusive`, the best fit that is not certain enough;
-    often empty. certain: for a tie, the effects that act together with any of the tied ones; empty if each tied effect acts
-    alone. discs_unexplained: for `inconclusive`, whether the reason is a gap in the discs that the best effect does not
-    explain.
+    answer: the effects that the verdict names; for `inconclusive`, the effects of the best fit, which are not certain enough,
+    or empty. tried: fits of all effects except probes, in this order: pairs of the answer, single effects with the best
+    first, fits that failed in a full refit. amiss: labels of the fits that failed in a full refit. probes: fits of the
+    probes, best first. best: the fit with the best effects. certain: for a tie, the effects that act together with any of
+    the tied effects; empty if each tied effect acts alone. discs_unexplained: for `inconclusive`, whether the reason is a
+    gap in the discs that the best effect does not explain.
     """
 
     verdict: Verdict
@@ -160,26 +182,27 @@ class Judgement:
 
     @property
     def tied(self) -> tuple[str, ...]:
-        """For a tie, the effects that cannot be told apart."""
+        """For a tie, the effects that these data cannot separate; empty for other verdicts."""
         return (
             tuple(name for name in self.answer if name not in self.certain) if self.verdict == "tie" else ()
         )
 
 
-# Returns the model of a full refit with an effect in it, whose columns follow those of the PSF; None if the fit failed.
+# A function that makes a full refit with the effects of a fit. It returns the linear model at the refit, in which the
+# columns of the effects follow the columns of the PSF; None if the refit failed.
 Refitter = Callable[[Tried], LinearModel | None]
 
 
 def no_refit(tried: Tried) -> LinearModel | None:
-    """Use this where no full refits are made."""
+    """A Refitter that makes no full refit and returns None."""
     return None
 
 
 def judge(model: LinearModel, refit: Refitter = no_refit, beyond: Refitter = no_refit) -> Judgement:
-    """The verdict under the model's floor, confirmed with two other floors.
+    """The final verdict: made with the floor of the model, and confirmed with two other floors.
 
-    refit: returns the model of a full refit with one or several effects. beyond: returns the same model with these effects
-    always fitted and the rest of the library added. Each is called at most once for the same effects.
+    refit: returns the linear model at a full refit with these effects. beyond: returns the same model with the rest of the
+    library added, in which the effects of the refit are always fitted. Each is called at most once for the same effects.
     """
     once, further = _once(refit), _once(beyond)
     found = first = _judge(model, once, further)
@@ -190,7 +213,7 @@ def judge(model: LinearModel, refit: Refitter = no_refit, beyond: Refitter = no_
         if len(amiss) == MOST_AMISS or len(best.names) > 1:
             found = replace(found, verdict="inconclusive", answer=(), certain=())
             return replace(found, amiss=(*_labels(amiss), best.label), tried=(*found.tried, *amiss))
-        # The full refit does not confirm the linear fit: judge the other effects.
+        # The full refit does not confirm the linear fit of this effect: judge the other effects.
         amiss.append(best)
         gone = {name for tried in amiss for name in tried.names}
         others = tuple(effect for effect in model.evidence.effects if effect.name not in gone)
@@ -213,7 +236,10 @@ def _labels(tried: Sequence[Tried]) -> tuple[str, ...]:
 def _without_those_that_fail(
     model: LinearModel, found: Judgement, refit: Refitter
 ) -> tuple[Judgement, list[Tried]]:
-    """A tie without the single effects that fail in a full refit, and these effects; at most MOST_AMISS are refitted."""
+    """Two results: the tie without the single effects that fail in a full refit, and the fits of these effects.
+
+    At most MOST_AMISS of the tied effects are refitted, in addition to the best one.
+    """
     alone = [t for t in found.tried if t is not found.best and len(t.names) == 1 and t.label in found.answer]
     fallen = [tried for tried in alone[:MOST_AMISS] if _fails_for_real(model, tried, refit)]
     answer = tuple(name for name in found.answer if name not in _labels(fallen))
@@ -221,7 +247,7 @@ def _without_those_that_fail(
 
 
 def _confirmed(model: LinearModel, found: Judgement, once: Refitter, further: Refitter) -> Judgement:
-    """The verdict under the model's floor after the tests on held-out images and under other floors."""
+    """The verdict `found` after the test on held-out images and the repetition with the other floors."""
     if found.answer and _worse_held_out(model, found, once):
         return replace(found, verdict="inconclusive")
     if found.verdict == "none" and len(model.evidence.discs) < LEAST_IMAGES:
@@ -243,14 +269,15 @@ def _confirmed(model: LinearModel, found: Judgement, once: Refitter, further: Re
 
 
 def _fails_for_real(model: LinearModel, tried: Tried, refit: Refitter) -> bool:
-    """Whether a full refit explains less than half of what an effect explains in the linear model, or cannot be made.
+    """Whether the full refit with an effect fails, or explains less than half of what the linear model explains.
 
-    The comparison uses the discs or the unocculted field, whichever the effect explains more of.
+    "Explains" means the decrease of chi2, either in the discs or in the unocculted field: where the linear model explains
+    more.
     """
     real = refit(tried)
     if real is None:
         return True
-    # A refit locates the discs again and may lose one.
+    # A refit locates the discs again and may drop an image.
     both = set(model.evidence.images) & set(real.evidence.images)
     real = replace(real, floor=model.floor)
     nothing, linear = (left_chi2(model, step, both) for step in (model.base, tried.step))
@@ -266,13 +293,16 @@ def _acting(found: Judgement) -> int:
 
 
 def _worse_held_out(model: LinearModel, found: Judgement, refit: Refitter) -> bool:
-    """Whether the answer predicts held-out images worse than no effect does, so that it fits only by its freedom."""
+    """Whether the model with the best effects predicts held-out images worse than the model without any effect.
+
+    If so, the effects fit well only because of their free parameters.
+    """
     scheme = time_blocks(model)
     before = hold_out(model, (), scheme)
     if found.best is None or before is None:
         return False
     if model.evidence.all_unocculted.freedom and not before.unocculted_expected.any():
-        return False  # few images: no fold has two neighbours, so the unocculted blocks are not tested
+        return False  # no fold leaves two fitted images of a pointing: the unocculted blocks are not tested
     linear = hold_out(model, found.best.step.columns[len(model.evidence.base) :], scheme)
     if linear is not None and fall(before, linear) > 0:
         return False
@@ -294,7 +324,10 @@ def _once(ask: Refitter) -> Refitter:
 
 
 def _judge(model: LinearModel, refit: Refitter, beyond: Refitter, lenient: float = 1.0) -> Judgement:
-    """The verdict under one floor. lenient: factor on the p-values below which a gap and an effect count as significant."""
+    """The verdict with the floor of the model.
+
+    lenient: factor on the p-values below which a gap and an effect count as significant.
+    """
     evidence = model.evidence
     every = [fitted(model, (effect,)) for effect in evidence.effects]
     named = sorted((t for t in every if t.named), key=lambda t: -t.score)
@@ -303,14 +336,14 @@ def _judge(model: LinearModel, refit: Refitter, beyond: Refitter, lenient: float
     p_gap = _p_of_gap(before, named)
     if p_gap > lenient * ALARM or not named:
         return Judgement("none", (), p_gap, tuple(named), probes, named[0] if named else None)
-    # An effect that was measured in the unocculted field fits it whatever the cause: its score does not count as a rival.
+    # A measured effect fits the unocculted field whatever the cause, so it does not count as a rival.
     measured = {t.label for t in named if evidence.numbers_of(_own(model, t))}
     outdone = measured if _few_numbers_do(named, measured) else set()
     others, failed = _held_out_first(model, [t for t in named if t.label not in outdone])
     named = [*others, *(t for t in named if t.label in outdone)]
     failed |= outdone
     best = named[0] = _with_left(model, named[0], before, refit)
-    # So does a probe that was measured there: it counts only against another such effect, or if it explains clearly more.
+    # A measured probe also fits it: the probe counts only against a measured effect, or if it explains clearly more.
     fits_all = {t.label for t in probes if evidence.numbers_of(_own(model, t))}
     probes = tuple(
         t
@@ -327,8 +360,8 @@ def _judge(model: LinearModel, refit: Refitter, beyond: Refitter, lenient: float
             return replace(second, p_value=p_gap, tried=(*second.tried, *named), probes=probes)
         of_few = max((t.score for t in others_near if t.label not in fits_all), default=0.0)
         if best.label in measured and of_few < UNRIVALLED * best.score:
-            # The Sun changes faster than the images follow: much remains in the unocculted field, and the discs' places,
-            # found by comparison with neighbouring images, are wrong.
+            # The Sun changes faster than the cadence of the images. Much of the gap then remains in the unocculted field,
+            # and the fitted positions of the discs are wrong, because they depend on neighbouring images.
             return Judgement("attributed", best.names, p_gap, tuple(named), probes, best)
     pair = _best_pair(model, best, before, refit, enough=enough)
     winner = pair or best
@@ -367,9 +400,9 @@ def _judge(model: LinearModel, refit: Refitter, beyond: Refitter, lenient: float
 
 
 def _few_numbers_do(named: Sequence[Tried], measured: set[str]) -> bool:
-    """Whether the best effect was measured in the unocculted field, and an effect of few parameters gains nearly as much.
+    """Whether the best effect is a measured effect, and an effect that was not measured gains nearly as much.
 
-    Such an effect would not gain so much if it were not the cause.
+    The second effect has few parameters. It could not gain nearly as much if it were not the cause.
     """
     best = named[0]
     rivals = (t.gain for t in named if t.label not in measured)
@@ -377,10 +410,10 @@ def _few_numbers_do(named: Sequence[Tried], measured: set[str]) -> bool:
 
 
 def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tried], set[str]]:
-    """Sort the effects, and return the labels of those that are clearly worse on held-out images.
+    """Two results: the effects sorted again, and the labels of the effects that are clearly worse on held-out images.
 
-    Of the effects with about the best score, those come first that predict held-out images as well as the best; those that
-    are clearly worse fit only by their freedom.
+    Several effects may have about the best score. Among them, those come first that predict held-out images about as well
+    as the best one does. Those that predict these images clearly worse fit well only because of their free parameters.
     """
     best = named[0]
     alike = [t for t in named if best.score - t.score < max(TIE, TIE_SHARE * best.gain)]
@@ -395,8 +428,9 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
         falls[tried.label] = 0.0 if after is None else fall(before, after)
     most = max(falls.values())
     nearly = max(TIE, TIE_SHARE * most)
-    # A difference of deviance between two models has a standard error of about twice its root, at most that of the
-    # difference between the best model and none. Within this error an effect only comes later; beyond it, it fails.
+    # The standard error of a difference of deviance D between two models is about 2 sqrt(D). Its largest value is that for
+    # the best effect compared with no effect. Within this error an effect comes later in the order; beyond it, the effect
+    # fails.
     by_chance = HELD_OUT_SIGMA * 2 * math.sqrt(max(most, 0.0))
     failed = {label for label, down in falls.items() if down < most - max(nearly, by_chance)}
 
@@ -408,12 +442,14 @@ def _held_out_first(model: LinearModel, named: Sequence[Tried]) -> tuple[list[Tr
 
 
 def _beside(model: LinearModel, best: Tried, beyond: Refitter) -> Judgement | None:
-    """The verdict when one effect explains most of a gap but not all: does a second effect act? None if this cannot be decided.
+    """The verdict if the best effect explains most of the gap, but not all of it: does a second effect act?
 
-    It returns the first effect alone if more than MOST_SECONDS could be the second. `tried` holds only the answer's fits.
-    The same applies if the best effect was measured in the unocculted field and leaves much there, as a Sun that flickers
-    faster than the images follow. The discs do not show that effect, so their residuals are judged separately: two effects
-    may act in them, and if they cannot be identified, the verdict is `inconclusive`.
+    None if this cannot be decided. The verdict names the best effect alone if more than MOST_SECONDS effects could be the
+    second. `tried` contains only the fits of the answer.
+    This function also serves if the best effect is a measured effect that leaves much in the unocculted field. An example is
+    a Sun that flickers faster than the cadence of the images. The discs do not show such an effect, so their residuals are
+    judged separately: two further effects may act in the discs. If these cannot be identified, the verdict is
+    `inconclusive`.
     """
     rest = beyond(best)
     if rest is None:
@@ -423,8 +459,8 @@ def _beside(model: LinearModel, best: Tried, beyond: Refitter) -> Judgement | No
     rest = replace(rest, evidence=replace(rest.evidence, effects=still))
     unocculted = rest.evidence.steady_unocculted
     rest = replace(rest, floor=model.floor)
-    # The form of the first effect is not exact, so a little of what it explained remains in the unocculted field. This
-    # scale prevents another form from fitting that remainder by chance.
+    # The template of the first effect is not exact, so a small part of its change remains in the unocculted field. This
+    # scale prevents that another template fits this remainder by chance.
     excess = rest.left_unocculted(rest.base) - (
         unocculted.freedom - rest.evidence.numbers_of(rest.base.columns)
     )
@@ -434,7 +470,7 @@ def _beside(model: LinearModel, best: Tried, beyond: Refitter) -> Judgement | No
         return Judgement("attributed", best.names, second.p_value, (), (), best) if best.explains else None
     unocculted_alone = _unocculted_alone(model, best)
     if second.best is None or second.verdict not in ("attributed", "tie"):
-        # If the occulters' places are reliable, changes in the unocculted field do not cause the gap in the discs.
+        # If the positions of the occulters are reliable, changes in the unocculted field do not cause the gap in the discs.
         found_well = all(model.evidence.image_info[n].described for n in model.evidence.images)
         if not (unocculted_alone and found_well):
             return None
@@ -458,22 +494,22 @@ def _beside(model: LinearModel, best: Tried, beyond: Refitter) -> Judgement | No
 
 
 def _own(model: LinearModel, tried: Tried) -> list[int]:
-    """The columns of a fit that belong to its own effects, without those that are always fitted."""
+    """The columns of the effects of a fit, without the columns that every fit contains."""
     return [column for column in tried.step.columns if column not in model.evidence.base]
 
 
 def _unocculted_alone(model: LinearModel, tried: Tried) -> bool:
-    """Whether an effect was measured in the unocculted field and changes no disc."""
+    """Whether the fit is that of a measured effect, and this effect changes no disc."""
     own = _own(model, tried)
     silent = all(not disc.jacobian[own].any() for disc in model.evidence.discs)
     return silent and model.evidence.numbers_of(own) > 0
 
 
 def _explains_more(probe: Tried, best: Tried) -> bool:
-    """Whether a probe with a higher score explains more than the best effect.
+    """Whether a probe has a higher score than the best effect and also explains more.
 
-    It does not if it leads only by having fewer parameters (a simpler form of the effect), or if noise could give its
-    additional parameters the same gain.
+    A probe may have a higher score only because it has fewer parameters, as a simpler template of the same effect. It then
+    does not explain more. The same holds if noise could give its additional parameters the additional gain.
     """
     more = probe.gain - best.gain
     numbers = max(len(probe.values) - len(best.values), 1)
@@ -481,12 +517,15 @@ def _explains_more(probe: Tried, best: Tried) -> bool:
 
 
 def _freer(tried: Tried, best: Tried, measured: set[str]) -> bool:
-    """Whether an effect has more freedom than the best: if it still does worse, an inexact form is not the reason."""
+    """Whether an effect is measured, or has more parameters than the best effect.
+
+    If such an effect has a lower score, the reason is not that its template is inexact.
+    """
     return tried.label in measured or len(tried.values) > len(best.values)
 
 
 def _searched(tried: Tried, evidence: Evidence) -> bool:
-    """Whether an effect's place was searched for over the whole field."""
+    """Whether an effect of this fit searched for its position in the whole field."""
     return any(effect.trials >= MANY_PLACES for effect in evidence.effects if effect.name in tried.names)
 
 
@@ -499,7 +538,11 @@ def _is_enough(tried: Tried, rival_score: float) -> bool:
 def _best_pair(
     model: LinearModel, best: Tried, before: _Left, refit: Refitter, *, enough: bool
 ) -> Tried | None:
-    """The pair of effects that explains most, if it is clearly better than a single effect and leaves no significant residuals."""
+    """The pair of effects that explains most of the gap.
+
+    None if no pair is clearly better than the best single effect, or if significant residuals remain after the best pair.
+    enough: whether the best single effect is enough; then only pairs with this effect are tried.
+    """
     couples = itertools.combinations((effect for effect in model.evidence.effects if effect.named), 2)
     if enough:
         with_best = (two for two in couples if best.names[0] in (two[0].name, two[1].name))
@@ -511,14 +554,16 @@ def _best_pair(
     if pair is None:
         return None
     pair = _with_left(model, pair, before, refit)
-    # Two inexact forms can fit almost anything, so a pair may leave no significant residuals.
+    # Two inexact templates can fit almost anything. A pair is therefore accepted only if its residuals are not significant.
     return pair if (pair.left_p_value or 0.0) >= ENOUGH else None
 
 
 def _second(model: LinearModel, best: Tried, pairs: Sequence[Tried]) -> Tried | None:
-    """Of the pairs that contain an effect that is enough alone, the one that explains most beyond it; None if that could be
-    noise found by a search, or an error of the first effect's form (a fraction of what it explains in the discs, and of what
-    it explains in the unocculted field). What a full refit of the first effect explains is not credited to a second.
+    """The pair that explains most in addition to an effect that is enough alone (`best`); all `pairs` contain this effect.
+
+    None if noise, found by the search over the pairs, can give the additional gain, or if an error of the first template
+    can: a fraction of what the first effect explains, computed for the discs and for the unocculted field. The second effect
+    gets no credit for what a full refit of the first effect explains.
     """
     alone, nothing = left_chi2(model, best.step), left_chi2(model, model.base)
     if best.left_for_real is not None:
@@ -538,14 +583,17 @@ def _second(model: LinearModel, best: Tried, pairs: Sequence[Tried]) -> Tried | 
 
 
 def left_chi2(model: LinearModel, step: Step, images: Collection[int] | None = None) -> Vector:
-    """chi2 after a step: of the discs, for some images (None: all), and of the unocculted field."""
+    """chi2 after a fit: two values, for the discs of some images (None: all images) and for the unocculted field."""
     discs = zip(model.evidence.images, model.left(step), strict=True)
     left = sum(float(one @ one) for n, one in discs if images is None or n in images)
     return np.array([left, model.left_unocculted(step)])
 
 
 def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tried]]:
-    """For each effect of a pair, the other effects that explain about as much together with its partner: pairs by name."""
+    """The other effects that could replace one effect of a pair, because the new pair explains about as much.
+
+    The result has, for each effect of the pair, the fits of the new pairs by the name of the replacement.
+    """
     effects = {effect.name: effect for effect in model.evidence.effects if effect.named}
     found: dict[str, dict[str, Tried]] = {name: {} for name in pair.names}
     for stays, goes in (pair.names, pair.names[::-1]):
@@ -562,20 +610,21 @@ def _in_place_of_one(model: LinearModel, pair: Tried) -> dict[str, dict[str, Tri
 
 
 def _takes_part(name: str, pair: Tried) -> bool:
-    """Whether the fit of a pair keeps any parameter of an effect."""
+    """Whether the fit of a pair still contains a parameter of the effect `name`."""
     return any(key.startswith(f"{name}.") for key in pair.values)
 
 
 def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> Tried:
-    """Fit the PSF's parameters together with these effects.
+    """Fit the coordinates of the PSF together with these effects.
 
-    A parameter that must be positive but would not be is left out, unless any_sign (a step may have either sign). A
-    parameter whose change was measured in the unocculted field is left out if it gains less than that costs.
+    A parameter that must be positive is left out if its fitted value is not positive. A parameter whose change was measured
+    in the unocculted field is left out if its gain is smaller than the cost of the measured numbers. any_sign: keep all
+    parameters, whatever their sign and gain.
     """
     columns = {
         column: (effect, parameter)
         for effect in effects
-        # An effect that is fitted per pointing has one change for each: fewer or more than its parameters.
+        # An effect that is fitted for each pointing may have fewer or more changes than parameters.
         for column, parameter in zip(model.evidence.columns[effect.name], effect.parameters, strict=False)
     }
     step = model.fit(tuple(columns))
@@ -619,7 +668,10 @@ def fitted(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = Fa
 
 
 def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
-    """Of the columns of a step that gain less than their measured numbers cost, the one that gains least; None if there is none."""
+    """The column of a fit that gains least, among the columns that gain less than their measured numbers cost.
+
+    None if every column gains at least as much as its measured numbers cost.
+    """
     columns = step.columns[len(model.evidence.base) :]
     idle = {}
     for column in columns:
@@ -631,7 +683,10 @@ def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
 
 
 def _p_of_gap(left: _Left, named: Sequence[Tried]) -> float:
-    """The smallest of the p-values of patterns, means, cells, unocculted blocks and single effects, times their number."""
+    """The p-value of a gap: the smallest p-value of all tests, times the number of tests.
+
+    The tests are the patterns, means, cells and unocculted blocks, and the gains of single effects.
+    """
     effects = min((t.p_value for t in named), default=1.0) * max(len(named), 1)
     tests = (*left.p_values, effects)
     return float(min(1.0, len(tests) * min(tests)))
@@ -639,23 +694,26 @@ def _p_of_gap(left: _Left, named: Sequence[Tried]) -> float:
 
 @dataclass(frozen=True)
 class _Left:
-    """The chi2 that a step leaves, and its degrees of freedom: along patterns, in the discs' means, in all cells, in the blocks."""
+    """What remains after a fit: chi2 (`gains`) and its degrees of freedom, for each of four tests.
+
+    The tests are: the patterns, the means of the discs, all cells, and the blocks of the unocculted field.
+    """
 
     gains: tuple[float, ...]
     freedom: tuple[int, ...]
 
     @property
     def p_values(self) -> tuple[float, ...]:
-        """The p-value of each."""
+        """The p-value of each test."""
         return tuple(float(chdtrc(k, gain)) for gain, k in zip(self.gains, self.freedom, strict=True))
 
     @property
     def p_value(self) -> float:
-        """The smallest p-value, times their number."""
+        """The smallest p-value, times the number of tests."""
         return min(1.0, len(self.gains) * min(self.p_values))
 
     def share_of(self, before: _Left) -> float:
-        """The largest remaining fraction of the excess, among those that are still significant."""
+        """The largest fraction of the excess that remains, among the tests that are still significant. before: without effect."""
         shares = [
             max(gain - k, 0.0) / max(gain_before - k_before, 1e-9)
             for gain, k, p, gain_before, k_before in zip(
@@ -666,14 +724,14 @@ class _Left:
         return max(shares, default=0.0)
 
     def of_most(self, before: _Left) -> float:
-        """The remaining fraction of what had the largest excess before."""
+        """The fraction of the excess that remains in the test that had the largest excess without the effect."""
         excess = [gain - k for gain, k in zip(before.gains, before.freedom, strict=True)]
         most = int(np.argmax(excess))
         return max(self.gains[most] - self.freedom[most], 0.0) / max(excess[most], 1e-9)
 
 
 def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refitter) -> Tried:
-    """The fit with its residuals judged: in the linear model and, if they are significant, after a full refit."""
+    """The same fit, with its residuals judged: in the linear model and, if they are significant there, also after a full refit."""
     unsure = np.array(tried.step.values) * TEMPLATE_ERROR
     unsure[: len(model.base.columns)] = 0.0
     left = _left(model, tried.step, unsure)
@@ -695,9 +753,10 @@ def _with_left(model: LinearModel, tried: Tried, before: _Left, refit: Refitter)
 
 
 def _left(model: LinearModel, step: Step, unsure: Vector) -> _Left:
-    """The residuals of a step, if the Jacobian of its columns times `unsure` is the error of the effects' forms."""
+    """What remains after a fit. unsure: errors of its parameters that change the cells as much as errors of the templates do."""
     here = list(step.columns)
-    # An inexact template adds a covariance along its own change of the cells: reduce that direction, disc by disc.
+    # An inexact template adds a covariance in the direction of its change of the cells. Reduce the residuals of each disc
+    # in this direction.
     shrink = []
     for disc, left in zip(model.discs, model.left(step), strict=True):
         answer = disc.jacobian[here].T @ unsure

@@ -1,9 +1,13 @@
-"""Where the gap lies: which share of it varies with each axis.
+"""Where the gap lies: the share of the gap that varies along each axis.
 
-The axes are confounded: a transit has three pointings and one track, so place, time and brightness vary together. The
-share of an axis is its contribution to what all axes explain together, averaged over all orders in which the axes can
-be added (Shapley value). Its p-value is the fraction of random sign flips of the images' residuals for which chi2
-decreases at least as much by this axis alone, times the number of axes.
+An axis is a property of an image (for example its time) or of a cell in the disc (for example its radius). The axes are
+confounded: a transit has few pointings and one track, so position, time and brightness vary together. All axes together
+explain a decrease of chi2. The share of an axis is its contribution to this decrease, averaged over all orders in which
+the axes can be added (Shapley value).
+
+The p-value of an axis comes from random sign flips: each flip reverses the sign of the residuals of random images. A flip counts
+if this axis alone then decreases chi2 at least as much as for the true residuals. The p-value is the fraction of flips that
+count, times the number of axes. If the brightness of the unocculted field gives a smaller p-value, this one is used.
 """
 
 from __future__ import annotations
@@ -27,14 +31,18 @@ Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 SIGN_FLIPS = 999
-AS_GOOD = 0.3  # an axis of the best effect comes first if it alone explains this fraction of what the best axis explains
-SIGNIFICANT = 0.05  # axes below this p-value come before the others
-SUSPECT = 2  # number of pointings that are named
+AS_GOOD = 0.3  # an axis of the best effect comes first if it explains at least this fraction of what the best axis explains
+SIGNIFICANT = 0.05  # axes with a p-value below this level come before the others
+SUSPECT = 2  # number of pointings that the report names
 
 
 @dataclass(frozen=True)
 class Axis:
-    """How much of a gap varies with one axis, and where along it."""
+    """How much of the gap varies along one axis, and where the gap is largest.
+
+    share: fraction, 0 to 1. alone: the decrease of chi2 by this axis alone. at: the pointings with the largest residuals, and
+    the range of the axis in them.
+    """
 
     name: str
     share: float
@@ -43,18 +51,18 @@ class Axis:
     at: dict[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """The axis in the form of the gap report."""
+        """The axis as JSON, for the gap report."""
         return {"axis": self.name, "share": self.share, "p_value": self.p_value, "at": self.at}
 
 
 def where(
     model: LinearModel, rng: np.random.Generator, favoured: Sequence[str] = (), explained: Step | None = None
 ) -> tuple[Axis, ...]:
-    """All axes, the strongest first: of those that are significant, the one with the largest share.
+    """All axes, the strongest first. Significant axes come before the others; then the share decides.
 
-    favoured: the axes of the best effect. If they explain about as much as others they come first, because the effect was
-    identified by more than its place on the track. explained: the fit of an effect that explains the gap; the shares then
-    refer to what it explains, which has no noise.
+    favoured: the axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the best axis
+    explains, because more data than the position on the track identified this effect. explained: the fit of an effect that explains the gap.
+    If given, the shares are computed from the part of the residuals that this effect explains, which contains no noise.
     """
     designs = _designs(model.evidence)
     cells, unocculted = _of_cells(model, designs), _of_unocculted(model, designs)
@@ -92,7 +100,7 @@ def where(
 
 
 def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
-    """For each axis along which these images vary: a pattern (columns, cells) in DN/s for each disc."""
+    """The patterns of each axis along which these images vary: for each disc an array (patterns, cells), DN/s."""
     taken = [evidence.image_info[disc.index] for disc in evidence.discs]
     level = [np.full(disc.expected.size, disc.mean_expected) for disc in evidence.discs]
     out: dict[str, list[Matrix]] = {}
@@ -107,7 +115,7 @@ def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
 
 
 def _along(discs: Sequence[DiscCells], taken: Sequence[ImageInfo]) -> dict[str, Vector]:
-    """Each image's value on each axis."""
+    """The value of each image on each axis: (images,)."""
     return {
         "detector_x": np.array([t.x_px for t in taken]),
         "detector_y": np.array([t.y_px for t in taken]),
@@ -121,7 +129,10 @@ def _along(discs: Sequence[DiscCells], taken: Sequence[ImageInfo]) -> dict[str, 
 
 
 def _curve(values: Vector) -> Matrix | None:
-    """A slope and a curvature along an axis, (2 or 1, images); None if all images have the same value."""
+    """Functions of the values of an axis (functions, images): a slope, and a curvature if at least three values differ.
+
+    None if all images have the same value.
+    """
     spread = float(values.std())
     if spread <= 1e-9 * max(1.0, float(np.abs(values).max())):
         return None
@@ -133,7 +144,7 @@ def _curve(values: Vector) -> Matrix | None:
 
 
 def _kinds(values: Vector) -> Matrix | None:
-    """Indicators of the kind of an image, minus their mean: (kinds - 1, images)."""
+    """Indicators of each kind of image but the first, minus their mean: (kinds - 1, images). None if there is only one kind."""
     kinds = np.unique(values)
     if kinds.size < 2:
         return None
@@ -156,18 +167,22 @@ class _Normal:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """All discs' cells, whitened: the axes' columns without the component that the PSF absorbs, and a basis of that component."""
+    """The whitened cells of all discs.
+
+    design: the patterns of the axes (patterns, cells), without the component that a change of the PSF can absorb. absorbed: an
+    orthonormal basis of that component (cells, coordinates).
+    """
 
     design: Matrix
     absorbed: Matrix
 
     def left(self, of_discs: Sequence[Vector]) -> Vector:
-        """The residuals of all discs in one vector, without the component that the PSF's coordinates absorb."""
+        """The residuals of all discs in one vector, without the component that a change of the PSF can absorb."""
         residual = np.concatenate(of_discs)
         return np.asarray(residual - self.absorbed @ (self.absorbed.T @ residual))
 
     def equations(self, of_discs: Sequence[Vector]) -> _Normal:
-        """Normal equations of the axes' columns for these residuals."""
+        """The normal equations of the patterns of all axes, for the residuals of each disc."""
         return _Normal(self.design @ self.design.T, self.design @ self.left(of_discs))
 
 
@@ -183,14 +198,17 @@ def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Cells:
 
 
 def _explained(model: LinearModel, step: Step) -> list[Vector]:
-    """What a fit's effects explain in each disc's cells."""
+    """The part of the cells of each disc that the effects of a fit explain."""
     base = len(model.evidence.base)
     here, values = list(step.columns[base:]), step.values[base:]
     return [disc.jacobian[here].T @ values for disc in model.discs]
 
 
 def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal:
-    """Normal equations of the axes' columns for the brightness of the images relative to their pointing, over its usual width."""
+    """The normal equations of the patterns of all axes, for the brightness of the unocculted field.
+
+    The brightness of an image is relative to the mean of its pointing, and divided by its usual spread (`gain_width`).
+    """
     unocculted = model.evidence.unocculted
     gains = model.evidence.all_unocculted.gains[list(model.evidence.images)] / unocculted.gain_width
     columns = np.vstack(
@@ -202,7 +220,7 @@ def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Nor
         ]
     )
     pointing = unocculted.pointing[list(model.evidence.images)]
-    for one in np.unique(pointing):  # brightness is known only relative to the same pointing
+    for one in np.unique(pointing):  # only brightness relative to the same pointing is known
         here = pointing == one
         columns[:, here] -= columns[:, here].mean(axis=1, keepdims=True)
         gains = np.where(here, gains - gains[here].mean(), gains)
@@ -218,7 +236,10 @@ def _fall_of(of: _Normal, columns: list[int]) -> float:
 
 
 def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
-    """The decrease of chi2 by these columns minus their number, for every row of scores (flips, columns)."""
+    """The decrease of chi2 by these columns, minus their number, at least 0.
+
+    scores: right-hand sides of the normal equations (flips, columns); the result has one value for each row.
+    """
     if not columns:
         return np.zeros(scores.shape[0])
     normal, scores = normal[np.ix_(columns, columns)], scores[:, columns]
@@ -233,7 +254,7 @@ def _p_of_unocculted(unocculted: _Normal, columns: list[int], axes: int) -> floa
 
 
 def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
-    """The contribution of each name, averaged over all orders."""
+    """The Shapley value of each name. worth: the decrease of chi2 by each subset of the names."""
     count = len(names)
     out = dict.fromkeys(names, 0.0)
     for chosen, value in worth.items():
@@ -247,7 +268,7 @@ def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str,
 
 
 def _sign_flipped_scores(model: LinearModel, cells: _Cells, rng: np.random.Generator) -> Matrix:
-    """Scores of all columns with the residuals of random images sign-flipped: (SIGN_FLIPS, columns)."""
+    """Right-hand sides of the normal equations after each sign flip: (SIGN_FLIPS, columns)."""
     residual = cells.left([disc.residual for disc in model.discs])
     which = np.repeat(np.arange(len(model.discs)), [d.residual.size for d in model.discs])
     signs = np.array([rng.choice((-1.0, 1.0), len(model.discs)) for _ in range(SIGN_FLIPS)])
@@ -255,7 +276,7 @@ def _sign_flipped_scores(model: LinearModel, cells: _Cells, rng: np.random.Gener
 
 
 def _at(model: LinearModel, name: str) -> dict[str, Any]:
-    """The pointings with the largest residuals, and the range of the axis in them."""
+    """The pointings with the largest residuals, and the range of the axis in these pointings."""
     evidence = model.evidence
     left = model.left(model.base)
     excess = np.array([float(r @ r) - r.size for r in left])

@@ -97,11 +97,11 @@ EXPECTED = {
     "the same, >= 1 % left, inconclusive = 1/2": (5, 3.5 / 5, False),
     # Two means of chi2 3^2 + 3^2 = 18 are below 30: none of these cases counts.
     "the same, >= 2 % left, shown by the discs": (0, None, None),
-    "first place is the truth": (3, 2 / 3, False),
+    "first effect is the true one": (3, 2 / 3, False),
     "one wrong effect named with confidence": (13, 3 / 13, False),
-    "mean size of the answer": (4, (1 + 1 + 2 + 2) / 4, True),
+    "mean number of named effects": (4, (1 + 1 + 2 + 2) / 4, True),
     "unknown effects called unknown or inconclusive": (2, 1 / 2, False),
-    "closure over that of the true effect": (3, 1.0, True),  # of 1, 0.6 / 0.8, 1
+    "closure by the first effect / by the true effect": (3, 1.0, True),  # of 1, 0.6 / 0.8, 1
     "90 % interval contains the true closure": (3, 2 / 3, False),
     "strongest axis is right": (3, 2 / 3, False),
     "time of the slowest case, s": (13, 22.0, True),

@@ -21,7 +21,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.contract.identities import instrument_text
 from workers.lineage import Ancestor, made_by
-from workers.tasks import product as product_task
+from workers.tasks.data import product as product_task
 
 ON_TRANSIT = {"transit_id": "1" * 64, "seed": 5}
 LIMITS = FitsLimits(max_pixels=2**24)

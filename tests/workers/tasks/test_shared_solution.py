@@ -16,7 +16,7 @@ from service.local import LocalService
 from tests.gap_files import quick_diagnosis
 from tests.transit_files import write_simulated
 from workers.settings import Settings
-from workers.tasks import solutions
+from workers.tasks.data import solutions
 
 Results = dict[str, Any]
 pytestmark = pytest.mark.slow

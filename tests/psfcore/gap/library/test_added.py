@@ -88,8 +88,8 @@ def test_the_examples_of_the_documentation_work(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "expected EFFECTS to be a tuple of Effect; got no such name"),
-        ("EFFECTS = ()", "got an empty one"),
+        ("", "expected EFFECTS to be a tuple of Effect; got no variable of this name"),
+        ("EFFECTS = ()", "got an empty tuple or list"),
         ("EFFECTS = (1, 'a')", "got a tuple or list of int, str"),
         ("EFFECTS = 3", "got int"),
         ("EFFECTS = (", "SyntaxError"),
@@ -136,9 +136,9 @@ def test_a_missing_source_is_reported(source: str) -> None:
     [
         (
             "lambda n, images: plane[1:]",
-            "edge_glow: expected an image of shape (96, 96) [y, x]; got one of shape (95, 96)",
+            "edge_glow: expected an image of shape (96, 96) [y, x]; got an array of shape (95, 96)",
         ),
-        ("lambda n, images: plane * np.nan", "got one with NaN or infinite values"),
+        ("lambda n, images: plane * np.nan", "got an image with NaN or infinite values"),
         ("lambda n, images: plane / nothing", "NameError: name 'nothing' is not defined (line 8)"),
     ],
 )

@@ -77,12 +77,12 @@ def test_the_page_needs_no_other_file_and_begins_with_the_summary() -> None:
 
 def test_verdict_gap_and_noise_are_at_the_top() -> None:
     gap, said = report_of(found())["gap"], values(read_page(html()))
-    assert said["verdict"] == "attributed" and said["answer"] == "dark offset"
+    assert said["verdict"] == "attributed" and said["named effects"] == "dark offset"
     assert said["gap before the refit"] == f"{interval_words(gap['before_refit_pct'])} %"
     assert said["gap, PSF refitted"] == f"{interval_words(gap['rms_pct'])} %"
-    assert said["gap with the answer in the model"] == f"{interval_words(gap['after_pct'])} %"
+    assert said["gap with the named effects in the model"] == f"{interval_words(gap['after_pct'])} %"
     assert float(said["noise"].split()[0]) == pytest.approx(gap["noise_pct"], rel=0.05)
-    assert "To confirm the answer, take a dark exposure" in text_of(html())
+    assert "To confirm the named effects, take a dark exposure" in text_of(html())
 
 
 def test_the_page_has_all_figures_and_one_picture_combines_them() -> None:
@@ -128,7 +128,7 @@ def test_images_inputs_and_provenance_are_listed() -> None:
     ("verdict", "answer", "told"),
     [
         ("none", (), "There is no gap, so no effect is needed"),
-        ("unknown", (), "No effect is the answer, and no pair of effects is"),
+        ("unknown", (), "No effect and no pair of effects explains the gap"),
         ("inconclusive", (), "changes with the assumed floor"),
         ("tie", ("dark_offset", "gain_mismatch"), "Tied: dark offset or gain mismatch."),
     ],
@@ -146,8 +146,8 @@ def test_every_verdict_is_explained_on_its_page(
     assert any(name.startswith("Observed") for name in pictures(read_page(page))) is (verdict == "tie")
     # Bars of closure are shown only if there is a gap.
     assert ("Bars of held-out closure by effect" in pictures(read_page(page))) is (verdict != "none")
-    assert ("To tell them apart, take a dark exposure" in text) is (verdict == "tie")
-    assert ("with the answer” means with the best of the tied effects: dark offset" in text) is (
+    assert ("To separate the tied effects, take a dark exposure" in text) is (verdict == "tie")
+    assert ("with the named effects” means with the best of the tied effects: dark offset" in text) is (
         verdict == "tie"
     )
     assert ("a patch of added light" in text) is (verdict in ("unknown", "inconclusive"))
@@ -160,7 +160,7 @@ def test_an_unexplained_gap_in_the_discs_is_reported_separately(coarse: None) ->
     told = "dark offset explains the unocculted field, but the cause of the gap in the discs cannot be identified"
     assert told[1:] in report["sentence"] and "assumed floor" not in report["sentence"]
     text = text_of(gap_page(diagnosis, report).html())
-    assert f"No effect is the answer: {told}." in text and "assumed floor" not in text
+    assert f"The report names no effect: {told}." in text and "assumed floor" not in text
 
 
 def test_a_tie_names_the_certain_and_the_tied_effects(coarse: None) -> None:
@@ -169,7 +169,7 @@ def test_a_tie_names_the_certain_and_the_tied_effects(coarse: None) -> None:
     report = report_of(both)
     assert report["ties"] == [["core_blur", "gain_mismatch"]]
     told = "dark offset, together with core blur or gain mismatch"
-    assert f"These data cannot tell which effect causes it: {told}." in report["sentence"]
+    assert f"These data cannot show which effect causes the gap: {told}." in report["sentence"]
     assert "a dark exposure" not in report["would_separate"] and "both gain modes" in report["would_separate"]
     assert f"Tied: {told}." in text_of(gap_page(both, report).html())
     rows = [
@@ -254,7 +254,7 @@ def test_bars_show_closure_and_mark_values_outside_the_chart() -> None:
     assert widths[1] == pytest.approx(axes.get_xlim()[0])
     assert "-4.0" in [text.get_text() for text in axes.texts]
     assert "<" in [line.get_marker() for line in axes.lines]
-    assert axes.get_yticklabels()[0].get_text() == "dark offset  (answer)"
+    assert axes.get_yticklabels()[0].get_text() == "dark offset  (named)"
 
 
 def test_cells_show_means_of_all_discs_and_noise_has_no_strong_colour() -> None:

@@ -143,7 +143,7 @@ def test_lineage_and_rerun(sun: Client, tmp_path: Path) -> None:
 def test_a_rerun_that_differs_ends_with_status_1(
     sun: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from workers.tasks import product as product_task
+    from workers.tasks.data import product as product_task
 
     write_image(tmp_path / "i.fits")
     write_psf(tmp_path / "p.fits")

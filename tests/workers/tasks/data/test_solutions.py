@@ -21,9 +21,9 @@ from workers.contract.requests import PsfBuild
 from workers.contract.resolved import ResolvedCrossValidate, ResolvedPsfFit, ResolvedReport
 from workers.files.store import Store, StoreAway
 from workers.settings import Settings
-from workers.tasks import solutions
 from workers.tasks.context import Context
-from workers.tasks.solutions import solution_identity, solved
+from workers.tasks.data import solutions
+from workers.tasks.data.solutions import solution_identity, solved
 
 REQUEST = ResolvedPsfFit(transit_id="1" * 64)
 

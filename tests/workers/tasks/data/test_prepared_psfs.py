@@ -14,8 +14,8 @@ from psfcore.fits.psfs import read_psf
 from psfcore.psf_sampling import psf_for_image
 from service.local import LocalService
 from tests.conftest import write_image, write_psf
-from workers.tasks import prepared_psfs
-from workers.tasks.prepared_psfs import PreparedPsfs
+from workers.tasks.data import prepared_psfs
+from workers.tasks.data.prepared_psfs import PreparedPsfs
 
 LIMITS = FitsLimits(max_pixels=512 * 512)
 SHAPE = (96, 128)

@@ -1,0 +1,1 @@
+"""What tasks read and keep: transits, PSFs, solutions, products and reports."""
