@@ -13,6 +13,7 @@ HERE = Path(__file__).parents[2]
 PACKAGES = ("heliopsf", "psfcore", "workers", "service", "benchmarks", "studies")
 MOST_FILES = 15
 # Folders that hold one thing of many equal parts: each catalogue table, and each kind of job, has its file there.
+LARGER = {"workers/catalogue": 18}
 # Richardson-Lucy is the method's own name; revisions of the database are numbered.
 OWN_NAMES = {"psfcore/deconvolve/methods": "richardson"}
 

@@ -33,7 +33,7 @@ from workers.contract.resolved import ResolvedCrossValidate
 from workers.tasks.context import Context
 from workers.tasks.data.reports import keep_report, provenance_of, write_json
 from workers.tasks.data.solutions import solved
-from workers.tasks.data.transits import load_transit
+from workers.tasks.transits import load_transit
 
 WAIT_S = 0.5
 MOST_HELPERS = 16

@@ -17,7 +17,7 @@ from workers.tasks.context import Context
 from workers.tasks.data.psfs import psf_row
 from workers.tasks.data.reports import provenance_of, write_json
 from workers.tasks.data.solutions import solver
-from workers.tasks.data.transits import load_transit
+from workers.tasks.transits import load_transit
 
 
 def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:

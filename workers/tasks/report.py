@@ -19,7 +19,7 @@ from workers.tasks.context import Context
 from workers.tasks.data.psfs import given_psf
 from workers.tasks.data.reports import keep_report, provenance_of, write_json
 from workers.tasks.data.solutions import solver
-from workers.tasks.data.transits import load_transit
+from workers.tasks.transits import load_transit
 
 KIND = "report"
 POINT_PX = 17
