@@ -16,13 +16,13 @@ class Comparison:
 
     same: equal bit for bit. largest_relative: the largest difference divided by the largest absolute value of the
     first array; None if the shapes differ, or if one array is finite where the other is not.
-    values_that_differ: their number; None if the shapes differ.
+    values_that_differ: number of differing values; None if the shapes differ.
     """
 
     same: bool
     largest_relative: float | None
     values_that_differ: int | None
-    sha256: tuple[str, str]  # of the values in C order, in the array's own number type, little-endian
+    sha256: tuple[str, str]  # hashes of both arrays: values in C order and little-endian, number type unchanged
 
 
 def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
