@@ -185,8 +185,8 @@ def contact_sheet_png(
         va="center",
     )
     legend = (
-        f"for each image: before and after deconvolution (same scale), and the change from -{CHANGE_LIMIT_PCT:g} % (blue) to "
-        f"+{CHANGE_LIMIT_PCT:g} % (red); circles mark suspected artefacts"
+        f"Columns: before, after (same scale), change (blue -{CHANGE_LIMIT_PCT:g} %, red +{CHANGE_LIMIT_PCT:g} %). "
+        "Circles: suspected artefacts"
     )
     figure.text(0.3 / width, 1 - 0.55 / height, legend, fontsize=9, color=INK, va="center")
     for index, row in enumerate(shown):

@@ -103,7 +103,7 @@ def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
         xlabel=f"Mean of {_HISTOGRAM_BLOCK_PX} x {_HISTOGRAM_BLOCK_PX} px ({unit})",
     )
     axes.set_title(
-        "Number of blocks by brightness; dashed lines: percentiles 1 and 99", fontsize=11, color=INK, loc="left"
+        "Number of blocks by brightness; dashed: percentiles 1 and 99", fontsize=11, color=INK, loc="left"
     )
     axes.tick_params(labelsize=8.5)
     axes.legend(frameon=False, loc="upper left")
