@@ -36,8 +36,8 @@ def fit_scatter(
     seed: seed of the random numbers.
     progress(stage, step, steps) is called after each step.
 
-    The result holds the total PSF (``kernel`` [y, x], 2048 px), its scatter kernel, the curve of 1 - encircled energy
-    (radius in px, light in percent), the parameters with their errors, and the limits of the fit.
+    The result holds the total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel. It also holds the curve of
+    1 - encircled energy (radius in px, light in percent), the parameters with their errors, and the limits of the fit.
     Raises ``DataError``, for example "no-manifest" or "too-few-frames".
     """
     fitted = _read(transit, noise, saturation_dn, threads)

@@ -5,8 +5,8 @@ the diffraction patterns of the pupil and of the meshes are convolved with each 
 the diffuse scatter.
 
 Light is counted over the full reach, a grid of 2048 px, on which every kernel sums to 1. Each kernel is computed on
-that grid and cut to the requested size. A kernel of a larger size, up to 4096 px, is computed on a grid of that size
-and scaled so that its inner 2048 px sum to 1. Its outer pixels then hold the light beyond the full reach, and its sum
+that grid and cut to the requested size. A kernel of a larger size, up to 4096 px, is computed on a grid of that
+size. It is scaled so that its inner 2048 px sum to 1. Its outer pixels then hold the light beyond the full reach, and its sum
 exceeds 1. The inner 2048 px equal the PSF of 2048 px, except for one difference: on the larger grid, a convolution
 also moves light from beyond the reach into the reach. For the diffraction of HRI_EUV this is 1e-5 of all light.
 """

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
 
-WEAKEST_DIRECTION = 1e-15  # share of B's largest eigenvalue: a direction with a smaller eigenvalue is undetermined
+# Share of B's largest eigenvalue: a direction whose eigenvalue is smaller is undetermined.
+WEAKEST_DIRECTION = 1e-15
 
 
 def scaled_inverse(normal: Matrix, *, weakest: float = WEAKEST_DIRECTION) -> Matrix:

@@ -35,7 +35,9 @@ from psfcore.convolution.fft_kernels import LANES, Plan, forward, good_length, i
 from psfcore.errors import DataError
 
 BLOCK_ROWS = 2 * LANES
-SYMMETRIC_TO = 1e-7  # share of the sum of weights; it is smaller than the float32 rounding of the transfer function
+# Largest imaginary part of the transfer function of a symmetric PSF, as a share of the sum of weights. It is smaller
+# than the float32 rounding of the transfer function.
+SYMMETRIC_TO = 1e-7
 # Chunks per thread for small and for large images. To start a chunk takes about as long as one or two small blocks.
 _CHUNKS_A_THREAD = (2, 4)
 _BLOCKS_A_CHUNK = 8
@@ -156,17 +158,11 @@ class Engine:
         self.run(work, self.row_blocks)
 
     def columns(self, *, adjoint: bool) -> None:
-        """Transform the columns, multiply by the transfer function, and transform back.
-
-        adjoint: multiply by the complex conjugate of the transfer function.
-        """
+        """Transform the columns, multiply by the transfer function (adjoint: its conjugate), and transform back."""
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
-        """Transform the columns, multiply by a filter, and transform back.
-
-        transfer: the filter, in the layout of the transfer function. conjugate: multiply by its complex conjugate.
-        """
+        """As ``columns``, with any filter in the layout of the transfer function, or with the conjugate of the filter."""
         kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
         sign = np.float32(-1.0 if conjugate else 1.0)
 
@@ -321,10 +317,7 @@ def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # typ
 
 @compiled()
 def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
-    """Combine the spectra of 32 rows into one block, as the inverse of ``spectrum_from_buffer``.
-
-    Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k].
-    """
+    """Do the inverse of ``spectrum_from_buffer``: Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k]."""
     z = buffer.reshape((-1, 2, LANES))
     last = length // 2
     for group in range(spectrum.shape[0]):

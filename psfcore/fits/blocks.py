@@ -101,7 +101,9 @@ class _GzipSource:
     def read(self, count: int) -> bytes:
         self._left -= count
         if self._left < 0:
-            raise HeaderError("too-many-bytes", "expected decompressed data within the size limit; got more bytes")
+            raise HeaderError(
+                "too-many-bytes", "expected decompressed data within the size limit; got more bytes"
+            )
         try:
             return self._stream.read(count)
         except EOFError:
@@ -180,7 +182,9 @@ def _no_image(kinds: list[str]) -> HeaderError:
         return HeaderError("not-2d", f"{wanted}; got an image of one axis")
     if "table" in kinds:
         return HeaderError("table-only", f"{wanted}; got only tables ({len(kinds)} HDUs)")
-    return HeaderError("no-image", f"{wanted}; got {len(kinds)} HDUs, and the data of none of them have two axes")
+    return HeaderError(
+        "no-image", f"{wanted}; got {len(kinds)} HDUs, and the data of none of them have two axes"
+    )
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
@@ -312,7 +316,8 @@ def _data_bytes(header: Header, hdu: int) -> int:
     size = abs(bitpix) // 8 * groups * (extra + elements)
     if size > _LARGEST_COUNT:
         raise HeaderError(
-            "bad-card", f"expected a data size below 2^63 bytes in HDU {hdu}; its header declares {size:.3g} bytes"
+            "bad-card",
+            f"expected a data size below 2^63 bytes in HDU {hdu}; its header declares {size:.3g} bytes",
         )
     return size
 

@@ -32,7 +32,9 @@ class BulkRow(Base):
     running_since: Mapped[float | None]
     ended_at: Mapped[float | None]
     listed: Mapped[bool]  # whether all files have been listed as items
-    lister: Mapped[str | None] = mapped_column(String(32))  # token of the lease under which a worker lists files now
+    lister: Mapped[str | None] = mapped_column(
+        String(32)
+    )  # token of the lease of the worker that lists files
     total: Mapped[int] = mapped_column(default=0)
     done: Mapped[int] = mapped_column(default=0)
     reused: Mapped[int] = mapped_column(default=0)  # done images whose product existed before

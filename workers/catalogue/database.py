@@ -97,9 +97,8 @@ def _write_ahead(connection: sqlite3.Connection) -> None:
         try:
             connection.execute("PRAGMA journal_mode=WAL")
             return
-        except (
-            sqlite3.OperationalError
-        ) as error:  # the timeout of the connection does not apply to this statement
+        # The timeout of the connection does not apply to this statement.
+        except sqlite3.OperationalError as error:
             if "locked" not in str(error) or time.monotonic() > deadline:
                 raise
             time.sleep(0.02)

@@ -95,7 +95,7 @@ class Jobs:
         """Find the live job that an identical request can share; returns its key and the job.
 
         If there is no such job, returns the key for a new job, and None. If an identical job cannot be shared, the key of
-        the new job is computed from the id of that job, so that later identical requests find the new job.
+        the new job is computed from the id of that job. Later identical requests then find the new job.
         """
         key = request_key
         live = select(JobRow, TermsRow.job_id).outerjoin(TermsRow, TermsRow.job_id == JobRow.id)

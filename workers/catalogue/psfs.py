@@ -87,10 +87,7 @@ class Psfs:
             return session.scalars(query.order_by(*_NEWEST_FIRST).limit(limit)).all()
 
     def emptied_by(self, wanted: PsfFilter, owner: str) -> str | None:
-        """Apply the filters one after the other; return the name of the filter after which no PSF is left.
-
-        None if a PSF meets all filters.
-        """
+        """Apply the filters one by one; return the name of the first after which no PSF is left, or None."""
         met = PsfFilter()
         with self._database.reading() as session:
             for name in (field.name for field in fields(PsfFilter)):
@@ -98,9 +95,8 @@ class Psfs:
                 if value is None:
                     continue
                 met = replace(met, **{name: value})
-                first = (
-                    _query(met, owner).order_by(*_NEWEST_FIRST).limit(1)
-                )  # sorted as in the index for lists
+                # Sorted as in the index for lists.
+                first = _query(met, owner).order_by(*_NEWEST_FIRST).limit(1)
                 if session.scalars(first).first() is None:
                     return name.removesuffix("_id")
         return None
@@ -238,10 +234,7 @@ def _found(session: Session, psf_id: str, owner: str) -> PsfRow:
 
 
 def _series(row: PsfRow, asked: StatusAsked) -> str:
-    """The series of a PSF. The request ``asked`` may complete instrument, channel and kind.
-
-    Raises ``DataError`` "line-known" or "no-line".
-    """
+    """The series of a PSF, completed with ``asked``. Raises ``DataError`` "line-known" or "no-line"."""
     instrument, channel, kind = _said_of_series(row, asked)
     series = series_of(instrument, channel, kind)
     if series is None:
@@ -263,7 +256,8 @@ def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | 
         said = getattr(asked, name)
         if said is not None and value is not None and said != value:
             raise DataError(
-                "line-known", f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {said!r}"
+                "line-known",
+                f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {said!r}",
             )
     return (
         row.instrument or asked.instrument,
@@ -352,7 +346,7 @@ def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> No
         supersedes=asked.supersedes or None,
     )
     if row.status == PsfStatus.DEPRECATED and (row.successor_id is not None or asked.successor_id is None):
-        has = f"successor {row.successor_id} (a successor cannot change)" if row.successor_id else "no successor"
+        has = f"successor {row.successor_id}, which cannot change" if row.successor_id else "no successor"
         raise DataError(
             "successor-named",
             f"expected a first successor for the deprecated PSF {row.id}, which has {has}; got {asked.successor_id or 'no successor'}",

@@ -76,7 +76,7 @@ class PsfRow(Base):
     version: Mapped[str]
     instrument: Mapped[str | None]
     channel: Mapped[str | None]  # the wavelength in whole angstrom, such as 174
-    kind: Mapped[str] = mapped_column(server_default="total")  # "total", "uploaded", or the name of a component
+    kind: Mapped[str] = mapped_column(server_default="total")  # "total", "uploaded" or a component's name
     series: Mapped[str | None]  # instrument/channel/kind; None without an instrument
     status: Mapped[str]
     # The range of observation times, only if the PSF is or was certified. An open end is an infinity.
@@ -249,9 +249,8 @@ class JobRow(Base):
     stage: Mapped[str] = mapped_column(default="")
     result_id: Mapped[str | None] = mapped_column(String(64))
     error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
-    estimate: Mapped[dict[str, Any] | None] = mapped_column(
-        JSON(none_as_null=True)
-    )  # made when the job was submitted
+    # The estimate was made when the job was submitted.
+    estimate: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
         # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first job.
@@ -328,7 +327,7 @@ class WorkerRow(Base):
     """A running worker process. It renews its heartbeat and deletes the row when it ends."""
 
     __tablename__ = "workers"
-    name: Mapped[str] = mapped_column(String(128), primary_key=True)  # host:process, the same name as in the row of a job
+    name: Mapped[str] = mapped_column(String(128), primary_key=True)  # host:process, as in JobRow.worker
     started_at: Mapped[float]
     heartbeat_at: Mapped[float]
     version: Mapped[str] = mapped_column(String(64))

@@ -138,7 +138,10 @@ def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
 def _walk(
     top: Path, parts: tuple[str, ...], allowed: Sequence[Path], tick: Callable[[], None]
 ) -> Iterator[Found]:
-    """Read each folder once, for all parts of the pattern that may match in it; then several ** cost no more time."""
+    """Read each folder only once, and match all parts of the pattern that can apply there.
+
+    Several ** in a pattern therefore cost no additional time.
+    """
     left = [(top, frozenset({0}))]
     while left:
         folder, places = left.pop()

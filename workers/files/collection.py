@@ -14,7 +14,8 @@ from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Blob, Store
 
-SECOND_LOOK_AFTER_S = 10.0  # an upload adds its row directly after it stored its file; a job adds its row within seconds
+# An upload adds its row directly after it stored its file; a job adds its row within seconds.
+SECOND_LOOK_AFTER_S = 10.0
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,8 @@ class RemoteStore(Store):
                 self._s3.cp_file(self._key(digest), self._key_aside(digest))
             except FileNotFoundError:
                 return False
-            if not self._is_old(digest, kept_before):  # checked again, because it takes long to copy a large file
+            # Check again, because it takes long to copy a large file.
+            if not self._is_old(digest, kept_before):
                 return False
             self._s3.rm_file(self._key(digest))
         super().path(digest).unlink(missing_ok=True)
@@ -97,7 +98,8 @@ class RemoteStore(Store):
         if not aside:
             return set()
         time.sleep(after_s)
-        wanted = aside.intersection(named)  # `named` is read after the listing; copies that are moved aside later stay there
+        # `named` is read after the listing; copies that are moved aside later stay there.
+        wanted = aside.intersection(named)
         put_back = set()
         with _answering():
             for digest in wanted:

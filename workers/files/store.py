@@ -130,7 +130,8 @@ class Store:
 
         If there are such files, ``named`` is read after ``after_s`` seconds. Returns the hashes of the restored files.
         """
-        return set()  # in a local folder there is nothing to finish: remove() checks the file that it moved aside
+        # In a local folder there is nothing to finish: remove() itself checks the file that it moved aside.
+        return set()
 
 
 def sha256_of(path: Path) -> str:

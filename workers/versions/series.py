@@ -27,9 +27,8 @@ def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str
     """
     if wavelength_angstrom is None and instrument in instrument_names():
         wavelength_angstrom = load_instrument(instrument).wavelength_angstrom
-    if (
-        wavelength_angstrom is None or not 0.5 <= wavelength_angstrom < 1e6
-    ):  # a header card may contain any number
+    # A header card may contain any number.
+    if wavelength_angstrom is None or not 0.5 <= wavelength_angstrom < 1e6:
         return None
     return str(round(wavelength_angstrom))
 

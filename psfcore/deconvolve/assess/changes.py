@@ -4,8 +4,8 @@ Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI
 intensify by up to 40 %, while dark regions decrease by up to 85 %". The paper does not define a feature, the number
 of pixels over which it is averaged, or the meaning of "up to". This module therefore tabulates several definitions.
 Structures are blocks of n x n pixels (BLOCKS_PX). The brightest and the darkest blocks (TAILS_PCT) are selected by
-percentiles of the image before deconvolution. Each row of the table gives the change of the summed light of these
-blocks, the median change, and the largest change after the most extreme 1 % of the blocks are left out.
+percentiles of the image before deconvolution. Each row of the table gives three numbers: the change of the summed
+light of these blocks, the median change, and the largest change without the most extreme 1 % of the blocks.
 
     change = 100 (after / before - 1)                             Eq. (1)
     dynamic range = percentile 100 - p divided by percentile p    Eq. (2)    percentiles of the block means
@@ -126,7 +126,8 @@ def measure_changes(
         sigma = np.sqrt(noise.variance(np.where(counted, image.pixels, 0.0), dn_per_unit(image)))
     centre = (psf.kernel.shape[0] // 2, psf.kernel.shape[1] // 2)
     peak_weight = float(psf.kernel[centre])
-    with ThreadPoolExecutor(1) as beside:  # the filters of the artefact check run at the same time as the percentiles
+    # The filters of the artefact check run at the same time as the percentiles.
+    with ThreadPoolExecutor(1) as beside:
         artefacts = beside.submit(find_artefacts, image.pixels, result, counted, peak_weight, sigma=sigma)
         blocks = [_blocks(image.pixels, result, counted, block_px) for block_px in BLOCKS_PX]
         structures = tuple(row for part in blocks for row in _structures(part))

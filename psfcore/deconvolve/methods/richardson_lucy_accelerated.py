@@ -77,7 +77,7 @@ class _Accelerated(Iteration):
         self._order = order
         self.prediction = problem.engine.to_lanes(estimate)
         self._x, self._before = self.prediction.copy(), self.prediction.copy()
-        # Order 1 does not need x_(k-2): the array of x_(k-1) is used in place of it.
+        # Order 1 does not need x_(k-2), so the array of x_(k-1) takes its role.
         self._earlier = self.prediction.copy() if order == 2 else self._before
         self._gradient = np.zeros_like(self._x)
         self._corrected = np.zeros_like(self._x)

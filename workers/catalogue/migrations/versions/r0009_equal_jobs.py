@@ -1,4 +1,7 @@
-"""The identity of a job's result, in addition to its key. Only one of several jobs with the same result executes."""
+"""The identity of a job's result, in addition to its key.
+
+Of several jobs with the same result, only one executes at any time.
+"""
 
 from __future__ import annotations
 

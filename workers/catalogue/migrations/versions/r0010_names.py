@@ -40,9 +40,8 @@ _ITEMS = sa.table(
 def upgrade() -> None:
     """Rename tables, columns and indexes, and then the names that occur in the rows."""
     op.rename_table("psf_lines", "psf_series")
-    if (
-        op.get_bind().dialect.name == "postgresql"
-    ):  # in a new database, the name of a primary key contains the name of its table
+    # In a new database, the name of a primary key contains the name of its table.
+    if op.get_bind().dialect.name == "postgresql":
         op.execute("ALTER INDEX psf_lines_pkey RENAME TO psf_series_pkey")
     for table in ("psfs", "psf_pins", "psf_series"):
         op.execute(f"ALTER TABLE {table} RENAME COLUMN line TO series")
