@@ -96,7 +96,7 @@ def _check_weights(kernel: Kernel) -> None:
     if not SMALLEST_SUM < total <= LARGEST_SUM:
         wanted = f"weights that sum to 1 over the full reach, or to less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
         raise DataError(
-            "psf-sum", f"expected {wanted}; got a sum of {total:.6g}. Divide the weights by their sum first"
+            "psf-sum", f"expected {wanted}; got {total:.6g}. Divide the weights by their sum first"
         )
 
 

@@ -25,7 +25,7 @@ _VERSION = re.compile(VERSION, re.ASCII)
 
 
 class PsfStatus(StrEnum):
-    """The status of a PSF says how far the PSF may be trusted."""
+    """How far a PSF may be trusted."""
 
     DRAFT = "draft"
     CERTIFIED = "certified"
