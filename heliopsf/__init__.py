@@ -6,8 +6,8 @@
     >>> with heliopsf.Client("http://127.0.0.1:8765") as client:     # on a service
     ...     client.deconvolve("image.fits", "deconvolved.fits")
 
-The functions compute in this process. ``Client`` sends requests to a service, which keeps products, versions and lineage.
-Importing this package loads nothing else: each name is imported when it is first used.
+The functions compute in this process. ``Client`` sends requests to a service. The service keeps products, versions and
+lineage. ``import heliopsf`` is fast, because each name is imported when it is first used.
 """
 
 from __future__ import annotations

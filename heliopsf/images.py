@@ -32,10 +32,13 @@ def deconvolve(
 ) -> Deconvolved:
     """Deconvolve an image with a PSF. The result's ``pixels`` [y, x] have the shape and the unit of the image.
 
-    image: a FITS file, or an ``Image`` (pixels [y, x] in its unit, and a mask). psf: a FITS file, or a ``Psf``; it is
-    rebinned if the image is binned. noise: photon gain (DN per photon) and read noise (DN rms). saturation_dn: pixels from
-    this level (DN) are ignored; used if ``image`` is a file. edges: "zero", "symmetric" or "extended"; default: the best for
-    the method. progress(step, steps) is called after each step. parameters: of the method, such as ``steps=20``.
+    image: a FITS file, or an ``Image`` (pixels [y, x] with their unit, and a mask).
+    psf: a FITS file, or a ``Psf``. The PSF is rebinned if the image is binned.
+    noise: photon gain (DN per photon) and read noise (DN rms).
+    saturation_dn: pixels at or above this level (DN) are ignored. The level is used only if ``image`` is a file.
+    edges: "zero", "symmetric" or "extended"; default: the assumption that suits the method best.
+    progress(step, steps) is called after each step.
+    parameters: parameters of the method, such as ``steps=20``.
 
     Raises ``DataError``; its ``code`` is the reason, such as "not-fits", "plate-scale-mismatch" or "unknown-method".
     """

@@ -23,13 +23,16 @@ def build_psf(
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Psf:
-    """Compute the PSF of an instrument: its ``kernel`` [y, x] on (size, size) px, with its ``components``.
+    """Compute the PSF of an instrument: a ``kernel`` [y, x] of (size, size) px, and its ``components``.
 
-    instrument: the name of a known one, such as "hri_euv", or the path of an instrument file (TOML); the mask image that the
-    file names is read too. size: even, 64 to 4096 px. component: one component alone, such as "DIFFRACTION".
+    instrument: the name of a known instrument, such as "hri_euv", or the path of an instrument file (TOML). If the file
+    names a mask image of the mount, that image is read too.
+    size: an even number from 64 to 4096 (px).
+    component: compute only this component, such as "DIFFRACTION".
     progress(step, steps) is called after each step.
 
-    Raises ``DataError`` "bad-size", "unknown-component", and as ``psfcore.instruments.model.load_instrument``.
+    Raises ``DataError`` "bad-size", "unknown-component" or "bad-mount", and the errors of
+    ``psfcore.instruments.model.load_instrument``.
     """
     known = load_instrument(instrument)
     mask = None
@@ -41,8 +44,9 @@ def build_psf(
 
 
 def read_psf(path: str | Path) -> Psf:
-    """Read a PSF from a FITS file: its ``kernel`` [y, x] (weights, sum at most 1) and its ``components``, if any.
+    """Read a PSF from a FITS file: its ``kernel`` [y, x] and its ``components``, if it has any.
 
-    Raises ``DataError``, such as "not-fits".
+    The weights of the kernel sum to 1 over the reach, and to less on a smaller array.
+    Raises ``DataError``, for example "not-fits".
     """
     return psfs.read_psf(path, LIMITS)

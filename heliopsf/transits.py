@@ -1,4 +1,4 @@
-"""Fit a transit, and diagnose the gap that the fit leaves, in this process."""
+"""Fit a scatter kernel to a transit, and diagnose the gap that the fit leaves. All of it runs in this process."""
 
 from __future__ import annotations
 
@@ -26,14 +26,19 @@ def fit_scatter(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> TransitFit:
-    """Fit the scatter kernel to the light in the occulter's disc of a transit's images.
+    """Fit the scatter kernel to the stray light that a transit's images show inside the occulter's disc.
 
-    transit: a folder with a transit.json. shape: of the scatter kernel. noise: photon gain (DN per photon) and read noise
-    (DN rms); default: those in transit.json. saturation_dn: pixels from this level (DN) are ignored; default: the
-    instrument's. seed: of random numbers. progress(stage, step, steps) is called after each step.
+    transit: a folder with a transit.json.
+    shape: the formula of the scatter kernel.
+    noise: photon gain (DN per photon) and read noise (DN rms); default: the values in transit.json.
+    saturation_dn: pixels at or above this level (DN) are ignored; default: the level that the instrument description
+    gives for the image's gain mode.
+    seed: seed of the random numbers.
+    progress(stage, step, steps) is called after each step.
 
-    The result holds the total PSF (``kernel`` [y, x], 2048 px), its scatter, the curve of light beyond radii (px, percent),
-    parameters with errors, and limits of the fit. Raises ``DataError``, such as "no-manifest" or "too-few-frames".
+    The result holds the total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel. It also holds the curve of
+    1 - encircled energy (radius in px, light in percent), the parameters with their errors, and the limits of the fit.
+    Raises ``DataError``, for example "no-manifest" or "too-few-frames".
     """
     fitted = _read(transit, noise, saturation_dn, threads)
     return fit_transit(fitted, shape=shape, seed=seed, threads=threads, progress=progress)
@@ -50,8 +55,8 @@ def diagnose_gap(
 ) -> diagnose.Diagnosis:
     """Fit a transit and find out which effect explains the residuals of the fit.
 
-    Parameters: as for ``fit_scatter``. ``psfcore.gap.report.report.gap_report`` turns the result into the report (JSON).
-    Raises ``DataError`` as ``fit_scatter``.
+    The parameters are those of ``fit_scatter``. ``psfcore.gap.report.report.gap_report`` turns the result into the report
+    (JSON). Raises the same errors as ``fit_scatter``.
     """
     return diagnose.diagnose(
         _read(transit, noise, saturation_dn, threads), seed=seed, threads=threads, progress=progress

@@ -1,1 +1,1 @@
-"""Point-spread functions of solar imagers: building, applying and removing them."""
+"""Point-spread functions of solar imagers: heliopsf computes and fits them, and deconvolves images with them."""

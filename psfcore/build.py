@@ -1,14 +1,14 @@
 """Computes a PSF from an instrument description.
 
 Hofmeister et al., The point-spread function of HRI_EUV, sections "Implementation" and "The combined PSF":
-the diffraction patterns of the pupil and of the meshes are convolved with each other, and the result with the
-diffuse scatter.
+the diffraction patterns of the pupil and of the meshes are convolved with each other. The result is convolved with
+the diffuse scatter.
 
 Light is counted over the full reach, a grid of 2048 px, on which every kernel sums to 1. Each kernel is computed on
-that grid and cut to the requested size. For a larger size, up to 4096 px, it is computed on 4096 px and scaled so
-that its inner 2048 px sum to 1: the outer pixels hold the light beyond the full reach, and the sum exceeds 1.
-The inner 2048 px then equal those of the smaller PSF except for light that a convolution brings back from
-beyond: 1e-5 of all light for the diffraction of HRI_EUV.
+that grid and cut to the requested size. A kernel of a larger size, up to 4096 px, is computed on a grid of that
+size. It is scaled so that its inner 2048 px sum to 1. Its outer pixels then hold the light beyond the full reach, and its sum
+exceeds 1. The inner 2048 px equal the PSF of 2048 px, except for one difference: on the larger grid, a convolution
+also moves light from beyond the reach into the reach. For the diffraction of HRI_EUV this is 1e-5 of all light.
 """
 
 from __future__ import annotations
@@ -42,9 +42,10 @@ def build_psf(
     progress: Progress | None = None,
     threads: int = 1,
 ) -> Psf:
-    """The PSF of `instrument` on (size, size), an even size of 64 to 4096 px: the total PSF with its components.
+    """Compute the total PSF of `instrument`, with its components; its shape is (size, size).
 
-    component: build only this one of component_names(); the result is a PSF without components.
+    size: an even number from 64 to 4096 (px).
+    component: build only this component, one of component_names(); the result is then a PSF without components.
     mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see fits.mask_file).
     progress: called with (step, steps); it may raise to stop the work.
     Raises DataError "bad-size", "unknown-component", "bad-mount".
@@ -94,7 +95,7 @@ def build_psf(
 
 
 def component_names(instrument: Instrument) -> tuple[str, ...]:
-    """The components of a PSF of this instrument."""
+    """The names of the components that a PSF of this instrument has."""
     return available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
 
 
@@ -109,7 +110,7 @@ def _nine_tenths_of(progress: Progress | None) -> Progress:
 
 
 def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
-    """Weights >= 0 that sum to 1 on the full reach, and the share of the light that was beyond it."""
+    """Scale the weights, so that they sum to 1 on the full reach; also return the share of light beyond the reach."""
     positive = np.maximum(kernel, 0.0)  # Fourier transforms leave +-1e-17 where there is no light
     inner = float(crop_centred(positive, (REACH_GRID_PX, REACH_GRID_PX)).sum())
     return positive / inner, 1 - inner

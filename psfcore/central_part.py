@@ -9,7 +9,7 @@ from psfcore.psf import Psf, crop_centred
 
 
 def central_part(psf: Psf, size_px: int) -> Psf:
-    """The central (size_px, size_px) px of a PSF and of its components, not renormalised.
+    """The central (size_px, size_px) px of a PSF and of its components. The weights are not renormalised.
 
     Raises DataError "cutout-too-large" if the PSF is smaller.
     """

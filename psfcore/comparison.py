@@ -16,13 +16,14 @@ class Comparison:
 
     same: equal bit for bit. largest_relative: the largest difference divided by the largest absolute value of the
     first array; None if the shapes differ, or if one array is finite where the other is not.
-    values_that_differ: their number; None if the shapes differ.
+    values_that_differ: number of differing values; None if the shapes differ. sha256: hashes of the two arrays, see
+    ``array_sha256``.
     """
 
     same: bool
     largest_relative: float | None
     values_that_differ: int | None
-    sha256: tuple[str, str]  # of the values in C order, in the array's own number type, little-endian
+    sha256: tuple[str, str]
 
 
 def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
@@ -45,6 +46,9 @@ def compare(first: NDArray[Any], again: NDArray[Any]) -> Comparison:
 
 
 def array_sha256(array: NDArray[Any]) -> str:
-    """SHA-256 (hex) of an array's values, independent of byte order and memory layout."""
+    """SHA-256 (hex) of an array's values in C order and little-endian, in the array's number type.
+
+    The hash does not depend on the byte order and the memory layout of the array.
+    """
     plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return hashlib.sha256(plain.tobytes()).hexdigest()

@@ -1,13 +1,15 @@
-"""Kernels compiled by numba and kept on disk, safely for processes that compile at the same time.
+"""Compile kernels (fast functions) with numba and keep them on disk. Several processes may compile at the same time.
 
-numba keeps the machine code of a function in numbered files. It reads, changes and writes their index without a lock,
-and it names symbols by a counter of the process. Two processes can compile two kernels of the same name at once, for
-example FFT passes of two lengths (`fft_kernels`). Both may then write file number 1 or use the same symbol, so that
-one kernel is called in place of the other: transforms are wrong, without any error. Here the name of a file is a hash
-of what was compiled, there is no index, and functions made inside another function get a name of their own.
+numba's own cache is not safe when several processes compile. It keeps the machine code of a function in numbered
+files; it reads, changes and writes the index of these files without a lock; and it names symbols by a counter of the
+process. Two processes can compile two kernels of the same name at once, for example FFT passes of two lengths
+(`fft_kernels`). Both may then write file number 1 or use the same symbol. One kernel is then called in place of the
+other, and the transforms are wrong without any error message. The cache in this module has no index. The name of a
+file is a hash of what was compiled, and a function that is defined inside another function gets a unique name.
 
-numba also does not notice a change in another file whose function a kernel calls. Here every kernel depends on all
-source files that define kernels. A kernel file cut short by a power failure is ignored.
+numba also does not notice when a kernel calls a function of another file and that file changes. In this module, every
+kernel depends on all source files that define kernels. If a power failure left a kernel file incomplete, the file is
+ignored.
 """
 
 from __future__ import annotations
@@ -31,10 +33,10 @@ log = logging.getLogger(__name__)
 def compiled(
     *, name: str | None = None, **options: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: `numba.njit` with these options; releases the interpreter's lock and keeps the kernel on disk.
+    """Decorator: `numba.njit` with these options. The kernel releases the interpreter's lock and is kept on disk.
 
-    name: required for a function that uses constants of its enclosing function; different for each set of constants.
-    Raises TypeError if it is missing.
+    name: required for a function that uses constants of its enclosing function. Each set of constants needs another
+    name. Raises TypeError if the name is required and missing.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -44,7 +46,7 @@ def compiled(
             )
         function.__qualname__ = name or function.__qualname__
         kernel: Any = njit(nogil=True, cache=True, **options)(function)
-        if isinstance(kernel, Dispatcher):  # a plain function if compiling is switched off
+        if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
             cache = kernel._cache  # type: ignore[attr-defined]
             cache._cache_file = KernelFiles(
                 cache.cache_path, cache._impl.filename_base, cache._impl.locator.get_source_stamp()
@@ -61,7 +63,7 @@ class KernelFiles(IndexDataCacheFile):
     """
 
     def save(self, key: Any, data: Any) -> None:
-        """Write a kernel to disk in one step. If this fails, log a warning; the kernel can be used all the same."""
+        """Write a kernel to disk in one step. If this fails, log a warning; the kernel can still be used."""
         payload = self._dump(data)
         try:
             with self._open_for_write(self._data_path(self._name(key))) as file:
@@ -72,7 +74,7 @@ class KernelFiles(IndexDataCacheFile):
             )
 
     def load(self, key: Any) -> Any:
-        """The kernel for this key, compiled from the present sources; None if there is none yet."""
+        """The kernel for this key, compiled from the present sources; None if it is not on disk yet."""
         name = self._name(key)
         if not self._is_good(name):
             return None

@@ -6,8 +6,8 @@ from __future__ import annotations
 class DataError(ValueError):
     """The user's data cannot be used.
 
-    code: stable, in kebab-case, for programs ("all-nan"). message: for people; it says what was expected and what
-    was found.
+    code: a stable word in kebab-case for programs, such as "all-nan". message: a sentence for people; it says what was
+    expected and what was found.
     """
 
     def __init__(self, code: str, message: str) -> None:
@@ -20,4 +20,4 @@ class DataError(ValueError):
 
 
 class HeaderError(DataError):
-    """A file whose headers show that it cannot be used; no pixel was read."""
+    """The headers of a file show that the file cannot be used. No pixel was read."""

@@ -1,4 +1,4 @@
-"""An image with a mask that tells which pixels cannot be trusted, and why."""
+"""An image, with a mask that marks the pixels that cannot be trusted and says why."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SMALLEST_SIDE_PX = 16
 
 
 class MaskBit(IntFlag):
-    """Bits of the mask plane. Negative pixels are valid data (noise about zero) and have no bit."""
+    """Bits of the mask plane. Negative pixels are valid, because noise scatters around zero; they have no bit."""
 
     NONFINITE = 1
     SATURATED = 2
@@ -23,7 +23,7 @@ class MaskBit(IntFlag):
 
 @dataclass(frozen=True)
 class Image:
-    """Pixels [y, x] (float64, in `unit`), mask [y, x] (bits of MaskBit), header, exposure in seconds.
+    """Pixels [y, x] (float64, in `unit`), mask [y, x] (bits of MaskBit), header, and exposure time in seconds.
 
     Raises DataError: "not-2d", "too-small", "mask-shape", "unmasked-nonfinite".
     """
@@ -47,7 +47,7 @@ class Image:
         if not np.isfinite(self.pixels[(self.mask & MaskBit.NONFINITE) == 0]).all():
             raise DataError(
                 "unmasked-nonfinite",
-                "expected every NaN or infinite pixel to be masked; got at least one that is not",
+                "expected every NaN or infinite pixel to be masked; got at least one such pixel without a mask",
             )
 
     @property

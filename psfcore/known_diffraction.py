@@ -1,4 +1,4 @@
-"""The diffraction PSF for a transit whose transit.json names no file of it."""
+"""The diffraction PSF for a transit whose transit.json does not name a file with a diffraction PSF."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from psfcore.instruments.model import load_instrument
 
 
 def known_diffraction(instrument: str | None, *, threads: int = 1) -> Kernel:
-    """Weights [y, x] of the diffraction PSF of a known instrument. Raises DataError "no-known-psf" for others."""
+    """The diffraction PSF of a known instrument, as weights [y, x].
+
+    Raises DataError "no-known-psf" if the instrument is not known.
+    """
     if instrument not in instrument_names():
         known = ", ".join(instrument_names())
         raise DataError(

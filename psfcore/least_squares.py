@@ -1,11 +1,11 @@
-"""The covariance of a least-squares fit: the inverse of a normal matrix whose parameters have different units.
+"""The covariance of a least-squares fit: invert a normal matrix whose parameters have different units.
 
     A = S B S,   S = diag(sqrt(A_kk))        Eq. (1)
     A^+ = S^-1 B^+ S^-1                      Eq. (2)
 
-B has a unit diagonal for any units of the fitted parameters. The data alone, and not the ratio of units such as px and
-DN/s, then decide which directions are undetermined. B^+ is the pseudo-inverse of B (Moore and Penrose): it gives an
-undetermined direction no change and no variance.
+The diagonal of B is 1, whatever the units of the fitted parameters are. Therefore only the data decide which
+directions in the space of parameters are undetermined; a ratio of units, such as px and DN/s, has no influence. B^+ is
+the pseudo-inverse of B (Moore and Penrose). Along an undetermined direction it gives no change and no variance.
 
 | symbol | name |
 |---|---|
@@ -20,13 +20,15 @@ from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
 
-WEAKEST_DIRECTION = 1e-15  # relative to B's largest eigenvalue; weaker directions are undetermined
+# Share of B's largest eigenvalue: a direction whose eigenvalue is smaller is undetermined.
+WEAKEST_DIRECTION = 1e-15
 
 
 def scaled_inverse(normal: Matrix, *, weakest: float = WEAKEST_DIRECTION) -> Matrix:
-    """Eq. (2) for a symmetric, non-negative matrix (n, n). Parameters without any influence get 0.
+    """Compute A^+ by Eq. (2) for a symmetric, non-negative matrix (n, n).
 
-    weakest: a direction is undetermined if its eigenvalue of B is at most this share of the largest.
+    The rows and columns of parameters that have no influence on the data are 0.
+    weakest: a direction is undetermined if its eigenvalue of B is at most this share of the largest eigenvalue.
     """
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scale = np.outer(size, size)

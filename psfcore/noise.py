@@ -1,10 +1,10 @@
 """Noise of an exposure: photon noise and read noise.
 
-    var(D) = g D + r^2            Eq. (1)    of D in DN
-    var(R) = (g R t + r^2) / t^2  Eq. (2)    of a rate R = D / t in DN/s
+    var(D) = g D + r^2            Eq. (1)    D in DN
+    var(R) = (g R t + r^2) / t^2  Eq. (2)    rate R = D / t in DN/s
 
-The variance follows from the expected value of a pixel. From the observed value it would be too small where the noise
-happens to be negative, and negative where the pixel is negative.
+The variance is computed from the expected value of a pixel. A variance from the observed value would be too small for
+a pixel whose noise happens to be negative, and it would be negative for a negative pixel.
 
 | symbol | name | unit |
 |---|---|---|
@@ -32,7 +32,7 @@ Plane = NDArray[np.float64]
 class Noise:
     """Photon gain and read noise of a camera.
 
-    Raises DataError "bad-noise" unless both are finite and at least zero, and one of them is above zero.
+    Both must be finite and at least zero, and one of them must be above zero; otherwise raises DataError "bad-noise".
     """
 
     photon_gain_dn: float
@@ -47,7 +47,7 @@ class Noise:
             )
 
     def variance(self, expected: Plane, dn_per_unit: float) -> Plane:
-        """Variance [y, x] of pixels with the expected value `expected`; negative values count as zero."""
+        """Variance [y, x] of pixels whose expected values are `expected`; negative expected values count as zero."""
         photons = self.photon_gain_dn * np.maximum(expected, 0.0) / dn_per_unit
         return np.asarray(photons + (self.read_noise_dn / dn_per_unit) ** 2)  # Eq. (1), Eq. (2)
 
@@ -69,8 +69,6 @@ def dn_per_unit(image: Image) -> float:
     if (image.unit or "").replace(" ", "").lower() != "dn/s":
         return 1.0
     if image.exposure_s is None:
-        message = (
-            "expected XPOSURE or EXPTIME in the header, to compute the noise of an image in DN/s; got neither"
-        )
+        message = "expected XPOSURE or EXPTIME in the header, to compute the noise of an image in DN/s; got neither of them"
         raise DataError("no-exposure", message)
     return image.exposure_s

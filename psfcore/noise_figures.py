@@ -1,4 +1,4 @@
-"""The JSON form of ``psfcore.noise.Noise``. Importing it loads no numerics, so the web process can check requests."""
+"""``psfcore.noise.Noise`` in JSON. This module imports no numerical library, so the web process can check requests."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 if TYPE_CHECKING:
     from psfcore.noise import Noise
 
-# Strict: neither the text "12.5" nor true is a number.
+# Strict: the text "12.5" and the value true are refused, because they are not numbers.
 Figure = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 
 

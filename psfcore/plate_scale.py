@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-PLATE_SCALE_TOLERANCE = 0.01  # of the ratio of two plate scales, from 1
+PLATE_SCALE_TOLERANCE = 0.01  # largest deviation from 1 of the ratio of two plate scales

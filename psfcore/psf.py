@@ -23,7 +23,7 @@ from psfcore.plate_scale import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
 REACH_GRID_PX = 2048
 LARGEST_SUM = 1 + 1e-3
 SMALLEST_SUM = 0.05
-CENTRE_TOLERANCE = 1e-3  # of the largest weight: pixels that share the peak may differ by rounding
+CENTRE_TOLERANCE = 1e-3  # share of the largest weight: pixels that share the peak may differ by rounding
 
 Kernel = NDArray[np.float64]
 
@@ -32,8 +32,8 @@ Kernel = NDArray[np.float64]
 class FittedShape:
     """The fitted formula of a scatter kernel, with its uncertainty.
 
-    shape: name of the formula in psfcore.scatter.shapes. parameters: names of its parameters. coordinates: the
-    unbounded coordinates in which the fit was done. covariance: of the coordinates.
+    shape: name of the formula in psfcore.scatter.shapes. parameters: names of its parameters. coordinates: values of
+    the unbounded coordinates in which the fit was done. covariance: covariance matrix of the coordinates.
     """
 
     shape: str
@@ -44,8 +44,9 @@ class FittedShape:
 
 @dataclass(frozen=True)
 class Psf:
-    """Weights [y, x] (share of a point source's light per pixel), centred at [ny // 2, nx // 2], and their origin.
+    """The weights [y, x] of a PSF, and how they were obtained.
 
+    kernel: a weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2].
     components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON.
     fitted: the fitted formula of SCATTER. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative", "psf-sum",
     "psf-not-centred".
@@ -69,7 +70,7 @@ class Psf:
 
     @property
     def total(self) -> float:
-        """Sum of all weights on this array: 1 for the full reach; a larger array may hold more."""
+        """Sum of all weights on this array: 1 for the full reach; a larger array may sum to more than 1."""
         return float(self.kernel.sum())
 
     @property
@@ -88,12 +89,12 @@ def _check_weights(kernel: Kernel) -> None:
             "psf-nonfinite", f"expected finite weights; got {bad} weights that are NaN or infinite"
         )
     largest, smallest = float(kernel.max()), float(kernel.min())
-    # The sum is defined over the full reach; a larger array may hold more.
+    # The sum is defined over the full reach; a larger array may sum to more than 1.
     total = float(crop_centred(kernel, _within_reach(kernel.shape)).sum())
     if smallest < -1e-12 * max(largest, 0.0):
         raise DataError("psf-negative", f"expected weights >= 0; the smallest is {smallest:.3g}")
     if not SMALLEST_SUM < total <= LARGEST_SUM:
-        wanted = f"a sum of 1 over the full reach, or less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
+        wanted = f"weights that sum to 1 over the full reach, or to less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
         raise DataError(
             "psf-sum", f"expected {wanted}; got {total:.6g}. Divide the weights by their sum first"
         )
@@ -104,7 +105,7 @@ def _within_reach(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def _check_centre(kernel: Kernel) -> None:
-    """Check that the centre holds the largest weight: otherwise every deconvolved image would be shifted."""
+    """Check that the centre holds the largest weight. Otherwise every deconvolved image would be shifted."""
     centre = (kernel.shape[0] // 2, kernel.shape[1] // 2)
     if kernel[centre] < kernel.max() * (1 - CENTRE_TOLERANCE):
         peak = np.unravel_index(int(kernel.argmax()), kernel.shape)
@@ -114,14 +115,17 @@ def _check_centre(kernel: Kernel) -> None:
 
 
 def crop_centred(kernel: Kernel, shape: tuple[int, int]) -> Kernel:
-    """The central part of `kernel`, centred at [n // 2] of the new shape (not larger); not renormalised."""
+    """Cut out the central part of `kernel`; the new centre is at [ny // 2, nx // 2] of `shape`.
+
+    `shape` must not be larger than the kernel. The weights are not renormalised.
+    """
     ny, nx = shape
     top, left = kernel.shape[0] // 2 - ny // 2, kernel.shape[1] // 2 - nx // 2
     return kernel[top : top + ny, left : left + nx].copy()
 
 
 def crop_or_pad(kernel: Kernel, size: int) -> Kernel:
-    """A kernel cropped or padded with zeros to (size, size), centred at [size // 2, size // 2]."""
+    """Crop a kernel, or pad it with zeros, to (size, size); the new centre is at [size // 2, size // 2]."""
     if kernel.shape[0] >= size and kernel.shape[1] >= size:
         return crop_centred(kernel, (size, size))
     out = np.zeros((size, size))
@@ -140,7 +144,7 @@ def squared_radii(shape: tuple[int, int]) -> NDArray[np.int64]:
 
 
 def encircled_energy(kernel: Kernel, radii_px: ArrayLike) -> NDArray[np.float64]:
-    """Sum of the weights with r <= R, for each R in `radii_px`; same shape as `radii_px`."""
+    """Sum of the weights with r <= R, for each R in `radii_px`; the result has the shape of `radii_px`."""
     by_square = np.bincount(squared_radii(kernel.shape).ravel(), weights=kernel.ravel())
     inside = np.concatenate(([0.0], np.cumsum(by_square)))
     radii = np.asarray(radii_px, dtype=np.float64)
@@ -153,13 +157,13 @@ def encircled_energy(kernel: Kernel, radii_px: ArrayLike) -> NDArray[np.float64]
 def cumulative_curve(kernel: Kernel, radii_px: ArrayLike) -> NDArray[np.float64]:
     """1 - encircled energy in percent: the light beyond each R (px), including light outside the array.
 
-    It is never below 0, although an array larger than the full reach may sum to more than 1.
+    The result is never below 0, although an array larger than the full reach may sum to more than 1.
     """
     return np.asarray(100.0 * np.maximum(1.0 - encircled_energy(kernel, radii_px), 0.0))
 
 
 def radial_profile(kernel: Kernel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(radius_px, mean weight) of rings one pixel wide; ring k holds the pixels whose r rounds to k."""
+    """Radius (px) and mean weight of rings that are one pixel wide. Ring k holds the pixels whose r rounds to k."""
     ring = np.rint(np.sqrt(squared_radii(kernel.shape))).astype(np.int64).ravel()
     count = np.bincount(ring)
     mean = np.bincount(ring, weights=kernel.ravel()) / np.maximum(count, 1)

@@ -4,19 +4,20 @@ A binned pixel is the mean of n x n pixels. For a scene that is constant within 
 
     K[M] = sum over d of t(d) h[n M + d],   t(d) = (1 - |d| / n) for |d| < n       Eq. (1), on each axis
 
-t is the convolution of two boxes of n pixels, one for the binned pixel in the scene and one for the binned pixel in the
-image. For even n, their shifts by half a pixel cancel, so K is centred at [size // 2, size // 2] for even and odd
-factors. K is the box-averaged h, averaged over all positions of a source within a binned pixel. The t(n M + d) sum to
-1 over M, so no light is lost. A delta function stays a delta function.
+t is the convolution of two boxes of n pixels: one box is the binned pixel in the scene, the other is the binned pixel
+in the image. For even n, the boxes are shifted by half a pixel in opposite directions, so the shifts cancel. Therefore
+K is centred at [size // 2, size // 2] for even and odd factors. K is h averaged over a box, and then averaged over all
+positions of a source within a binned pixel. The values t(n M + d) sum to 1 over M, so no light is lost. A delta function
+stays a delta function.
 
-A cut-out, or a window that starts elsewhere on the detector (PXBEG), has the same PSF: with one PSF for the whole
-field, only the difference of two positions matters. Near the edges of a window, light from outside the window enters
-the image; no choice of PSF corrects this.
+A cut-out, or a window that starts at another pixel of the detector (PXBEG), has the same PSF as the whole image. The
+reason is that one PSF is used for the whole field, so only the difference of two positions matters. Near the edges of
+a window, light from outside the window enters the image; no choice of PSF corrects this.
 
 | symbol | name | unit |
 |---|---|---|
 | h | kernel, centre at [size // 2, size // 2] | - |
-| K | the kernel of a binned pixel | - |
+| K | kernel for binned pixels | - |
 | n | factor | px |
 """
 
@@ -39,7 +40,7 @@ Kernel = NDArray[np.float64]
 
 
 def psf_for_image(psf: Psf, header: Header) -> Psf:
-    """The PSF for the pixels of an image with this header: `psf` itself, or rebinned by `binning_factor`."""
+    """The PSF for the pixels of an image with this header: `psf` itself, or `psf` rebinned by `binning_factor`."""
     return rebinned(psf, binning_factor(psf, header))
 
 
@@ -61,10 +62,10 @@ def check_compatible(image: Image, psf: Psf) -> None:
 def binning_factor(psf: Psf, header: Header) -> int:
     """Number of the PSF's pixels per image pixel, along each axis.
 
-    It is 1 if the plate scales agree to 1 % or one of them is not known. If the image's plate scale is the same whole
-    multiple on both axes, it is that multiple. This requires that the image is from the PSF's instrument, or that the
-    PSF names no instrument: pixels of another telescope may be a multiple by chance (an FSI pixel is nine HRI_EUV
-    pixels). Raises DataError "plate-scale-mismatch".
+    The factor is 1 if the plate scales agree to 1 %, or if one of them is not known. If the image's plate scale is the
+    same whole multiple of the PSF's on both axes, the factor is that multiple. This requires that the image is from the
+    PSF's instrument, or that the PSF names no instrument. Otherwise the multiple may be a coincidence: a pixel of FSI,
+    for example, is as wide as nine pixels of HRI_EUV. Raises DataError "plate-scale-mismatch".
     """
     if psf.plate_scale_arcsec is None:
         return 1
@@ -85,7 +86,7 @@ def _same_instrument(psf: Psf, header: Header) -> bool:
 
 
 def rebinned(psf: Psf, factor: int) -> Psf:
-    """The PSF, with its components, for pixels that are means of factor x factor pixels.
+    """Rebin the PSF and its components for pixels that are means of factor x factor pixels.
 
     Raises DataError "bad-binning" if the factor is out of range or larger than half the kernel.
     """
@@ -109,7 +110,7 @@ def rebinned(psf: Psf, factor: int) -> Psf:
 
 
 def rebinned_kernel(kernel: Kernel, factor: int) -> Kernel:
-    """Eq. (1) along both axes. Only weights within the full reach (in unbinned pixels) are used; their sum is kept."""
+    """Eq. (1) along both axes. Only weights within the full reach (in unbinned pixels) are used; their sum is unchanged."""
     inner = crop_centred(kernel, (min(kernel.shape[0], REACH_GRID_PX), min(kernel.shape[1], REACH_GRID_PX)))
     rows = _rebin_axis(inner, factor)
     return np.ascontiguousarray(_rebin_axis(rows.T, factor).T)
@@ -128,6 +129,6 @@ def _rebin_axis(kernel: Kernel, factor: int) -> Kernel:
 
 
 def _factor(ratio: float) -> int | None:
-    """The whole number that equals the ratio of two plate scales to 1 %, or None."""
+    """The whole number that agrees with the ratio of two plate scales to 1 %; None if there is no such number."""
     whole = round(ratio)
     return whole if whole >= 1 and abs(ratio / whole - 1) <= PLATE_SCALE_TOLERANCE else None

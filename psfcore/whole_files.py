@@ -15,7 +15,7 @@ PARTIAL = ".part"
 
 @contextmanager
 def whole_file(target: Path) -> Iterator[BinaryIO]:
-    """Open a temporary file beside `target`; it replaces `target` when all of it is on the disk.
+    """Open a temporary file beside `target`. It replaces `target` when its whole content is on the disk.
 
     A killed process leaves its temporary file behind; `partials` finds it. Raises OSError.
     """

@@ -1,14 +1,15 @@
-"""Linear convolution through SciPy's Fourier transforms. No other file of psfcore calls a library's transforms.
+"""Linear convolution through SciPy's Fourier transforms. No other file of psfcore calls the transforms of a library.
 
 The scene is zero outside the field, and the result is cut to the field:
 
-    (H x)[j] = sum over o of h[o] x[j - o],      Eq. (1)    j and j - o on the field
+    (H x)[j] = sum over o of h[o] x[j - o],      Eq. (1)    where j and j - o lie in the field
     (H^T y)[i] = sum over o of h[o] y[i + o]     Eq. (2)
 
-The paper (Hofmeister et al. 2024) pads image and PSF by half an image edge on all sides, so that nothing wraps
-around. Light that wraps into pixels which are cut off afterwards does no harm. A transform of the length field +
-largest offset therefore gives the same numbers (the tests compare both) and is shorter: 3072 px for a field and a
-PSF of 2048 px.
+A Fourier transform is periodic: light that leaves the plane on one side enters it again on the other side ("wraps").
+The paper (Hofmeister et al. 2024) pads image and PSF by half the image's width on all sides, so that no light wraps.
+Wrapped light does no harm, however, in pixels that are cut off afterwards. The length of the transform can therefore
+be the sum of the field and the largest offset. This gives the same numbers (the tests compare both) with a shorter
+transform: 3072 px for a field and a PSF of 2048 px.
 
 | symbol | name |
 |---|---|
@@ -29,9 +30,9 @@ Field = NDArray[np.floating]
 
 
 class Convolver:
-    """Convolution with one PSF, cut to one field, and its adjoint.
+    """Convolution with one PSF, cut to one field, and the adjoint of this operator.
 
-    psf_kernel: weights [y, x], centre at [n // 2, n // 2]. field_shape: (ny, nx) of the arrays to convolve.
+    psf_kernel: weights [y, x], centre at [ny // 2, nx // 2]. field_shape: (ny, nx) of the arrays to convolve.
     dtype: float32 or float64, for transforms and results. threads: number of threads for the transforms.
     Raises DataError "field-shape" if an array has another shape.
     """
@@ -66,14 +67,14 @@ class Convolver:
     def adjoint(self, y: Field) -> Field:
         """H^T y, Eq. (2): the field correlated with the PSF; shape (ny, nx)."""
         spectrum = self._forward(y)
-        # spectrum * conj(transfer), without a temporary array for the conjugate
+        # Compute spectrum * conj(transfer) without a temporary array for the conjugate.
         np.conjugate(spectrum, out=spectrum)
         spectrum *= self._transfer
         np.conjugate(spectrum, out=spectrum)
         return self._inverse(spectrum)
 
     def _forward(self, x: Field) -> NDArray[np.complexfloating]:
-        """Transform along x first, only the rows of the field: the padding rows are zero."""
+        """Transform along x, then along y. Along x only the rows of the field are needed: the padding rows are zero."""
         if x.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {x.shape}")
         rows = scipy.fft.rfft(np.asarray(x, dtype=self.dtype), n=self.length[1], axis=1, workers=self.threads)
@@ -91,19 +92,19 @@ class Convolver:
 def needed_kernel(
     psf_kernel: NDArray[np.floating], field_shape: tuple[int, int]
 ) -> tuple[NDArray[np.floating], tuple[int, int]]:
-    """The part of a kernel whose offsets can connect two pixels of the field, and the offset of its first pixel."""
+    """Cut a kernel to the offsets that can connect two pixels of the field; also return the offset of its first pixel."""
     (y0, y1), (x0, x1) = (_needed(n, size) for n, size in zip(psf_kernel.shape, field_shape, strict=True))
     return psf_kernel[y0:y1, x0:x1], (y0 - psf_kernel.shape[0] // 2, x0 - psf_kernel.shape[1] // 2)
 
 
 def _needed(kernel_size: int, field_size: int) -> tuple[int, int]:
-    """Index range of the offsets that can connect two pixels of the field, along one axis."""
+    """Range of indices, along one axis, of the offsets that can connect two pixels of the field."""
     centre = kernel_size // 2
     return max(0, centre - (field_size - 1)), min(kernel_size, centre + field_size)
 
 
 def _length(field_size: int, lowest: int, highest: int) -> int:
-    """Length of the shortest fast transform in which no wrapped light reaches the field."""
+    """Shortest length of a fast transform for which no wrapped light reaches the field."""
     return int(scipy.fft.next_fast_len(field_size + max(-lowest, highest, 0), real=True))
 
 
@@ -114,9 +115,9 @@ def linear_convolve(
     *,
     threads: int = 1,
 ) -> NDArray[np.float64]:
-    """Convolve two kernels linearly in float64; both have their centre at [n // 2, n // 2].
+    """Convolve two kernels linearly, in float64. The centre of each kernel is at [ny // 2, nx // 2].
 
-    The result has the shape `out_shape` and its centre at [n // 2, n // 2]. Light outside it is cut off.
+    The result has the shape `out_shape`, and its centre is at [ny // 2, nx // 2] too. Light outside is cut off.
     """
     length = tuple(
         int(scipy.fft.next_fast_len(p + q - 1, real=True))
@@ -139,10 +140,11 @@ def linear_convolve(
 def correlations(
     planes: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int
 ) -> NDArray[np.floating]:
-    """Sums over pixels of plane(x) scene(x - d), for displacements d up to reach_px along each axis.
+    """Correlate planes with a scene: for each displacement d, sum plane(x) scene(x - d) over all pixels x.
 
-    planes: (k, ny, nx). scene: (ny + 2 reach, nx + 2 reach); its middle covers the same pixels as the planes.
-    Returns (k, 2 reach + 1, 2 reach + 1), with displacement 0 in the middle.
+    planes: shape (k, ny, nx). scene: shape (ny + 2 reach_px, nx + 2 reach_px); its inner (ny, nx) pixels are the pixels
+    of the planes. d runs from -reach_px to reach_px along each axis. The result has the shape
+    (k, 2 reach_px + 1, 2 reach_px + 1); d = 0 is in the middle.
     """
     length = tuple(int(scipy.fft.next_fast_len(n, real=True)) for n in scene.shape)
     wide = scipy.fft.rfft2(planes, s=length)
@@ -154,13 +156,14 @@ def correlations(
 
 
 class ChirpTransform:
-    """Fourier sum between two centred grids of arbitrary steps, as one convolution with a chirp (Bluestein 1970).
+    """Fourier sum from one centred grid to another, with arbitrary steps, computed by convolution (Bluestein 1970).
 
         F[k] = sum over n of f[n] exp(-2 pi i r n' k'),  n' = n - (N - 1) / 2,  k' = k - (K - 1) / 2
         n' k' = (n'^2 + k'^2 - (k' - n')^2) / 2
 
-    r: ratio, the product of the two grid steps in units of one period (1 / N for an FFT).
-    N, K: samples, out_samples. The grids are not periodic: the sum is evaluated exactly as written.
+    The second line turns the sum into a convolution with a chirp, exp(i pi r n^2).
+    r: `ratio`, the product of the two grid steps in units of one period (1 / N for an FFT).
+    N, K: `samples`, `out_samples`. The grids are not periodic: the sum is evaluated exactly as written.
     """
 
     def __init__(self, ratio: float, samples: int, out_samples: int) -> None:
@@ -176,7 +179,7 @@ class ChirpTransform:
         self._transfer = scipy.fft.fft(kernel, overwrite_x=True)
 
     def apply(self, f: NDArray[np.complexfloating]) -> NDArray[np.complex128]:
-        """F, shape (out_samples,), from f, shape (samples,). Raises DataError "field-shape"."""
+        """Compute F, shape (out_samples,), from f, shape (samples,). Raises DataError "field-shape"."""
         if f.shape != (self.samples,):
             raise DataError("field-shape", f"expected a field of {(self.samples,)}; got {f.shape}")
         spectrum = scipy.fft.fft(f * self._before, n=self._length, overwrite_x=True)
@@ -190,5 +193,5 @@ def _chirp(ratio: float, n: NDArray[np.floating]) -> NDArray[np.complex128]:
 
 
 def transform_axis(a: NDArray[np.complex64], *, axis: int, threads: int = 1) -> NDArray[np.complex64]:
-    """Forward transform along one axis. It may overwrite `a`."""
+    """Fourier transform along one axis. The function may overwrite `a`."""
     return np.asarray(scipy.fft.fft(a, axis=axis, workers=threads, overwrite_x=True))

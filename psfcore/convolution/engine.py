@@ -1,18 +1,19 @@
 """Fast convolution with one PSF, and its adjoint, for fields of one shape, in single precision.
 
-The operators are those of `psfcore.convolution.convolver.Convolver` (Eq. (1) and (2) there). The engine is several
-times faster (`python -m benchmarks.deconvolution` prints the ratio to SciPy and ducc0) for three reasons:
+The engine computes the same operators as `psfcore.convolution.convolver.Convolver`: H of Eq. (1) and H^T of Eq. (2) in
+that module. The engine is several times faster than SciPy (`python -m benchmarks.deconvolution` prints the ratios to
+SciPy and ducc0). There are three reasons:
 
-- Pruned transforms: along x only the field's rows of the padded plane are transformed. Along y, a block of sixteen
-  columns is padded, transformed, multiplied by the transfer function and transformed back while it is in the cache.
-  Only the field's rows are written back.
-- Fused steps: between two convolutions of an iteration, a block of rows is transformed back, changed by the method
-  and transformed again while it is in the cache. H x is never written to memory.
-- A real transfer function, if the PSF is symmetric about its centre.
+- Transforms of zeros are left out. Along x, only the rows of the field are transformed, not the padding rows. Along y,
+  a block of sixteen columns is padded, transformed, multiplied by the transfer function and transformed back while it
+  is in the cache. Only the rows of the field are written back.
+- Steps are combined. Between two convolutions of an iteration, a block of rows is transformed back, changed by the
+  method and transformed again while it is in the cache. H x is never written to memory.
+- The transfer function is real if the PSF is symmetric about its centre.
 
-Layout of a field: blocks of 32 rows, [block][x][half][lane], where the row is 32 block + 16 half + lane. The two
-halves are the real and imaginary part of one complex transform, so a real row costs half a transform. Layout of a
-spectrum: [block of 16 columns][row][re, im][lane]. Each block is processed on its own and in a fixed order, so the
+A field is stored in blocks of 32 rows, [block][x][half][lane]; the row is 32 block + 16 half + lane. The two halves
+are the real and the imaginary part of one complex transform, so a real row costs half a transform. A spectrum is
+stored as [block of 16 columns][row][re, im][lane]. Each block is processed independently and in a fixed order, so the
 result does not depend on the number of threads.
 """
 
@@ -34,8 +35,10 @@ from psfcore.convolution.fft_kernels import LANES, Plan, forward, good_length, i
 from psfcore.errors import DataError
 
 BLOCK_ROWS = 2 * LANES
-SYMMETRIC_TO = 1e-7  # of the sum of weights: smaller than the float32 rounding of the transfer function
-# For small and for large images. Handing out a chunk takes about as long as one or two small blocks.
+# Largest imaginary part of the transfer function of a symmetric PSF, as a share of the sum of weights. It is smaller
+# than the float32 rounding of the transfer function.
+SYMMETRIC_TO = 1e-7
+# Chunks per thread for small and for large images. To start a chunk takes about as long as one or two small blocks.
 _CHUNKS_A_THREAD = (2, 4)
 _BLOCKS_A_CHUNK = 8
 
@@ -44,20 +47,21 @@ Single = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Scratch:
-    """Memory of one thread: the buffer of a transform, and a small array to transpose blocks in."""
+    """Working memory of one thread: the buffer of a transform, and a small array in which blocks are transposed."""
 
     buffer: Single
     corner: Single
 
 
 class Engine:
-    """Convolution with one PSF, cut to one field, and its adjoint, in float32.
+    """Convolution with one PSF, cut to one field, and the adjoint of this operator, in float32.
 
-    psf_kernel: weights [y, x], centre at [n // 2, n // 2]; any shape, even or odd. field_shape: (ny, nx).
-    span: (ny, nx); the convolution is exact between pixels closer than this. Default: the field's shape, so that it
-    is exact between all pixels. If the field includes a margin, pixels farther apart lie in opposite margins; light
-    may wrap between them, which keeps the transforms short. threads: number of threads; it does not change the
-    result. Raises DataError "field-shape" if an array has another shape.
+    psf_kernel: weights [y, x] of any shape, even or odd; centre at [ny // 2, nx // 2]. field_shape: (ny, nx).
+    span: (ny, nx); the convolution is exact between two pixels that are closer than this. Default: the shape of the
+    field, so that the convolution is exact between all pixels. If the field includes a margin, a smaller span keeps the
+    transforms short: pixels that are farther apart lie in opposite margins, and light may wrap between them.
+    threads: number of threads; it does not change the result.
+    Raises DataError "field-shape" if an array has another shape.
     """
 
     def __init__(
@@ -97,7 +101,7 @@ class Engine:
 
     @property
     def symmetric(self) -> bool:
-        """Whether the PSF is symmetric about its centre, so that its transfer function is real."""
+        """Whether the PSF is symmetric about its centre. The transfer function is then real."""
         return self.transfer.shape[2] == 1
 
     # Whole operators -------------------------------------------------------------------------------
@@ -120,7 +124,7 @@ class Engine:
     # Steps that a method combines -------------------------------------------------------------------
 
     def to_lanes(self, field: NDArray[np.floating], *, padding: float = 0.0) -> Single:
-        """Convert a field (ny, nx) to the engine's layout. Rows that fill up the last block hold `padding`."""
+        """Convert a field (ny, nx) to the engine's layout. Additional rows that complete the last block hold `padding`."""
         if field.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {field.shape}")
         ny, nx = self.field_shape
@@ -129,7 +133,7 @@ class Engine:
         return np.ascontiguousarray(padded.transpose(0, 3, 1, 2))
 
     def from_lanes(self, lanes: Single) -> Single:
-        """The inverse of `to_lanes`; shape (ny, nx)."""
+        """Convert from the engine's layout to a field, shape (ny, nx)."""
         ny, nx = self.field_shape
         return np.ascontiguousarray(lanes.transpose(0, 2, 3, 1).reshape(-1, nx)[:ny])
 
@@ -154,11 +158,11 @@ class Engine:
         self.run(work, self.row_blocks)
 
     def columns(self, *, adjoint: bool) -> None:
-        """Transform the columns, multiply by the transfer function (its conjugate for the adjoint), transform back."""
+        """Transform the columns, multiply by the transfer function (adjoint: its conjugate), and transform back."""
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
-        """Transform the columns, multiply by a filter in the layout of the transfer function, transform back."""
+        """As ``columns``, with any filter in the layout of the transfer function, or with the conjugate of the filter."""
         kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
         sign = np.float32(-1.0 if conjugate else 1.0)
 
@@ -168,10 +172,10 @@ class Engine:
         self.run(work, self.column_blocks)
 
     def row_stage(self, work: Callable[..., Any], *fields: Any) -> list[Any]:
-        """Run a method's compiled row stage on all blocks; returns its results, one per chunk.
+        """Run `work`, the compiled function of a method for the rows, on all blocks; returns one result per chunk.
 
-        `work` is called with the spectrum, the fields, buffer and corner of the scratch memory, the range of blocks
-        and the numbers of the row plan.
+        The arguments of `work` are the spectrum, the fields, buffer and corner of the scratch memory, the range of
+        blocks, and the numbers of the row plan.
         """
 
         def part(start: int, stop: int, scratch: Scratch) -> Any:
@@ -183,7 +187,7 @@ class Engine:
 
     @property
     def row_numbers(self) -> tuple[Any, ...]:
-        """The row plan in the form of kernel arguments."""
+        """The row plan as arguments of a compiled kernel."""
         return (*_numbers(self.row_plan), self.row_plan.place)
 
     def run(self, work: Callable[[int, int, Scratch], Any], blocks: int) -> list[Any]:
@@ -204,9 +208,9 @@ class Engine:
         return [one(0)] if chunks == 1 else self._shared_out(one, chunks)
 
     def _shared_out(self, one: Callable[[int], Any], chunks: int) -> list[Any]:
-        """Results of all chunks. This thread works too, and each thread takes the next free chunk.
+        """Process all chunks and return their results. The calling thread works too; each thread takes the next free chunk.
 
-        For a small image, waking another thread for each chunk would take longer than the chunk itself.
+        For a small image, it would take longer to wake a thread for each chunk than to process the chunk.
         """
         results: list[Any] = [None] * chunks
         taken = itertools.count()
@@ -219,13 +223,13 @@ class Engine:
         try:
             work()
         finally:
-            for other in others:  # wait: they write to the same spectrum
+            for other in others:  # wait, because they write to the same spectrum
                 other.result()
         return results
 
     @property
     def transfer_scale(self) -> int:
-        """Divisor of the transfer function: with it, a forward and an inverse transform need no other scaling."""
+        """The transfer function is divided by this number, so that a forward and an inverse transform need no scaling."""
         return self.row_plan.length * self.column_plan.length
 
     def _transfer_function(self, kernel: NDArray[np.floating], first: tuple[int, int]) -> Single:
@@ -261,7 +265,7 @@ class Engine:
 def _wrapped_rows(
     kernel: NDArray[np.floating], first: tuple[int, int], shape: tuple[int, int], rows: slice
 ) -> Single:
-    """Some rows of a periodic plane that holds the kernel with its centre at [0, 0], and zeros elsewhere."""
+    """Some rows of a periodic plane. The plane holds the kernel, with its centre at [0, 0], and zeros elsewhere."""
     (ky, kx), (fy, fx), (ly, lx) = kernel.shape, first, shape
     out = np.zeros((rows.stop - rows.start, lx), np.float32)
     split = min(kx, max(0, -fx))
@@ -313,7 +317,7 @@ def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # typ
 
 @compiled()
 def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
-    """The inverse of ``spectrum_from_buffer``: Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k]."""
+    """Do the inverse of ``spectrum_from_buffer``: Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k]."""
     z = buffer.reshape((-1, 2, LANES))
     last = length // 2
     for group in range(spectrum.shape[0]):
@@ -357,7 +361,7 @@ def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, radices,
 
 @compiled()
 def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
-    # The block may hold more padding rows than the transform is long. They are zero and stay zero.
+    # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
     filled = min(spectrum.shape[1], length) * 2 * LANES
     z = buffer.reshape((-1, 2, LANES))
     for group in range(start, stop):
@@ -376,8 +380,8 @@ def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radice
 
 @compiled()
 def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
-    """As `_columns_real` for an asymmetric PSF; `sign` -1 uses the conjugate, for the adjoint."""
-    # The block may hold more padding rows than the transform is long. They are zero and stay zero.
+    """As `_columns_real`, for an asymmetric PSF. sign: -1 multiplies by the conjugate, for the adjoint; otherwise 1."""
+    # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
     filled = min(spectrum.shape[1], length) * 2 * LANES
     z = buffer.reshape((-1, 2, LANES))
     for group in range(start, stop):

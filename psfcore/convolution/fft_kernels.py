@@ -1,20 +1,20 @@
-"""Fast Fourier transforms of sixteen signals at a time, in single precision and in the cache.
+"""Fast Fourier transforms of sixteen signals at a time, in single precision, with all data in the cache.
 
 These are mixed-radix Cooley-Tukey transforms in place. The forward transform decimates in frequency, from natural to
 digit-reversed order. The inverse decimates in time, from digit-reversed back to natural order. A convolution
-multiplies between the two, so the frequencies are never sorted (`Plan.frequency` gives the frequency at each place).
+multiplies between the two, so the frequencies need not be sorted. `Plan.frequency` gives the frequency of each index.
 
-Sixteen signals ("lanes") lie side by side, so each butterfly is one operation on sixteen neighbours. A buffer is flat
-float32, [index][re, im][lane]. The compiler turns the innermost loop over lanes into vector instructions. With more
-than three legs per butterfly this works only if the distances between legs are constants: there is therefore one
-compiled function for each length of a radix-8 or radix-4 pass. The radix-4 or radix-2 pass comes before the radix-8
-passes, which keeps the number of lengths, and the time to compile on the first run, small. Indices are unsigned,
-because the check for negative indices would prevent vector instructions.
+Sixteen signals ("lanes") are stored side by side, so each butterfly is one operation on sixteen neighbours. A buffer is
+a flat float32 array, [index][re, im][lane]. The compiler turns the innermost loop, which runs over the lanes, into
+vector instructions. If a butterfly has more than three inputs ("legs"), this works only if the distances between the
+legs are constants. Therefore there is one compiled function for each length of a radix-8 or radix-4 pass. The radix-4
+or radix-2 pass comes before the radix-8 passes. This order keeps the number of lengths small, and so the time to
+compile on the first run. Indices are unsigned, because a check for negative indices would prevent vector instructions.
 
     X[k] = sum_j x[j] exp(-2 pi i j k / L)                                                          Eq. (1)
 
-A pass of radix r on length n = r m takes legs x[p + q m], q = 0 .. r-1, to DFT_r(legs)[q] exp(-2 pi i p q / n).
-L times the inverse of Eq. (1) is the same transform with real and imaginary parts exchanged in input and output.
+A pass of radix r on length n = r m replaces the legs x[p + q m], q = 0 .. r-1, by DFT_r(legs)[q] exp(-2 pi i p q / n).
+The inverse of Eq. (1), times L, is the same transform with real and imaginary parts exchanged in input and output.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ODD_FACTORS = (1, 3, 9)
 _HALF_ROOT = np.float32(np.sqrt(0.5))
 _HALF_ROOT_3 = np.float32(np.sqrt(0.75))
 _W = np.uint64(LANES)
-# Allow fused multiply-add only: no option that assumes finite numbers or changes the order of sums.
+# Allow only fused multiply-add. Options that assume finite numbers or change the order of sums are not allowed.
 _FAST: Any = {"contract"}
 
 Flat = NDArray[np.float32]
@@ -44,9 +44,10 @@ Flat = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How to transform one length: radix and length of each pass, twiddle factors, and order of the result.
+    """How to transform signals of one length: radix and length of each pass, twiddle factors, and order of the result.
 
-    `frequency[i]` is the frequency at place i after a forward transform; `place` is the inverse permutation.
+    `frequency[i]` is the frequency at index i after a forward transform. `place` is the inverse permutation:
+    `place[k]` is the index of frequency k.
     """
 
     length: int
@@ -59,7 +60,7 @@ class Plan:
 
 
 def good_length(at_least: int) -> int:
-    """The smallest supported length >= `at_least`: 2^a, 3 2^a or 9 2^a with a >= 4. Raises ValueError."""
+    """The smallest supported length >= `at_least`. Supported are 2^a, 3 2^a and 9 2^a with a >= 4. Raises ValueError."""
     candidates = [odd << a for odd in _ODD_FACTORS for a in range(4, 15) if odd << a <= LARGEST_LENGTH]
     fitting = [length for length in candidates if length >= at_least]
     if not fitting:
@@ -83,7 +84,7 @@ def make_plan(length: int) -> Plan:
         offsets.append(offset)
         twiddles.append(table.ravel())
         offset += table.size
-        # Block q of this pass holds the frequencies congruent to q, so the first pass gives the lowest digit.
+        # Block q of this pass holds the frequencies congruent to q modulo the radix: the first pass gives the lowest digit.
         frequency = (frequency[:, None] + scale * np.arange(radix)[None, :]).ravel()
         scale *= radix
         n = m
@@ -101,7 +102,7 @@ def make_plan(length: int) -> Plan:
 
 
 def _radices(length: int) -> list[int]:
-    """Radices of the passes: threes, then the remaining four or two, then eights (few different lengths)."""
+    """Radices of the passes: first 3 (up to twice), then 4 or 2 if needed, then 8. This order gives few lengths."""
     radices, rest = [], length
     while rest % 3 == 0:
         radices.append(3)
@@ -117,7 +118,7 @@ def _radices(length: int) -> list[int]:
     return radices + [8] * eights
 
 
-# Butterflies on scalars; the compiler applies them to all lanes ---------------------------------------
+# Butterflies of single numbers; the compiler applies them to all lanes ---------------------------------------
 
 
 @njit(inline="always", fastmath=_FAST)
@@ -133,7 +134,7 @@ def _times(ar, ai, wr, wi):  # type: ignore[no-untyped-def]
 
 
 def _radix8(n: int, inverse: bool) -> Callable[..., None]:
-    """The radix-8 pass for blocks of length n, a constant for the compiler."""
+    """Make the radix-8 pass for blocks of length n; n is a constant for the compiler."""
     m = n // 8
     h = _HALF_ROOT
     M1, M2, M3, M4, M5, M6, M7 = (np.uint64(q * m * 2 * LANES) for q in range(1, 8))
@@ -250,7 +251,7 @@ def _backward3(x, tw, length, n):  # type: ignore[no-untyped-def]
 
 
 def _radix4(n: int, inverse: bool) -> Callable[..., None]:
-    """The radix-4 pass for blocks of length n, a constant for the compiler."""
+    """Make the radix-4 pass for blocks of length n; n is a constant for the compiler."""
     m = n // 4
     M1, M2, M3 = (np.uint64(q * m * 2 * LANES) for q in range(1, 4))
     R, I = (np.uint64(LANES), np.uint64(0)) if inverse else (np.uint64(0), np.uint64(LANES))  # noqa: E741
@@ -334,7 +335,7 @@ _forward_4096, _backward_4096 = _radix8(4096, False), _radix8(4096, True)
 
 @compiled()
 def forward(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
-    """Eq. (1) for sixteen lanes in place; the result is in the order of `Plan.frequency`."""
+    """Compute Eq. (1) for sixteen lanes, in place. The result is in the order of `Plan.frequency`."""
     for stage in range(len(radices)):
         tw, n = twiddles[offsets[stage] :], lengths[stage]
         if radices[stage] == 3:
@@ -361,7 +362,7 @@ def forward(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-
 
 @compiled()
 def inverse(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
-    """`length` times the inverse of `forward`, in place; the result is in natural order."""
+    """Compute `length` times the inverse of `forward`, in place. The result is in natural order."""
     for stage in range(len(radices) - 1, -1, -1):
         tw, n = twiddles[offsets[stage] :], lengths[stage]
         if radices[stage] == 3:

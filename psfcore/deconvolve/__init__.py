@@ -1,6 +1,7 @@
 """Deconvolution of images with a known PSF.
 
-Each method is one file in `methods`, with a function `deconvolve(image, psf, conditions, ...) -> Deconvolved`. The
-constant METHOD is its name, and EDGES is its default for what lies beyond the field; `methods.registry.method_named`
-finds it. A method that uses the engine is an `Iteration` between `problem.pose` and `problem.solution`.
+Each method is one file in `methods` with a function `deconvolve(image, psf, conditions, ...) -> Deconvolved`. The
+constant METHOD is the name of the method, and EDGES is its default assumption about the scene beyond the field.
+`methods.registry.method_named` finds a method by its name. A method that uses the engine calls `problem.pose`, runs an
+`Iteration`, and passes its estimate to `problem.solution`.
 """

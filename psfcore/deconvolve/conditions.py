@@ -26,11 +26,12 @@ def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
 class Conditions:
     """Options of a deconvolution. Raises DataError "bad-margin" for a negative margin.
 
-    edges: assumption about the scene beyond the field; None: the method's own default, EDGES.
-    margin_px: width of the margin beyond the field (unused with zero edges); None: chosen from the PSF.
-    noise: required if a method stops by discrepancy. threads: number of threads; it does not change the result.
+    edges: assumption about the scene beyond the field; None: the default of the method, EDGES.
+    margin_px: width of the margin beyond the field; it is not used with zero edges. None: it is chosen from the PSF.
+    noise: noise of the camera; required if the stopping rule is "discrepancy".
+    threads: number of threads; it does not change the result.
     progress(step, steps) is called after each step; its exceptions are not caught.
-    engine_for: makes the engine; an `EngineCache` keeps engines between images.
+    engine_for: function that makes the engine; an `EngineCache` keeps engines between images.
     """
 
     edges: Edges | None = None
@@ -46,10 +47,10 @@ class Conditions:
 
 
 class EngineCache:
-    """A cache of engines by PSF, shape, span and threads; it drops the least recently used one first.
+    """A cache of engines by PSF, shape, span and threads. If it is full, it drops the least recently used engine.
 
-    An engine handles one image at a time, so threads must not share a cache. PSFs are compared by identity: pass the
-    same object again to reuse its engine.
+    An engine handles one image at a time, so threads must not share a cache. An engine is reused only if the same `Psf`
+    object is passed again; an equal copy does not count.
     """
 
     def __init__(self, capacity: int = 2) -> None:

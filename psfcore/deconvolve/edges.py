@@ -1,21 +1,22 @@
 """Assumptions about the scene beyond the field: zero, the field's mirror image, or an unknown scene.
 
 - zero: the scene is zero beyond the field, as in Hofmeister et al. (2024).
-- symmetric: a margin continues the field by its mirror image; field and margin are deconvolved, then the margin is
-  cut off.
+- symmetric: the mirror image of the field fills a margin around it. Field and margin are deconvolved, and then the
+  margin is cut off.
 - extended: the scene is estimated on field and margin, although no pixel of the margin was observed
   (Bertero & Boccacci 2005, A&A 437, 369). The estimate starts from the mirror image.
 
-The PSF tells how far from an edge the scene beyond it matters. For a uniform scene, a pixel at distance d from a
-straight edge (0 for the outermost pixels) receives from beyond the edge the share
+The PSF determines how far from an edge the scene beyond the edge matters. In a uniform scene, a pixel at distance d
+from a straight edge (d = 0 for the outermost pixels) receives the share b(d) of its light from beyond the edge:
 
     b(d) = sum over o > d of l[o],   l[o] = sum of the weights whose offset across the edge is o      Eq. (1)
 
-of its light; l is the mean over the four directions.
+b is the mean over the four edges of the image.
 
 | symbol | name | unit |
 |---|---|---|
 | d | distance from the edge | px |
+| o | offset from the PSF's centre, perpendicular to the edge | px |
 | b | share_from_beyond | - |
 """
 
@@ -47,9 +48,9 @@ Trust = NDArray[np.bool_]
 class Domain:
     """The plane on which a method estimates the scene: the field and its margin.
 
-    pixels [y, x]: the image divided by `scale`, 0 where it is not finite; in the margin its mirror image.
-    trusted: pixels that the estimate is fitted to. finite: pixels that can serve as its starting value.
-    field: position of the field in the plane. scale: the largest absolute pixel value, so that float32 can hold
+    pixels [y, x]: the image divided by `scale`, and 0 where it is not finite; the margin holds its mirror image.
+    trusted: pixels to which the estimate is fitted. finite: pixels whose values can start the estimate.
+    field: position of the field in the plane. scale: the largest absolute pixel value. The division lets float32 hold
     any image.
     """
 
@@ -70,8 +71,8 @@ class Domain:
     def span(self) -> tuple[int, int]:
         """Distance (ny, nx) within which the convolution must be exact.
 
-        With extended edges it covers every pixel whose light reaches the field. Otherwise it is the size of the
-        field: opposite mirror images need no connection.
+        With extended edges, the distance covers every pixel whose light reaches the field. With other edges it is the
+        size of the field, because light need not travel from one margin to the opposite one.
         """
         sought = self.margin_px if self.edges == "extended" else 0
         ny, nx = (part.stop - part.start for part in self.field)
@@ -83,7 +84,7 @@ class Domain:
 
 
 def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
-    """b of Eq. (1) for d = 0, 1, ... px, up to half the PSF's size."""
+    """Compute b of Eq. (1) for d = 0, 1, ... px, up to half the size of the PSF."""
     ny, nx = psf.kernel.shape
     shares = np.zeros((4, max(ny, nx) + 1))
     for n, (line, centre) in enumerate(
@@ -97,7 +98,9 @@ def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
 
 
 def edge_band_px(psf: Psf, fraction: float = FLAGGED_SHARE) -> int:
-    """Width of the band along an edge in which more than `fraction` of a pixel's light may come from beyond it.
+    """Width of the band along an edge in which more than `fraction` of a pixel's light comes from beyond the edge.
+
+    The width holds for a uniform scene.
 
     Raises DataError "bad-fraction".
     """
@@ -107,14 +110,15 @@ def edge_band_px(psf: Psf, fraction: float = FLAGGED_SHARE) -> int:
 
 
 def band_px(shares: NDArray[np.float64], fraction: float) -> int:
-    """As `edge_band_px`, from b of Eq. (1). To compute b takes a pass over the whole PSF."""
+    """As `edge_band_px`, but from `shares`, which is b of Eq. (1). To compute b, the whole PSF must be read."""
     return int(np.count_nonzero(shares > fraction))
 
 
 def margin_for(shares: NDArray[np.float64], field_shape: tuple[int, int], *, share: float) -> int:
-    """Width of the margin in px: light from farther away is at most `share` of an edge pixel's light.
+    """Width of the margin in px. Beyond it, the scene gives a pixel at the edge at most `share` of its light.
 
-    shares: b of Eq. (1). The width is rounded up to half a block of the engine. It is at most half the field.
+    shares: b of Eq. (1). The width is rounded up to a multiple of 16 px, half a block of the engine. It is at most half
+    the width of the field.
     """
     half_block = BLOCK_ROWS // 2
     wanted = half_block * -(-band_px(shares, share) // half_block)
@@ -134,7 +138,7 @@ def lay_out(image: Image, *, edges: Edges, margin_px: int) -> Domain:
     scale = float(np.abs(image.pixels[finite]).max())
     if scale == 0:
         raise DataError("no-signal", "expected at least one pixel other than zero; all are zero")
-    # Divide in float64, because float32 can hold neither 1e-300 nor 1e300.
+    # Divide in float64: float32 cannot hold numbers such as 1e-300 and 1e300.
     scaled = np.where(finite, image.pixels, 0.0) / scale
     margin = 0 if edges == "zero" else margin_px
     ny, nx = scaled.shape

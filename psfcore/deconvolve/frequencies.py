@@ -1,11 +1,13 @@
 """Noise amplification of a linear method, computed frequency by frequency.
 
-A method x <- x + G (y - H x) that starts from x_0 = y multiplies a frequency with transfer T, after n steps, by
+Consider a method x <- x + G (y - H x) that starts from x_0 = y. T is the PSF's Fourier transform at one frequency.
+After n steps, the method has multiplied this frequency by
 
     A_n = A_(n-1) + G (1 - T A_(n-1)),   A_0 = 1        Eq. (1)
 
-It multiplies uncorrelated noise by the root of the mean of abs(A)^2 over all frequencies. This holds away from edges
-and masked pixels. Only every eighth (or third) frequency along one axis is used: transfers are smooth on that scale.
+The method multiplies the rms of uncorrelated noise by the root of the mean of abs(A)^2 over all frequencies. This
+holds away from edges and masked pixels. T varies smoothly from frequency to frequency. Therefore only every
+k-th frequency along y is used; k is 2, 3, 4 or 8, depending on the length of the transform.
 
 | symbol | name |
 |---|---|
@@ -30,18 +32,18 @@ LARGEST_GROWTH = 10.0
 
 @dataclass(frozen=True, eq=False)
 class TransferSample:
-    """Transfers at some frequencies (float64 or complex128) and their weights, which sum to 1."""
+    """Values of T at some frequencies (float64 or complex128) and the weights of these frequencies, which sum to 1."""
 
     values: NDArray[np.floating] | NDArray[np.complexfloating]
     weights: NDArray[np.float64]
 
 
 def transfer_sample(engine: Engine) -> TransferSample:
-    """A sample of an engine's transfers: along y, the frequencies in the first block of its transform."""
+    """A sample of an engine's transfer function: along y, every k-th frequency (k: first radix of its transform)."""
     rows = engine.column_plan.length // int(engine.column_plan.radices[0])
     lanes = engine.transfer[:, :rows].astype(np.float64) * engine.transfer_scale
     values = lanes[:, :, 0] if engine.symmetric else lanes[:, :, 0] + 1j * lanes[:, :, 1]
-    # Frequencies along x from 0 to L / 2; all but the two ends also represent their negatives.
+    # Frequencies along x run from 0 to L / 2. Except the first and last, each also represents its negative.
     k, half = np.arange(engine.column_blocks * LANES), engine.row_plan.length // 2
     times = np.where((k == 0) | (k == half), 1.0, np.where(k < half, 2.0, 0.0))
     weights = np.broadcast_to(times.reshape(-1, 1, LANES), values.shape)
@@ -52,8 +54,8 @@ def transfer_sample(engine: Engine) -> TransferSample:
 def noise_amplification(
     sample: TransferSample, step: NDArray[np.floating] | NDArray[np.complexfloating], steps: int
 ) -> float:
-    """Rms noise of the estimate, divided by that of the image, after `steps` steps of Eq. (1). step: G."""
-    # In closed form A_n = (1 - (1 - G T)^n (1 - T)) / T, but this fails for T near 0.
+    """Rms noise of the estimate after `steps` steps, divided by the rms noise of the image. step: G of Eq. (1)."""
+    # The closed form A_n = (1 - (1 - G T)^n (1 - T)) / T fails for T near 0.
     gain = np.ones_like(sample.values)
     for _ in range(steps):
         gain = gain + step * (1 - sample.values * gain)  # Eq. (1)
@@ -61,11 +63,11 @@ def noise_amplification(
 
 
 def check_converges(sample: TransferSample, steps: int) -> None:
-    """Raise DataError "method-diverges" if `steps` steps with G = 1 let a frequency grow too much."""
+    """Raise DataError "method-diverges" if an error grows by more than LARGEST_GROWTH in `steps` steps with G = 1."""
     worst = float(np.abs(1 - sample.values).max())
     if worst > 1 and steps * np.log(worst) > np.log(LARGEST_GROWTH):
         advice = "use richardson-lucy or linear, or fewer steps"
         raise DataError(
             "method-diverges",
-            f"expected a PSF whose transform T has abs(1 - T) <= 1; got {worst:.3g}, which grows to the power {steps}: {advice}",
+            f"expected a PSF whose Fourier transform T has abs(1 - T) <= 1; got {worst:.3g}, which {steps} steps raise to the power {steps}: {advice}",
         )

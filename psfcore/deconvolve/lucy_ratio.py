@@ -2,15 +2,15 @@
 
     w y / (H x) + (1 - w) a        Eq. (1)
 
-a is the ratio of a masked pixel, so chosen that the pixel agrees with the model. One plane stores both cases: the
-light (at least 0) of a trusted pixel, or -a of a masked pixel. A negative pixel is noise about zero and counts as 0,
-because these methods have no negative light.
+a is the ratio of a masked pixel. Its value is chosen so that the pixel has no influence on the estimate. One plane
+stores both cases: the light (at least 0) of a trusted pixel, or -a of a masked pixel. Negative pixels are due to noise
+around zero. They count as 0, because these methods cannot represent negative light.
 
 | symbol | name | unit |
 |---|---|---|
 | y | light of trusted pixels, divided by the domain's scale | - |
 | w | trusted, 1 or 0 | - |
-| a | agreed | - |
+| a | agreed: ratio at which a masked pixel agrees with the model | - |
 """
 
 from __future__ import annotations
@@ -26,19 +26,22 @@ from psfcore.convolution.fft_kernels import LANES, forward, inverse
 from psfcore.deconvolve.problem import Problem, first_estimate
 from psfcore.errors import DataError
 
-# Resolution of float32 relative to the brightest pixel. Smaller values are dominated by the rounding of the
-# transform. A floor at this level also avoids denormal numbers, which are slow.
+# Smallest value of a model pixel, as a fraction of the brightest pixel (the "floor"). It is the resolution of float32;
+# smaller values are dominated by the rounding of the transform. The floor also avoids denormal numbers, which are slow.
 FLOOR_OF_MAXIMUM = 2.0**-23
 # An estimate below this fraction of the floor is set to 0.
 DARK_OF_FLOOR = 1e-6
-# The compiler may reorder a sum within a block, but the order is then fixed and independent of the threads.
+# The compiler may reorder a sum within a block. The new order is fixed, so it does not depend on the threads.
 _SUMS: Any = {"contract", "reassoc"}
 
 Single = NDArray[np.float32]
 
 
 def light_above_floor(problem: Problem) -> Single:
-    """The first estimate [y, x], raised to the floor. Raises DataError "no-signal" if there is no light."""
+    """The first estimate [y, x], with values below the floor raised to the floor.
+
+    Raises DataError "no-signal" if no trusted pixel is above zero.
+    """
     domain = problem.domain
     if not (domain.pixels[domain.trusted] > 0).any():
         raise DataError("no-signal", "expected at least one trusted pixel above zero; got none")
@@ -47,9 +50,9 @@ def light_above_floor(problem: Problem) -> Single:
 
 
 class Ratio:
-    """Replaces the rows of x in the engine's spectrum by the rows of Eq. (1).
+    """Replaces the estimate x in the engine's spectrum by the ratio of Eq. (1).
 
-    agreed [y, x]: a of Eq. (1), above 0. brightest: largest value of the first estimate; it sets the model's floor.
+    agreed [y, x]: a of Eq. (1), above 0. brightest: largest value of the first estimate; the floor is a fraction of it.
     """
 
     def __init__(self, problem: Problem, agreed: Single | float, brightest: float) -> None:
@@ -60,14 +63,14 @@ class Ratio:
         self._light_or_agreed = self.engine.to_lanes(light_or_agreed)
 
     def measure(self) -> None:
-        """Compute H x, its chi2, and the ratio of Eq. (1)."""
+        """Compute H x, the chi2 of H x, and the ratio of Eq. (1)."""
         self.engine.columns(adjoint=False)
         self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, *self.judgement.numbers)
 
 
 @compiled(fastmath=_SUMS)
 def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Replace H x by Eq. (1), with H x at least `floor`; sum (y - H x)^2 / variance over judged pixels."""
+    """Replace H x, raised to `floor` where it is smaller, by Eq. (1); sum (y - H x)^2 / variance over judged pixels."""
     nx = light.shape[1]
     zero = np.float32(0.0)
     least = np.float32(1e-30)

@@ -1,4 +1,4 @@
-"""The frame of every method: prepare an image for a method, and turn its estimate into a result."""
+"""The parts that all methods share: prepare an image for a method, and turn the method's estimate into a result."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from psfcore.image import Image, MaskBit
 from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible
 
-# A missing pixel starts from its trusted neighbours if they hold at least this share of its PSF.
+# The first value of a missing pixel is computed from trusted neighbours if the PSF's weights on them sum to this.
 _ENOUGH_NEIGHBOURS = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A checked image and PSF, the plane on which the scene is estimated, and the engine for it."""
+    """A checked image and PSF, the plane on which the scene is estimated, and the engine for that plane."""
 
     image: Image
     psf: Psf
@@ -64,8 +64,8 @@ def pose(
 ) -> Problem:
     """Check the input and prepare a problem.
 
-    edges: the method's default, used if the conditions name none. margin_share: the largest share of an edge
-    pixel's light that may come from beyond the margin. Raises DataError: "bad-steps", "bad-stop", "bad-edges",
+    edges: the default of the method, used if `conditions.edges` is None. margin_share: the largest share of the light of
+    a pixel at the edge that may come from beyond the margin. Raises DataError: "bad-steps", "bad-stop", "bad-edges",
     "all-masked", "no-signal", "plate-scale-mismatch", "no-exposure".
     """
     check_steps(steps, stop)
@@ -82,9 +82,10 @@ def pose(
 
 
 def first_estimate(problem: Problem) -> NDArray[np.float32]:
-    """The observation [y, x] on the domain, as the starting value.
+    """The first estimate [y, x]: the observation on the domain.
 
-    Pixels that are not finite hold the PSF-weighted mean of trusted pixels.
+    A pixel without a finite value starts from the mean of the trusted pixels around it, weighted by the PSF; if there
+    are too few, from the mean of all trusted pixels.
     """
     domain, engine = problem.domain, problem.engine
     estimate = domain.pixels.copy()
@@ -112,7 +113,7 @@ def solution(
 ) -> Deconvolved:
     """Turn an estimate on the domain into the result for the image.
 
-    negatives_count: True if the method uses negative pixels as they are; False if it counts them as 0.
+    negatives_count: True if the method uses negative pixels unchanged; False if it counts them as 0.
     """
     image, domain = problem.image, problem.domain
     pixels = domain.cut(estimate)

@@ -16,14 +16,14 @@ class Deconvolved:
 
     pixels: estimate [y, x] in the image's unit; NaN where the image has no finite value.
     stopped_because: reason why the iteration ended.
-    flux_in: sum of the image over its valid pixels; negative pixels count as 0 if the method treats them so.
+    flux_in: sum of the image over its valid pixels. If the method counts negative pixels as 0, the sum does too.
     flux_out: sum of the estimate over the same pixels. negative_pixels: number of valid pixels below 0 in the image.
-    last_change: rms change of the last step, divided by the rms of the estimate.
+    last_change: rms of the change in the last step, divided by the rms of the estimate.
     edges, margin_px: assumption about the scene beyond the field, and width of the margin.
     edge_band_px: width of the band along the edges in which the result depends on light from beyond the field.
-    noise_amplification: rms noise of the estimate divided by that of the image, for uncorrelated noise; None if the
-    method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of pixels; None if the noise is not
-    known.
+    noise_amplification: rms noise of the estimate divided by the rms noise of the image, for uncorrelated noise; None if
+    the method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of judged pixels
+    (`psfcore.deconvolve.stopping`); None if the noise is not known.
     """
 
     pixels: NDArray[np.float64]

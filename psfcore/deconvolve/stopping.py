@@ -1,12 +1,13 @@
 """Stopping rules: a fixed number of steps, or the discrepancy principle.
 
 The discrepancy principle (Morozov 1966) stops when the model fits the image as well as the noise allows. The variance
-is that of the model image, so the noise of a faint pixel does not influence its own weight:
+is computed from the model image H x, so that the noise of a faint pixel does not influence the weight of that pixel:
 
     chi2 = 1/n sum over judged pixels of (y - H x)^2 / (g H x + r^2)        Eq. (1)
 
-The first estimate with chi2 <= 1 is the result: further steps would fit the noise. The n judged pixels are the
-trusted pixels outside the band along the edges in which light from beyond the field dominates.
+The first estimate with chi2 <= 1 is the result, because further steps would fit the noise. Chi2 is computed from the n
+judged pixels: the trusted pixels that are not near an edge. In a band along the edges (`edge_band_px`), more than 5 %
+of the light may come from beyond the field; the model does not know that light.
 
 | symbol | name | unit |
 |---|---|---|
@@ -35,7 +36,7 @@ MOST_STEPS = 10_000
 
 @dataclass(frozen=True)
 class Ended:
-    """Number of steps done, the reason for the end, and chi2 of Eq. (1), or None if the noise is not known.
+    """How an iteration ended: number of steps, reason, and chi2 of Eq. (1); chi2 is None if the noise is not known.
 
     With a fixed number of steps, chi2 belongs to the estimate before the last step.
     """
@@ -47,10 +48,11 @@ class Ended:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """The judged pixels of Eq. (1) and their variance, in the form that row stages need.
+    """The judged pixels of Eq. (1) and their variance, in the layout that the compiled kernels need.
 
-    rows [block][half][lane]: 1 for a judged row, else 0. first, last: range of judged columns. count: n.
-    slope, ground: terms of the variance in the domain's scaled unit. sums: chi2 * n for each block.
+    rows [block][half][lane]: 1 for a judged row, else 0. first, last: judged columns, from `first` to `last` - 1.
+    count: n. slope, ground: terms of the variance in the domain's scaled unit. sums: for each block of rows, the sum of
+    Eq. (1) without the factor 1/n.
     """
 
     rows: NDArray[np.float32]
@@ -63,21 +65,21 @@ class Judgement:
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        """The arguments of a row stage."""
+        """These values as arguments of a compiled kernel."""
         return self.rows, self.first, self.last, self.slope, self.ground, self.sums
 
     @property
     def chi2(self) -> float:
-        """Eq. (1) of the last row stage."""
+        """chi2 of Eq. (1), for the model image that was computed last."""
         return float(self.sums.sum()) / max(self.count, 1)
 
 
 def judgement(
     image: Image, band_px: int, domain: Domain, engine: Engine, conditions: Conditions
 ) -> Judgement:
-    """Prepare Eq. (1). A band of `band_px` along the edges (at most a quarter of the field) is not judged.
+    """Prepare Eq. (1). Pixels in a band of `band_px` along the edges (at most a quarter of the field) are not judged.
 
-    If the noise is not known the variance is 1, and chi2 is the mean square difference in scaled units.
+    If the noise is not known, the variance is 1, and chi2 is the mean square difference in scaled units.
     Raises DataError "no-exposure".
     """
     ny, nx = image.pixels.shape
@@ -104,8 +106,8 @@ def judgement(
 class Iteration:
     """One step of a method, in two parts.
 
-    `measure` computes H x from the estimate x, fills the judgement, and leaves in the engine's spectrum what the
-    method needs next. `update` makes the next estimate from it.
+    `measure` computes H x from the estimate x, stores the sums of chi2 in the judgement, and writes the input of `update`
+    into the engine's spectrum. `update` makes the next estimate from that spectrum.
     """
 
     def measure(self) -> None:
@@ -113,7 +115,7 @@ class Iteration:
         raise NotImplementedError
 
     def update(self, *, last: bool) -> None:
-        """Make the next estimate. last: no call of `measure` follows."""
+        """Make the next estimate. last: True if no call of `measure` follows."""
         raise NotImplementedError
 
 
@@ -133,7 +135,8 @@ def run(
     if stop == "discrepancy" and not (noise_known and found.count):
         raise DataError(
             "no-noise-model",
-            "expected photon gain and read noise, which stopping by discrepancy needs; got neither",
+            "expected photon gain, read noise and valid pixels away from the edges, which stopping by discrepancy needs; "
+            "at least one of them is missing",
         )
     for step in range(1, steps + 1):
         iteration.measure()

@@ -1,12 +1,12 @@
-"""The HDUs of a FITS file, one after the other, without reading a pixel.
+"""Read the headers of a FITS file, HDU by HDU, without reading a pixel.
 
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 3.3, 4.4 and 10.1.
-`walk` reads headers in blocks of 2880 bytes. It skips the data by the size that NAXISn, BITPIX, PCOUNT and
-GCOUNT declare. heliopsf uses the first two-dimensional image of a file: a plain image HDU, or a
-tile-compressed image in a binary table with ZIMAGE = T. `first_image` ignores everything after that image.
+`walk` reads headers in blocks of 2880 bytes and skips the data of each HDU. The size of the data follows from the
+cards NAXISn, BITPIX, PCOUNT and GCOUNT. heliopsf uses the first two-dimensional image of a file: a plain image HDU, or
+a tile-compressed image in a binary table with ZIMAGE = T. `first_image` ignores everything after that image.
 
-To skip data in a file that is compressed as a whole (.fits.gz), the reader must inflate it. It therefore
-checks every declared size first and limits the number of inflated bytes.
+If the whole file is compressed (.fits.gz), the reader must decompress data in order to skip them. It therefore checks
+every declared size first and limits the number of decompressed bytes.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ _BITPIX = (8, 16, 32, 64, -32, -64)
 _LARGEST_COUNT = 2**63 - 1
 _SKIP_BYTES = 1 << 20
 END_CARD = b"END" + b" " * 77
+# Exceptions that astropy raises for a damaged card. The kind of damage decides which one it raises.
+CARD_TROUBLE = (VerifyError, ValueError, TypeError, IndexError, OverflowError)
 _KNOWN_STARTS = (
     (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),
     (b"\xff\x4f\xff\x51", "a JPEG 2000 codestream"),
@@ -54,8 +56,8 @@ _KNOWN_STARTS = (
 class FitsLimits:
     """Upper limits for reading a FITS file.
 
-    max_pixels: pixels of an image, and of a tile of a compressed image. max_header_bytes: bytes of all headers
-    together. max_hdus: number of HDUs.
+    max_pixels: largest number of pixels of an image, and of a tile of a compressed image. max_header_bytes: largest
+    size of all headers together. max_hdus: largest number of HDUs.
     """
 
     max_pixels: int
@@ -64,7 +66,7 @@ class FitsLimits:
 
 
 class Source(Protocol):
-    """A stream of bytes that can be read or skipped, forwards only."""
+    """A stream of bytes that can be read or skipped, only forwards."""
 
     gzipped: bool
 
@@ -84,7 +86,7 @@ class _PlainSource:
         return self._file.read(count)
 
     def skip(self, count: int) -> int:
-        """Skip up to `count` bytes; returns how many of them the file holds."""
+        """Skip up to `count` bytes; returns the number of skipped bytes, which is smaller at the end of the file."""
         there = max(0, min(count, self._size - self._file.tell()))
         self._file.seek(there, io.SEEK_CUR)
         return there
@@ -100,7 +102,9 @@ class _GzipSource:
     def read(self, count: int) -> bytes:
         self._left -= count
         if self._left < 0:
-            raise HeaderError("too-many-bytes", "expected inflated data within the size limit; got more")
+            raise HeaderError(
+                "too-many-bytes", "expected decompressed data within the size limit; got more bytes"
+            )
         try:
             return self._stream.read(count)
         except EOFError:
@@ -122,7 +126,7 @@ class _GzipSource:
 
 @contextmanager
 def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
-    """Open a FITS file, plain or gzipped. Raises HeaderError "empty-file"."""
+    """Open a FITS file, which may be compressed with gzip. Raises HeaderError "empty-file"."""
     with path.open("rb") as file:
         start = file.read(2)
         file.seek(0)
@@ -165,7 +169,7 @@ def walk(source: Source, limits: FitsLimits, *, to_the_end: bool) -> Iterator[tu
         if last:
             return
     if not to_the_end or source.read(1):
-        message = f"expected at most {limits.max_hdus} HDUs, one of them an image; got more HDUs"
+        message = f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs"
         raise HeaderError("too-many-hdus", message)
 
 
@@ -179,11 +183,13 @@ def _no_image(kinds: list[str]) -> HeaderError:
         return HeaderError("not-2d", f"{wanted}; got an image of one axis")
     if "table" in kinds:
         return HeaderError("table-only", f"{wanted}; got only tables ({len(kinds)} HDUs)")
-    return HeaderError("no-image", f"{wanted}; got {len(kinds)} HDUs without data of two axes")
+    return HeaderError(
+        "no-image", f"{wanted}; got {len(kinds)} HDUs, and the data of none of them have two axes"
+    )
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
-    """The cards before END, in at most `most` bytes; None if the file ends before another header starts."""
+    """Read the cards before END; None if no further header starts. Raises HeaderError after `most` bytes without END."""
     raw = bytearray()
     while len(raw) < most:
         block = source.read(BLOCK_BYTES)
@@ -244,7 +250,7 @@ def _parse(raw: bytes, hdu: int) -> Header:
 
 
 def _kind(header: Header, hdu: int) -> str:
-    """Kind of an HDU: image, empty, line (one axis), "cube n" (n axes), table or other."""
+    """Kind of an HDU: "image" (two axes), "empty", "line" (one axis), "cube n" (n axes), "table" or "other"."""
     extension = "IMAGE" if hdu == 0 else card_text(header, "XTENSION")
     if extension == "BINTABLE" and card_flag(header, "ZIMAGE"):
         return _axes_kind(card_count(header, "ZNAXIS", largest=999))
@@ -322,13 +328,14 @@ def _data_bytes(header: Header, hdu: int) -> int:
     size = abs(bitpix) // 8 * groups * (extra + elements)
     if size > _LARGEST_COUNT:
         raise HeaderError(
-            "bad-card", f"expected a possible data size in HDU {hdu}; its header declares {size:.3g} bytes"
+            "bad-card",
+            f"expected a data size below 2^63 bytes in HDU {hdu}; its header declares {size:.3g} bytes",
         )
     return size
 
 
 def _value(header: Header, key: str) -> object:
-    """Value of a structural card, or None; HeaderError if the card is unreadable or occurs twice."""
+    """Value of a structural card, or None. Raises HeaderError if the card is unreadable or occurs more than once."""
     try:
         if header.count(key) > 1:
             raise HeaderError("bad-card", f"expected card {key} once; got it {header.count(key)} times")
@@ -344,7 +351,7 @@ def _value(header: Header, key: str) -> object:
 def card_count(
     header: Header, key: str, *, smallest: int = 0, largest: int = _LARGEST_COUNT, default: int | None = None
 ) -> int:
-    """Whole number of a structural card. Raises HeaderError "bad-card" if it is missing or out of range."""
+    """Whole number in a structural card. Raises HeaderError "bad-card" if it is missing or out of range."""
     value = _value(header, key)
     if value is None and default is not None:
         return default
@@ -356,11 +363,11 @@ def card_count(
 
 
 def card_flag(header: Header, key: str) -> bool:
-    """Whether a structural card is T."""
+    """Whether a structural card has the value T."""
     return _value(header, key) is True
 
 
 def card_text(header: Header, key: str) -> str | None:
-    """Text of a structural card, stripped; None if it is missing or no text."""
+    """Text of a structural card, without surrounding spaces; None if the card is missing or does not hold text."""
     value = _value(header, key)
     return value.strip() if isinstance(value, str) else None

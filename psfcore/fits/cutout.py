@@ -1,7 +1,8 @@
-"""The central part of a stored PSF as a FITS file, copied from the stored bytes without making an array.
+"""Write the central part of a stored PSF as a FITS file, without loading the whole PSF.
 
 A FITS image stores its rows one after the other (FITS standard 4.0, section 3.3.2), so a cut-out consists of a range
-of bytes from each row. This needs an uncompressed image in the first HDU, as in every PSF that heliopsf writes.
+of bytes from each row. The image must be uncompressed and in the first HDU. Every PSF that heliopsf writes is stored
+in this way.
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
 _FLOATS = {-32: "f", -64: "d"}
-# Cards of the whole image that are wrong for a cut-out. The cards that it needs are written again.
+# Cards that describe the whole image and would be wrong in a cut-out.
 _DROPPED = ("EXTEND", "CHECKSUM", "DATASUM", "DATAMIN", "DATAMAX", "DATAMEAN", "PCOUNT", "GCOUNT")
 
 
 def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
-    """Bytes of a FITS file with the central (size, size) px of a PSF; its centre is at [size // 2, size // 2].
+    """Return the bytes of a FITS file that holds the central (size, size) px of a PSF.
 
-    Raises DataError "cutout-too-large"; "cutout-not-plain" if the file is compressed or does not hold plain floats.
+    The centre of the PSF is at [size // 2, size // 2]. Raises DataError "cutout-too-large" if the PSF is smaller, and
+    "cutout-not-plain" if the file is compressed or does not hold plain floats.
     """
     summary = read_summary(path, limits)
     ny, nx = summary.shape
@@ -56,13 +58,11 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
 
 
 def _header(file: BinaryIO) -> Header:
-    """Read the first header; the file is then at the first byte of its data."""
-    from astropy.io.fits import Header  # see psfcore.fits.blocks: slow to import
-
+    """Read the first header. Afterwards the file is positioned at the first byte of the data."""
     raw = bytearray()
     block = b""
     while not any(block[at : at + CARD_BYTES] == END_CARD for at in range(0, len(block), CARD_BYTES)):
-        block = file.read(BLOCK_BYTES)  # ends: read_summary found END
+        block = file.read(BLOCK_BYTES)  # the loop ends, because read_summary found an END card
         raw += block
     return Header.fromstring(bytes(raw))
 

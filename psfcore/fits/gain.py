@@ -1,4 +1,4 @@
-"""Saturation level and noise of an image's gain mode.
+"""Saturation level and noise, which depend on the gain mode of an image.
 
 Some detectors are read with a high and a low gain. Saturation level, photon gain and read noise then depend on the
 mode, which the card GAINCOMB names (`combined`, `high-only`, `low-only`). The values come from the table
@@ -15,7 +15,10 @@ from psfcore.noise import Noise
 
 
 def gain_mode(instrument: Instrument, header: Header) -> GainMode | None:
-    """The mode that GAINCOMB names, upper or lower case; None if missing or unknown to the instrument."""
+    """The mode that GAINCOMB names, in upper or lower case.
+
+    None if the card is missing, or if the instrument description does not have this mode.
+    """
     named = (optional_text(header, "GAINCOMB") or "").lower()
     modes = {name.lower(): mode for name, mode in instrument.detector.gain_modes.items()}
     return modes.get(named)
@@ -28,7 +31,7 @@ def saturation_for(instrument: Instrument, header: Header) -> float | None:
 
 
 def noise_for(instrument: Instrument, header: Header) -> Noise | None:
-    """Photon gain and read noise of the image's mode; None if one of the two is not known."""
+    """Photon gain and read noise of the image's gain mode; None if one of the two is not known."""
     mode = gain_mode(instrument, header)
     if mode is None or mode.photon_gain_dn is None or mode.read_noise_dn is None:
         return None

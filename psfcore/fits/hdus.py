@@ -1,6 +1,7 @@
-"""Reading the pixels of one HDU, and writing a list of HDUs to a file.
+"""Read the pixels of one HDU, and write a list of HDUs to a file.
 
-A file written here carries CHECKSUM and DATASUM but no time of writing: equal content gives equal bytes.
+A file that this module writes has the cards CHECKSUM and DATASUM, but no date of writing. Equal content therefore
+gives equal bytes.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from psfcore.fits.header import HeaderSummary
 from psfcore.fits.tiles import check_tiles
 
 _CHECKSUM_COMMENT = "computed when the file was written"
-# Exceptions that astropy raises for a damaged data unit. Which one depends on the place of the damage.
+# Exceptions that astropy raises for a damaged data unit. The position of the damage decides which one it raises.
 PIXEL_TROUBLE = (
-    CfitsioException,  # from RICE decoding; astropy has no public name for it
+    CfitsioException,  # raised when RICE decoding fails; astropy has no public name for it
     VerifyError,
     OSError,
     EOFError,
@@ -41,7 +42,7 @@ PIXEL_TROUBLE = (
 def read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.float64], fits.Header]:
     """Pixels [y, x] (float64) and header of the image that `summary` describes.
 
-    Raises DataError "unreadable-pixels", "tile-too-large"; OSError if the disk fails.
+    Raises DataError "unreadable-pixels" or "tile-too-large", and OSError if the disk fails.
     """
     try:
         if summary.codec is not None:
@@ -65,7 +66,7 @@ def read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.fl
 
 
 class _TableHeap:
-    """The heap behind a binary table, which holds compressed tiles."""
+    """The heap after the rows of a binary table. It holds the compressed tiles."""
 
     def __init__(self, hdu: fits.BinTableHDU) -> None:
         place = hdu.fileinfo()
@@ -79,7 +80,7 @@ class _TableHeap:
 
 
 def _check_tiles(path: str | Path, summary: HeaderSummary) -> None:
-    """Raise DataError "tile-too-large" if a tile would inflate to more pixels than its declared size."""
+    """Raise DataError "tile-too-large" if a tile, when decompressed, has more pixels than its header declares."""
     with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as hdus:
         table = hdus[summary.hdu]
         tile_pixels = int(table.header.get("ZTILE1", summary.shape[1])) * int(table.header.get("ZTILE2", 1))
@@ -90,22 +91,22 @@ def _check_tiles(path: str | Path, summary: HeaderSummary) -> None:
 
 
 def _raise_if_storage(error: Exception) -> None:
-    """Raise an error of the disk again: the file is not the cause."""
+    """Raise the error again if the disk caused it, and not the content of the file."""
     if isinstance(error, OSError) and error.errno is not None:
         raise error
 
 
 def ascii_text(text: str) -> str:
-    """The text in printable ASCII, as FITS requires: line ends become spaces, other characters '?'."""
+    """Convert a text to printable ASCII, as FITS requires. White space becomes a space; other characters become '?'."""
     return "".join(c if " " <= c <= "~" else " " if c.isspace() else "?" for c in text)
 
 
 def write_hdus(path: str | Path, hdus: list[Any]) -> None:
-    """Write HDUs with checksums, without a time of writing."""
+    """Write HDUs with checksums, but without a date of writing."""
     hdus[0].header["EXTEND"] = True
     for hdu in hdus:
         hdu.verify("silentfix")
         hdu.add_checksum(when=_CHECKSUM_COMMENT)
-    # Pass an open file: given a name, astropy would compress by its ending.
+    # Pass an open file. If astropy gets a name such as x.fits.gz, it compresses the file because of the ending.
     with Path(path).open("wb") as file:
         fits.HDUList(hdus).writeto(file, output_verify="silentfix")

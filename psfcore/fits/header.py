@@ -1,7 +1,7 @@
-"""What the header of an image says: size, instrument, wavelength, date, exposure and unit.
+"""The contents of an image's header: size, instrument, wavelength, date, exposure and unit.
 
-Cards that only describe the image may be damaged or missing: their value is then None. Cards that define its
-structure must be correct (see `psfcore.fits.blocks`). No pixel is read, so the web process can import this file.
+Cards that only describe the image may be damaged or missing; their value is then None. Cards that define the structure
+of the file must be correct (see `psfcore.fits.blocks`). This module reads no pixels, so the web process can import it.
 """
 
 from __future__ import annotations
@@ -23,10 +23,7 @@ from psfcore.fits.blocks import (
 )
 from psfcore.instruments.files import match_instrument
 
-if TYPE_CHECKING:
-    from astropy.io.fits import Header
-
-# FitsLimits is exported here too: every caller of `read_summary` needs it.
+# This module also exports FitsLimits, because every caller of `read_summary` needs it.
 __all__ = [
     "FitsLimits",
     "HeaderSummary",
@@ -45,7 +42,10 @@ _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600
 
 @dataclass(frozen=True)
 class HeaderSummary:
-    """The first 2-D image of a file and its header values; None if a card is missing or unusable."""
+    """The first 2-D image of a file: its HDU, its shape (ny, nx) and values of its header.
+
+    A value is None if its card is missing or unusable.
+    """
 
     hdu: int
     shape: tuple[int, int]
@@ -77,7 +77,7 @@ def read_summary(path: str | os.PathLike[str], limits: FitsLimits) -> HeaderSumm
 
 
 def first_image_header(path: str | os.PathLike[str], limits: FitsLimits) -> Header:
-    """Unchanged header of the first 2-D image of a file. Raises HeaderError as `read_summary` does."""
+    """Unchanged header of the first 2-D image of a file. Raises HeaderError if the file has no usable image."""
     with open_source(Path(path), limits) as source:
         return first_image(source, limits)[0]
 
@@ -93,7 +93,10 @@ def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
 
 
 def optional_text(header: Header, *keys: str) -> str | None:
-    """Stripped text of the first of `keys` that holds a non-empty string; None if none does."""
+    """Text of the first of the cards `keys` that holds a non-empty string; None if no card does.
+
+    Surrounding spaces are removed.
+    """
     for key in keys:
         value = _lenient(header, key)
         if isinstance(value, str) and value.strip():
@@ -102,7 +105,7 @@ def optional_text(header: Header, *keys: str) -> str | None:
 
 
 def optional_number(header: Header, *keys: str) -> float | None:
-    """Value of the first of `keys` that holds a finite number; None if none does."""
+    """Value of the first of the cards `keys` that holds a finite number; None if no card does."""
     for key in keys:
         value = _lenient(header, key)
         if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
@@ -111,7 +114,7 @@ def optional_number(header: Header, *keys: str) -> float | None:
 
 
 def optional_value(header: Header, key: str) -> str | float | bool | None:
-    """Value of a card: True or False, a finite number, or a stripped text; None if it has no such value."""
+    """Value of a card: True or False, a finite number, or a text without surrounding spaces; otherwise None."""
     value = _lenient(header, key)
     if isinstance(value, bool):
         return value
@@ -122,7 +125,7 @@ def optional_value(header: Header, key: str) -> str | float | bool | None:
 def plate_scale_arcsec(header: Header, axis: int = 1) -> float | None:
     """Plate scale of an axis, |CDELT| in arcsec/px.
 
-    A missing CUNIT means arcsec. None if CDELT is missing or 0, or CUNIT is not an angle.
+    If CUNIT is missing, the unit is arcsec. Returns None if CDELT is missing or 0, or if CUNIT is not an angle.
     """
     step = optional_number(header, f"CDELT{axis}")
     factor = _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{axis}") or "arcsec").lower())
@@ -130,7 +133,7 @@ def plate_scale_arcsec(header: Header, axis: int = 1) -> float | None:
 
 
 def optional_exposure_s(header: Header) -> float | None:
-    """Exposure time in s from XPOSURE, otherwise EXPTIME; None if neither is above zero."""
+    """Exposure time in s: the value of XPOSURE, or else of EXPTIME. None if neither card holds a number above zero."""
     for key in ("XPOSURE", "EXPTIME"):
         exposure = optional_number(header, key)
         if exposure is not None and exposure > 0:

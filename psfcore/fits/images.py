@@ -1,7 +1,7 @@
-"""Reading images from FITS files, and writing products of deconvolution.
+"""Read images from FITS files, and write products of deconvolution.
 
-In memory, pixels are native float64 [y, x]. Files written here hold float32. They carry CHECKSUM and DATASUM but
-no time of writing: equal content gives equal bytes.
+In memory, pixels are float64 [y, x] in the byte order of the machine. Files that this module writes hold float32. They
+have the cards CHECKSUM and DATASUM, but no date of writing. Equal content therefore gives equal bytes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SATURATION_KEYS = ("SATURATE", "DATASAT")
 _TABLE_FORMAT = {np.dtype(np.uint8): "B", np.dtype(np.uint16): "I", np.dtype(np.float32): "E"}
 _BITS_STORED = {1: np.uint8, 2: np.uint16}
 _FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 15, 16))
-# Cards that describe how the input stored its pixels, or statistics of the input's pixels.
+# Cards that say how the input file stores its pixels, and cards with statistics of these pixels.
 _STORAGE_CARD = re.compile(
     r"SIMPLE|XTENSION|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|EXTEND|GROUPS|INHERIT|EXTNAME|EXTVER|EXTLEVEL|END|"
     r"BSCALE|BZERO|BLANK|CHECKSUM|DATASUM|ZHECKSUM|ZDATASUM|"
@@ -44,10 +44,10 @@ _STORAGE_CARD = re.compile(
 def read_image(path: str | Path, limits: FitsLimits, *, saturation_dn: float | None = None) -> Image:
     """Read the first 2-D image of a file and mask its unusable pixels.
 
-    saturation_dn: a pixel at or above this level (DN) is saturated; for an image in DN/s the level is divided by
-    the exposure time. The header's SATURATE or DATASAT, in the image's own unit, also sets a level; the lowest
-    level counts. Raises HeaderError for an unusable header; DataError "unreadable-pixels", "tile-too-large",
-    "no-exposure", "all-nan", "all-saturated", "no-signal", "too-small".
+    saturation_dn: a pixel at or above this level (DN) is saturated. For an image in DN/s, the level is divided by the
+    exposure time. The cards SATURATE and DATASAT, in the unit of the image, also give a level. If several levels are
+    known, the lowest one is used. Raises HeaderError for an unusable header; DataError "unreadable-pixels",
+    "tile-too-large", "no-exposure", "all-nan", "all-saturated", "no-signal", "too-small".
     """
     summary = read_summary(path, limits)
     pixels, header = read_pixels(path, summary)
@@ -72,7 +72,7 @@ def read_plane(path: str | Path, limits: FitsLimits) -> NDArray[np.float64]:
 def _saturation_level(
     header: fits.Header, unit: str | None, exposure_s: float | None, saturation_dn: float | None
 ) -> float | None:
-    """Lowest saturated value in the image's own unit; None if no level is known."""
+    """Lowest saturated value in the unit of the image; None if no level is known."""
     levels = [optional_number(header, key) for key in _SATURATION_KEYS]
     if saturation_dn is not None:
         if (unit or "").replace(" ", "").lower() != "dn/s":
@@ -80,7 +80,7 @@ def _saturation_level(
         elif exposure_s is not None:
             levels.append(saturation_dn / exposure_s)
         else:
-            message = "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s; got neither"
+            message = "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s; got neither of them"
             raise DataError("no-exposure", message)
     known = [level for level in levels if level is not None and level > 0]
     return min(known, default=None)
@@ -100,7 +100,7 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     if largest <= 0:
         raise DataError("no-signal", f"expected pixels above zero; the largest is {largest:g}")
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
-        message = f"expected pixels below saturation; all are {largest:g}, the full scale of an A/D converter"
+        message = f"expected pixels below saturation; all pixels are {largest:g}, the largest value of an A/D converter"
         raise DataError("all-saturated", message)
 
 
@@ -116,11 +116,13 @@ def write_image(
 ) -> None:
     """Write a product: float32 pixels, the input's header with its WCS, `cards`, `history`, mask and planes.
 
-    Cards that describe the input's storage are removed. DATAMIN, DATAMAX and DATAMEAN are computed again; the
-    input's median, rms and percentiles are removed.
-    mask: plane [y, x] to store instead of image.mask. planes: further planes [y, x] by name (ERROR, PSF_ERROR,
-    QUALITY); bits are stored as uint8 or uint16, numbers as float32 in the image's unit. plane_bits: the meaning
-    of a plane's bits. Raises DataError "bad-plane" for a wrong shape, a wrong type or a name used twice.
+    Cards that say how the input file stores its pixels are removed. DATAMIN, DATAMAX and DATAMEAN are computed again;
+    the cards with median, rms and percentiles of the input are removed.
+    mask: plane [y, x] to store instead of image.mask.
+    planes: further planes [y, x] by name (ERROR, PSF_ERROR, QUALITY). Planes of bits are stored as uint8 or uint16,
+    planes of numbers as float32 in the unit of the image.
+    plane_bits: for each plane of bits, the meaning of its bits.
+    Raises DataError "bad-plane" for a wrong shape, a wrong type or a name that is used twice.
     """
     header = _kept_header(image.header)
     pixels = image.pixels.astype(np.float32)
@@ -142,7 +144,7 @@ def write_image(
 
 
 def write_plane(path: str | Path, pixels: NDArray[Any], *, cards: Cards) -> None:
-    """Write pixels [y, x] with `cards` only: integers as int32, floats as float32."""
+    """Write pixels [y, x] and `cards` to a file. Integers are stored as int32, floats as float32."""
     header = fits.Header()
     for key, (value, comment) in cards.items():
         header[key] = (ascii_text(value) if isinstance(value, str) else value, ascii_text(comment))
@@ -151,7 +153,7 @@ def write_plane(path: str | Path, pixels: NDArray[Any], *, cards: Cards) -> None
 
 
 def read_planes(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read the planes [y, x] of a product by name, without the mask; floats are float32."""
+    """Read the planes [y, x] of a product, by name, except the mask. Floats are float32."""
     planes: dict[str, NDArray[Any]] = {}
     with fits.open(path, memmap=False) as hdus:
         for hdu in hdus[1:]:
@@ -177,8 +179,8 @@ def _plane_hdu(
     bits: type[IntFlag] | None = None,
     bit_key: str = "QBIT",
 ) -> fits.BinTableHDU:
-    # sunpy.map.Map makes a map of every HDU whose data have two or more axes: with an image extension, the
-    # product would open as a list of maps. A table with one row counts as one axis, and TDIM keeps the shape.
+    # sunpy.map.Map makes a map of every HDU whose data have two or more axes. If a plane were an image extension,
+    # sunpy would open the product as a list of maps. The data of a table have one axis, and TDIM stores the shape.
     ny, nx = plane.shape
     is_bits = plane.dtype.kind in "ub"
     stored = plane.astype(_BITS_STORED.get(plane.dtype.itemsize, np.uint16) if is_bits else np.float32)
@@ -209,7 +211,7 @@ def _check_plane(name: str, plane: NDArray[Any], shape: tuple[int, ...], *, take
 
 
 def _kept_header(source: fits.Header) -> fits.Header:
-    """The input's cards in order, without storage cards; an unreadable card becomes HISTORY text."""
+    """The input's cards in order, without the cards of _STORAGE_CARD. An unreadable card becomes a HISTORY card."""
     kept = fits.Header()
     for card in source.cards:
         if _STORAGE_CARD.fullmatch(card.keyword):
@@ -223,7 +225,10 @@ def _kept_header(source: fits.Header) -> fits.Header:
 
 
 def _readable(card: fits.Card) -> fits.Card | None:
-    """A copy that can be written, or None; a value that FITS does not allow (NaN, "1 2 3") becomes a string."""
+    """A copy of the card that can be written, or None if the card is unreadable.
+
+    A value that FITS does not allow (NaN, "1 2 3") becomes a string.
+    """
     try:
         value = _card_value(card)
         copy = fits.Card(
@@ -240,6 +245,6 @@ def _card_value(card: fits.Card) -> Any:
     try:
         value = card.value
     except VerifyError:
-        value = fits.Card.fromstring(card.image).value  # card.image puts the value in quotes
+        value = fits.Card.fromstring(card.image).value  # card.image contains the value as a quoted string
     not_a_number = isinstance(value, (float, complex)) and not np.isfinite(value)
     return str(value) if not_a_number else value

@@ -1,4 +1,4 @@
-"""Reading the mask image of a mount from a PNG or FITS file."""
+"""Read the mask image of a mount from a PNG or FITS file."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ LARGEST_MASK_PX = 16384
 def read_mask_image(path: Path) -> NDArray[np.float64]:
     """Read a mount's mask image as pixels [y, x], row 0 at the lowest y.
 
-    A PNG stores its lowest row last, so its rows are reversed. Colours are averaged; transparency is ignored.
-    Raises DataError "bad-mount", which names the key; for FITS also HeaderError and DataError "unreadable-pixels".
+    A PNG stores its lowest row last, so its rows are reversed. Colours are averaged; transparency is ignored. Raises
+    DataError "bad-mount"; its message names the key of the instrument file. A FITS file can also raise HeaderError and
+    DataError "unreadable-pixels".
     """
     if path.suffix.lower() == ".png":
         return _png(path)

@@ -1,6 +1,6 @@
-"""Reading and writing point-spread functions (PSFs) as FITS files.
+"""Read and write point-spread functions (PSFs) as FITS files.
 
-In memory, weights are float64 [y, x]. Files written here hold float32; equal content gives equal bytes.
+In memory, weights are float64 [y, x]. Files that this module writes hold float32. Equal content gives equal bytes.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from psfcore.psf import (
 def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = None) -> None:
     """Write a PSF: the kernel in the primary HDU, one image HDU per component, and tables.
 
-    Tables: PROFILE (weight by radius), FIT (the fitted shape, if any) and INSTRUMENT. Weights are float32; this
-    rounds each by 6e-8 at most and changes the sum by less than 1e-7.
-    instrument_file: the TOML text that the PSF was built from, stored unchanged.
+    The tables are PROFILE (weight by radius), FIT (the fitted shape, if any) and INSTRUMENT. Weights are stored as
+    float32. The rounding changes each weight by at most 6e-8 of its value, and the sum by less than 1e-7.
+    instrument_file: the TOML text from which the PSF was built. It is stored unchanged in INSTRUMENT.
     """
     hdus: list[Any] = [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))]
     for name, kernel in psf.components.items():
@@ -67,7 +67,7 @@ def _psf_header(psf: Psf) -> fits.Header:
 
 
 def _profile_hdu(psf: Psf) -> fits.BinTableHDU:
-    """Mean weight and encircled energy by radius, of the total PSF and of each component."""
+    """Table of mean weight and encircled energy by radius, for the total PSF and for each component."""
     radius, weight = radial_profile(psf.kernel)
     columns = [
         fits.Column(name="radius_px", format="D", unit="pixel", array=radius),
@@ -85,7 +85,7 @@ def _profile_hdu(psf: Psf) -> fits.BinTableHDU:
 
 
 def _fitted_hdu(fitted: FittedShape) -> fits.BinTableHDU:
-    """One row per parameter: name, fitted coordinate, and its row of the covariance matrix."""
+    """Table with one row for each parameter: its name, its fitted coordinate, and its row of the covariance matrix."""
     count = len(fitted.parameters)
     columns = [
         fits.Column(name="parameter", format="16A", array=np.array(fitted.parameters)),
@@ -119,10 +119,11 @@ def _instrument_hdu(text: bytes) -> fits.BinTableHDU:
 def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf:
     """Read a PSF from the first 2-D image of a file, and its metadata from the header.
 
-    Weights are not changed; the centre is at [n // 2, n // 2]. Without a card PSFNAME, the PSF is named after the
-    file. parts: also read the components, the instrument description and the fitted shape of a file that
-    `write_psf` wrote; a convolution does not need them. Raises HeaderError; DataError "unreadable-pixels" and the
-    errors of `Psf` ("psf-not-centred", "psf-sum", ...).
+    Weights are not changed. The file must have the centre of the PSF at [ny // 2, nx // 2]. If the card PSFNAME is
+    missing, the PSF is named after the file.
+    parts: also read the components, the instrument description and the fitted shape, if `write_psf` wrote the file. A
+    convolution does not need them.
+    Raises HeaderError; DataError "unreadable-pixels" and the errors of `Psf` ("psf-not-centred", "psf-sum", ...).
     """
     summary = read_summary(path, limits)
     kernel, header = read_pixels(path, summary)
@@ -151,8 +152,8 @@ def _read_extras(
     fitted: FittedShape | None = None
     components: dict[str, NDArray[np.float64]] = {}
     provenance: dict[str, Any] = {}
-    # Any file can carry a card PSFNAME. The size limits therefore hold for its other HDUs too, and HDUs that
-    # write_psf never writes (compressed components, other shapes) are ignored.
+    # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs. HDUs that write_psf never
+    # writes are ignored: compressed components, and components of another shape.
     check_all_headers(path, limits)
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:

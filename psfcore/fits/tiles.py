@@ -1,9 +1,10 @@
-"""Size check for the tiles of a compressed image, before they are decoded.
+"""Check the size of the tiles of a compressed image before they are decoded.
 
 FITS standard 4.0, section 10.1: each row of the table holds a descriptor (length, offset) of one tile in the table's
-heap. A gzip stream does not state its inflated size: half a megabyte can become half a gigabyte, whatever ZNAXISn
-declare. Each stream is therefore first inflated up to a limit, and the file is refused if a stream holds more bytes
-than the pixels of its tile. RICE_1 needs no check, because its decoder returns exactly the requested number of pixels.
+heap. A gzip stream does not say how large it is after decompression: half a megabyte can become half a gigabyte,
+whatever ZNAXISn declare. Each stream is therefore first decompressed up to a limit. The file is refused if a stream
+holds more bytes than the pixels of its tile need. RICE_1 needs no check, because its decoder returns exactly the
+requested number of pixels.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 
-# Gzip streams occur in GZIP tiles, and with RICE_1 for tiles that could not be quantised.
+# Columns that hold gzip streams. With RICE_1, only tiles that could not be quantised are gzip streams.
 _GZIP_COLUMNS = {
     "GZIP_1": ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"),
     "GZIP_2": ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"),
@@ -25,20 +26,20 @@ _GZIP_COLUMNS = {
 }
 _LARGEST_PIXEL_BYTES = 8
 _ITEM_BYTES = {"B": 1, "I": 2, "J": 4}
-_OVERHEAD_BYTES = 1024  # of a gzip stream over its content, with ample margin
+_OVERHEAD_BYTES = 1024  # upper limit of the bytes that gzip adds to its content
 
 
 class Heap(Protocol):
-    """The bytes that the descriptors refer to."""
+    """The bytes to which the descriptors refer."""
 
     def read(self, offset: int, count: int) -> bytes:
-        """`count` bytes from `offset` on; fewer at the end of the file."""
+        """Read `count` bytes, starting at `offset`; fewer at the end of the file."""
 
 
 def check_tiles(
     rows: NDArray[np.void], formats: dict[str, str], heap: Heap, codec: str, tile_pixels: int
 ) -> None:
-    """Raise DataError "tile-too-large" if a tile inflates to more than `tile_pixels` pixels of 8 bytes.
+    """Raise DataError "tile-too-large" if a decompressed tile is larger than `tile_pixels` pixels of 8 bytes.
 
     rows: the rows of the table as stored. formats: TFORMn by column name. A broken gzip stream raises OSError,
     EOFError or zlib.error.
@@ -54,13 +55,13 @@ def check_tiles(
 
 
 def _check_stream(heap: Heap, offset: int, count: int, most: int) -> None:
-    # A correct stream is hardly longer than its content. A longer one only costs time, many times if many
-    # descriptors point at it.
+    # A correct stream is hardly longer than its content. A much longer stream is refused, because reading it costs
+    # time, and many descriptors may refer to the same stream.
     if offset < 0 or not 0 < count <= 2 * most + _OVERHEAD_BYTES:
         raise _too_large(f"a compressed tile of {count} bytes", most)
     with gzip.GzipFile(fileobj=io.BytesIO(heap.read(offset, count))) as stream:
         if len(stream.read(most + 1)) > most:
-            raise _too_large("a compressed tile that inflates to more", most)
+            raise _too_large("a compressed tile that is larger after decompression", most)
 
 
 def _too_large(got: str, most: int) -> DataError:

@@ -28,7 +28,7 @@ class Affected:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a page ended. PSFs are sorted by id; the products of each PSF are sorted newest first."""
+    """The last product of a page of the list. PSFs are sorted by id; the products of each PSF are sorted newest first."""
 
     psf_id: str
     created_at: float
@@ -47,7 +47,7 @@ class AffectedProducts:
             return _told(session, [psf], session.scalars(_products(psf, limit, after)).all())
 
     def page(self, owner: str, *, superseded: bool, limit: int, after: Place | None = None) -> list[Affected]:
-        """Products that were made with deprecated PSFs; superseded: only with those that have a successor.
+        """Products that were made with deprecated PSFs. superseded: only PSFs that have a successor.
 
         A join would sort all products of a PSF before it returned the first one. Several queries read only the rows
         that they return.
@@ -70,7 +70,7 @@ class AffectedProducts:
 
 
 def _next_psfs(owner: str, superseded: bool, after: str) -> Select[Any]:
-    """Deprecated PSFs that products were made with, by id."""
+    """Deprecated PSFs with which products were made, sorted by id."""
     used = exists().where(ProductRow.owner == PsfRow.owner, ProductRow.psf_id == PsfRow.id)
     query = select(PsfRow).where(
         PsfRow.owner == owner, PsfRow.status == PsfStatus.DEPRECATED, PsfRow.id > after, used
@@ -89,11 +89,14 @@ def _products(psf: PsfRow, limit: int, after: tuple[float, str] | None = None) -
 
 
 def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> list[ProductRow]:
-    """The first products of these PSFs, in one statement, PSF after PSF, newest first within a PSF."""
+    """The first products of these PSFs, from one statement.
+
+    They are sorted in the order of ``psfs``; the products of each PSF are sorted newest first.
+    """
     each = [select(_products(psf, limit).subquery()) for psf in psfs]
     rows = session.scalars(select(ProductRow).from_statement(union_all(*each))).all()
     place = {psf.id: number for number, psf in enumerate(psfs)}
-    # A union has no guaranteed order.
+    # The order of the rows of a union is not guaranteed.
     return sorted(rows, key=lambda row: (-place[row.psf_id], row.created_at, row.id), reverse=True)
 
 

@@ -1,4 +1,4 @@
-"""The progress of bulk runs and their images: how many, how fast, with which results."""
+"""The progress of bulk runs: numbers of images, images per hour, and results."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from workers.catalogue.tables import ImageRow
 from workers.contract.bulk import OPEN, ItemState
 
 BATCH = 1000
-# The pace is computed from at most the last hour, and at most this many images.
+# The pace is computed from the images of the last hour, but from 500 images at most.
 PACE_S, PACE_IMAGES = 3600.0, 500
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Images that workers have now, and images done per hour (None if unknown)."""
+    """taken: images that workers process now. images_an_hour: images that ended per hour; None if not known."""
 
     taken: int
     images_an_hour: float | None
@@ -34,7 +34,7 @@ class BulkProgress:
         self._database = database
 
     def first_not_uploaded(self, ids: Sequence[str], owner: str) -> str | None:
-        """The first of these ids that is not an uploaded image of the owner; None if all are."""
+        """The first of these ids that is not an uploaded image of the owner; None if all are uploaded images."""
         rest = iter(ids)
         with self._database.reading() as session:
             while batch := list(islice(rest, BATCH)):
@@ -46,7 +46,7 @@ class BulkProgress:
         return None
 
     def pace(self, bulk: BulkRow) -> Pace:
-        """Images that workers have now, and images done per hour since the run was last started or resumed."""
+        """Images that workers process now, and images that ended per hour since the run was last started or resumed."""
         until = bulk.ended_at or time.time()
         since = max(bulk.running_since or bulk.created_at, until - PACE_S)
         ended = select(BulkItemRow.ended_at).where(
@@ -60,7 +60,7 @@ class BulkProgress:
             count, first = session.execute(select(func.count(), func.min(last.c.ended_at))).one()
         if not count:
             return Pace(at_work, None)
-        # The interval begins when the first of these images ended, so that image does not count.
+        # With 500 images, the interval begins when the first of them ended, so the first image does not count.
         start, images = (first, count - 1) if count == PACE_IMAGES else (since, count)
         lasted = until - start
         return Pace(at_work, images * 3600.0 / lasted if lasted > 0 else None)
@@ -95,7 +95,10 @@ class BulkProgress:
             return session.scalars(query).all()
 
     def done_before(self, owner: str, product_id: str, output: str) -> BulkItemRow | None:
-        """An image whose product is this one in this file, in any bulk run of the owner; None if there is none."""
+        """An image that is done and whose product ``product_id`` is in the file ``output``, in any bulk run of the owner.
+
+        None if there is no such image.
+        """
         query = select(BulkItemRow).join(BulkRow, BulkRow.id == BulkItemRow.bulk_id)
         query = query.where(
             BulkItemRow.product_id == product_id,
@@ -107,7 +110,7 @@ class BulkProgress:
             return session.scalars(query.limit(1)).first()
 
     def open_images(self) -> dict[str, int]:
-        """Numbers of images in all bulk runs that have not ended: left, done, failed."""
+        """Numbers of images in all bulk runs that have not ended: images left, done and failed."""
         left = BulkRow.total - BulkRow.done - BulkRow.failed
         sums = [func.coalesce(func.sum(one), 0) for one in (left, BulkRow.done, BulkRow.failed)]
         query = select(*sums).where(BulkRow.phase.in_(sorted(OPEN)))

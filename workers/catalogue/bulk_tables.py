@@ -9,27 +9,32 @@ from sqlalchemy.orm import Mapped, mapped_column
 
 from workers.catalogue.tables import Base
 
-MOST_LETTERS = 1024  # of a file's path
+MOST_LETTERS = 1024  # longest path of a file
 _OPEN = text("phase IN ('ERROR', 'LISTING', 'PAUSED', 'RUNNING')")
 
 
 class BulkRow(Base):
-    """A bulk run: many images deconvolved in the same way. Its counts change in the transactions that change its items."""
+    """A bulk run: many images that are deconvolved in the same way.
+
+    A transaction that changes the items of the run also changes its counts.
+    """
 
     __tablename__ = "bulks"
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     owner: Mapped[str] = mapped_column(String(64))
     name: Mapped[str] = mapped_column(String(80))
     phase: Mapped[str] = mapped_column(String(16))
-    request: Mapped[dict[str, Any]]  # without the ids of uploaded images, which are items
+    request: Mapped[dict[str, Any]]  # without the ids of uploaded images; they are items of the run
     request_key: Mapped[str] = mapped_column(String(64))
     psf_id: Mapped[str | None] = mapped_column(String(64))
     context_id: Mapped[str | None] = mapped_column(String(64))
     created_at: Mapped[float]
     running_since: Mapped[float | None]
     ended_at: Mapped[float | None]
-    listed: Mapped[bool]  # whether all its files have been listed as items
-    lister: Mapped[str | None] = mapped_column(String(32))  # the lease under which files are listed now
+    listed: Mapped[bool]  # whether all files have been listed as items
+    lister: Mapped[str | None] = mapped_column(
+        String(32)
+    )  # token of the lease of the worker that lists files
     total: Mapped[int] = mapped_column(default=0)
     done: Mapped[int] = mapped_column(default=0)
     reused: Mapped[int] = mapped_column(default=0)  # done images whose product existed before
@@ -39,7 +44,7 @@ class BulkRow(Base):
     __table_args__ = (
         Index("bulks_listed", "owner", "created_at", "id"),
         Index("bulks_by_phase", "phase"),
-        # Of two identical requests at the same moment, the second insert fails and then finds the first.
+        # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first run.
         Index(
             "one_open_bulk_a_request",
             "owner",
@@ -52,7 +57,7 @@ class BulkRow(Base):
 
 
 class BulkItemRow(Base):
-    """An image of a bulk run. The worker that has it holds the lease ``token`` of the job ``job_id``."""
+    """An image of a bulk run. The worker that processes it holds the lease ``token`` of the job ``job_id``."""
 
     __tablename__ = "bulk_items"
     bulk_id: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -73,7 +78,7 @@ class BulkItemRow(Base):
     output: Mapped[str | None] = mapped_column(String(1200))  # the file in the output folder
     sha256: Mapped[str | None] = mapped_column(String(64))
     bytes: Mapped[int | None] = mapped_column(BigInteger)
-    score: Mapped[float | None]  # of the artefact check
+    score: Mapped[float | None]  # artefact score
     statistics: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
 

@@ -1,7 +1,8 @@
-"""Bulk runs and their images in the catalogue: created, listed, taken, done.
+"""Bulk runs and their images in the catalogue: create a run, list its files, take images, and store the results.
 
-A worker takes an image by compare-and-set under the lease of its job (``workers.bulk.task``). The image is free again
-when the lease is lost. The counts and the end of a run are written in the transaction that changes its images.
+A worker takes an image by compare-and-set under the lease of its job (``workers.bulk.task``). If the lease is lost,
+another worker can take the image. The counts and the end of a run are written in the transaction that changes its
+images.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from workers.catalogue.tables import JobRow
 from workers.contract.bulk import AT_WORK, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError, Phase
 
-# Errors of files whose paths the catalogue cannot store. They are not retried: the stored path names no file or another.
+# Errors of files whose paths the catalogue cannot store. Such files are not retried, because the stored path is wrong.
 NOT_UTF_8, TOO_LONG = "path-not-utf-8", "path-too-long"
 LOST = JobError(
     fault=Fault.INTERNAL,
     code="worker-lost",
-    message="every worker that began this image was lost; the image is not tried again unless the run is retried",
+    message="every worker that processed this image was lost; the image is not tried again unless you retry the run",
 )
 
 
@@ -47,7 +48,7 @@ class Listed:
 
 @dataclass(frozen=True)
 class Taken:
-    """The right to work on an image. Changes made after the right was lost have no effect."""
+    """The right to work on an image. When the right is lost, further changes by this worker have no effect."""
 
     bulk_id: str
     position: int
@@ -72,14 +73,17 @@ class Bulks:
             return session.get(BulkRow, bulk_id)
 
     def at_work(self) -> Sequence[BulkRow]:
-        """Runs with work to do that are not paused or stopped, oldest first."""
+        """Runs that list or process images now (LISTING, RUNNING), oldest first."""
         query = select(BulkRow).where(BulkRow.phase.in_(sorted(AT_WORK)))
         with self._database.reading() as session:
             return sorted(session.scalars(query), key=lambda bulk: bulk.created_at)
 
     def create(self, row: BulkRow, uploaded: Iterable[str]) -> tuple[BulkRow, bool]:
-        """A new run with these uploads as its first images, or the open run of an identical request; whether it is new."""
-        for _ in range(3):  # the identical run may end between the two statements
+        """Create a run whose first images are these uploads, or find the open run of an identical request.
+
+        Returns the run, and whether it is new.
+        """
+        for _ in range(3):  # between the two statements, the identical run may end
             try:
                 with self._database.writing.begin() as session:
                     session.add(row)
@@ -93,7 +97,7 @@ class Bulks:
         raise RuntimeError(f"bulk run for request {row.request_key} neither inserted nor found")
 
     def pause(self, bulk_id: str) -> bool:
-        """LISTING, RUNNING -> PAUSED. Images that workers have are finished."""
+        """LISTING, RUNNING -> PAUSED. Workers finish the images that they have taken."""
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.PAUSED)
 
     def resume(self, bulk_id: str) -> bool:
@@ -108,14 +112,14 @@ class Bulks:
         return self._set(bulk_id, OPEN, phase=BulkPhase.CANCELLED, ended_at=time.time())
 
     def stop_with(self, bulk_id: str, error: JobError) -> bool:
-        """LISTING, RUNNING -> ERROR, for a reason that concerns more than one image."""
+        """LISTING, RUNNING -> ERROR, for an error that concerns more than one image."""
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.ERROR, error=error.model_dump(mode="json"))
 
     def retry(self, bulk_id: str) -> int | None:
-        """Queue the failed images again; returns their number, or None for a cancelled run.
+        """Let the failed images be processed again; returns their number, or None for a cancelled run.
 
-        Files whose paths could not be stored stay failed. Raises DataError "equal-bulk-open" if the run has ended and
-        an identical one is open.
+        Files whose paths could not be stored stay failed. Raises DataError "equal-bulk-open" if this run has ended and
+        another run of an identical request is open.
         """
         for _ in range(3):  # the identical run may end between the two statements
             try:
@@ -150,7 +154,7 @@ class Bulks:
             return changed
 
     def _equal_open(self, row: BulkRow) -> BulkRow | None:
-        """Another open run of an identical request."""
+        """Find another open run of an identical request; None if there is none."""
         equal = select(BulkRow).where(
             BulkRow.owner == row.owner,
             BulkRow.request_key == row.request_key,
@@ -165,7 +169,7 @@ class Bulks:
     def begin_listing(self, bulk_id: str, lease: Lease) -> bool:
         """Begin to list the files under this lease. Files that a lost worker listed are deleted first.
 
-        False if the lease is lost or there is nothing to list.
+        False if the lease is lost or the run is not LISTING.
         """
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
@@ -177,7 +181,7 @@ class Bulks:
             return True
 
     def add_listed(self, bulk_id: str, lease: Lease, images: Sequence[Listed]) -> bool:
-        """Add images to a run that is listed under this lease; False if the lease is lost or the run is not LISTING."""
+        """Add images to a run. False if another lease now lists the files, or if the run is not LISTING."""
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
@@ -187,7 +191,7 @@ class Bulks:
             return True
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:
-        """LISTING -> RUNNING, or COMPLETED if no image is left."""
+        """LISTING -> RUNNING, or LISTING -> COMPLETED if no image is left. False under the conditions of ``add_listed``."""
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
@@ -200,9 +204,10 @@ class Bulks:
     # Images -------------------------------------------------------------------------------------------
 
     def take(self, bulk_id: str, lease: Lease, max_attempts: int) -> Taken | None:
-        """Take an image whose worker was lost, or the next waiting one.
+        """Take an image whose worker was lost, or else the next waiting image.
 
-        None if no image is left, the run is not RUNNING, or the lease is lost.
+        None if no image is left, the run is not RUNNING, or the lease is lost. An image that was taken
+        ``max_attempts`` times becomes a failed image.
         """
         while True:
             with self._database.writing.begin() as session:
@@ -223,12 +228,12 @@ class Bulks:
                 return Taken(bulk_id, item.position, item.source, item.uploaded, item.attempts, lease)
 
     def release(self, taken: Taken) -> bool:
-        """Release an image as if it had not been taken."""
+        """Give an image back, as if it had not been taken; the attempt does not count. False if the right to it was lost."""
         values = {"state": ItemState.WAITING, "attempts": BulkItemRow.attempts - 1, "token": None}
         return bool(self._database.change(update(BulkItemRow).where(*_holding(taken)).values(**values)))
 
     def finish(self, taken: Taken, *, reused: bool, **values: Any) -> bool:
-        """Note that an image is done; False if the right to it was lost."""
+        """Record that an image is done; False if the right to it was lost."""
         done = update(BulkItemRow).where(*_holding(taken)).values(
             state=ItemState.DONE, ended_at=time.time(), token=None, error=None, reused=reused, **values
         )  # fmt: skip
@@ -239,7 +244,7 @@ class Bulks:
             return True
 
     def fail(self, taken: Taken, error: JobError) -> bool:
-        """Note that an image failed; False if the right to it was lost."""
+        """Record that an image failed; False if the right to it was lost."""
         failed = update(BulkItemRow).where(*_holding(taken)).values(
             state=ItemState.FAILED, ended_at=time.time(), token=None, error=error.model_dump(mode="json")
         )  # fmt: skip
@@ -266,7 +271,7 @@ def new_id() -> str:
 
 
 def _add(session: Session, bulk_id: str, first: int, images: Iterable[Listed]) -> int:
-    """Insert images after position ``first`` - 1, in batches; returns their number."""
+    """Insert images at position ``first`` and the positions after it, in batches; returns the number of images."""
     numbered = enumerate(images, first)
     position = first
     while batch := [_values(bulk_id, number, image) for number, image in islice(numbered, BATCH)]:
@@ -290,12 +295,12 @@ def _values(bulk_id: str, position: int, image: Listed) -> Mapping[str, Any]:
 
 def _waiting(bulk_id: str) -> Any:
     query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.WAITING)
-    # Workers that take an image at the same moment get different ones.
+    # If two workers take an image at the same moment, they get different images.
     return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
 
 
 def _left(bulk_id: str) -> Any:
-    """Images that were taken under a lease that is lost."""
+    """A query for an image that was taken under a lease that is now lost."""
     held = select(JobRow.id).where(
         JobRow.id == BulkItemRow.job_id, JobRow.lease == BulkItemRow.token, JobRow.phase == Phase.EXECUTING
     )
@@ -306,7 +311,7 @@ def _left(bulk_id: str) -> Any:
 
 
 def _good(session: Session, lease: Lease) -> bool:
-    """Whether the lease still holds."""
+    """Whether the lease is still valid."""
     held = select(JobRow.id).where(
         JobRow.id == lease.job_id, JobRow.lease == lease.token, JobRow.phase == Phase.EXECUTING
     )
@@ -332,7 +337,7 @@ def _count(session: Session, bulk_id: str, **values: Any) -> None:
 
 
 def _end_if_done(session: Session, bulk_id: str) -> None:
-    """Any open phase -> COMPLETED, if all images are listed and none is left."""
+    """Any open phase -> COMPLETED, if all images are listed and each of them is done or failed."""
     done = update(BulkRow).where(
         BulkRow.id == bulk_id,
         BulkRow.phase.in_(sorted(OPEN)),

@@ -1,7 +1,7 @@
 """The catalogue: images, transits, PSFs, products and jobs, in SQLite or PostgreSQL through SQLAlchemy.
 
-Each subject has a class in a file of its own. The class here holds them together, with the operations that all
-content-addressed rows share.
+Each subject has a class in a separate file. The class ``Catalogue`` has an attribute for each of them, and the operations
+that are common to all content-addressed rows.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ AnyRow = TypeVar(
 
 
 class Catalogue:
-    """Reads and writes all rows. Each method, here and of each subject, is one transaction."""
+    """Reads and writes all rows. Each method, of this class and of its attributes, is one transaction."""
 
     def __init__(self, url: str) -> None:
         self._database = Database(url)
@@ -65,7 +65,7 @@ class Catalogue:
         self.named_files = NamedFiles(self._database)
 
     def upgrade(self) -> None:
-        """Upgrade the database to the tables of this version. Raises ``workers.catalogue.schema.SchemaError``."""
+        """Upgrade the tables of the database to this version. Raises ``workers.catalogue.schema.SchemaError``."""
         self.schema.upgrade()
 
     def close(self) -> None:
@@ -78,11 +78,10 @@ class Catalogue:
             session.execute(select(1))
 
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
-        """Insert a content-addressed row; returns the row of that identity, and whether it is new.
+        """Insert a content-addressed row; returns the row with this identity, and whether it is new.
 
-        quota_mib: the limit for owners without one of their own; None: no limit applies. Raises
-        ``workers.catalogue.owners.OverQuota`` and adds nothing if the row exceeds the limit even without the owner's
-        kept solutions. If it exceeds the limit with them, the oldest solutions are removed.
+        quota_mib: the limit for owners who have no individual limit; None: the limit is not checked. If the row exceeds
+        the limit, it is not added, and ``workers.catalogue.owners.OverQuota`` is raised.
         """
         try:
             with self._database.writing.begin() as session:
@@ -100,7 +99,7 @@ class Catalogue:
             return existing, False
 
     def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
-        """The row of this identity, or None."""
+        """The row with this identity, or None."""
         with self._database.reading() as session:
             return session.get(table, (owner, identity))
 
@@ -113,7 +112,10 @@ class Catalogue:
         after: tuple[float, str] | None = None,
         **equal: str | None,
     ) -> Sequence[AnyRow]:
-        """Rows newest first, from ``after`` = (created_at, id) of the last row seen; ``equal`` filters columns."""
+        """A page of rows, newest first. after: (created_at, id) of the last row of the previous page.
+
+        equal: values of columns; only rows with these values are returned.
+        """
         query: Select[AnyRow] = select(table).where(table.owner == owner)
         for column, value in equal.items():
             if value is not None:

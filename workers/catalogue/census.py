@@ -1,4 +1,4 @@
-"""Counts for operators: worker processes, jobs by kind and phase, waiting jobs, files."""
+"""Counts for operators: worker processes, jobs by kind and phase, waiting jobs, and files."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from workers.contract.queues import Queue
 
 @dataclass(frozen=True)
 class JobTally:
-    """Jobs of one kind in one phase, counted."""
+    """The number of jobs of one kind in one phase, with sums over these jobs."""
 
     kind: str
     phase: str
     jobs: int
     attempts: int
     retries: int
-    run_s: float  # of jobs that ended: from the last start to the end
+    run_s: float  # sum over the jobs that ended: seconds from the last start to the end
 
 
 @dataclass(frozen=True)
 class FileTally:
-    """Files of one kind and origin, counted."""
+    """The number of files of one kind and origin, and their size."""
 
     kind: str
     origin: str  # uploaded | built
@@ -53,7 +53,7 @@ class Census:
         self._database = database
 
     def announce(self, worker: str, started_at: float, version: str) -> None:
-        """Note that a worker process is alive; delete those that have been silent for an hour."""
+        """Record that a worker process is alive; delete the rows of workers that have been silent for an hour."""
         now = self._database.now
         insert = sqlite.insert if self._database.sqlite else postgresql.insert
         said = {"started_at": started_at, "heartbeat_at": now, "version": version}
@@ -63,7 +63,7 @@ class Census:
             session.execute(there.on_conflict_do_update(index_elements=["name"], set_=said))
 
     def take_leave(self, worker: str) -> None:
-        """Note that a worker process ends."""
+        """Record that a worker process ends."""
         with self._database.writing.begin() as session:
             session.execute(delete(WorkerRow).where(WorkerRow.name == worker))
 
@@ -121,7 +121,7 @@ class Census:
             return session.scalar(select(func.count()).select_from(JobRow).where(*silent)) or 0
 
     def count_unsubmitted(self, older_than_s: float) -> int:
-        """Number of queued jobs older than this that were not given to the broker, although they could start."""
+        """Number of queued jobs that could start, but were not given to the broker within ``older_than_s``."""
         left = (
             JobRow.phase == Phase.QUEUED,
             JobRow.submitted_at.is_(None),
@@ -132,6 +132,6 @@ class Census:
             return session.scalar(select(func.count()).select_from(JobRow).where(*left)) or 0
 
     def clock(self) -> float:
-        """The database's own time, in seconds since 1970."""
+        """The time of the database's clock, in seconds since 1970."""
         with self._database.reading() as session:
             return float(session.scalars(select(self._database.now)).one())

@@ -1,4 +1,4 @@
-"""Contexts: immutable sets of PSFs. A lookup in a context always gives the same PSF."""
+"""Contexts: named, fixed sets of PSFs. A lookup in a context always gives the same PSF."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from workers.contract.identities import canonical_hash
 from workers.versions.status import PsfStatus
 from workers.versions.validity import Validity, iso
 
-NOW = "now"  # in place of a context's name: the PSFs that are certified now, whatever the owner's default context is
+NOW = "now"  # used instead of a context's name: the PSFs that are certified now, whatever the owner's default context is
 RESERVED = (NOW, "default")
-NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$"  # shorter than an id
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$"  # shorter than an id, so a name is never read as an id
 _ID = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
 class Pin:
-    """A PSF for a range of times; validity None: the PSF's own range."""
+    """A PSF for a range of times. validity None: the range for which the PSF is certified."""
 
     psf_id: str
     validity: Validity | None = None
@@ -43,14 +43,16 @@ class Contexts:
     def create(
         self, name: str, owner: str, by: str, *, reason: str = "", pins: Sequence[Pin] | None = None
     ) -> tuple[PsfContextRow, bool]:
-        """Create a context of these pins, or of all certified PSFs if ``pins`` is None; also returns whether it is new.
+        """Create a context of these pins; if ``pins`` is None, of all certified PSFs.
+
+        Returns the context, and whether it is new. If the name exists with the same pins, that context is returned.
 
         Raises ``DataError``: "bad-name", "name-taken", "no-such-psf", "no-line", "nothing-to-pin", "ranges-overlap".
         """
         if not re.fullmatch(NAME, name) or name in RESERVED:
             raise DataError(
                 "bad-name",
-                f"expected a name of up to 63 letters, digits and . _ - other than {' and '.join(RESERVED)}; got "
+                f"expected a name of up to 63 letters, digits, full stops, underscores and hyphens, other than {' and '.join(RESERVED)}; got "
                 f"{ascii(name)[:80]}",
             )
         try:
@@ -72,7 +74,7 @@ class Contexts:
             return existing, False
 
     def find(self, id_or_name: str, owner: str) -> PsfContextRow | None:
-        """The context of this id or name, or None."""
+        """The context with this id or name, or None."""
         with self._database.reading() as session:
             if _ID.fullmatch(id_or_name):
                 return session.get(PsfContextRow, (owner, id_or_name))
@@ -82,7 +84,7 @@ class Contexts:
             return session.scalars(named).first()
 
     def named(self, id_or_name: str, owner: str) -> PsfContextRow:
-        """The context of this id or name. Raises ``DataError`` "no-such-context"."""
+        """The context with this id or name. Raises ``DataError`` "no-such-context"."""
         found = self.find(id_or_name, owner)
         if found is None:
             raise DataError(
@@ -108,14 +110,17 @@ class Contexts:
     # The default --------------------------------------------------------------------------------------
 
     def default(self, owner: str) -> PsfContextRow | None:
-        """The owner's default context, in which PSFs for images are looked up; None: the PSFs that are certified now."""
+        """The owner's default context; None if the owner uses the PSFs that are certified now."""
         query = select(DefaultContextRow.context_id).where(DefaultContextRow.owner == owner)
         with self._database.reading() as session:
             context_id = session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(1)).first()
             return None if context_id is None else session.get(PsfContextRow, (owner, context_id))
 
     def set_default(self, id_or_name: str | None, owner: str, by: str, reason: str = "") -> None:
-        """Set an owner's default context; None: no context. Raises ``DataError`` "no-such-context"."""
+        """Set an owner's default context; None: use the PSFs that are certified now.
+
+        Raises ``DataError`` "no-such-context".
+        """
         context_id = None if id_or_name is None else self.named(id_or_name, owner).id
         with self._database.writing.begin() as session:
             session.add(
@@ -123,13 +128,16 @@ class Contexts:
             )
 
     def default_changes(self, owner: str, limit: int = 200) -> Sequence[DefaultContextRow]:
-        """The changes of an owner's default, latest first."""
+        """The changes of an owner's default context, latest first."""
         query = select(DefaultContextRow).where(DefaultContextRow.owner == owner)
         with self._database.reading() as session:
             return session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(limit)).all()
 
     def asked_for(self, context: str | None, owner: str) -> PsfContextRow | None:
-        """The context that a request means by an id or a name. NOW: no context (None); None: the owner's default."""
+        """The context for a request that gives an id, a name, NOW or None.
+
+        NOW: no context; the function returns None. None: the owner's default context.
+        """
         if context is None:
             return self.default(owner)
         return None if context == NOW else self.named(context, owner)
@@ -167,7 +175,7 @@ def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
     if row.series is None:
         raise DataError(
             "no-line",
-            f"expected PSFs with an instrument; PSF {row.id} has none: certify it with an instrument first",
+            f"expected PSFs with an instrument; PSF {row.id} has no instrument: certify it with an instrument first",
         )
     own = Validity(
         -math.inf if row.valid_from is None else row.valid_from,
@@ -196,7 +204,7 @@ def _check_apart(rows: Sequence[PsfPinRow]) -> None:
 
 
 def _context(name: str, owner: str, by: str, reason: str, rows: Iterable[PsfPinRow]) -> PsfContextRow:
-    """The row of a context. Also writes its id into the rows of its pins."""
+    """Make the row of a context, and write the context's id into the rows of its pins."""
     pins = list(rows)
     identity = canonical_hash(
         {

@@ -1,4 +1,4 @@
-"""The database connection: an engine set up for many small writers, and two kinds of transactions."""
+"""The database connection: an engine for many small writers, and two kinds of transactions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sqlalchemy import (
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session, sessionmaker
 
-PATIENCE_S = 30.0  # how long to wait for other writers of SQLite
+PATIENCE_S = 30.0  # longest time to wait for other writers of SQLite
 
 
 class Database:
@@ -41,9 +41,9 @@ class Database:
 
     @property
     def now(self) -> ColumnElement[float]:
-        """Seconds since 1970 by the database's clock, which all machines share, as an SQL expression.
+        """An SQL expression for the time of the database's clock, in seconds since 1970. All machines share this clock.
 
-        It is the time at which the statement began, on SQLite in whole milliseconds.
+        The time is that at which the statement began. On SQLite it is rounded to milliseconds.
         """
         # PostgreSQL can use an index with this clock, because it is constant within a statement.
         now = (
@@ -54,7 +54,7 @@ class Database:
         return literal_column(f"({now})", Double)
 
     def change(self, statement: Update) -> int:
-        """Run one UPDATE in a transaction of its own; returns the number of changed rows."""
+        """Run one UPDATE in a separate transaction; returns the number of changed rows."""
         with self.writing.begin() as session:
             result = session.execute(statement)
             assert isinstance(result, CursorResult)
@@ -62,7 +62,7 @@ class Database:
 
 
 def open_engine(url: str) -> Engine:
-    """An engine with the settings each database needs for many small concurrent writers."""
+    """Make an engine, with the settings that the database needs for many small concurrent writers."""
     if not url.startswith("sqlite"):
         # Without a limit, a request to an unreachable database would wait for minutes.
         patience = {"connect_timeout": 5} if url.startswith("postgresql") else {}
@@ -71,7 +71,7 @@ def open_engine(url: str) -> Engine:
 
     @event.listens_for(engine, "connect")
     def _pragmas(connection: Any, _record: Any) -> None:
-        # The driver's own BEGIN comes too late for compare-and-set; see _begin.
+        # The driver would send BEGIN too late for a compare-and-set; see _begin.
         connection.isolation_level = None
         _write_ahead(connection)
         connection.execute("PRAGMA synchronous=FULL")
@@ -79,8 +79,8 @@ def open_engine(url: str) -> Engine:
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Any) -> None:
-        # IMMEDIATE waits for the write lock at the start; a deferred transaction that reads first and
-        # writes later would fail with "database is locked" instead of waiting. Readers need no lock.
+        # IMMEDIATE waits for the write lock at the start. Without it, a transaction that reads first and writes later
+        # would fail with "database is locked" instead of waiting. Readers need no lock.
         reads = connection.get_execution_options().get("read_only", False)
         connection.exec_driver_sql("BEGIN" if reads else "BEGIN IMMEDIATE")
 
@@ -88,22 +88,24 @@ def open_engine(url: str) -> Engine:
 
 
 def _write_ahead(connection: sqlite3.Connection) -> None:
-    """Switch SQLite to a write-ahead log. If several processes create a database at once, all but one must try again."""
+    """Switch SQLite to a write-ahead log.
+
+    If several processes create a database at the same moment, only one succeeds at once; the others must try again.
+    """
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
             connection.execute("PRAGMA journal_mode=WAL")
             return
-        except (
-            sqlite3.OperationalError
-        ) as error:  # the connection's own timeout does not cover this statement
+        # The timeout of the connection does not apply to this statement.
+        except sqlite3.OperationalError as error:
             if "locked" not in str(error) or time.monotonic() > deadline:
                 raise
             time.sleep(0.02)
 
 
 def _strict_json(value: Any) -> str:
-    """JSON. Raises ValueError for NaN and infinity, which PostgreSQL refuses and clients cannot read."""
+    """Write JSON. Raises ValueError for NaN and infinity: PostgreSQL refuses them, and clients cannot read them."""
     return json.dumps(value, allow_nan=False)
 
 

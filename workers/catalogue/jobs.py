@@ -1,8 +1,8 @@
-"""Jobs in the catalogue: submitted, claimed, executing, ended.
+"""Jobs in the catalogue: submit, claim, run and end them.
 
-The table of jobs is the only source of truth about jobs: the broker may lose messages. Every change of a job's phase is
-a compare-and-set on the row, so any number of workers, servers and reconcilers may try at once. Times that they compare
-with each other, such as heartbeats, come from the database's clock.
+The state of a job is stored only in the table of jobs, because the broker may lose messages. Every change of a job's
+phase is a compare-and-set on the row. Therefore any number of workers, servers and reconcilers may try to change it at
+the same moment. Times that they compare with each other, such as heartbeats, come from the database's clock.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to work on a job. Changes made under a lost lease have no effect."""
+    """The right to work on a job. When the lease is lost, further changes by this worker have no effect."""
 
     job_id: str
     token: str
@@ -60,14 +60,14 @@ class Jobs:
         queue: Queue | None = None,
         estimate: dict[str, Any] | None = None,
     ) -> tuple[JobRow, bool]:
-        """A new queued job, or the live job of an identical request; also returns whether it is new.
+        """Queue a new job, or share the live job of an identical request; also returns whether the job is new.
 
-        A shared job that waits in a less urgent queue moves to ``queue``. queue None: the queue of the job's kind. A
-        cancelled job and a job with UWS terms are not shared: the new job gets a key of its own, waits while the other
-        one executes, and then finds its result, if there is one.
+        queue: None: the queue of the job's kind. A shared job that waits in a less urgent queue moves to ``queue``.
+        A cancelled job and a job with UWS terms are not shared. In this case the new job gets a different key. It waits
+        while the other job executes, and then uses the result of the other job, if there is one.
         """
         queue = queue or queue_of(kind)
-        for _ in range(3):  # the identical job may fail between the two statements
+        for _ in range(3):  # between the two statements, the identical job may fail
             key, existing = self._shared(owner, request_key)
             if existing is not None:
                 return self._moved_up(existing, queue), False
@@ -92,10 +92,10 @@ class Jobs:
         raise RuntimeError(f"job for request {request_key} neither inserted nor found")
 
     def _shared(self, owner: str, request_key: str) -> tuple[str, JobRow | None]:
-        """The live job that an identical request shares, or None, and the key of that job or of a new one.
+        """Find the live job that an identical request can share; returns its key and the job.
 
-        The key of a job beside one that is not shared follows from that job's id, so that later identical requests find
-        the new job.
+        If there is no such job, returns the key for a new job, and None. If an identical job cannot be shared, the key of
+        the new job is computed from the id of that job. Later identical requests then find the new job.
         """
         key = request_key
         live = select(JobRow, TermsRow.job_id).outerjoin(TermsRow, TermsRow.job_id == JobRow.id)
@@ -125,19 +125,19 @@ class Jobs:
             return session.get(JobRow, job_id)
 
     def mark_submitted(self, *job_ids: str) -> None:
-        """Note that the broker has received the jobs' ids."""
+        """Record that the broker has received the jobs' ids."""
         self._set(
             [JobRow.id.in_(job_ids)], submitted_at=self._database.now, submissions=JobRow.submissions + 1
         )
 
     def forget_submission(self, job_id: str) -> None:
-        """Note that a worker took a queued job's message from the broker but did not claim the job."""
+        """Record that a worker took a queued job's message from the broker but did not claim the job."""
         self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
 
     def claim(self, job_id: str, worker: str) -> Lease | None:
-        """QUEUED -> EXECUTING for exactly one of the workers that try; None for all others.
+        """QUEUED -> EXECUTING. Exactly one of the workers that try gets the lease; all others get None.
 
-        Also None while another job with the same result executes; the job is submitted again later.
+        While another job with the same result executes, every worker gets None; the job is submitted again later.
         """
         lease = Lease(job_id, uuid.uuid4().hex)
         now = self._database.now
@@ -154,17 +154,17 @@ class Jobs:
                 steps=0,
                 stage="",
             )
-        except IntegrityError:  # the index one_at_work_a_result
+        except IntegrityError:  # because of the index one_at_work_a_result
             self.forget_submission(job_id)
             return None
         return lease if claimed else None
 
     def heartbeat(self, lease: Lease) -> bool:
-        """Note that the job is alive; False if the lease is lost or the job was cancelled."""
+        """Record that the worker is alive; False if the lease is lost or the job was cancelled."""
         return self._set([*_held(lease), JobRow.cancel_requested.is_(False)], heartbeat_at=self._database.now)
 
     def progress(self, lease: Lease, stage: str, step: int, steps: int) -> bool:
-        """Store the job's progress, which is also a heartbeat; False as for ``heartbeat``."""
+        """Store the job's progress and a heartbeat; False if the lease is lost or the job was cancelled."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             stage=stage,
@@ -174,13 +174,13 @@ class Jobs:
         )
 
     def complete(self, lease: Lease, result_id: str) -> bool:
-        """EXECUTING -> COMPLETED under the lease."""
+        """EXECUTING -> COMPLETED; False if the lease is lost."""
         return self._set(
             _held(lease), phase=Phase.COMPLETED, ended_at=self._database.now, result_id=result_id, lease=None
         )
 
     def fail(self, lease: Lease, error: JobError) -> bool:
-        """EXECUTING -> ERROR under the lease."""
+        """EXECUTING -> ERROR; False if the lease is lost."""
         return self._set(
             _held(lease),
             phase=Phase.ERROR,
@@ -190,16 +190,16 @@ class Jobs:
         )
 
     def requeue(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED under the lease, after a transient failure. The job is submitted again after the usual wait.
+        """EXECUTING -> QUEUED after a transient failure; False if the lease is lost.
 
-        A cancelled job is aborted instead.
+        The job is submitted again after the waiting time of ``unsubmitted``. A cancelled job is aborted instead.
         """
         return self._set(
             _held(lease), **self._again(), submitted_at=self._database.now, submissions=JobRow.attempt
         )
 
     def abort(self, lease: Lease) -> bool:
-        """EXECUTING -> ABORTED under the lease, when the worker has stopped a cancelled job."""
+        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job; False if the lease is lost."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(True)],
             phase=Phase.ABORTED,
@@ -208,9 +208,9 @@ class Jobs:
         )
 
     def cancel(self, job_id: str) -> None:
-        """PENDING, QUEUED -> ABORTED. An executing job is asked to stop; an ended job does not change."""
+        """PENDING, QUEUED -> ABORTED. The worker of an executing job is told to stop; an ended job does not change."""
         at_work = JobRow.phase == Phase.EXECUTING
-        self._set(  # one statement: between two, the job could be claimed or queued again
+        self._set(  # one statement, because between two statements the job could be claimed or queued again
             [JobRow.id == job_id, JobRow.phase.in_((Phase.PENDING, Phase.QUEUED, Phase.EXECUTING))],
             phase=case((at_work, JobRow.phase), else_=Phase.ABORTED.value),
             ended_at=case((at_work, JobRow.ended_at), else_=self._database.now),
@@ -218,7 +218,7 @@ class Jobs:
         )
 
     def hand_back(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED under the lease because the worker stops. The attempt does not count."""
+        """EXECUTING -> QUEUED, because the worker stops. The attempt does not count. False if the lease is lost."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             phase=Phase.QUEUED,
@@ -229,9 +229,9 @@ class Jobs:
         )
 
     def give_up_silent(self, lease_s: float, max_attempts: int) -> list[str]:
-        """Queue jobs again whose worker has been silent for longer than the lease; returns their ids.
+        """Queue the jobs again whose worker has been silent for longer than ``lease_s``; returns the ids of these jobs.
 
-        A cancelled job is aborted instead. A job that was started ``max_attempts`` times ends in ERROR.
+        A cancelled job is aborted instead. A job that was already started ``max_attempts`` times ends in ERROR.
         """
         silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
         too_often = and_(JobRow.cancel_requested.is_(False), JobRow.attempt >= max_attempts)
@@ -251,15 +251,16 @@ class Jobs:
             for job_id in session.scalars(lost.returning(JobRow.id)):
                 log.error("job %s: %s (%s)", job_id, error.message, error.code)
         with self._database.writing.begin() as session:
-            # Other jobs may have been cancelled, or lost too often, since the previous statement.
+            # Since the previous statement, further jobs may have been cancelled or lost for the last allowed time.
             back = update(JobRow).where(*silent, ~too_often).values(**self._again(), submitted_at=None)
             taken = session.execute(back.returning(JobRow.id, JobRow.phase))
             return [job_id for job_id, phase in taken if phase == Phase.QUEUED]
 
     def unsubmitted(self, resubmit_s: float, limit: int = 1000) -> list[Waiting]:
-        """Queued jobs that the broker never received or seems to have lost, by queue, then oldest first.
+        """Queued jobs that the broker never received or seems to have lost; sorted by queue, then oldest first.
 
-        The wait doubles with each submission of a job, so that a long queue is not submitted again and again.
+        A job seems lost when it has waited for ``resubmit_s`` since its submission. This waiting time doubles with each
+        submission, so that the jobs of a long queue are not submitted again and again.
         """
         waits = {number: resubmit_s * 2 ** (number - 1) for number in range(2, 9)}
         wait_s = case(
@@ -278,7 +279,7 @@ class Jobs:
         return found
 
     def of_kind(self, kind: str) -> Sequence[JobRow]:
-        """All jobs of a kind, in any phase. For kinds that have few jobs."""
+        """All jobs of a kind, in any phase. Use this only for kinds with few jobs."""
         with self._database.reading() as session:
             return session.scalars(select(JobRow).where(JobRow.kind == kind)).all()
 
@@ -297,7 +298,7 @@ class Jobs:
             return session.scalars(query.limit(1)).first() is not None
 
     def _again(self) -> dict[str, Any]:
-        """Values that queue an executing job again, or abort it if it was cancelled."""
+        """Values of an UPDATE that queues an executing job again, or aborts it if it was cancelled."""
         cancelled = JobRow.cancel_requested.is_(True)
         return {
             "phase": case((cancelled, Phase.ABORTED.value), else_=Phase.QUEUED.value),
@@ -318,12 +319,12 @@ class Jobs:
             return [(estimate or {}, float(seconds)) for estimate, seconds in session.execute(query)]
 
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
-        """Run one UPDATE; whether it changed a row."""
+        """Run one UPDATE; returns whether it changed a row."""
         return bool(self._database.change(update(JobRow).where(and_(*conditions)).values(**values)))
 
 
 def no_equal_at_work() -> ColumnElement[bool]:
-    """A condition: no other job with the same result executes now."""
+    """The condition that no other job with the same result executes now."""
     other = aliased(JobRow)
     at_work = select(other.id).where(
         other.owner == JobRow.owner,
@@ -334,7 +335,7 @@ def no_equal_at_work() -> ColumnElement[bool]:
 
 
 def _is_at_work(phase: InstrumentedAttribute[str]) -> ColumnElement[bool]:
-    # Literal in the statement's text, so that the databases see that they can use the partial index.
+    # The phase is a literal in the text of the statement. Only then do the databases use the partial index.
     return phase == literal(Phase.EXECUTING.value, literal_execute=True)
 
 

@@ -1,7 +1,7 @@
-"""API keys of owners. A key is shown once, when it is made; the database keeps only the hash of its secret.
+"""API keys of owners. A key is shown once, when it is made; the database stores only the hash of its secret.
 
-A key has the form ``hpsf_ID_SECRET``. The id is public: lists and logs show it. The secret is 256 random bits. One round
-of SHA-256 protects it, because it cannot be guessed as a password can.
+A key has the form ``hpsf_ID_SECRET``. The id is public: lists and logs show it. The secret consists of 256 random bits.
+A password can be guessed; these bits cannot. Therefore one round of SHA-256 is enough to protect the secret.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from workers.catalogue.tables import KeyRow
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 LABEL_LENGTH = 80
 _KEY = re.compile(r"hpsf_([0-9a-f]{16})_([A-Za-z0-9_-]{43})", re.ASCII)
-_USE_NOTED_EVERY_S = 60.0  # at most one write a minute, not one per request
+_USE_NOTED_EVERY_S = 60.0  # the time of use is written at most once a minute, not for every request
 _NOBODY = hashlib.sha256(b"nobody").hexdigest()
 
 
@@ -37,7 +37,7 @@ class Scope(StrEnum):
 
 
 class KeyRefused(Exception):
-    """A key is not valid; ``code`` and the message say why and never contain the key."""
+    """A key is not valid. ``code`` and the message give the reason; they never contain the key."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -53,7 +53,7 @@ class Keys:
     def make(
         self, owner: str, scopes: Collection[Scope], *, label: str = "", expires_at: float | None = None
     ) -> str:
-        """Make a key and return it; it cannot be shown again. Raises ValueError."""
+        """Make a key and return it; it cannot be shown again. Raises ValueError for a bad owner or without scopes."""
         if not OWNER.fullmatch(owner):
             raise ValueError(
                 f"expected an owner of lower-case letters, digits, '.', '_' and '-'; got {owner!r}"
@@ -77,7 +77,7 @@ class Keys:
         return f"hpsf_{identity}_{secret}"
 
     def check(self, key: str) -> KeyRow:
-        """The row of a valid key; notes its use. Raises ``KeyRefused``."""
+        """Return the row of a valid key, and record the time of its use. Raises ``KeyRefused``."""
         parts = _KEY.fullmatch(key)
         if parts is None:
             raise KeyRefused(
@@ -89,10 +89,10 @@ class Keys:
         if row is None or not same:
             raise KeyRefused(
                 "bad-key",
-                "expected a key of this service; this one is unknown here: ask the operator for a key",
+                "expected a key of this service; this key is not known to the service: ask the operator for a key",
             )
         now = time.time()
-        # Only a caller who has the secret learns these reasons.
+        # Only a caller who knows the secret is told these reasons.
         if row.revoked_at is not None:
             raise KeyRefused("key-revoked", f"key {row.id} was revoked: ask the operator for a new one")
         if row.expires_at is not None and row.expires_at <= now:
@@ -107,7 +107,7 @@ class Keys:
             return session.scalars(select(KeyRow).order_by(KeyRow.created_at, KeyRow.id)).all()
 
     def revoke(self, identity: str) -> bool:
-        """Revoke a key from the next request on; False if there is no key with this id."""
+        """Revoke a key. The next request with it is refused. Returns False if there is no key with this id."""
         revoked = update(KeyRow).where(KeyRow.id == identity)
         return bool(
             self._database.change(revoked.values(revoked_at=func.coalesce(KeyRow.revoked_at, time.time())))

@@ -1,7 +1,7 @@
-"""The files that the database refers to, of all owners.
+"""Find the files of all owners to which the database refers.
 
-A row refers to a file if the file's hash appears in any text or JSON column. The search needs no knowledge of the
-tables. It may find hashes that name no file, such as that of a key; it never misses a file.
+A row refers to a file if the file's hash appears in any text or JSON column. The search therefore works for all tables
+in the same way. It may find hashes that are not hashes of files, for example the hash of a key. It misses no file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from workers.catalogue.tables import Base, SolutionRow
 
 BATCH = 1000
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-# This table is very long and refers only to files that images and products refer to too.
+# This table is very long. The tables of images and products also refer to all of its files.
 _SKIPPED = frozenset({BulkItemRow.__tablename__})
 
 
@@ -28,11 +28,8 @@ class NamedFiles:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
-        """Every hash in the database, some of them more than once; rows are read in batches.
-
-        solutions_from: without the kept solutions that were made before this time.
-        """
+    def all(self) -> Iterator[str]:
+        """Every hash in the database; a hash may occur more than once. Rows are read in batches."""
         for table in Base.metadata.sorted_tables:
             if table.name not in _SKIPPED:
                 yield from self._in(table, solutions_from)

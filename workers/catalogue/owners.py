@@ -1,10 +1,7 @@
-"""How many bytes each owner keeps, and the owner's quota.
+"""The number of bytes that each owner keeps, and the owner's quota.
 
-The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The count changes
-in the transaction that adds the row.
-
-A solution can be made again, so it never takes room from anything else: the oldest solutions are removed if an upload or
-another solution needs their room.
+The files of the owner's uploads, PSFs, products and reports are counted; their pictures are not. The transaction that
+adds a row also changes the count.
 """
 
 from __future__ import annotations
@@ -35,10 +32,7 @@ NOT_KEPT = "the result of this job could not be kept"  # a reason for Usage.no_r
 
 @dataclass(frozen=True)
 class Usage:
-    """The bytes that an owner keeps, and the limit; limit_bytes None: no limit.
-
-    removable_bytes: the part of used_bytes that kept solutions take.
-    """
+    """The bytes that an owner keeps, and the limit. limit_bytes None: no limit."""
 
     owner: str
     used_bytes: int
@@ -46,18 +40,16 @@ class Usage:
     removable_bytes: int = 0
 
     def allows(self, more_bytes: int = 0) -> bool:
-        """Whether this many more bytes fit, if need be without the kept solutions."""
-        if self.limit_bytes is None:
-            return True
-        return self.used_bytes - self.removable_bytes + more_bytes <= self.limit_bytes
+        """Whether ``more_bytes`` can be added without exceeding the limit."""
+        return self.limit_bytes is None or self.used_bytes + more_bytes <= self.limit_bytes
 
     @property
     def full(self) -> bool:
-        """Whether no more bytes fit."""
+        """Whether no byte can be added without exceeding the limit."""
         return not self.allows(1)
 
     def no_room(self, why: str) -> str:
-        """The message if there is no room. why: a clause that says what the room is needed for."""
+        """The message for a full quota. why: a clause that gives the reason for the message."""
         assert self.limit_bytes is not None
         return (
             f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are used, and "
@@ -66,7 +58,7 @@ class Usage:
 
 
 class OverQuota(Exception):
-    """A file does not fit into the owner's quota. usage: without the file."""
+    """A file does not fit into the owner's quota. usage: the owner's usage without this file."""
 
     def __init__(self, usage: Usage) -> None:
         super().__init__(usage.owner)
@@ -80,27 +72,27 @@ class Owners:
         self._database = database
 
     def usage(self, owner: str, quota_mib: int) -> Usage:
-        """The usage of an owner. quota_mib: the limit for owners without one of their own; 0: unlimited."""
+        """The usage of an owner. quota_mib: the limit if the owner has no individual limit; 0: unlimited."""
         with self._database.reading() as session:
             return _usage(session, owner, quota_mib)
 
     def all(self, quota_mib: int) -> list[Usage]:
-        """The usage of all owners who keep files or have a limit of their own."""
+        """The usage of all owners who keep files or have an individual limit. quota_mib: as for ``usage``."""
         with self._database.reading() as session:
             names = session.scalars(select(OwnerRow.owner).order_by(OwnerRow.owner)).all()
         return [self.usage(name, quota_mib) for name in names]
 
     def set_quota(self, owner: str, quota_mib: int | None) -> None:
-        """Set an owner's own limit; 0: unlimited; None: the default limit."""
+        """Set the individual limit of an owner. 0: unlimited. None: the default limit is used."""
         with self._database.writing.begin() as session:
             add_bytes(session, owner, 0)
             session.execute(update(OwnerRow).where(OwnerRow.owner == owner).values(quota_mib=quota_mib))
 
     def recount(self) -> Sequence[str]:
-        """Count all files again and correct the counts; returns the owners whose count was wrong."""
+        """Count the bytes of all files again and correct the counts; returns the owners whose count was wrong."""
         wrong = []
         with self._database.writing.begin() as session:
-            # A transaction that adds a row meanwhile waits for these locks before it counts its bytes.
+            # If another transaction adds a row now, it waits for these locks before it changes the count.
             rows = session.scalars(select(OwnerRow).with_for_update()).all()
             truth: dict[str, int] = {}
             for table in COUNTED:
@@ -113,7 +105,7 @@ class Owners:
                     wrong.append(row.owner)
                     row.bytes = right
             for owner, total in truth.items():
-                # This owner's row may have been added, with its bytes, while this transaction waited.
+                # While this transaction waited, another one may have added this owner's row with its bytes.
                 add_bytes(session, owner, 0)
                 session.execute(update(OwnerRow).where(OwnerRow.owner == owner).values(bytes=total))
                 wrong.append(owner)
@@ -135,7 +127,7 @@ class Owners:
 
 
 def add_bytes(session: Session, owner: str, count: int) -> None:
-    """Add bytes to an owner's count, in the transaction that adds the row of the file."""
+    """Add bytes to an owner's count. Call it in the transaction that adds the row of the file."""
     insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
     row = insert(OwnerRow).values(owner=owner, bytes=count)
     session.execute(
@@ -143,11 +135,11 @@ def add_bytes(session: Session, owner: str, count: int) -> None:
     )
 
 
-def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, removable: bool) -> None:
-    """Raise OverQuota if ``count`` bytes, which are counted already, did not fit; remove solutions that are in the way.
+def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int) -> None:
+    """Raise OverQuota if ``count`` bytes do not fit into the quota. The usage already includes these bytes.
 
-    removable: whether they are the bytes of a solution. Other transactions of the owner wait until this one ends. If
-    several uploads fit one by one but not together, the last ones are refused.
+    Other transactions of the owner wait until this one ends. Several uploads at once may exceed the limit although each
+    of them would fit; the last ones are then refused.
     """
     counted = _usage(session, owner, quota_mib)
     before = replace(

@@ -1,4 +1,4 @@
-"""Parts of jobs that several workers share. A worker takes a part by compare-and-set under a lease of the part."""
+"""Parts of jobs that several workers share. A worker takes a part by compare-and-set; it then holds a lease of it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workers.catalogue.tables import PartRow
 
 @dataclass(frozen=True)
 class Part:
-    """The right to work on a part. A worker that lost it may still deliver the result, unless another one has."""
+    """The right to work on a part. A worker that lost it may still store the result, if no other worker has stored one."""
 
     owner: str
     request_key: str
@@ -30,7 +30,7 @@ class Parts:
         self._database = database
 
     def open(self, owner: str, request_key: str, count: int) -> None:
-        """Create those of the parts 0 to count - 1 that do not exist."""
+        """Create the parts 0 to ``count`` - 1, except those that exist."""
         with self._database.writing.begin() as session:
             there = set(
                 session.scalars(
@@ -42,7 +42,7 @@ class Parts:
                     session.add(PartRow(owner=owner, request_key=request_key, number=number))
 
     def take(self, owner: str, request_key: str, lease_s: float) -> Part | None:
-        """Take an open part, or one whose worker has been silent for ``lease_s``; None if there is none."""
+        """Take an open part, or a part whose worker has been silent for ``lease_s`` seconds; None if there is no such part."""
         free = [
             PartRow.owner == owner,
             PartRow.request_key == request_key,
@@ -65,9 +65,9 @@ class Parts:
         return self._set(_holding(part), heartbeat_at=self._database.now)
 
     def finish(self, part: Part, result: dict[str, Any]) -> bool:
-        """Store a part's result; False if it has one.
+        """Store the result of a part; False if the part already has a result.
 
-        The first result counts, even from a worker that lost the part: every worker computes the same result.
+        The first result is kept, even if the worker has lost the part, because every worker computes the same result.
         """
         return self._set(_undone(part), result=result, token=None)
 
@@ -76,7 +76,7 @@ class Parts:
         self._set(_holding(part), token=None)
 
     def results(self, owner: str, request_key: str) -> list[dict[str, Any]]:
-        """Results of the done parts, by number."""
+        """Results of the parts that are done, sorted by number."""
         query = select(PartRow.result).where(
             PartRow.owner == owner, PartRow.request_key == request_key, PartRow.result.is_not(None)
         )

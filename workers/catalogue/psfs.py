@@ -1,7 +1,8 @@
-"""PSFs in the catalogue: found by their properties and validity, certified and deprecated.
+"""PSFs in the catalogue: find them by their properties and validity, certify and deprecate them.
 
-A change of status holds a lock from before it reads the other PSFs of the series until it is written: the lock on the
-series' row (PostgreSQL), or the database's write lock (SQLite). Of two conflicting changes, the second sees the first.
+A change of status takes a lock before it reads the other PSFs of the series, and holds it until the change is written.
+On PostgreSQL, this is a lock on the row of the series; on SQLite, it is the write lock of the database. If two changes
+conflict, the second one therefore sees the first one and is refused.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ class StatusAsked:
     version: str | None = None
     validity: Validity | None = None
     successor_id: str | None = None
-    supersedes: tuple[str, ...] = ()  # certified PSFs of the series that are deprecated in the same step
-    # Only for a draft that lacks them.
+    supersedes: tuple[str, ...] = ()  # certified PSFs of the series to deprecate in the same step
+    # The next three are only for a draft whose file does not give them.
     instrument: str | None = None
     channel: str | None = None
     kind: str | None = None
@@ -66,7 +67,7 @@ class Psfs:
         self._database = database
 
     def describe(self, psf_id: str, owner: str, *, tables_sha256: str, preview_sha256: str) -> None:
-        """Store the hashes of a PSF's tables and picture, which were made from its unchanged file."""
+        """Store the hashes of the tables and of the picture that were made from a PSF's file."""
         with self._database.writing.begin() as session:
             row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
             if row is not None:
@@ -78,7 +79,7 @@ class Psfs:
     def page(
         self, wanted: PsfFilter, owner: str, *, limit: int, after: tuple[float, str] | None = None
     ) -> Sequence[PsfRow]:
-        """PSFs newest first, after ``after`` = (created_at, id) of the last row of the previous page."""
+        """A page of PSFs, newest first. after: (created_at, id) of the last row of the previous page."""
         query = _query(wanted, owner)
         if after is not None:
             query = query.where(tuple_(PsfRow.created_at, PsfRow.id) < after)
@@ -86,7 +87,7 @@ class Psfs:
             return session.scalars(query.order_by(*_NEWEST_FIRST).limit(limit)).all()
 
     def emptied_by(self, wanted: PsfFilter, owner: str) -> str | None:
-        """The name of the first filter that, with those before it, leaves no PSF; None if PSFs are left."""
+        """Apply the filters one by one; return the name of the first after which no PSF is left, or None."""
         met = PsfFilter()
         with self._database.reading() as session:
             for name in (field.name for field in fields(PsfFilter)):
@@ -94,9 +95,8 @@ class Psfs:
                 if value is None:
                     continue
                 met = replace(met, **{name: value})
-                first = (
-                    _query(met, owner).order_by(*_NEWEST_FIRST).limit(1)
-                )  # in the order of the index for lists
+                # Sorted as in the index for lists.
+                first = _query(met, owner).order_by(*_NEWEST_FIRST).limit(1)
                 if session.scalars(first).first() is None:
                     return name.removesuffix("_id")
         return None
@@ -121,7 +121,10 @@ class Psfs:
             return session.scalars(_released(series, owner)).all()
 
     def change(self, psf_id: str, owner: str, asked: StatusAsked, by: str) -> PsfRow:
-        """Certify a PSF, change the range of a certified PSF, deprecate it, or name the successor of a deprecated PSF.
+        """Change the status of a PSF.
+
+        The request certifies a draft, changes the range of a certified PSF, deprecates a certified PSF, or names the
+        successor of a deprecated PSF.
 
         Raises ``DataError`` and changes nothing: "no-such-psf", "no-line", "line-known", "wrong-transition",
         "not-of-this-change", "ranges-overlap", "not-to-supersede", "no-such-successor", "successor-named",
@@ -156,10 +159,10 @@ _NEWEST_FIRST = (PsfRow.created_at.desc(), PsfRow.id.desc())
 
 
 def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
-    """A query of PSFs that meet the filters, unsorted.
+    """A query for the PSFs that meet the filters, unsorted.
 
-    The PSFs of a context or of a time are few: a subquery finds them first. The subquery is DISTINCT, because otherwise
-    SQLite walks all PSFs in the order of the list until it meets some of them.
+    A context has few PSFs, and few PSFs are valid at one time. Therefore a subquery finds these PSFs first. The subquery
+    is DISTINCT, because otherwise SQLite reads all PSFs in the order of the list until it finds some of them.
     """
     query = select(PsfRow).where(PsfRow.owner == owner)
     if wanted.context_id is not None:
@@ -167,7 +170,7 @@ def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
     elif wanted.valid_at is not None:
         query = query.join(latest := _latest_from(wanted, owner).subquery(), PsfRow.id == latest.c.psf_id)
         query = query.where(PsfRow.valid_to > wanted.valid_at)
-    # The series replaces instrument, channel and kind, because indexes begin with it.
+    # If the series is known, it replaces instrument, channel and kind, because the indexes begin with the series.
     whole = ("series",) if wanted.series is not None else ("instrument", "channel", "kind")
     for name in (*whole, "name", "version", "status"):
         value = getattr(wanted, name)
@@ -177,7 +180,7 @@ def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
 
 
 def _pinned(wanted: PsfFilter, owner: str) -> Select[Any]:
-    """Ids of the PSFs that a context pins, for a time if one is given."""
+    """Ids of the PSFs that a context pins; if a time is given, only those that are pinned for that time."""
     query = select(PsfPinRow.psf_id).where(
         PsfPinRow.owner == owner, PsfPinRow.context_id == wanted.context_id
     )
@@ -185,13 +188,13 @@ def _pinned(wanted: PsfFilter, owner: str) -> Select[Any]:
         query = query.where(PsfPinRow.series == wanted.series)
     if wanted.valid_at is not None:
         query = query.where(PsfPinRow.valid_from <= wanted.valid_at, PsfPinRow.valid_to > wanted.valid_at)
-    return query.distinct()  # one may be pinned for several ranges
+    return query.distinct()  # a PSF may be pinned for several ranges
 
 
 def _latest_from(wanted: PsfFilter, owner: str) -> Select[Any]:
-    """For each series, the id of the certified PSF whose range began last before the time.
+    """For each series, the id of the certified PSF whose range begins last before ``wanted.valid_at``.
 
-    Ranges of a series do not overlap, so no other PSF of the series can be valid at the time.
+    The ranges of a series do not overlap, so no other PSF of the series can be valid at that time.
     """
     latest = (
         select(PsfRow.id)
@@ -231,13 +234,13 @@ def _found(session: Session, psf_id: str, owner: str) -> PsfRow:
 
 
 def _series(row: PsfRow, asked: StatusAsked) -> str:
-    """The series of a PSF, completed by the request. Raises ``DataError`` "line-known" or "no-line"."""
+    """The series of a PSF, completed with ``asked``. Raises ``DataError`` "line-known" or "no-line"."""
     instrument, channel, kind = _said_of_series(row, asked)
     series = series_of(instrument, channel, kind)
     if series is None:
         raise DataError(
             "no-line",
-            f"expected an instrument, because the file of PSF {row.id} names none: give instrument, channel and kind",
+            f"expected an instrument, because the file of PSF {row.id} does not name one: give instrument, channel and kind",
         )
     return series
 
@@ -253,7 +256,8 @@ def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | 
         said = getattr(asked, name)
         if said is not None and value is not None and said != value:
             raise DataError(
-                "line-known", f"{name}: expected {value!r}, which PSF {row.id} has and keeps; got {said!r}"
+                "line-known",
+                f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {said!r}",
             )
     return (
         row.instrument or asked.instrument,
@@ -271,7 +275,7 @@ def _certify(session: Session, row: PsfRow, series: str, asked: StatusAsked, by:
     elif asked.version not in (None, row.version):
         raise DataError(
             "not-of-this-change",
-            f"expected version {row.version}, which the certified PSF keeps; got {asked.version}",
+            f"expected version {row.version}, because the version of a certified PSF cannot change; got {asked.version}",
         )
     validity = asked.validity or _validity(row)
     for superseded_id in asked.supersedes:
@@ -291,7 +295,7 @@ def _certify(session: Session, row: PsfRow, series: str, asked: StatusAsked, by:
     if other is not None:
         raise DataError(
             "ranges-overlap",
-            f"expected a range that overlaps with no certified PSF of {series}; got {validity}, which overlaps with that of "
+            f"expected a range that overlaps with no certified PSF of {series}; got {validity}, which overlaps with the range of "
             f"PSF {other.id} ({other.name} {other.version}), {_validity(other)}: deprecate that PSF, name it "
             "in `supersedes`, or change its range first",
         )
@@ -310,16 +314,17 @@ def _certify(session: Session, row: PsfRow, series: str, asked: StatusAsked, by:
 
 
 def _validity(row: PsfRow) -> Validity:
-    """The range of a PSF; all times if it has none."""
+    """The range of times for which a PSF is valid; all times if the PSF has no range."""
     if row.valid_from is None or row.valid_to is None:
         return Validity()
     return Validity(row.valid_from, row.valid_to)
 
 
 def _overlapping(session: Session, row: PsfRow, series: str, validity: Validity) -> PsfRow | None:
-    """The certified PSF of the series whose range overlaps with this one, or None.
+    """The certified PSF of the series whose range overlaps with ``validity``, or None.
 
-    Their ranges do not overlap each other, so only the last one that begins before the end can overlap.
+    The ranges of the certified PSFs do not overlap each other. So it is enough to check the PSF whose range begins last
+    before ``validity`` ends.
     """
     query = select(PsfRow).where(
         PsfRow.owner == row.owner,
@@ -341,10 +346,10 @@ def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> No
         supersedes=asked.supersedes or None,
     )
     if row.status == PsfStatus.DEPRECATED and (row.successor_id is not None or asked.successor_id is None):
-        has = f"successor {row.successor_id}, which it keeps" if row.successor_id else "no successor"
+        has = f"successor {row.successor_id}, which cannot change" if row.successor_id else "no successor"
         raise DataError(
             "successor-named",
-            f"expected the first successor of the deprecated PSF {row.id}, which has {has}; got {asked.successor_id or 'none'}",
+            f"expected a first successor for the deprecated PSF {row.id}, which has {has}; got {asked.successor_id or 'no successor'}",
         )
     if asked.successor_id is not None:
         successor = session.get(PsfRow, (row.owner, asked.successor_id))
@@ -368,12 +373,12 @@ def _refuse(asked: StatusAsked, other: str, **given: object) -> None:
         if value is not None:
             raise DataError(
                 "not-of-this-change",
-                f"{name}: expected only with a {other}; got it with status {asked.status}: leave it out",
+                f"{name}: expected this field only in a {other}; got it with status {asked.status}: leave it out",
             )
 
 
 def _write(session: Session, row: PsfRow, reason: str, by: str, **values: object) -> None:
-    """Change the row and add the change to the PSF's history."""
+    """Change the row of a PSF, and add the change to the PSF's history."""
     before, version_before = row.status, row.version
     for name, value in values.items():
         setattr(row, name, value)

@@ -1,8 +1,8 @@
-"""The revision of the database, the revision that this version needs, and the upgrade.
+"""Compare the revision of the database with the revision that this version of heliopsf needs, and upgrade the database.
 
-Revisions are in ``workers/catalogue/migrations/versions``. Alembic runs them; it is imported only when needed. Any number
-of processes may start at once: the first one that gets the database's lock upgrades it in one transaction; the others
-wait and find it upgraded.
+A revision is a numbered state of the tables. The revisions are in ``workers/catalogue/migrations/versions``. Alembic runs
+them; it is imported only when needed. Any number of processes may start at the same moment. The first process that gets
+the lock of the database upgrades the database in one transaction. The others wait, and then find that it is upgraded.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 REVISIONS = Path(__file__).parent / "migrations"
 LOCK = 0x68656C696F  # PostgreSQL's advisory lock for upgrades: "helio"
-# Alembic keeps its running environment in a module variable, so this process may run one upgrade at a time.
+# Alembic stores the running upgrade in a module variable, so this process can run only one upgrade at a time.
 _ONE_AT_A_TIME = threading.Lock()
 
 State = Literal["empty", "unversioned", "older", "current", "newer"]
 
 
 class SchemaError(Exception):
-    """This version cannot upgrade the database; the message says why."""
+    """This version cannot use or upgrade the database; the message gives the reason."""
 
 
 @dataclass(frozen=True)
 class SchemaStatus:
-    """The revision of a database, and the one that this version needs."""
+    """The revision of a database, and the revision that this version needs."""
 
     revision: str | None  # None: the database has no revision
     wanted: str
@@ -60,9 +60,9 @@ class Schema:
         self._database = database
 
     def upgrade(self) -> None:
-        """Upgrade a database that is empty, older, or made before there were revisions.
+        """Upgrade a database that is empty, has an older revision, or was made before revisions existed.
 
-        Raises ``SchemaError`` if it is of a later version or holds foreign tables.
+        Raises ``SchemaError`` if the database belongs to a later version, or if its tables are not those of heliopsf.
         """
         from alembic import command
 
@@ -81,7 +81,7 @@ class Schema:
             command.upgrade(config, "head")
 
     def check(self) -> None:
-        """Raise ``SchemaError``, which says what to do, if the database is not at the revision of this version."""
+        """Raise ``SchemaError`` if the database is not at the revision of this version. The message says what to do."""
         status = self.status()
         if status.state == "newer":
             raise SchemaError(_too_new(status))
@@ -95,17 +95,17 @@ class Schema:
             )
 
     def mend(self) -> None:
-        """Create again tables and indexes that were removed from a database at the revision of this version."""
+        """Create the missing tables and indexes of a database that is at the revision of this version."""
         with self._database.engine.begin() as connection:
             make_missing(Base.metadata, connection)
 
     def status(self) -> SchemaStatus:
-        """The revision of the database; changes nothing."""
+        """The revision of the database. Does not change the database."""
         with self._database.engine.execution_options(read_only=True).connect() as connection:
             return _status(connection)
 
     def faults(self) -> SchemaFaults:
-        """What the database lacks; changes nothing."""
+        """The missing tables, columns and indexes. Does not change the database."""
         with self._database.engine.execution_options(read_only=True).connect() as connection:
             return _faults(Base.metadata, connection)
 
@@ -155,9 +155,9 @@ def _too_new(status: SchemaStatus) -> str:
 
 
 def _check_baseline(connection: Connection) -> None:
-    """Raise ``SchemaError`` unless tables without a revision have all columns of the first revision.
+    """Check a database that has tables but no revision: the tables must have all columns of the first revision.
 
-    The first revision creates missing tables and indexes, as the versions before it did at each start.
+    Raises ``SchemaError``. Missing tables and indexes are allowed, because the first revision creates them.
     """
     from workers.catalogue.migrations.versions.r0001_baseline import METADATA as BASELINE
 

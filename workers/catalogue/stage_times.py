@@ -1,4 +1,4 @@
-"""How long jobs spent in each stage, in total, by kind of job."""
+"""The total time that jobs spent in each stage, by kind of job."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from workers.catalogue.database import Database
 from workers.catalogue.tables import StageTimeRow
 
-MOST_LETTERS = 64  # of a stage's name
+MOST_LETTERS = 64  # longest name of a stage
 
 
 @dataclass
@@ -31,7 +31,7 @@ class KeptStageTimes:
     def add(self, kind: str, spent: Mapping[str, Spent]) -> None:
         """Add the times of one attempt of a job of this kind."""
         insert = sqlite.insert if self._database.sqlite else postgresql.insert
-        # Sorted, so that two attempts that write at once cannot deadlock.
+        # The rows are sorted, so that two attempts that write at the same moment cannot deadlock.
         rows = [
             {"kind": kind, "stage": stage, "seconds": one.seconds, "steps": one.steps}
             for stage, one in sorted(spent.items())

@@ -1,7 +1,7 @@
 """The tables of the catalogue.
 
-Times are seconds since 1970 (UTC). A change here needs a revision in ``workers/catalogue/migrations/versions``, which
-upgrades existing databases.
+Times are seconds since 1970 (UTC). A change of the tables needs a new revision in
+``workers/catalogue/migrations/versions``. The revision upgrades existing databases.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Base(DeclarativeBase):
     type_annotation_map = {  # noqa: RUF012 - SQLAlchemy's own convention
         dict[str, Any]: JSON,
         list[str]: JSON,
-        float: Double,  # without this the type depends on SQLAlchemy's version
+        float: Double,  # without this line, the type depends on the version of SQLAlchemy
     }
 
 
@@ -33,7 +33,7 @@ _EXECUTING = text("phase = 'EXECUTING'")
 
 
 def _listed(table: str, *by: str) -> Index:
-    """The index for lists of an owner's rows, newest first; ``by``: of rows with one value in these columns."""
+    """An index for lists of an owner's rows, newest first. by: columns by which the list is filtered."""
     return Index("_".join((table, "listed", *(("by", *by) if by else ()))), "owner", *by, "created_at", "id")
 
 
@@ -56,16 +56,16 @@ class ImageRow(Uploaded, Base):
 
 
 class TransitRow(Uploaded, Base):
-    """An uploaded transit: the archive as it was sent."""
+    """An uploaded transit: the archive, unchanged."""
 
     __tablename__ = "transits"
     __table_args__ = (_listed("transits"),)
 
 
 class PsfRow(Base):
-    """A PSF, uploaded, built or fitted. Its content never changes: another content is another row.
+    """An uploaded, built or fitted PSF. Its content never changes; a PSF with other content has another row.
 
-    ``version`` is that of the file until the PSF is certified; then it is the version within its series.
+    Before the PSF is certified, ``version`` is the version in the file. Afterwards it is the version in the series.
     """
 
     __tablename__ = "psfs"
@@ -75,11 +75,11 @@ class PsfRow(Base):
     name: Mapped[str]
     version: Mapped[str]
     instrument: Mapped[str | None]
-    channel: Mapped[str | None]  # the wavelength in whole angstrom, as 174
-    kind: Mapped[str] = mapped_column(server_default="total")  # total, a component's name, uploaded
+    channel: Mapped[str | None]  # the wavelength in whole angstrom, such as 174
+    kind: Mapped[str] = mapped_column(server_default="total")  # "total", "uploaded" or a component's name
     series: Mapped[str | None]  # instrument/channel/kind; None without an instrument
     status: Mapped[str]
-    # Only if the PSF is or was certified: the range of times of observation; an open end is an infinity.
+    # The range of observation times, only if the PSF is or was certified. An open end is an infinity.
     valid_from: Mapped[float | None]
     valid_to: Mapped[float | None]
     successor_id: Mapped[str | None] = mapped_column(String(64))
@@ -106,7 +106,7 @@ class PsfRow(Base):
             )
         ),
         Index("psfs_by_validity", "owner", "series", "status", "valid_from"),
-        # A version is used only once in a series.
+        # Each version occurs only once in a series.
         Index(
             "one_psf_a_version",
             "owner",
@@ -121,7 +121,7 @@ class PsfRow(Base):
 
 
 class PsfSeriesRow(Base):
-    """A series with at least one certified PSF. A change of status in the series locks this row."""
+    """A series of which a PSF was certified. A change of the status of a PSF in the series locks this row."""
 
     __tablename__ = "psf_series"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -129,7 +129,7 @@ class PsfSeriesRow(Base):
 
 
 class PsfChangeRow(Base):
-    """A change of a PSF's status: who made it, when and why. Rows are never changed or deleted."""
+    """A change of a PSF's status, with the person, time and reason. Rows are never changed or deleted."""
 
     __tablename__ = "psf_changes"
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
@@ -150,7 +150,10 @@ class PsfChangeRow(Base):
 
 
 class PsfContextRow(Base):
-    """A named set of PSFs, one per series and range of times. Immutable; its id is the hash of its name and pins."""
+    """A context: a named set of PSFs, with one PSF for each series and range of times.
+
+    A context never changes. Its id is the hash of its name and of its pins.
+    """
 
     __tablename__ = "psf_contexts"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -168,7 +171,7 @@ class PsfContextRow(Base):
 
 
 class PsfPinRow(Base):
-    """A PSF that a context pins for a series and a range of times of observation."""
+    """A pin: the PSF that a context uses for a series and a range of observation times."""
 
     __tablename__ = "psf_pins"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -181,7 +184,10 @@ class PsfPinRow(Base):
 
 
 class DefaultContextRow(Base):
-    """A change of an owner's default context; None: the PSFs certified now. The last row is valid."""
+    """A change of an owner's default context. The latest row of an owner is valid.
+
+    context_id None: the owner uses the PSFs that are certified now.
+    """
 
     __tablename__ = "default_contexts"
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
@@ -214,7 +220,10 @@ class ProductRow(Base):
 
 
 class JobRow(Base):
-    """A job. ``work_key`` is the identity of its result. ``request_key`` is the same unless another live job has it."""
+    """A job. ``work_key`` is the identity of its result.
+
+    ``request_key`` equals ``work_key``, unless another live job already has that key.
+    """
 
     __tablename__ = "jobs"
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -240,12 +249,11 @@ class JobRow(Base):
     stage: Mapped[str] = mapped_column(default="")
     result_id: Mapped[str | None] = mapped_column(String(64))
     error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
-    estimate: Mapped[dict[str, Any] | None] = mapped_column(
-        JSON(none_as_null=True)
-    )  # made when the job was submitted
+    # The estimate was made when the job was submitted.
+    estimate: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
-        # Of two identical requests at the same moment, the second insert fails and then finds the first.
+        # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first job.
         Index(
             "one_live_job_a_request",
             "owner",
@@ -254,7 +262,7 @@ class JobRow(Base):
             sqlite_where=phase.in_(sorted(LIVE)),
             postgresql_where=phase.in_(sorted(LIVE)),
         ),
-        # Of two jobs with the same result, the second cannot be claimed while the first executes.
+        # If two jobs have the same result, the second cannot be claimed while the first executes.
         Index(
             "one_at_work_a_result",
             "owner",
@@ -267,13 +275,13 @@ class JobRow(Base):
         Index("jobs_waiting", "phase", "queue", "created_at", "submitted_at"),
         _listed("jobs"),
         _listed("jobs", "phase"),
-        # Contains all columns that tally() needs, so that it does not read the rows.
+        # This index contains all columns that tally() needs, so that tally() need not read the rows.
         Index("jobs_tallied", "kind", "phase", "attempt", "started_at", "ended_at"),
     )
 
 
 class TermsRow(Base):
-    """The UWS terms of a job. A job without such a row has no run id and no limits."""
+    """The UWS terms of a job: run id, time limit and destruction time. Without this row, a job has none of them."""
 
     __tablename__ = "job_terms"
     job_id: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -283,7 +291,7 @@ class TermsRow(Base):
 
 
 class ReportRow(Base):
-    """The report of a job on a transit, or on a rerun; its id is the identity of the request."""
+    """A report about a transit or about a rerun; its id is the identity of the request."""
 
     __tablename__ = "reports"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
@@ -312,9 +320,9 @@ class SolutionRow(Base):
 
 
 class PartRow(Base):
-    """A part of a job that several workers share: open, taken under a token, or done with its result.
+    """A part of a job that several workers share. A part is open, taken (it has a token), or done (it has a result).
 
-    Parts belong to the request, not to the job: results stay when the job is tried again.
+    Parts belong to the request and not to the job. If the job is tried again, the results of its parts are still there.
     """
 
     __tablename__ = "parts"
@@ -330,14 +338,14 @@ class WorkerRow(Base):
     """A running worker process. It renews its heartbeat and deletes the row when it ends."""
 
     __tablename__ = "workers"
-    name: Mapped[str] = mapped_column(String(128), primary_key=True)  # host:process, as in a job's row
+    name: Mapped[str] = mapped_column(String(128), primary_key=True)  # host:process, as in JobRow.worker
     started_at: Mapped[float]
     heartbeat_at: Mapped[float]
     version: Mapped[str] = mapped_column(String(64))
 
 
 class StageTimeRow(Base):
-    """The total time that attempts of jobs of a kind spent in a stage. It stays when the jobs are deleted."""
+    """The total time that jobs of a kind spent in a stage, in all attempts. The sum stays when the jobs are deleted."""
 
     __tablename__ = "stage_times"
     kind: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -347,7 +355,7 @@ class StageTimeRow(Base):
 
 
 class OwnerRow(Base):
-    """The bytes that an owner keeps, and the owner's own limit; quota_mib None: the default limit."""
+    """The bytes that an owner keeps, and the individual limit of the owner. quota_mib None: the default limit."""
 
     __tablename__ = "owners"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)

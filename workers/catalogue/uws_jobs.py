@@ -1,4 +1,4 @@
-"""Jobs of the UWS interface: they are set up before they start, have time limits, and can be destroyed."""
+"""Jobs of the UWS interface: clients set them up before they start, give them time limits, and destroy them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from workers.contract.phases import Phase
 
 @dataclass(frozen=True)
 class JobLine:
-    """A job as a list shows it."""
+    """The values of a job that a list of jobs shows."""
 
     id: str
     phase: str
@@ -47,7 +47,7 @@ class UwsJobs:
         execution_duration_s: int = 0,
         destruction_at: float | None = None,
     ) -> JobRow:
-        """A new PENDING job with the parameters given so far. Identical requests do not share it."""
+        """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it."""
         row = JobRow(
             id=uuid.uuid4().hex,
             owner=owner,
@@ -69,7 +69,7 @@ class UwsJobs:
         return row
 
     def amend(self, job_id: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> bool:
-        """Change the parameters of a PENDING job; False, and nothing changed, in any other phase."""
+        """Change the parameters of a PENDING job. In any other phase, nothing changes; returns False."""
         with self._database.writing.begin() as session:
             row = session.get(JobRow, job_id, with_for_update=True)
             if row is None or row.phase != Phase.PENDING:
@@ -87,8 +87,8 @@ class UwsJobs:
     ) -> bool:
         """PENDING -> QUEUED with ``parameters``, which were resolved from ``given``.
 
-        False if the job is not PENDING or its parameters are no longer ``given``. If an identical request has a live
-        job, this job gets a key of its own; it waits until that job ends and then finds its result.
+        False if the job is not PENDING, or if its parameters are no longer ``given``. If an identical request has a live
+        job, this job gets a different key. It waits until the other job ends, and then uses the result of that job.
         """
         for key in (request_key, canonical_hash({"request_key": request_key, "job": job_id})):
             try:
@@ -104,7 +104,7 @@ class UwsJobs:
         raise RuntimeError(f"another job has the key that belongs to job {job_id} alone")
 
     def destroy(self, job_id: str) -> bool:
-        """Delete the job in any phase. Its worker loses the lease and stops. Results stay."""
+        """Delete a job, in any phase. Its worker loses the lease and stops. Its result stays."""
         with self._database.writing.begin() as session:
             session.execute(delete(TermsRow).where(TermsRow.job_id == job_id))
             result = session.execute(delete(JobRow).where(JobRow.id == job_id))
@@ -119,7 +119,7 @@ class UwsJobs:
     def set_terms(self, job_id: str, **values: Any) -> None:
         """Change UWS terms of a job."""
         with self._database.writing.begin() as session:
-            # The lock on the job's row orders changes; a deleted job gets no terms.
+            # The lock on the job's row puts changes in order. Terms are not added to a deleted job.
             if session.get(JobRow, job_id, with_for_update=True) is not None:
                 session.merge(TermsRow(job_id=job_id, **values))
 
@@ -148,7 +148,11 @@ class UwsJobs:
         from_time: float | None = None,
         last: int | None = None,
     ) -> list[JobLine]:
-        """Jobs of an owner, newest first. phases: only these; from_time: created then or later; last: at most this many."""
+        """Jobs of an owner, newest first.
+
+        phases: only jobs in these phases; empty: all. from_time: only jobs created at this time or later. last: the
+        largest number of jobs.
+        """
         query = select(JobRow.id, JobRow.phase, JobRow.owner, JobRow.created_at, TermsRow.run_id)
         query = query.outerjoin(TermsRow, TermsRow.job_id == JobRow.id).where(JobRow.owner == owner)
         if phases:

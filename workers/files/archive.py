@@ -1,7 +1,7 @@
 """Files of an archive of images: allowed folders, patterns that match files, and names of output files.
 
-A path of a request is resolved first, with its symbolic links, and must then lie below a folder that the operator
-allows. The same holds for every file that a pattern matches, and again when the file is read.
+The path in a request is resolved first, with its symbolic links. The resolved path must lie below a folder that the
+operator allows. Every file that a pattern matches is checked in the same way, and checked again when it is read.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ _CHUNK = 2**20
 
 @dataclass(frozen=True)
 class Found:
-    """A file that a pattern matches, or an entry of a folder that could not be inspected, with the error."""
+    """A file that a pattern matches; or an entry of a folder that could not be inspected, with the error."""
 
     path: Path
     error: DataError | None = None
 
 
 def roots(folders: str) -> tuple[Path, ...]:
-    """The resolved folders of a setting, which are separated as in PATH."""
+    """The folders of a setting, resolved. The setting separates folders in the same way as PATH."""
     return tuple(Path(folder).resolve() for folder in folders.split(os.pathsep) if folder.strip())
 
 
 def check_under(path: Path, allowed: Sequence[Path], what: str = "a path") -> Path:
-    """The resolved path, if it lies below an allowed folder.
+    """Resolve a path and check that it lies below an allowed folder; returns the resolved path.
 
-    Raises DataError "path-not-allowed", and "bad-path" if its links cannot be resolved.
+    Raises DataError "path-not-allowed", or "bad-path" if the links in the path cannot be resolved.
     """
     try:
         resolved = _resolved(path)
@@ -54,7 +54,7 @@ def check_under(path: Path, allowed: Sequence[Path], what: str = "a path") -> Pa
         ) from error
     if any(resolved.is_relative_to(root) for root in allowed):
         return resolved
-    none = "a folder that the operator allows; none is set (HELIOPSF_BULK_ROOTS, HELIOPSF_BULK_OUTPUT_ROOTS)"
+    none = "a folder that the operator allows (no folder is set in HELIOPSF_BULK_ROOTS, HELIOPSF_BULK_OUTPUT_ROOTS)"
     where = ", ".join(map(str, allowed)) or none
     raise DataError("path-not-allowed", f"expected {what} below {where}; got {ascii(str(path))[:200]}")
 
@@ -66,10 +66,11 @@ def check_glob(glob: str, allowed: Sequence[Path]) -> None:
 
 
 def find(glob: str, allowed: Sequence[Path], tick: Callable[[], None] = lambda: None) -> Iterator[Found]:
-    """The files that a pattern matches, each once: those of a folder by name, then those of its subfolders.
+    """Find the files that a pattern matches. Each file is yielded once.
 
-    Links that lead out of the allowed folders are not followed. A matching entry that cannot be inspected is yielded
-    with its error. ``tick`` is called for every folder and entry; an exception from it ends the walk.
+    The files of a folder are sorted by name; the files of its subfolders follow. Links that lead out of the allowed
+    folders are not followed. A matching entry that cannot be inspected is yielded with the error. ``tick`` is called for
+    every folder and entry; if it raises an exception, the search ends.
     Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
     """
     folder, parts = _split(glob)
@@ -77,7 +78,7 @@ def find(glob: str, allowed: Sequence[Path], tick: Callable[[], None] = lambda: 
 
 
 def matches(path: Path, where: dict[str, Condition], limits: FitsLimits) -> bool:
-    """Whether the header of a file's image meets all conditions. Raises DataError if it cannot be read."""
+    """Whether the header of a file's first image meets all conditions. Raises DataError if it cannot be read."""
     if not where:
         return True
     header = first_image_header(path, limits)
@@ -85,9 +86,9 @@ def matches(path: Path, where: dict[str, Condition], limits: FitsLimits) -> bool
 
 
 def copy_hashed(source: Path, target: Path, max_bytes: int) -> str:
-    """Copy a file; returns the SHA-256 of the copy. Raises DataError "too-large", OSError.
+    """Copy a file; returns the SHA-256 of the copy. Raises DataError "too-large", or OSError.
 
-    The task works on the copy, because a file of the archive may change meanwhile.
+    The task uses the copy, because the file in the archive may change while the task runs.
     """
     digest, size = hashlib.sha256(), 0
     with source.open("rb") as file, target.open("wb") as copy:
@@ -103,20 +104,23 @@ def copy_hashed(source: Path, target: Path, max_bytes: int) -> str:
 
 
 def safe_name(name: str, identity: str) -> str:
-    """The name of a product's file: from its image's name, of letters, digits and . _ - only."""
+    """Make the name of a product's file from the name of its image and the product's identity.
+
+    The name has only letters, digits, full stops, underscores and hyphens.
+    """
     stem = _NOT_IN_A_NAME.sub("_", _FITS_ENDING.sub("", PurePath(name).name)).strip("._-")[:80] or "image"
     return f"{stem}-{identity[:16]}.fits"
 
 
 def shown(path: PurePath) -> str:
-    """A path as valid UTF-8 text: other bytes are shown as \\xff."""
+    """A path as valid UTF-8 text. A byte that is not UTF-8 is written in the form \\xff."""
     return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
-    """The folder before the first part with a wildcard, and the parts from there on.
+    """Split a pattern: the folder before the first part with a wildcard, and the parts from that part on.
 
-    Several ** in a row become one, and a final ** becomes ** and *.
+    Several consecutive ** become one, and a final ** becomes ** followed by *. Raises DataError "bad-path".
     """
     path = PurePath(glob)
     if not path.is_absolute() or ".." in path.parts:
@@ -134,7 +138,10 @@ def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
 def _walk(
     top: Path, parts: tuple[str, ...], allowed: Sequence[Path], tick: Callable[[], None]
 ) -> Iterator[Found]:
-    """Walk each folder once, for all parts that may match next in it, so that several ** do not multiply the work."""
+    """Read each folder only once, and match all parts of the pattern that can apply there.
+
+    Several ** in a pattern therefore cost no additional time.
+    """
     left = [(top, frozenset({0}))]
     while left:
         folder, places = left.pop()
@@ -162,9 +169,9 @@ def _walk(
 def _meant(
     entry: os.DirEntry[str], parts: tuple[str, ...], places: frozenset[int], allowed: Sequence[Path]
 ) -> tuple[bool, frozenset[int]]:
-    """Whether an entry is a matching file, and the parts that may match next in it (empty unless it is a folder).
+    """Whether an entry is a matching file; and the parts of the pattern that may match inside it.
 
-    Raises OSError if the entry cannot be inspected.
+    The second result is empty if the entry is not a folder. Raises OSError if the entry cannot be inspected.
     """
     further = {place for place in places if parts[place] == ANY_FOLDERS}
     if further and (entry.name.startswith(".") or not entry.is_dir(follow_symlinks=False)):
@@ -198,12 +205,12 @@ def _resolved(path: Path) -> Path:
 
 
 def reason_of(error: OSError) -> str:
-    """The system's message, without the path."""
+    """The message of the operating system, without the path."""
     return error.strerror or type(error).__name__
 
 
 def _named(name: str, pattern: str) -> bool:
-    """Whether a name matches; wildcards do not match names that begin with a full stop."""
+    """Whether a name matches a pattern. A wildcard does not match the first full stop of a name."""
     return fnmatchcase(name, pattern) and (not name.startswith(".") or pattern.startswith("."))
 
 
@@ -222,7 +229,10 @@ def _same(value: Any, other: Any) -> bool:
 
 
 def _compared(value: Any, sign: str, other: Any) -> bool:
-    """Compare numbers with numbers and texts with texts (ISO times sort as texts). Other pairs only meet !=."""
+    """Compare numbers with numbers, and texts with texts (ISO times are compared as texts).
+
+    For a number and a text, and for True or False, only the condition != is met.
+    """
     if isinstance(value, bool) or isinstance(value, str) != isinstance(other, str):
         return sign == "!="
     match sign:

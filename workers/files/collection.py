@@ -1,9 +1,8 @@
-"""Removal of files to which no row refers. A job leaves such files if it is killed before it writes its row.
+"""Remove files to which no row of the catalogue refers. A job leaves such files if it is killed before it adds its row.
 
-Recent files stay, because an upload stores its file before its row. If a file is stored again at the moment of its
-removal, its row appears a little later: the rows are therefore read a second time before the file is deleted for good.
-
-Kept solutions of transits can be made again. Those that were made before the same time are removed with their rows.
+Recent files stay, because an upload stores its file before it adds its row. A file may be stored again at the moment at
+which it is removed; its row then appears a little later. Therefore the rows are read a second time before a file is
+deleted permanently.
 """
 
 from __future__ import annotations
@@ -15,14 +14,18 @@ from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Blob, Store
 
-SECOND_LOOK_AFTER_S = 10.0  # an upload writes its row directly after its file, a job within seconds
+# An upload adds its row directly after it stored its file; a job adds its row within seconds.
+SECOND_LOOK_AFTER_S = 10.0
 
 
 @dataclass(frozen=True)
 class Collected:
-    """The files of the store, and those that were removed, or would be removed in a dry run."""
+    """The result of a collection: the files of the store, and the removed files.
 
-    files: int  # in the store
+    removed: in a dry run, the files that would be removed.
+    """
+
+    files: int  # number of files in the store
     bytes: int
     removed: tuple[Blob, ...]
 
@@ -41,12 +44,11 @@ def collect(
     even_most: bool = False,
     second_look_after_s: float = SECOND_LOOK_AFTER_S,
 ) -> Collected:
-    """Remove files that were last stored more than ``older_than_s`` ago and to which no row, or only the row of an
-    old solution, refers.
+    """Remove files that were last stored more than ``older_than_s`` seconds ago and to which no row refers.
 
-    Run one collection at a time. Raises DataError "nothing-named" if no row refers to any file: then the database belongs
-    to another store. Raises DataError "most-unnamed" if more than half of the files would be removed, unless
-    ``even_most``: killed jobs do not leave that many.
+    Run only one collection at a time. Raises DataError "nothing-named" if no row refers to any file of the store: the
+    database then probably belongs to another store. Raises DataError "most-unnamed" if more than half of the files would
+    be removed and ``even_most`` is False, because killed jobs rarely leave so many files.
     """
     kept_before = time.time() - older_than_s
     there = {blob.digest: blob for blob in store.blobs()}
@@ -57,7 +59,7 @@ def collect(
     if there and len(left) == len(there):
         raise DataError(
             "nothing-named",
-            f"expected a database that refers to some of the {len(there)} files of the store; this one refers to none: check "
+            f"expected a database that refers to some of the {len(there)} files of the store; this one refers to none of them: check "
             "that the settings name the right database",
         )
     old = [blob for blob in left.values() if blob.kept_at < kept_before]
@@ -79,8 +81,8 @@ def collect(
 def _removed(
     old: list[Blob], catalogue: Catalogue, store: Store, kept_before: float, second_look_after_s: float
 ) -> list[Blob]:
-    """Remove these files; returns those to which no row refers even after the removal."""
-    # First restore files that a killed collection moved aside, if a row refers to them.
+    """Remove the files ``old``; returns the files to which no row refers after the removal either."""
+    # First restore files that an earlier, killed collection moved aside, if a row refers to them.
     store.settle(catalogue.named_files.all())
     gone = [blob for blob in old if store.remove(blob.digest, kept_before)]
     put_back = store.settle(catalogue.named_files.all(), after_s=second_look_after_s)

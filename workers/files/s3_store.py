@@ -1,6 +1,6 @@
 """Files by the hash of their content in S3 or a compatible store, with copies in a local folder of bounded size.
 
-S3 shows an object only when its upload is complete, so an existing object is whole. Credentials, region and endpoint
+S3 shows an object only when its upload is complete, so an existing object is complete. Credentials, region and endpoint
 come from the usual environment variables (``AWS_*``).
 """
 
@@ -19,21 +19,21 @@ from botocore.exceptions import BotoCoreError
 
 from workers.files.store import Blob, Store, StoreAway, sha256_of, sync
 
-LOOK_AFTER_S = 10.0  # at most this often the size of the copies is measured
-IN_USE_S = 60.0  # a copy that was requested this recently may be about to be opened
-FILL = 0.8  # of the allowed size, after copies were removed
-RETRIES = 3  # of a request after a transient failure, with about a second in between
+LOOK_AFTER_S = 10.0  # shortest time between two measurements of the size of the copies
+IN_USE_S = 60.0  # a copy that was requested in the last minute is not removed: it may be opened soon
+FILL = 0.8  # fraction of the allowed size: copies are removed until they are smaller than this
+RETRIES = 3  # number of times that a request is repeated after a transient failure, about once a second
 
 
 class RemoteStore(Store):
-    """Content-addressed objects below a prefix of a bucket. Readers get copies in the local folder."""
+    """Objects below a prefix of a bucket, named by the hash of their content. Readers get copies in the local folder."""
 
     def __init__(self, url: str, folder: Path, max_copies_bytes: int) -> None:
         super().__init__(folder, blobs="copies")
         self._root = url.removeprefix("s3://").rstrip("/")
         self._max_copies_bytes = max_copies_bytes
         self._counted_at = 0.0
-        # No cache of listings: objects that others store must be seen at once.
+        # Listings are not cached, because objects of other processes must be visible at once.
         self._s3: Any = s3fs.S3FileSystem(
             use_listings_cache=False,
             skip_instance_cache=True,
@@ -56,7 +56,7 @@ class RemoteStore(Store):
             self._s3.pipe_file(f"{self._root}/probe", b"heliopsf")
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
-        """Upload a finished file and keep it as a local copy; returns its SHA-256. Raises ``StoreAway``."""
+        """Upload a complete file and keep it as a local copy; returns its SHA-256. Raises ``StoreAway``."""
         digest = digest or sha256_of(temporary)
         with _answering():
             self._s3.put_file(str(temporary), self._key(digest))
@@ -64,7 +64,7 @@ class RemoteStore(Store):
         return digest
 
     def blobs(self) -> Iterator[Blob]:
-        """All files of the store, listed by their first digit. Raises ``StoreAway``."""
+        """All files of the store, in the order of the first digit of their hashes. Raises ``StoreAway``."""
         for digit in "0123456789abcdef":
             with _answering():
                 found = self._s3.find(f"{self._root}/blobs", prefix=digit, detail=True)
@@ -72,10 +72,10 @@ class RemoteStore(Store):
                 yield Blob(name.rsplit("/", 1)[1], int(about["size"]), about["LastModified"].timestamp())
 
     def remove(self, digest: str, kept_before: float) -> bool:
-        """Remove a file unless it is gone or was stored again; whether it was removed. Raises ``StoreAway``.
+        """Remove a file, unless it no longer exists or was stored again since ``kept_before``.
 
-        S3 cannot check and remove in one step: a copy stays aside until ``settle``, in case the file is stored again in
-        between.
+        Returns whether the file was removed. Raises ``StoreAway``. S3 cannot check and remove a file in one step.
+        Therefore a copy is kept aside until ``settle``, in case the file is stored again between the two steps.
         """
         with _answering():
             if not self._is_old(digest, kept_before):
@@ -84,27 +84,29 @@ class RemoteStore(Store):
                 self._s3.cp_file(self._key(digest), self._key_aside(digest))
             except FileNotFoundError:
                 return False
-            if not self._is_old(digest, kept_before):  # copying a large file takes long
+            # Check again, because it takes long to copy a large file.
+            if not self._is_old(digest, kept_before):
                 return False
             self._s3.rm_file(self._key(digest))
         super().path(digest).unlink(missing_ok=True)
         return True
 
     def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """As ``Store.settle``, also for copies that a killed process left aside. Raises ``StoreAway``."""
+        """As ``Store.settle``. It also treats copies that a killed process left aside. Raises ``StoreAway``."""
         with _answering():
             aside = {name.rsplit("/", 1)[1] for name in self._s3.find(f"{self._root}/aside")}
         if not aside:
             return set()
         time.sleep(after_s)
-        wanted = aside.intersection(named)  # read after the listing: later copies stay aside
+        # `named` is read after the listing; copies that are moved aside later stay there.
+        wanted = aside.intersection(named)
         put_back = set()
         with _answering():
             for digest in wanted:
                 if not self._s3.exists(self._key(digest)):
                     self._s3.cp_file(self._key_aside(digest), self._key(digest))
                     put_back.add(digest)
-            # Only after all are restored: if this is interrupted, the next call finds the copies.
+            # Delete only after all files are restored. If this function is interrupted, the next call finds the copies.
             for digest in aside:
                 self._s3.rm_file(self._key_aside(digest))
         return put_back
@@ -137,14 +139,17 @@ class RemoteStore(Store):
     def _keep_copy(self, temporary: Path, copy: Path) -> None:
         copy.parent.mkdir(exist_ok=True)
         os.utime(temporary)
-        sync(temporary)  # the content of a copy is not checked again
+        sync(temporary)  # force it to the disk, because the content of a copy is not checked again
         os.replace(temporary, copy)
         if time.monotonic() - self._counted_at > LOOK_AFTER_S:
             self._make_room()
             self._counted_at = time.monotonic()
 
     def _make_room(self) -> None:
-        """Remove the least recently used copies if they are too large; other processes may do the same now."""
+        """Remove the least recently used copies if all copies together are too large.
+
+        Other processes may do the same at the same moment.
+        """
         found: list[tuple[float, int, Path]] = []
         for path in self._blobs.glob("??/*"):
             with suppress(FileNotFoundError):
@@ -162,7 +167,7 @@ class RemoteStore(Store):
 
 @contextmanager
 def _answering() -> Iterator[None]:
-    """Turn errors of S3 and of the network into ``StoreAway``, but not FileNotFoundError for a missing object."""
+    """Turn errors of S3 and of the network into ``StoreAway``. FileNotFoundError for a missing object is not changed."""
     try:
         yield
     except FileNotFoundError:

@@ -1,7 +1,7 @@
-"""Files by the hash of their content, in a local folder. ``workers.files.s3_store`` does the same with S3.
+"""Files in a local folder, named by the hash of their content. ``workers.files.s3_store`` does the same with S3.
 
-A file is written under a temporary name, forced to disk and renamed, so that an existing file is whole. File names come
-from hashes only, never from a client.
+A file is written under a temporary name, forced to the disk and then renamed. An existing file is therefore complete.
+File names are hashes; they never come from a client.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from psfcore.transit.archive import ArchiveLimits, unpack
 
 
 class StoreAway(ConnectionError):
-    """The storage does not answer now; a later attempt may succeed."""
+    """The storage does not respond now; a later attempt may succeed."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Blob:
 
     digest: str
     bytes: int
-    kept_at: float  # when it was last stored; it may be older
+    kept_at: float  # time when the file was last stored; it may have been stored earlier, too
 
 
 class Store:
@@ -42,9 +42,9 @@ class Store:
         self._tmp.mkdir(parents=True, exist_ok=True)
 
     def sweep(self, older_than_s: float = 86_400.0) -> None:
-        """Remove temporary files that killed processes left."""
+        """Remove temporary files older than ``older_than_s`` seconds. Killed processes leave such files."""
         for path in self._tmp.iterdir():
-            # Running tasks remove their files when they end, and another sweep may run now.
+            # A file may disappear meanwhile: a task removes its files when it ends, and another sweep may run now.
             with suppress(FileNotFoundError):
                 if time.time() - path.stat().st_mtime > older_than_s:
                     if path.is_dir():
@@ -53,7 +53,7 @@ class Store:
                         path.unlink()
 
     def path(self, digest: str) -> Path:
-        """The path of the file with this SHA-256, for opening it soon; the file need not exist."""
+        """The path of the file with this SHA-256. Open the file soon, because it may be removed. It need not exist."""
         return self._blobs / digest[:2] / digest
 
     def check(self) -> None:
@@ -63,7 +63,7 @@ class Store:
 
     @contextmanager
     def temporary(self) -> Iterator[Path]:
-        """A free path to write to; a file that is still there at the end is removed."""
+        """A path for a temporary file. If the file still exists at the end, it is removed."""
         path = self._tmp / uuid.uuid4().hex
         try:
             yield path
@@ -72,7 +72,7 @@ class Store:
 
     @contextmanager
     def temporary_folder(self) -> Iterator[Path]:
-        """An empty folder, removed at the end with its content."""
+        """An empty folder. At the end it is removed with its content."""
         folder = self._tmp / uuid.uuid4().hex
         folder.mkdir()
         try:
@@ -82,13 +82,16 @@ class Store:
 
     @contextmanager
     def unpacked(self, digest: str, limits: ArchiveLimits) -> Iterator[Path]:
-        """The files of a stored archive, in a folder that is removed at the end. Raises DataError as ``unpack``."""
+        """Unpack a stored archive into a folder that is removed at the end. Raises the errors of ``unpack``."""
         with self.temporary_folder() as folder:
             unpack(self.path(digest), folder, limits)
             yield folder
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
-        """Move a finished file into the store and force it to disk; returns its SHA-256, computed if not given."""
+        """Move a complete file into the store and force it to the disk; returns its SHA-256.
+
+        digest: the SHA-256, if it is already known.
+        """
         digest = digest or sha256_of(temporary)
         target = self.path(digest)
         target.parent.mkdir(exist_ok=True)
@@ -105,9 +108,10 @@ class Store:
                 yield Blob(path.name, found.st_size, found.st_mtime)
 
     def remove(self, digest: str, kept_before: float) -> bool:
-        """Remove a file unless it is gone or was stored again since ``kept_before``; whether it was removed.
+        """Remove a file, unless it no longer exists or was stored again since ``kept_before``.
 
-        The file is moved aside and checked there, so that a file that is stored at the same moment is not lost.
+        Returns whether the file was removed. The file is first moved aside and checked there, so that a file that is
+        stored at the same moment is not lost.
         """
         aside = self._tmp / uuid.uuid4().hex
         target = self.path(digest)
@@ -116,17 +120,18 @@ class Store:
         except FileNotFoundError:
             return False
         if aside.stat().st_mtime >= kept_before:
-            os.replace(aside, target)  # a file stored there meanwhile has the same content
+            os.replace(aside, target)  # if a file was stored there meanwhile, its content is the same
             return False
         aside.unlink()
         return True
 
     def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """Finish ``remove``: restore those of the files moved aside that are in ``named``, and delete the others.
+        """Finish ``remove``: of the files that were moved aside, restore those in ``named`` and delete the others.
 
-        ``named`` is read ``after_s`` seconds later, and only if a file is aside. Returns the restored hashes.
+        If there are such files, ``named`` is read after ``after_s`` seconds. Returns the hashes of the restored files.
         """
-        return set()  # in a folder, remove() itself checks the file that it moved aside
+        # In a local folder there is nothing to finish: remove() itself checks the file that it moved aside.
+        return set()
 
 
 def sha256_of(path: Path) -> str:
@@ -136,7 +141,7 @@ def sha256_of(path: Path) -> str:
 
 
 def sync(path: Path) -> None:
-    """Force a file, or the names in a folder, to the disk."""
+    """Force the content of a file, or the file names in a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

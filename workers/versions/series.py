@@ -9,7 +9,7 @@ from typing import Any
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import load_instrument
 
-TOTAL = "total"  # a whole PSF, with which images are deconvolved
+TOTAL = "total"  # a total PSF, with which images are deconvolved
 UPLOADED = "uploaded"  # an uploaded PSF whose kind is not known
 WORD = r"^[a-z0-9][a-z0-9_.-]{0,39}$"
 _NOT_OF_A_WORD = re.compile(r"[^a-z0-9_.]+")
@@ -21,24 +21,32 @@ def series_of(instrument: str | None, channel: str | None, kind: str) -> str | N
 
 
 def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str | None:
-    """The channel: the wavelength in whole angstrom, such as 174; without one, that of the shipped instrument."""
+    """The channel: the wavelength in whole angstrom, such as 174.
+
+    If the wavelength is not given, the wavelength of the instrument description is used. None if there is none.
+    """
     if wavelength_angstrom is None and instrument in instrument_names():
         wavelength_angstrom = load_instrument(instrument).wavelength_angstrom
-    if (
-        wavelength_angstrom is None or not 0.5 <= wavelength_angstrom < 1e6
-    ):  # a header card may contain any number
+    # A header card may contain any number.
+    if wavelength_angstrom is None or not 0.5 <= wavelength_angstrom < 1e6:
         return None
     return str(round(wavelength_angstrom))
 
 
 def instrument_of(header: Mapping[str, Any]) -> str | None:
-    """The instrument in the summary of an upload's header: a shipped one, else its DETECTOR or INSTRUME as a name."""
+    """The instrument in the summary of an upload's header.
+
+    It is the name of a known instrument, or else the card DETECTOR or INSTRUME, converted by ``word``.
+    """
     known: str | None = header["instrument"]
     return known or word(header["detector"] or header["instrume"])
 
 
 def word(text: str | None) -> str | None:
-    """A header's text as a name of lower-case letters, digits, _ and full stops; None if nothing is left."""
+    """Convert a text of a header to a name of lower-case letters, digits, underscores and full stops.
+
+    None if no character is left.
+    """
     if text is None:
         return None
     return _NOT_OF_A_WORD.sub("_", text.lower()).strip("_.")[:40] or None

@@ -1,13 +1,14 @@
-"""The status of a PSF, its allowed changes, and version numbers. This module uses no database.
+"""The status of a PSF, its allowed changes, and version numbers. This module does not use the database.
 
     draft ----------> certified ----------> deprecated
                       |      ^              |        ^
                       +------+              +--------+
                   another range         a successor named
 
-A draft is used only by requests that name it. A certified PSF is used for images of its series if a request names no PSF:
-it has a version of its own, and a range of times of observation that overlaps with no other certified PSF of its series.
-A deprecated PSF stays available by name. Its successor cannot change once it is named.
+A draft is used only by requests that name it. If a request names no PSF, the certified PSF of the image's series is
+used. A certified PSF has a version that no other PSF of its series has. Its range of observation times does not overlap
+with the range of any other certified PSF of its series. A request can still name a deprecated PSF. Once the successor
+of a deprecated PSF is named, it cannot change.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ def check_transition(before: PsfStatus, after: PsfStatus) -> None:
 
 
 def next_version(released: Iterable[str]) -> str:
-    """The version after the highest one given: its second number plus one; without any, FIRST_VERSION."""
+    """The next free version: the highest of the ``released`` versions, with its second number increased by 1.
+
+    FIRST_VERSION if no version was released.
+    """
     highest = max((_numbers(version) for version in released), default=None)
     return FIRST_VERSION if highest is None else f"{highest[0]}.{highest[1] + 1}.0"
 

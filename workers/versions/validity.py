@@ -1,7 +1,7 @@
 """Times of observation, and the ranges of times for which a PSF is valid.
 
-In the database, times are seconds since 1970 (UTC) and an open end is an infinity, so that ranges compare as numbers. In
-requests and answers, times are ISO 8601 and an open end is null.
+In the database, times are seconds since 1970 (UTC), and an open end is an infinity; so ranges can be compared as numbers.
+In requests and responses, times are ISO 8601, and an open end is null.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ _TIME = re.compile(TIME, re.ASCII)
 
 
 def seconds(text: str, name: str = "time") -> float:
-    """Seconds since 1970 of a time such as 2024-03-01T12:00:00Z, or of the start of a day; without a zone, UTC.
+    """Convert a time such as 2024-03-01T12:00:00Z to seconds since 1970. A date means the start of that day.
 
-    Raises ``DataError`` "bad-time".
+    A time without a zone is in UTC. name: name of the field, for the message. Raises ``DataError`` "bad-time".
     """
     try:
         if not _TIME.fullmatch(text):
             raise ValueError
         when = datetime.fromisoformat(text)
         at = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-        iso(at)  # raises for times near the year 9999 that cannot be written back
+        iso(at)  # raises an error for times near the year 9999 that cannot be converted back
         return at
     except (ValueError, OverflowError) as error:
         raise DataError(
@@ -52,7 +52,10 @@ class Validity:
 
     @classmethod
     def of(cls, start: str | None, end: str | None) -> Validity:
-        """The range between two ISO 8601 times; None: an open end. Raises ``DataError`` "bad-time" or "empty-range"."""
+        """The range between two times in ISO 8601. None means an open end.
+
+        Raises ``DataError`` "bad-time" or "empty-range".
+        """
         made = cls(
             -math.inf if start is None else seconds(start, "valid_from"),
             math.inf if end is None else seconds(end, "valid_to"),
@@ -62,11 +65,11 @@ class Validity:
         return made
 
     def holds(self, at: float) -> bool:
-        """Whether the time is in the range."""
+        """Whether the time ``at`` is in the range."""
         return self.start <= at < self.end
 
     def overlaps(self, other: Validity) -> bool:
-        """Whether the ranges have a time in common."""
+        """Whether the two ranges have a time in common."""
         return self.start < other.end and other.start < self.end
 
     def __str__(self) -> str:

@@ -1,22 +1,24 @@
 """Signs of artefacts: structures that a deconvolution made and that are not on the Sun.
 
-There are four signs. Each is something that cannot be real, given the image before deconvolution:
+There are four signs. None of them can be real, given the image before deconvolution ("the image before"):
 
-    hole        x <= 0, or x < 0.02 y, where y > 5 sigma                                       Eq. (1)
-    overshoot   x > (y + 5 sigma) / h0:  positive light convolved with the PSF has y >= h0 x   Eq. (2)
-    new extreme |x - med x| > 8 sigma_x at an extreme of 3 x 3 px, where |y - med y| < sigma
-                or has the other sign: a point where the image before is smooth                Eq. (3)
+    hole        x < 0.02 y (or x <= 0) in a pixel with y > 5 sigma                             Eq. (1)
+    overshoot   x > (y + 5 sigma) / h0: no scene without negative light can give this,
+                because such a scene has y >= h0 x                                             Eq. (2)
+    new extreme |x - med x| > 8 sigma_x in a pixel that is the largest or smallest of 3 x 3 px,
+                where the image before is smooth: y - med y has the opposite sign,
+                or |y - med y| < sigma                                                         Eq. (3)
     ringing     rise after the first dip of the mean profile around bright sources, in percent
                 of the peak, minus the same rise in the image before                           Eq. (4)
 
-med is the median of 5 x 5 px. The score is the sum of the four signs, each divided by the value from which a person
-should inspect the image. Below 1, nothing was found. The score ranks the images of a catalogue; it is not a
-probability.
+med is the median of 5 x 5 px. ALARMS gives for each sign the value from which a person should inspect the image. The
+artefact score is the sum of the four signs, each divided by its value in ALARMS. A score below 1 means that nothing was
+found. The score ranks the images of a catalogue; it is not a probability.
 
-sigma comes from the noise of the camera if it is known. Otherwise, and always for the image after deconvolution, it is
-estimated from the pixels (Immerkaer 1996): for white noise, the second difference in both directions has a standard
-deviation of 6 sigma. Its median absolute value is taken in classes of brightness. Structure adds to this estimate, so
-it is an upper limit.
+sigma is computed from the noise of the camera if that noise is known. Otherwise sigma is estimated from the pixels
+(Immerkaer 1996); sigma_x always is. The estimate uses the second difference in both directions: for white noise, its
+standard deviation is 6 sigma. The pixels are divided into classes of brightness, and each class gives the median
+absolute value of its second differences. Structure in the image increases this estimate, so it is an upper limit.
 
 | symbol | name | unit |
 |---|---|---|
@@ -37,7 +39,7 @@ from scipy.ndimage import convolve, maximum_filter, minimum_filter
 HOLE_SHARE = 0.02
 DETECTION_SIGMA = 5.0
 EXTREME_SIGMA = 8.0
-# Values from which a person should inspect the image: per million pixels, and percent of a source's peak.
+# Values from which a person should inspect the image: pixels per million, and percent of the peak of a source.
 ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 2.0}
 RING_RADIUS_PX = 8
 _SOURCES = 100
@@ -53,8 +55,9 @@ Flags = NDArray[np.bool_]
 class Artefacts:
     """Signs of artefacts in one image.
 
-    suspected: pixels [y, x] with a sign of Eq. (1) to (3). signs: value of each sign in ALARMS; ringing_pct is None
-    with fewer than three bright sources. sources: number of bright sources. score: 0 is clean; inspect from 1.
+    suspected: pixels [y, x] that show a sign of Eq. (1) to (3). signs: the measured value of each sign, with the names of
+    ALARMS; ringing_pct is None if there are fewer than three bright sources. sources: number of bright sources.
+    score: artefact score; 0 means no signs, and an image with a score of 1 or more should be inspected.
     """
 
     suspected: Flags
@@ -72,9 +75,9 @@ def find_artefacts(
 ) -> Artefacts:
     """Find signs of artefacts in the counted pixels of `after` [y, x].
 
-    sigma: noise of `before` [y, x], in its unit; None: estimated from the pixels.
+    sigma: noise of `before` [y, x], in the unit of `before`; None: the noise is estimated from the pixels.
     """
-    # Single precision is accurate enough here, and makes the filters twice as fast.
+    # Single precision is accurate enough for these filters, and twice as fast.
     filled_before, filled_after = (_filled(plane).astype(np.float32) for plane in (before, after))
     classes = classes_of(filled_before[counted])
     noise_after = noise_from_pixels(filled_after, filled_before, counted, classes)
@@ -102,14 +105,17 @@ def find_artefacts(
 
 @dataclass(frozen=True, eq=False)
 class BrightnessClasses:
-    """Classes of equal size by brightness: indices of the pixels and median brightness of each class."""
+    """Classes of pixels by brightness, all of the same size.
+
+    members: indices of the pixels of each class. centres: median brightness of each class.
+    """
 
     members: list[NDArray[np.intp]]
     centres: Plane
 
 
 def classes_of(brightness: Plane) -> BrightnessClasses:
-    """Brightness classes of pixels (n,); no classes if there are too few pixels."""
+    """Divide pixels into classes by their brightness (n,). With fewer than 16 pixels there are no classes."""
     if brightness.size < _BRIGHTNESS_CLASSES:
         return BrightnessClasses([], np.empty(0))
     ordered = np.argsort(brightness)
@@ -125,13 +131,13 @@ def noise_from_pixels(pixels: Plane, brightness: Plane, counted: Flags, classes:
         return np.full(pixels.shape, smallest)
     centres = classes.centres
     levels = np.array([1.4826 * np.median(second[part]) for part in classes.members])
-    # The brightest class spans a wide range. Within it, let the noise grow like photon noise.
+    # The brightest class spans a wide range of brightness. In it, the noise grows like photon noise.
     beyond = np.sqrt(np.maximum(brightness, centres[-1]) / centres[-1]) if centres[-1] > 0 else 1.0
     return np.asarray(np.maximum(np.interp(brightness, centres, levels) * beyond, smallest))
 
 
 def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
-    """Eq. (4), or None with fewer than three sources, and the number of sources."""
+    """Compute Eq. (4); also return the number of bright sources. With fewer than three sources, Eq. (4) is None."""
     sources = _bright_sources(before, counted)
     if len(sources) < _FEWEST_SOURCES:
         return None, len(sources)
@@ -140,17 +146,17 @@ def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | No
 
 
 def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after: Plane) -> Flags:
-    """Eq. (3)."""
+    """Find the pixels that fulfil Eq. (3)."""
     limit = EXTREME_SIGMA * noise_after
-    # A median lies between the minimum and the maximum of its pixels. A pixel closer to them than the limit cannot
-    # be an extreme, so medians are needed only for the few remaining pixels.
+    # A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
+    # limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the few remaining pixels.
     peak = (after == maximum_filter(after, 3)) & (after - minimum_filter(after, 5) > limit)
     pit = (after == minimum_filter(after, 3)) & (maximum_filter(after, 5) - after > limit)
     places = np.nonzero(peak | pit)
     away_after = after[places] - _medians(after, places)
     away_before = before[places] - _medians(before, places)
     limits, noise = limit[places], noise_before[places]
-    # A real peak or pit must show in the image before, within its noise.
+    # A real peak or pit is also visible in the image before, except for the noise.
     new_peak = peak[places] & (away_after > limits) & (away_before < noise)
     new_pit = pit[places] & (away_after < -limits) & (away_before > -noise)
     found = np.zeros(after.shape, dtype=np.bool_)
@@ -159,14 +165,17 @@ def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after:
 
 
 def _medians(plane: Plane, places: tuple[NDArray[np.intp], ...]) -> Plane:
-    """Median of the 5 x 5 px around each place; the plane is mirrored at its edges."""
+    """Median of the 5 x 5 px around each position in `places`; the plane is mirrored at its edges."""
     mirrored = np.pad(plane, 2, mode="symmetric")
     windows = np.lib.stride_tricks.sliding_window_view(mirrored, (5, 5))
     return np.asarray(np.median(windows[places].reshape(len(places[0]), 25), axis=1))
 
 
 def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
-    """[y, x] of the brightest compact peaks, no two closer than RING_RADIUS_PX along both axes; shape (n, 2)."""
+    """Positions [y, x] of the brightest compact peaks, shape (n, 2).
+
+    A peak is the largest value within RING_RADIUS_PX along both axes.
+    """
     size = 2 * RING_RADIUS_PX + 1
     whole = minimum_filter(counted.astype(np.uint8), size, mode="constant", cval=0) > 0
     found = np.argwhere(whole & (before == maximum_filter(before, size)))
@@ -177,7 +186,7 @@ def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
 
 
 def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:
-    """Median of sixteen pixels on a circle around each place [y, x]."""
+    """Median of sixteen pixels on a circle around each position [y, x] in `places`."""
     angle = np.arange(16) * np.pi / 8
     rows = places[:, :1] + np.rint(RING_RADIUS_PX * np.sin(angle)).astype(int)
     columns = places[:, 1:] + np.rint(RING_RADIUS_PX * np.cos(angle)).astype(int)
@@ -185,7 +194,11 @@ def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:
 
 
 def _mean_profile(plane: Plane, sources: NDArray[np.int64]) -> Plane:
-    """Median over sources of the mean by radius, minus the outermost ring and scaled to a peak of 1."""
+    """Mean radial profile of the sources.
+
+    The profile of a source is the mean of each ring minus the mean of the outermost ring, scaled to a peak of 1. The
+    result is the median of these profiles.
+    """
     offset = np.arange(-RING_RADIUS_PX, RING_RADIUS_PX + 1)
     ring = np.rint(np.hypot(*np.meshgrid(offset, offset))).astype(int).ravel()
     inside = ring <= RING_RADIUS_PX
@@ -201,7 +214,7 @@ def _mean_profile(plane: Plane, sources: NDArray[np.int64]) -> Plane:
 
 
 def _rise(profile: Plane) -> float:
-    """Rise of a profile after its first dip, in units of the peak."""
+    """Rise of a profile after its first dip, as a fraction of the peak."""
     falls = np.flatnonzero(np.diff(profile) > 0)
     if falls.size == 0:
         return 0.0
@@ -210,6 +223,6 @@ def _rise(profile: Plane) -> float:
 
 
 def _filled(plane: Plane) -> Plane:
-    """The plane with pixels that are not finite replaced by the median of the others."""
+    """Replace the pixels of a plane that are not finite by the median of the finite pixels."""
     good = np.isfinite(plane)
     return np.where(good, plane, float(np.median(plane[good])) if good.any() else 0.0)

@@ -1,17 +1,17 @@
-"""What a deconvolution changed in an image, in numbers that can be compared with the paper.
+"""Measure what a deconvolution changed in an image, with numbers that can be compared with the paper.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images": "bright features
 intensify by up to 40 %, while dark regions decrease by up to 85 %". The paper does not define a feature, the number
-of pixels it is averaged over, or the meaning of "up to". This module therefore tabulates several definitions.
-Structures are blocks of n x n pixels. They are bright or dark by percentiles of the image before deconvolution, for
-every n and percentile below. Each row gives the change of their summed light, the median change, and the largest
-change without the most extreme 1 % of the blocks.
+of pixels over which it is averaged, or the meaning of "up to". This module therefore tabulates several definitions.
+Structures are blocks of n x n pixels (BLOCKS_PX). The brightest and the darkest blocks (TAILS_PCT) are selected by
+percentiles of the image before deconvolution. Each row of the table gives three numbers: the change of the summed
+light of these blocks, the median change, and the largest change without the most extreme 1 % of the blocks.
 
-    change = 100 (after / before - 1)                       Eq. (1)
-    dynamic range = percentile 100 - p over percentile p    Eq. (2)    of block means
+    change = 100 (after / before - 1)                             Eq. (1)
+    dynamic range = percentile 100 - p divided by percentile p    Eq. (2)    percentiles of the block means
 
-Blocks are selected in the image before deconvolution, which is noisy: some of the brightest single pixels are bright
-only by noise. This hardly matters for blocks of 4 px and more.
+The image before deconvolution, in which the blocks are selected, is noisy: some of the brightest single pixels are
+bright only because of noise. This hardly matters for blocks of 4 px and more.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ Flags = NDArray[np.bool_]
 class Structure:
     """Change, Eq. (1), of the brightest or darkest `tail_pct` percent of blocks of block_px x block_px.
 
-    kind: bright or dark. sum_pct: change of their summed light. median_pct: median change. up_to_pct: the rise of
-    bright blocks, or fall of dark blocks, that 1 % of the blocks exceed. before: mean before, in the image's unit.
+    kind: bright or dark. sum_pct: change of the summed light of these blocks. median_pct: median of their changes.
+    up_to_pct: percentile 99 of the changes of bright blocks, or percentile 1 of the changes of dark blocks.
+    before: mean of the blocks before deconvolution, in the unit of the image.
     """
 
     kind: str
@@ -58,9 +59,10 @@ class Structure:
 
 @dataclass(frozen=True)
 class Range:
-    """Dynamic range, Eq. (2), and contrast (rms divided by mean) of block means, before and after.
+    """Dynamic range, Eq. (2), and contrast of block means, before and after deconvolution.
 
-    A dynamic range is None if the lower percentile is not above zero.
+    Contrast is the standard deviation divided by the mean. A dynamic range is None if the lower percentile is not above
+    zero.
     """
 
     block_px: int
@@ -75,9 +77,10 @@ class Range:
 class Changes:
     """What a deconvolution changed in one image.
 
-    pixels: number of pixels compared. edge_px: width of the excluded band at the edges. change_pct: percentiles of the
-    change of single pixels, Eq. (1). difference: percentiles of after - before, in the image's unit.
-    not_positive_before, not_positive_after: number of pixels not above zero; for the former Eq. (1) is not defined.
+    pixels: number of compared pixels. edge_px: width of the excluded band at the edges. change_pct: percentiles of the
+    change of single pixels, Eq. (1). difference: percentiles of after - before, in the unit of the image.
+    not_positive_before, not_positive_after: number of pixels that are not above zero, before and after deconvolution.
+    Eq. (1) is not defined for pixels that are not above zero before.
     """
 
     pixels: int
@@ -104,10 +107,11 @@ class Changes:
 def measure_changes(
     image: Image, result: Plane, psf: Psf, *, noise: Noise | None = None, edge_px: int = 0
 ) -> Changes:
-    """Compare `result` [y, x], the deconvolution of `image` with `psf`, with the image, over trusted pixels.
+    """Compare an image with its deconvolution, `result` [y, x], in the trusted pixels.
 
-    edge_px: width of a band at the edges to exclude. noise: noise of the camera; if it is None, the artefact check
-    estimates the noise from the pixels. Raises DataError "field-shape", "no-signal", "no-exposure".
+    psf: the PSF with which the image was deconvolved. edge_px: width of the band at the edges that is left out.
+    noise: noise of the camera; if it is None, the artefact check estimates the noise from the pixels. Raises DataError
+    "field-shape", "no-signal", "no-exposure".
     """
     if result.shape != image.pixels.shape:
         raise DataError("field-shape", f"expected a result of {image.pixels.shape}; got {result.shape}")
@@ -122,7 +126,8 @@ def measure_changes(
         sigma = np.sqrt(noise.variance(np.where(counted, image.pixels, 0.0), dn_per_unit(image)))
     centre = (psf.kernel.shape[0] // 2, psf.kernel.shape[1] // 2)
     peak_weight = float(psf.kernel[centre])
-    with ThreadPoolExecutor(1) as beside:  # filters and percentiles run at the same time
+    # The filters of the artefact check run at the same time as the percentiles.
+    with ThreadPoolExecutor(1) as beside:
         artefacts = beside.submit(find_artefacts, image.pixels, result, counted, peak_weight, sigma=sigma)
         blocks = [_blocks(image.pixels, result, counted, block_px) for block_px in BLOCKS_PX]
         structures = tuple(row for part in blocks for row in _structures(part))
@@ -151,7 +156,7 @@ def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
 
 
 def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
-    """Means of the blocks of block_px x block_px pixels whose pixels all count; shape (n_blocks,)."""
+    """Means of blocks of block_px x block_px pixels, shape (n_blocks,). All pixels of such a block must be counted."""
     if block_px == 1:
         return np.asarray(plane[counted])
     ny, nx = plane.shape[0] // block_px, plane.shape[1] // block_px
@@ -164,7 +169,7 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Block means (n,) before and after, and their lower and upper percentile for each tail."""
+    """Block means (n,) before and after deconvolution, and for each tail the lower and the upper percentile of them."""
 
     block_px: int
     old: Plane
@@ -174,7 +179,7 @@ class _Blocks:
 
     @property
     def tails(self) -> list[float]:
-        """Tails with at least one block."""
+        """The tails (percent of the blocks) that contain at least one block."""
         return [tail for tail in TAILS_PCT if self.old.size * tail >= 100]
 
 
@@ -184,7 +189,7 @@ def _blocks(before: Plane, after: Plane, counted: Flags, block_px: int) -> _Bloc
 
 
 def _levels(means: Plane) -> dict[float, tuple[float, float]]:
-    """(lower, upper) percentile of each tail."""
+    """For each tail of p percent: (percentile p, percentile 100 - p) of the block means."""
     if means.size == 0:
         return {}
     wanted = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
@@ -198,7 +203,7 @@ def _structures(blocks: _Blocks) -> list[Structure]:
 
 
 def _structure(blocks: _Blocks, kind: str, tail: float) -> Structure | None:
-    """One row, or None if the tail has no light."""
+    """One row of the table; None if no block of the tail was above zero before deconvolution."""
     old, new, block_px = blocks.old, blocks.new, blocks.block_px
     bright = kind == "bright"
     level = blocks.old_levels[tail][bright]

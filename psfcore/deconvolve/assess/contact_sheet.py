@@ -1,8 +1,8 @@
-"""What deconvolution changes in many images: numbers for each, the most doubtful first, and a sheet of thumbnails.
+"""Measure what deconvolution changes in many images: numbers for each image, and a sheet of thumbnails.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images", deconvolved a catalogue
-at a daily cadence "to visually inspect for artifacts". Here the artefact score ranks the images, so that a person
-inspects the most doubtful ones first. Only thumbnails of the images are kept in memory.
+at a daily cadence "to visually inspect for artifacts". This module sorts the images by artefact score, so that a person
+inspects the most doubtful images first. Only thumbnails of the images are kept in memory.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from psfcore.psf_sampling import psf_for_image
 
 THUMBNAIL_PX = 256
 MOST_ON_SHEET = 60
-# The rows of psfcore.deconvolve.assess.changes that represent an image: blocks of 4 px, tails of 1 %.
+# Each image is represented by these rows of psfcore.deconvolve.assess.changes: blocks of 4 px, tails of 1 %.
 BLOCK_PX, TAIL_PCT = 4, 1.0
 LOOK_FROM = 1.0
 _MARKS = 300
@@ -45,8 +45,8 @@ Deconvolve = Callable[[Image, Psf], "Treated"]
 class Treated:
     """One deconvolved image.
 
-    taken: date of the observation. found: what changed. before, after: thumbnails [y, x]. suspected: thumbnail pixels
-    with suspected artefacts, (n, [y, x]).
+    taken: date of the observation. found: the measured changes. before, after: thumbnails [y, x]. suspected: positions
+    [y, x] of the thumbnail pixels with suspected artefacts, shape (n, 2).
     """
 
     name: str
@@ -61,11 +61,11 @@ class Treated:
 
     @property
     def score(self) -> float:
-        """Artefact score; below 1, nothing was found."""
+        """Artefact score; a score below 1 means that nothing was found."""
         return self.found.artefacts.score
 
     def structure(self, kind: str) -> dict[str, float] | None:
-        """Change of the bright or dark blocks: sum_pct and up_to_pct of `Structure`; None without such blocks."""
+        """Change of the bright or dark blocks: sum_pct and up_to_pct of `Structure`; None if there are no such blocks."""
         for row in self.found.structures:
             if (row.kind, row.block_px, row.tail_pct) == (kind, BLOCK_PX, TAIL_PCT):
                 return {"sum_pct": row.sum_pct, "up_to_pct": row.up_to_pct}
@@ -105,7 +105,7 @@ def treat(
     conditions: Conditions | None = None,
     **parameters: Any,
 ) -> Treated:
-    """Deconvolve one image and measure what changed.
+    """Deconvolve one image and measure the changes.
 
     Raises DataError "plate-scale-mismatch" and the errors of the method.
     """
@@ -134,10 +134,10 @@ def treat_many(
     *,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[list[Treated], list[Failure]]:
-    """Deconvolve many images. Returns the results, highest score first, and the failures, in the order of `names`.
+    """Deconvolve many images. Returns the results, with the highest score first, and the failures in the order of `names`.
 
-    one(name) reads and deconvolves an image. If it raises DataError or OSError, the image becomes a failure and the
-    run continues.
+    one(name) reads and deconvolves one image. If it raises DataError or OSError, the image becomes a `Failure`, and the
+    next image follows.
     """
     treated: list[Treated] = []
     failures: list[Failure] = []
@@ -154,7 +154,7 @@ def treat_many(
 
 
 def table(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
-    """The run as JSON values: a summary, one row per image in the order given, and the failures."""
+    """The results as JSON values: a summary, one row per image in the order of `treated`, and the failures."""
     return {
         "schema": "effects/1",
         "summary": _summary(treated, failures),
@@ -167,7 +167,7 @@ def table(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, 
 def contact_sheet_png(
     treated: Sequence[Treated], failures: Sequence[Failure], path: str | Path, *, most: int = MOST_ON_SHEET
 ) -> None:
-    """Draw before, after and change of the first `most` images, and a list of the failures, to a PNG file."""
+    """Draw the first `most` images (before, after and change) and a list of the failures into a PNG file."""
     shown = list(treated[:most])
     across = 1 if len(shown) < 4 else 2
     down = max(1, -(-len(shown) // across))
@@ -185,8 +185,8 @@ def contact_sheet_png(
         va="center",
     )
     legend = (
-        f"each image: before, after (same scale), change from -{CHANGE_LIMIT_PCT:g} % (blue) to "
-        f"+{CHANGE_LIMIT_PCT:g} % (red); circles: suspected artefacts"
+        f"Columns: before, after (same scale), change (blue -{CHANGE_LIMIT_PCT:g} %, red +{CHANGE_LIMIT_PCT:g} %). "
+        "Circles: suspected artefacts"
     )
     figure.text(0.3 / width, 1 - 0.55 / height, legend, fontsize=9, color=INK, va="center")
     for index, row in enumerate(shown):
@@ -233,7 +233,7 @@ def _heading(treated: Sequence[Treated], shown: Sequence[Treated]) -> str:
     doubtful = sum(row.score >= LOOK_FROM for row in treated)
     images = f"{len(treated)} image{'' if len(treated) == 1 else 's'}"
     part = "" if len(shown) == len(treated) else f" (shown: the {len(shown)} with the highest scores)"
-    return f"{images} deconvolved{part}, sorted by artefact score; {doubtful} to inspect (score {LOOK_FROM:g} or more)"
+    return f"{images} deconvolved{part}, sorted by artefact score; inspect {doubtful} (score {LOOK_FROM:g} or more)"
 
 
 def _changes(row: Treated) -> str:
@@ -260,7 +260,7 @@ def _short(name: str) -> str:
 
 
 def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
-    """Summary of all images: how many a person should inspect, and medians and extremes of the changes."""
+    """Summary of all images: the number that a person should inspect, and medians and extremes of the changes."""
     out: dict[str, Any] = {
         "images": len(treated),
         "failures": len(failures),

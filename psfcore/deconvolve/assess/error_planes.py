@@ -6,23 +6,25 @@ Photon and read noise are treated by the parametric bootstrap (Efron and Tibshir
     d_k = run(noise_k(m)) - run(m)                        Eq. (2)    k = 1 ... K
     sigma^2 = n W(sum over k of d_k^2 / n) / K            Eq. (3)    n: variance of the smoothed m
 
-Noise is added to the model image m and not to the observation, which already contains noise. The factor with G
-corrects m near the edges: a method that conserves flux does not restore light that leaves the field, so H x is below y
-there by the lost share of a pixel's light.
+G and W are local means with a Gaussian window. Noise is added to the model image m and not to the observation y,
+because y already contains noise. The factor G(y) / G(H x) corrects m near the edges: a method that conserves flux does
+not restore light that leaves the field, so H x is smaller than y near the edges.
 
-Because of the window W, few noise realisations are enough. The variance follows the scene, and so does n; their
-quotient varies slowly. W averages it with a Gaussian of 2 px, which covers about 50 pixels. We measured the accuracy
-for Richardson-Lucy with 20 steps, against 300 realisations of noise on the true scene: 8 realisations give sigma to
-8 % rms at 100 photons per pixel, 11 % at 7 photons and 19 % at 1 photon. A wider window blurs edges in sigma; a
-narrower one leaves more scatter. Realisations about the observation (y + noise) are worse at few photons, and a
-linearised update fails there, by a factor of up to 3.
+Because of the window W, few noise realisations are enough. The variance of the result and n both follow the scene, so
+their quotient varies slowly from pixel to pixel. W averages this quotient with a Gaussian of 2 px, which covers about 50
+pixels. We measured the accuracy of sigma for Richardson-Lucy with 20 steps, compared with 300 realisations of noise on
+the true scene. With 8 realisations, the rms error of sigma is 8 % at 100 photons per pixel, 11 % at 7 photons and 19 %
+at 1 photon. A wider window blurs edges in sigma; a narrower window leaves more scatter. If noise is added to the
+observation instead (y + noise), sigma is less accurate at few photons. An error propagation through a linearised step
+is wrong by a factor of up to 3 at few photons.
 
-The scatter of sigma itself is taken into account. The degrees of freedom nu follow from the scatter of W(d_k^2 / n)
-between realisations by Satterthwaite's rule (1946), and sigma is divided by the mean of the root of a chi-square (c4).
+A correction takes account of the scatter of sigma. The scatter of W(d_k^2 / n) between realisations gives the degrees of
+freedom nu by Satterthwaite's rule (1946). The root of a variance is too small on average, by the factor c4 for nu
+degrees of freedom; therefore sigma is divided by c4.
 
-The uncertainty of the PSF: mean and variance over deconvolutions with several PSFs. These are random samples, or the
-sigma points of a covariance (Julier and Uhlmann 1997), which need two deconvolutions per parameter and no random
-numbers.
+The error from the uncertainty of the PSF is the standard deviation over deconvolutions with several PSFs. These PSFs
+are random samples, or the sigma points of a covariance (Julier and Uhlmann 1997). Sigma points need two deconvolutions
+per parameter and no random numbers.
 
 | symbol | name | unit |
 |---|---|---|
@@ -64,12 +66,13 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class ErrorPlanes:
-    """1-sigma planes [y, x] of a deconvolved image, in its unit; NaN where a pixel is not trusted.
+    """1-sigma planes [y, x] of a deconvolved image, in the unit of the image; NaN where a pixel is not trusted.
 
-    error: from photon and read noise. psf_error: from the uncertainty of the PSF; None if it is not known.
-    amplification: median of error divided by the noise of the observation; None if the edge bands leave no pixel.
-    degrees_of_freedom: of a pixel's variance, whose relative error is sqrt(2 / degrees_of_freedom).
-    draws: number of noise realisations. seed: of the random numbers.
+    error: standard deviation from photon and read noise. psf_error: standard deviation from the uncertainty of the PSF;
+    None if this uncertainty is not known. amplification: median of error divided by the noise of the observation; None
+    if the edge bands cover all pixels. degrees_of_freedom: degrees of freedom of the variance of a pixel; the relative
+    error of the variance is sqrt(2 / degrees_of_freedom). draws: number of noise realisations. seed: seed of the random
+    numbers.
     """
 
     error: Plane
@@ -93,10 +96,10 @@ def error_planes(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> ErrorPlanes:
-    """Compute the error plane of `run(image)`, where `run` is any method for images of this shape and mask.
+    """Compute the error plane of `run(image)`. `run` deconvolves an image of this shape and mask with any method.
 
-    estimate: run(image), if already known. draws: number of noise realisations. edge_px: width of the band at the
-    edges that the amplification leaves out. The same seed gives the same planes. progress(done, of) is called after
+    estimate: run(image), if it is already known. draws: number of noise realisations. edge_px: width of the band at the
+    edges that is left out of the amplification. The same seed gives the same planes. progress(done, of) is called after
     each run; its exceptions are not caught. Raises DataError "bad-draws", "no-exposure".
     """
     if draws < SMALLEST_DRAWS:
@@ -129,7 +132,7 @@ def error_planes(
 
 
 def expected_image(image: Image, estimate: Plane, psf: Psf, *, threads: int = 1) -> Plane:
-    """m of Eq. (1): the noise-free model image of the scene `estimate` [y, x]; not below zero."""
+    """Compute m of Eq. (1): the model image, without noise, of the scene `estimate` [y, x]. It is not below zero."""
     finite = np.isfinite(estimate)
     scene = np.where(finite, estimate, _local_mean(estimate, finite, MODEL_WINDOW_PX))
     convolved = np.maximum(
@@ -142,17 +145,18 @@ def expected_image(image: Image, estimate: Plane, psf: Psf, *, threads: int = 1)
 
 
 def with_psf_error(planes: ErrorPlanes, psf_error: Plane) -> ErrorPlanes:
-    """The planes with `psf_error` added; it is NaN where `error` is NaN."""
+    """Add a plane `psf_error` to the planes. The added plane is NaN where `error` is NaN."""
     return replace(planes, psf_error=np.where(np.isnan(planes.error), np.nan, psf_error))
 
 
 def psf_error_plane(
     psfs: Sequence[Psf], run: RunWithPsf, *, chance: bool = True, progress: Progress | None = None
 ) -> Plane:
-    """1-sigma plane [y, x] of run(psf) over `psfs`, all with equal weight.
+    """Standard deviation [y, x] of run(psf) over `psfs`, all with equal weight.
 
-    chance: True for random samples of PSFs: the variance is divided by n - 1, and sigma by c4. False for the sigma
-    points of a covariance, whose variance is exact. Raises DataError "bad-draws" for fewer than two PSFs.
+    chance: True if `psfs` are n random samples: the sum of squares is divided by n - 1, and sigma by c4. False if they
+    are the sigma points of a covariance: their variance is exact, and the sum of squares is divided by n. Raises
+    DataError "bad-draws" for fewer than two PSFs.
     """
     if len(psfs) < SMALLEST_DRAWS:
         raise DataError("bad-draws", f"expected at least {SMALLEST_DRAWS} PSFs; got {len(psfs)}")
@@ -171,7 +175,7 @@ def psf_error_plane(
 
 
 def sigma_points(mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """2 p parameter vectors (2 p, p) of equal weight with this mean (p,) and covariance (p, p).
+    """Make 2 p parameter vectors, shape (2 p, p). With equal weights they have this mean (p,) and covariance (p, p).
 
     Raises DataError "bad-covariance" if the covariance is not symmetric or has a negative eigenvalue.
     """
@@ -188,13 +192,13 @@ def sigma_points(mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> 
 
 
 def mean_of_root(freedom: float) -> float:
-    """c4: mean of sqrt(chi2 / nu) for nu degrees of freedom. It is below 1: the root of a variance is too small."""
+    """c4: mean of sqrt(chi2 / nu) for nu = `freedom` degrees of freedom. It is below 1."""
     ratio = math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)
     return math.sqrt(2 / freedom) * math.exp(ratio)
 
 
 def _with_pixels(image: Image, pixels: Plane) -> Image:
-    """The image with other values of its trusted pixels."""
+    """Copy the image with new values of its trusted pixels."""
     return replace(image, pixels=np.where(image.valid, pixels, image.pixels))
 
 
@@ -208,7 +212,11 @@ def _local_mean(plane: Plane, counted: NDArray[np.bool_], window_px: float) -> P
 
 
 def _degrees_of_freedom(total: Plane, squares: Plane, draws: int) -> float:
-    """Satterthwaite's rule: 2 mean^2 / variance of the local variance over realisations, times their number."""
+    """Degrees of freedom by Satterthwaite's rule: 2 K mean^2 / variance for K realisations.
+
+    Mean and variance are those of the local variance W(d_k^2 / n) over the realisations. The ratio variance / mean^2 is
+    averaged over the pixels.
+    """
     mean = total / draws
     variance = (squares - draws * mean**2) / (draws - 1)
     positive = mean > 0

@@ -1,7 +1,7 @@
-"""A row of the contact sheet, read from a product: what a deconvolution by the service changed in an image.
+"""Read a row of the contact sheet from a product: what a deconvolution by the service changed in an image.
 
-The task ``deconvolve`` computes the figures and keeps them in the product's details; the product's QUALITY plane marks
-the suspected pixels. Nothing is deconvolved or computed again here; the thumbnails are binned from both files.
+The task ``deconvolve`` computed the numbers and stored them in the product's details. The product's QUALITY plane marks
+the suspected pixels. This module does not deconvolve; it only bins both images to thumbnails.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
 def changes_in_product(
     name: str, before: str | Path, product: str | Path, details: dict[str, Any], limits: FitsLimits
 ) -> Treated:
-    """The row of one image. ``before``, ``product``: the FITS files of the image and of its product.
+    """Make the row of one image. ``before``, ``product``: the FITS files of the image and of its product.
 
-    details: the product's details, with "changes", "steps_done" and "stopped_because". Raises DataError as
+    details: the product's details, with "changes", "steps_done" and "stopped_because". Raises the errors of
     ``read_image``.
     """
     image, after = read_image(before, limits), read_image(product, limits)
@@ -49,7 +49,7 @@ def changes_in_product(
 
 
 def changes_from_json(figures: dict[str, Any], suspected: NDArray[np.bool_]) -> Changes:
-    """The figures that ``Changes.as_json`` wrote, with the plane of suspected pixels [y, x]."""
+    """Make a ``Changes`` from the numbers that ``Changes.as_json`` wrote and the plane of suspected pixels [y, x]."""
     artefacts = figures["artefacts"]
     return Changes(
         **figures

@@ -1,4 +1,4 @@
-"""A page with six panels that show what a deconvolution changed in an image, and its main numbers."""
+"""Draw a page with six panels that show what a deconvolution changed in an image, and the main numbers."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ Plane = NDArray[np.float64]
 def changes_png(
     before: Plane, after: Plane, found: Changes, path: str | Path, *, title: str, unit: str = "DN/s"
 ) -> None:
-    """Draw before, after, change in percent, difference, ratio and histogram to a PNG file; row 0 is at the bottom.
+    """Draw before, after, change in percent, difference, ratio and histogram into a PNG file.
 
-    before, after: [y, x], in `unit`. found: the numbers below the panels.
+    before, after: pixels [y, x] in `unit`; row 0 is drawn at the bottom. found: the numbers below the panels.
     """
     step = max(1, -(-max(before.shape) // PANEL_PX))
     old, new = binned(before, step), binned(after, step)
@@ -112,7 +112,7 @@ def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
 
 
 def _figures(found: Changes) -> str:
-    """The line below the panels: blocks of 4 px, brightest and darkest 1 %."""
+    """The line of text below the panels, for blocks of 4 px and the brightest and darkest 1 % of them."""
     parts = [
         f"{row.kind} {row.tail_pct:g} % of {row.block_px} px blocks: {row.sum_pct:+.0f} %, up to {row.up_to_pct:+.0f} %"
         for row in found.structures

@@ -16,12 +16,12 @@ Plane = NDArray[np.float64]
 
 
 class QualityBit(IntFlag):
-    """Bits of the quality plane. The first two equal those of the mask."""
+    """Bits of the quality plane. The first two are the bits of the mask plane."""
 
-    NONFINITE = 1  # the input has no finite value, so the result has none
+    NONFINITE = 1  # the input has no finite value, so the result has no finite value
     SATURATED = 2  # the input is saturated; the result is an estimate from the surrounding pixels
-    NEAR_MASKED = 4  # within 3 px of a nonfinite or saturated pixel
-    EDGE = 8  # in the band at the edges where the result depends on light from beyond the field
+    NEAR_MASKED = 4  # the pixel is within 3 px of a nonfinite or saturated pixel
+    EDGE = 8  # the pixel is in the band at the edges where the result depends on light from beyond the field
     NEGATIVE = 16  # the result is below zero
     ARTEFACT = 32  # the pixel shows a sign of an artefact
     NO_ERROR = 64  # there is no estimate of the noise
@@ -35,9 +35,9 @@ def quality_plane(
     suspected: NDArray[np.bool_] | None = None,
     error: Plane | None = None,
 ) -> NDArray[np.uint8]:
-    """Bits of QualityBit [y, x] for `result`, the deconvolution of `image`.
+    """Make the quality plane, bits of QualityBit [y, x], for `result`, the deconvolution of `image`.
 
-    edge_px: width of the band at the edges, see `Deconvolved.edge_band_px`. suspected: pixels with a sign of an
+    edge_px: width of the band at the edges (`Deconvolved.edge_band_px`). suspected: pixels with a sign of an
     artefact. error: noise plane; if it is None, every pixel has NO_ERROR.
     """
     plane = np.zeros(result.shape, dtype=np.uint8)

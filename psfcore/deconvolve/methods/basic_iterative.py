@@ -2,15 +2,17 @@
 
     x <- x + w (y - H x),   x_0 = y      Eq. (1)
 
-The paper recommends this method for a bright source near an edge. Eq. (1) converges to H x = y, whatever share of
-the light H keeps, so it restores the light that a pixel loses beyond the field. Light that comes in from beyond the
-field needs the same care: with a scene that is zero beyond the field, the pixels along the edge become a third too
-bright (`python -m studies.edges`). By default the field is therefore continued by its mirror image. If the field is
-much smaller than the PSF, the margin still makes use of the whole PSF.
+The paper recommends this method for a bright source near an edge. Eq. (1) converges to H x = y even if H loses light
+beyond the field. The method therefore restores the light of a pixel that falls beyond the field. It must also take
+account of the light that enters from beyond the field. If the scene is assumed to be zero beyond the field, the
+pixels along the edge become a third too bright (`python -m studies.edges`). By default, the mirror image of the field
+therefore continues the scene beyond the field. If the field is much smaller than the PSF, the margin still makes use
+of the whole PSF.
 
-The method is linear: negative pixels are used as they are, and the result may be negative. A masked pixel (w = 0)
-keeps its first estimate. At a frequency with the PSF's transform T, the noise of the estimate after n steps is the
-noise of the image times the sum over j = 0 .. n of (1 - T)^j. This grows without limit if abs(1 - T) > 1.
+The method is linear: negative pixels are used unchanged, and the result may be negative. A masked pixel (w = 0) keeps
+its first estimate. Let T be the Fourier transform of the PSF at one frequency. After n steps, the noise at this
+frequency is the noise of the image times the sum over j = 0 .. n of (1 - T)^j. It grows without limit if
+abs(1 - T) > 1.
 
 | symbol | name | unit |
 |---|---|---|
@@ -44,10 +46,10 @@ MARGIN_SHARE = 0.015
 def deconvolve(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 20, stop: Stop = "fixed"
 ) -> Deconvolved:
-    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], which was observed with `psf`. The first estimate is the observation.
 
-    The result may be negative. It is NaN where the image is not finite, and the first estimate where the image is
-    saturated. Raises DataError as `problem.pose` does, and "method-diverges" if the PSF is too broad.
+    The result may be negative. It is NaN where the image is not finite. Saturated pixels keep their first estimate.
+    Raises the errors of `problem.pose`, and DataError "method-diverges" if abs(1 - T) is too large.
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     sample = transfer_sample(problem.engine)
@@ -66,7 +68,7 @@ def deconvolve(
 
 
 class _BasicIterative(Iteration):
-    """Eq. (1) with one row stage per step: `measure` makes the next estimate, and `update` adopts it."""
+    """Eq. (1) with one pass over the rows per step: `measure` computes the next estimate, and `update` adopts it."""
 
     def __init__(self, problem: Problem) -> None:
         domain, engine = problem.domain, problem.engine
@@ -89,14 +91,17 @@ class _BasicIterative(Iteration):
 
     @property
     def change(self) -> float:
-        """Rms of the last step, divided by the rms of x."""
+        """Rms of the change in the last step, divided by the rms of x."""
         total = float(self._total.sum())
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
 @compiled(fastmath={"contract", "reassoc"})
 def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """new <- Eq. (1), and transform its rows; sum (change)^2, x^2, and (y - H x)^2 / variance of judged pixels."""
+    """Compute `new` by Eq. (1) and transform its rows.
+
+    Also sum (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over judged pixels.
+    """
     nx = x.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)
     z = buffer.reshape((-1, 2, LANES))

@@ -2,14 +2,15 @@
 
     x <- x + G w (y - H x),   x_0 = y,   G = T* / max(abs(T)^2, t^2)      Eq. (1)
 
-H is the convolution cut to the field, and T is the PSF's transform on the padded, periodic plane. G therefore inverts
-H except for light that crosses the field's edge; a few steps account for that light. Where abs(T) is below t
-(LEAST_TRANSFER) the step is a Landweber step: frequencies at which the PSF has little power are restored slowly, and
-so is their noise.
+H is the convolution with the PSF, cut to the field. T is the PSF's Fourier transform on the padded, periodic plane. G
+therefore inverts H, except for light that crosses the edge of the field; a few steps correct for that light. Where
+abs(T) is below t (LEAST_TRANSFER), Eq. (1) is a Landweber step: frequencies at which the PSF has little power are
+restored slowly, and the noise at these frequencies is amplified slowly.
 
-The method does not force the scene to be positive, so faint pixels have no bias. One PSF amplifies the noise of every
-image by the same factor, `noise_amplification` (2 to 2.4 for HRI_EUV). Negative pixels are used as they are, and the
-result may be negative. A masked pixel (w = 0) does not influence the fit; its estimate follows from its neighbours.
+The method does not force the scene to be positive, so faint pixels have no bias. For one PSF, the method amplifies the
+noise of every image by the same factor, `noise_amplification` (2 to 2.4 for HRI_EUV). Negative pixels are used
+unchanged, and the result may be negative. A masked pixel (w = 0) does not influence the fit; its estimate follows from
+its neighbours.
 
 | symbol | name | unit |
 |---|---|---|
@@ -46,9 +47,9 @@ LEAST_TRANSFER = 0.1
 def deconvolve(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 5, stop: Stop = "fixed"
 ) -> Deconvolved:
-    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], which was observed with `psf`. The first estimate is the observation.
 
-    The result may be negative, and is NaN where the image is not finite. Raises DataError as `problem.pose` does.
+    The result may be negative. It is NaN where the image is not finite. Raises the errors of `problem.pose`.
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     iteration = _Linear(problem)
@@ -89,13 +90,13 @@ class _Linear(Iteration):
 
     @property
     def change(self) -> float:
-        """Rms of the last step, divided by the rms of x."""
+        """Rms of the change in the last step, divided by the rms of x."""
         total = float(self._total.sum())
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
 def inverse_filter(engine: Engine) -> NDArray[np.float32]:
-    """G of Eq. (1), in the layout of the engine's transfer function."""
+    """Compute G of Eq. (1) in the layout of the engine's transfer function."""
     scale = np.float32(engine.transfer_scale)
     power = np.square(engine.transfer).sum(axis=2, keepdims=True) * scale**2
     g = engine.transfer / np.maximum(power, np.float32(LEAST_TRANSFER**2))
@@ -106,7 +107,7 @@ def inverse_filter(engine: Engine) -> NDArray[np.float32]:
 
 @compiled(fastmath={"contract", "reassoc"})
 def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Replace H x by w (y - H x); sum (y - H x)^2 / variance over judged pixels. y is NaN where w is 0."""
+    """Replace H x by w (y - H x), where y is NaN if w is 0; sum (y - H x)^2 / variance over judged pixels."""
     nx = observed.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)
     z = buffer.reshape((-1, 2, LANES))
@@ -133,7 +134,7 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
 
 @compiled(fastmath={"contract", "reassoc"})
 def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """x <- x + G w (y - H x), Eq. (1); sum (change)^2 and x^2 for each block."""
+    """Compute x <- x + G w (y - H x), Eq. (1); sum (change)^2 and x^2 for each block."""
     nx = x.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))

@@ -1,4 +1,4 @@
-"""Finds methods by name: the file `richardson_lucy.py` holds the method "richardson-lucy"."""
+"""Find methods by name: the file `richardson_lucy.py` holds the method "richardson-lucy"."""
 
 from __future__ import annotations
 

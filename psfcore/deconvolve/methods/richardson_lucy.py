@@ -1,18 +1,18 @@
-"""Richardson-Lucy deconvolution: Richardson (1972), Lucy (1974), as Hofmeister et al. recommend for HRI_EUV.
+"""Richardson-Lucy deconvolution (Richardson 1972, Lucy 1974), which Hofmeister et al. recommend for HRI_EUV.
 
     x <- x * H^T( w y / (H x) + (1 - w) / s ),   s = H^T 1      Eq. (1)
 
-Without masked pixels (w = 1) this is the published step. It conserves the flux: sum x = sum y over the plane, because
-H^T is applied to a ratio with H x itself in the denominator. A masked pixel (w = 0) gets the ratio at which it agrees
-with the model, so it does not change the fit. That ratio is 1 / s and not 1: the published step does not restore
-light that leaves the plane, so its ratios converge to 1 / s, and pixels with the ratio 1 would fade by the factor s
-at each step. A negative pixel is noise about zero and counts as 0 in the ratio, because the method has no negative
-light.
+Without masked pixels (w = 1), Eq. (1) is the published step. It conserves the flux, sum x = sum y over the plane,
+because H^T is applied to y / (H x). A masked pixel (w = 0) gets the ratio 1 / s, at which it agrees with the model and
+does not change the fit. The ratio 1 would be wrong for the following reason. The published step does not restore light
+that leaves the plane, so the ratios of the other pixels converge to 1 / s. A pixel with the ratio 1 would become
+fainter by the factor s at each step. Negative pixels are due to noise around zero. They count as 0 in the ratio,
+because the method cannot represent negative light.
 
-In the paper the scene is zero beyond the field (edges "zero"). Light from beyond the field then makes up for the light
-lost only on average, and the outermost rows become 4 to 6 % too dark. If the field is continued by its mirror image,
-the error is at most 1.3 % (`python -m studies.edges`). The default is therefore "symmetric". A margin of about 64 px
-is enough, because the published step compensates the rest.
+In the paper the scene is zero beyond the field (edges "zero"). In this case, the outermost rows of the result become 4
+to 6 % too dark: the light that enters from beyond the field replaces the light that leaves the field only on average.
+If the mirror image of the field continues the scene, the error is at most 1.3 % (`python -m studies.edges`). The
+default is therefore "symmetric". A margin of about 64 px is enough, because the published step compensates the rest.
 
 | symbol | name | unit |
 |---|---|---|
@@ -53,10 +53,10 @@ Single = NDArray[np.float32]
 def deconvolve(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 20, stop: Stop = "fixed"
 ) -> Deconvolved:
-    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], which was observed with `psf`. The first estimate is the observation.
 
-    The result is not negative. It is NaN where the image is not finite; where the image is saturated, it is an
-    estimate from the surrounding pixels. Raises DataError as `problem.pose` does, and "no-signal".
+    The result is not negative. It is NaN where the image is not finite. Where the image is saturated, the result is an
+    estimate from the surrounding pixels. Raises the errors of `problem.pose`, and DataError "no-signal".
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     iteration = _RichardsonLucy(problem)
@@ -74,13 +74,13 @@ def deconvolve(
 def richardson_lucy(
     image: Image, psf: Psf, *, steps: int = 20, threads: int = 1, progress: Progress | None = None
 ) -> Deconvolved:
-    """The published method: a fixed number of steps, and a scene that is zero beyond the field."""
+    """Run the published method: a fixed number of steps, and a scene that is zero beyond the field."""
     conditions = Conditions(edges="zero", threads=threads, progress=progress)
     return deconvolve(image, psf, conditions, steps=steps)
 
 
 class _RichardsonLucy(Iteration):
-    """Eq. (1). Between two convolutions, a block of rows stays in the cache."""
+    """Eq. (1). A block of rows stays in the cache between two convolutions."""
 
     def __init__(self, problem: Problem) -> None:
         estimate = light_above_floor(problem)
@@ -102,13 +102,13 @@ class _RichardsonLucy(Iteration):
 
     @property
     def change(self) -> float:
-        """Rms of the last step, divided by the rms of x."""
+        """Rms of the change in the last step, divided by the rms of x."""
         total = float(self._total.sum())
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
 def agreed(problem: Problem) -> Single:
-    """1 / s of Eq. (1) on the domain; 1 if all pixels are trusted, because then it is not used."""
+    """Compute 1 / s of Eq. (1) on the domain. If all pixels are trusted, 1 / s is not needed, and the result is 1."""
     ones = np.ones(problem.domain.shape, dtype=np.float32)
     if problem.domain.trusted.all():
         return ones
@@ -117,7 +117,7 @@ def agreed(problem: Problem) -> Single:
 
 @compiled(fastmath=_SUMS)
 def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """x <- x * correction, Eq. (1), zero below `dark`; sum (change)^2 and x^2 for each block."""
+    """Compute x <- x * correction, Eq. (1); set values below `dark` to 0; sum (change)^2 and x^2 for each block."""
     nx = estimate.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))
@@ -132,7 +132,7 @@ def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, 
             for side in range(2):
                 for w in range(LANES):
                     old = estimate[block, i, side, w]
-                    # A correction of 0 may be negative by rounding.
+                    # Rounding may turn a correction of 0 into a negative number.
                     new = old * max(z[i, side, w], zero)
                     new = zero if new < dark else new
                     estimate[block, i, side, w] = new

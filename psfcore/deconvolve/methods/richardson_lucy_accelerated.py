@@ -4,9 +4,9 @@
     x_(k+1) = R(p_k)                                                                                    Eq. (2)
     a_k = sum(g_(k-1) g_(k-2)) / sum(g_(k-2)^2),  0 <= a_k < 1,   g_k = x_(k+1) - p_k                   Eq. (3)
 
-R is one Richardson-Lucy step, with its masks and edges. With order 1 the term in q is left out. Predictions are kept
-above 0. A few accelerated steps reach as far as many plain steps. With noise, they also pass the best estimate as
-quickly: stop by discrepancy.
+R is one Richardson-Lucy step, with the masks and edges of `richardson_lucy`. With order 1, the term with q is left out.
+Predictions are kept above 0. A few accelerated steps change the estimate as much as many plain steps. If the image is
+noisy, they therefore also amplify the noise after fewer steps: stop by discrepancy.
 
 | symbol | name |
 |---|---|
@@ -46,10 +46,10 @@ def deconvolve(
     order: int = 1,
     stop: Stop = "fixed",
 ) -> Deconvolved:
-    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], which was observed with `psf`. The first estimate is the observation.
 
-    order: order of the extrapolation, 1 or 2. The result is not negative, and NaN where the image is not finite.
-    Raises DataError as `problem.pose` does, "bad-order", "no-signal".
+    order: order of the extrapolation, 1 or 2. The result is not negative. It is NaN where the image is not finite.
+    Raises the errors of `problem.pose`, and DataError "bad-order" or "no-signal".
     """
     if order not in (1, 2):
         raise DataError("bad-order", f"expected an order of 1 or 2; got {order}")
@@ -67,7 +67,7 @@ def deconvolve(
 
 
 class _Accelerated(Iteration):
-    """Eq. (1) to (3). `measure` uses `prediction`; after the last step, `prediction` is x."""
+    """Eq. (1) to (3). `measure` convolves `prediction`; after the last step, `prediction` is x."""
 
     def __init__(self, problem: Problem, order: int) -> None:
         estimate = light_above_floor(problem)
@@ -77,7 +77,7 @@ class _Accelerated(Iteration):
         self._order = order
         self.prediction = problem.engine.to_lanes(estimate)
         self._x, self._before = self.prediction.copy(), self.prediction.copy()
-        # Order 1 needs no third estimate: the array of x_(k-1) is used again.
+        # Order 1 does not need x_(k-2), so the array of x_(k-1) takes its role.
         self._earlier = self.prediction.copy() if order == 2 else self._before
         self._gradient = np.zeros_like(self._x)
         self._corrected = np.zeros_like(self._x)
@@ -98,7 +98,7 @@ class _Accelerated(Iteration):
             self._engine.rows_forward(self.prediction)
 
     def _correct(self) -> float:
-        """Eq. (2), writing the new estimate over the oldest one; returns Eq. (3)."""
+        """Compute Eq. (2); the new estimate replaces the oldest one. Returns a_k of Eq. (3)."""
         new, before = self._earlier, self._before
         sums = np.zeros((self._engine.row_blocks, 4))
 
@@ -129,7 +129,7 @@ class _Accelerated(Iteration):
 
 @compiled(fastmath={"contract", "reassoc"})
 def _correct(new, prediction, correction, x, gradient, dark, sums, start, stop):  # type: ignore[no-untyped-def]
-    """new <- prediction * correction, gradient <- new - prediction; sums for Eq. (3) and for the change."""
+    """Compute new <- prediction * correction and gradient <- new - prediction, and the sums for Eq. (3) and the change."""
     zero = np.float32(0.0)
     for block in range(start, stop):
         n, p, c = new[block].reshape(-1), prediction[block].reshape(-1), correction[block].reshape(-1)
@@ -149,7 +149,7 @@ def _correct(new, prediction, correction, x, gradient, dark, sums, start, stop):
 
 @compiled(fastmath={"contract"})
 def _predict(prediction, x, before, earlier, a, curvature, dark, start, stop):  # type: ignore[no-untyped-def]
-    """Eq. (1), kept above 0 where x is above 0."""
+    """Compute the prediction of Eq. (1). Where x is above 0, the prediction is kept above 0."""
     two = np.float32(2.0)
     for block in range(start, stop):
         p, new = prediction[block].reshape(-1), x[block].reshape(-1)

@@ -2,13 +2,14 @@
 
     x <- (x / a) * H^T( w y / (H x) ),   a = H^T w      Eq. (1), their Eq. (12)
 
-on field and margin. w is 1 on trusted pixels of the field, and 0 on masked pixels and in the margin. a(i) is the share
-of the light of pixel i that falls on observed pixels. Where it is below LEAST_OBSERVED, the data do not determine the
-scene, and x is 0; the paper uses a threshold for the same reason, to avoid a division by nearly 0. Unlike the step in
-`richardson_lucy`, this step converges to the most likely scene also near edges and masked pixels. Negative pixels
-count as 0.
+Eq. (1) holds on field and margin. w is 1 on trusted pixels of the field, and 0 on masked pixels and in the margin.
+a(i) is the share of the light of pixel i that falls on trusted pixels. Where a is below LEAST_OBSERVED, the data do not
+determine the scene, and x is 0. The paper also uses a threshold, to avoid a division by nearly 0. Near edges and masked
+pixels, this step converges to the most likely scene; the step in `richardson_lucy` does not. Negative pixels count
+as 0.
 
-The scene in the margin starts from the field's mirror image: from a constant, twenty steps would not be enough.
+The first estimate in the margin is the mirror image of the field. If it were a constant, twenty steps would not be
+enough.
 
 | symbol | name | unit |
 |---|---|---|
@@ -36,17 +37,17 @@ METHOD = "richardson-lucy-extended"
 EDGES: Edges = "extended"
 MARGIN_SHARE = 0.005
 LEAST_OBSERVED = 1e-3
-# The ratio of a masked pixel is 0 here: a already accounts for the pixel.
+# A masked pixel has the ratio 0 in Eq. (1), because a already accounts for the pixel. The code needs a number above 0.
 _NO_RATIO = 1e-30
 
 
 def deconvolve(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 20, stop: Stop = "fixed"
 ) -> Deconvolved:
-    """Estimate the scene from `image` [y, x], observed with `psf`, in the field and in a margin around it.
+    """Estimate the scene from `image` [y, x], which was observed with `psf`, in the field and in a margin around it.
 
-    The result covers the field only. It is not negative, and NaN where the image is not finite.
-    Raises DataError as `problem.pose` does, and "no-signal".
+    The result covers only the field. It is not negative. It is NaN where the image is not finite.
+    Raises the errors of `problem.pose`, and DataError "no-signal".
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     iteration = _Extended(problem)
@@ -94,7 +95,7 @@ class _Extended(Iteration):
             self._engine.rows_forward(self.x)
 
     def _step(self, blocks: slice, last: bool) -> tuple[float, float]:
-        """Eq. (1) on some blocks; returns the sums of (change)^2 and x^2, computed in the last step only."""
+        """Compute Eq. (1) on some blocks. Returns the sums of (change)^2 and x^2 in the last step, and 0 before."""
         x, correction = self.x[blocks], self._correction[blocks]
         np.maximum(correction, np.float32(0), out=correction)
         correction *= self._gain[blocks]

@@ -2,17 +2,18 @@
 
     x <- x / (1 - k div(grad x / |grad x|)) * H^T( w y / (H x) + (1 - w) / s )      Eq. (1), their Eq. (14)
 
-This is the step of `richardson_lucy`, with its masks and edges, and a penalty k (in counts) on differences between
-neighbouring pixels. Noise then costs more than it improves the fit, so further steps do not amplify it. In simulated
-HRI_EUV images (100 photons in a quiet pixel) the rms error after 20 steps is 157 DN/s instead of 169 at 512 px, and 92
-instead of 130 at 1024 px. Plain Richardson-Lucy reaches 166 and 112 with the best number of steps, which is not known
-for real images. Structures as faint as the noise are lost too. Use this method for pictures and for finding features,
-not for the photometry of small spots: they stay smoothed even without noise, and forward differences shift them by up
-to 0.002 px.
+Eq. (1) is the step of `richardson_lucy`, with the same masks and edges, and with a penalty on differences between
+neighbouring pixels. k is the weight of the penalty. A fit to the noise costs more penalty than it improves chi2, so
+further steps do not amplify the noise. We simulated HRI_EUV images with 100 photons in a quiet pixel. After 20 steps,
+the rms error of this method is 157 DN/s in an image of 512 px, and 92 DN/s at 1024 px. Plain Richardson-Lucy has 169
+and 130 DN/s. With the best number of steps, which is not known for real images, it reaches 166 and 112 DN/s.
+Structures that are as faint as the noise are lost too. Use this method for pictures and for finding features. Do not
+use it for the photometry of small spots: they stay smoothed even without noise, and the forward differences shift them
+by up to 0.002 px.
 
-|grad x| is the root of the sum of squares of the forward differences and of SOFTENING x, so that differences below a
-tenth of the light are smoothed only weakly. This departs from the paper, which has no softening. Without it the step
-overshoots where differences are small, and flat light breaks up into a pattern with an amplitude of 4 k.
+|grad x| is the root of a sum of squares: of the two forward differences, and of SOFTENING times x. Differences below a
+tenth of the light are therefore smoothed only weakly. The paper has no softening. Without it, the step overshoots
+where differences are small, and an area of uniform light breaks up into a pattern with an amplitude of 4 k.
 
 | symbol | name | unit |
 |---|---|---|
@@ -40,7 +41,7 @@ METHOD = "richardson-lucy-total-variation"
 EDGES: Edges = "symmetric"
 MARGIN_SHARE = 0.05
 SOFTENING = 0.1
-# In one step, a small difference changes by 8 k / SOFTENING of itself. It converges if this is below 2.
+# One step multiplies a small difference by 1 - 8 k / SOFTENING. The steps converge if 8 k / SOFTENING is below 2.
 MOST_SMOOTHING = 0.02
 
 
@@ -53,10 +54,10 @@ def deconvolve(
     smoothing: float = 0.01,
     stop: Stop = "fixed",
 ) -> Deconvolved:
-    """Estimate the scene from `image` [y, x], observed with `psf`, starting from the observation.
+    """Estimate the scene from `image` [y, x], which was observed with `psf`. The first estimate is the observation.
 
-    smoothing: k of Eq. (1). The result is not negative, and NaN where the image is not finite.
-    Raises DataError as `problem.pose` does, "bad-smoothing", "no-signal".
+    smoothing: k of Eq. (1). The result is not negative. It is NaN where the image is not finite.
+    Raises the errors of `problem.pose`, and DataError "bad-smoothing" or "no-signal".
     """
     if not 0 <= smoothing <= MOST_SMOOTHING:
         raise DataError("bad-smoothing", f"expected smoothing of 0 to {MOST_SMOOTHING}; got {smoothing}")
@@ -74,7 +75,7 @@ def deconvolve(
 
 
 class _TotalVariation(Iteration):
-    """Eq. (1). x is a plane [y, x], because its differences cross the engine's blocks."""
+    """Eq. (1). x is a plane [y, x], because the differences connect pixels of different blocks of the engine."""
 
     def __init__(self, problem: Problem, smoothing: float) -> None:
         self.x = light_above_floor(problem)
@@ -113,7 +114,7 @@ class _TotalVariation(Iteration):
 
 @compiled()
 def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
-    """grad x / |grad x| at a pixel, (along y, along x); differences across the last row and column are 0."""
+    """grad x / |grad x| at a pixel, (along y, along x). Differences beyond the last row and column count as 0."""
     zero = np.float32(0.0)
     here = x[row, column]
     dy = x[row + 1, column] - here if row + 1 < x.shape[0] else zero
@@ -127,7 +128,7 @@ def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _smooth_rows(x, correction, new, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
-    """new <- Eq. (1) on rows [start, stop), zero below `dark`; sum (change)^2 and x^2 for each row."""
+    """Compute `new` by Eq. (1) on rows [start, stop); set values below `dark` to 0; sum (change)^2 and x^2 by row."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for row in range(start, stop):
         moved, total = 0.0, 0.0

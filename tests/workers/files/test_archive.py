@@ -158,7 +158,7 @@ def test_paths_outside_the_allowed_folders_are_refused(archive: Path, glob: str,
 
 def test_without_allowed_folders_every_path_is_refused(archive: Path) -> None:
     assert archive_files.roots("") == ()
-    with pytest.raises(DataError, match="none is set"):
+    with pytest.raises(DataError, match="no folder is set"):
         archive_files.check_glob(f"{archive}/*.fits", ())
 
 

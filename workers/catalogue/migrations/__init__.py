@@ -1,1 +1,1 @@
-"""Revisions of the catalogue's tables. ``workers.catalogue.schema`` runs them through alembic."""
+"""Revisions of the catalogue's tables. ``workers.catalogue.schema`` runs them with Alembic."""

@@ -1,4 +1,4 @@
-"""Alembic's environment: revisions run on the connection and in the transaction of the caller."""
+"""Alembic's environment. Revisions run on the connection of the caller, and in the transaction of the caller."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""One file per revision, in order. A released revision never changes: a later one corrects it.
+"""One file per revision, in order. A released revision never changes; if it is wrong, a later revision corrects it.
 
-A revision contains all that it needs and imports nothing from ``workers.catalogue.tables``, which changes later. New
-columns have a default in the database, so that workers of the previous version can go on until they are restarted.
-Revision 0010 renames columns: before it runs, workers of the previous version must be stopped.
+A revision imports nothing from ``workers.catalogue.tables``, because those tables change later. New columns have a
+default in the database, so that workers of the previous version can continue to work until they are restarted. Revision
+0010 renames columns: before it runs, workers of the previous version must be stopped.
 """

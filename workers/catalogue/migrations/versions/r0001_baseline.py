@@ -1,7 +1,7 @@
 """The tables as they were when revisions began.
 
-Versions before it created these tables and missing indexes at each start. This revision does the same with a database
-of such a version.
+Versions without revisions created missing tables and indexes at each start. This revision does the same in a database
+that such a version made.
 """
 
 from __future__ import annotations
@@ -134,5 +134,5 @@ sa.Table(
 
 
 def upgrade() -> None:
-    """Make what is not there."""
+    """Create the missing tables and indexes."""
     make_missing(METADATA, op.get_bind())

@@ -10,7 +10,7 @@ down_revision = "0001"
 
 
 def upgrade() -> None:
-    """Make the table of keys."""
+    """Create the table of keys."""
     op.create_table(
         "keys",
         sa.Column("id", sa.String(16), primary_key=True),

@@ -1,6 +1,7 @@
-"""Lines (now: series) of PSFs, with status, validity and successors; contexts; reruns; an index for every list.
+"""Series of PSFs (called lines in this revision), with status, validity and successors; contexts; reruns.
 
-The line of a PSF follows from its row. Every existing PSF becomes a draft, because none was certified.
+The line of a PSF is computed from its row. Every existing PSF becomes a draft, because no PSF was certified before. Every
+list gets an index.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ REPLACED = {
 }
 RELEASED = sa.text("status IN ('certified', 'deprecated')")
 DEPRECATED = sa.text("status = 'deprecated'")
-# The instruments that shipped with the versions before, for PSFs whose fit did not say a wavelength.
+# The channels of the instruments of earlier versions, for PSFs whose fit did not store a wavelength.
 CHANNELS = {"hri_euv": "174", "aia_171": "171"}
 
 _PSFS = sa.table(
@@ -142,7 +143,7 @@ def _new_tables() -> None:
 
 
 def _fill(connection: sa.Connection) -> None:
-    """Fill channel, kind and line of the existing PSFs, in batches, because their details are long."""
+    """Fill in channel, kind and line of the existing PSFs. Rows are read in batches, because their details are long."""
     key = sa.tuple_(_PSFS.c.owner, _PSFS.c.id)
     columns = (_PSFS.c.owner, _PSFS.c.id, _PSFS.c.instrument, _PSFS.c.origin, _PSFS.c.details)
     after = ("", "")

@@ -1,4 +1,4 @@
-"""The estimate of a job's needs, made when it was submitted. Existing jobs have none."""
+"""The estimate of a job's time and memory, made when the job was submitted. Existing jobs have no estimate."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ _OPEN = sa.text("phase IN ('ERROR', 'LISTING', 'PAUSED', 'RUNNING')")
 
 
 def upgrade() -> None:
-    """Make the tables of bulks and of their images."""
+    """Create the tables of bulk runs and of their images."""
     op.create_table(
         "bulks",
         sa.Column("id", sa.String(32), primary_key=True),

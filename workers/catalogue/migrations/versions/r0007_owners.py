@@ -1,4 +1,4 @@
-"""The bytes that each owner keeps, counted from the existing rows, and the owners' own limits."""
+"""The bytes that each owner keeps, counted from the existing rows, and the individual limits of owners."""
 
 from __future__ import annotations
 

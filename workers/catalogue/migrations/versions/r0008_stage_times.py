@@ -10,7 +10,7 @@ down_revision = "0007"
 
 
 def upgrade() -> None:
-    """Make the table; jobs that are there already left no times."""
+    """Create the table. There are no times of earlier jobs."""
     op.create_table(
         "stage_times",
         sa.Column("kind", sa.String(32), primary_key=True),

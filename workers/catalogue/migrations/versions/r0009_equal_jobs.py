@@ -1,4 +1,7 @@
-"""The identity of a job's result, beside its key. Of two jobs with the same result, one executes at a time."""
+"""The identity of a job's result, in addition to its key.
+
+Of several jobs with the same result, only one executes at any time.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ down_revision = "0008"
 
 
 def upgrade() -> None:
-    """Add the column and its index. For existing jobs the key is the identity of the result."""
+    """Add the column and its index. The key of an existing job is also the identity of its result."""
     op.add_column("jobs", sa.Column("work_key", sa.String(64), nullable=True))
     jobs = sa.table("jobs", sa.column("work_key"), sa.column("request_key"))
     op.execute(jobs.update().where(jobs.c.request_key != "").values(work_key=jobs.c.request_key))

@@ -1,7 +1,7 @@
 """New names: series of PSFs (was line), the job kind report (was evaluate), changes of an image (was effects).
 
-Columns and tables are renamed, so workers of the version before must be stopped before this revision runs. The keys of
-bulk runs are hashes of their requests and are computed anew; all other hashes stay.
+This revision renames columns and tables, so workers of the previous version must be stopped before it runs. The keys of
+bulk runs are hashes of their requests; they are computed again. All other hashes stay.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ down_revision = "0009"
 BATCH = 1000
 OLD_PICTURE, NEW_PICTURE = "effects_picture", "changes_picture"
 OLD_KIND, NEW_KIND = "evaluate", "report"
-# Indexes whose names contain a column's name; those with other names follow their columns.
+# Indexes whose names contain the name of a column. Other indexes need no change: the database renames their columns.
 RENAMED_INDEXES = {
     "psfs_listed_by_line": ("psfs_listed_by_series", ["owner", "series", "created_at", "id"]),
     "psfs_listed_by_line_status": (
@@ -38,11 +38,10 @@ _ITEMS = sa.table(
 
 
 def upgrade() -> None:
-    """Rename tables, columns and indexes, then what their rows contain."""
+    """Rename tables, columns and indexes, and then the names that occur in the rows."""
     op.rename_table("psf_lines", "psf_series")
-    if (
-        op.get_bind().dialect.name == "postgresql"
-    ):  # the name of a primary key follows its table in a new database
+    # In a new database, the name of a primary key contains the name of its table.
+    if op.get_bind().dialect.name == "postgresql":
         op.execute("ALTER INDEX psf_lines_pkey RENAME TO psf_series_pkey")
     for table in ("psfs", "psf_pins", "psf_series"):
         op.execute(f"ALTER TABLE {table} RENAME COLUMN line TO series")
@@ -70,7 +69,7 @@ def _rename_in_products(connection: sa.Connection) -> None:
 
 
 def _rename_in_jobs(connection: sa.Connection) -> None:
-    """A rerun's parameters contain those of what it makes again."""
+    """Rename the picture in the parameters of jobs. The parameters of a rerun contain those of the repeated request."""
     found = _JOBS.c
     rename = sa.update(_JOBS).where(found.id == sa.bindparam("key"))
     for rows in _batches(connection, [found.id], found.parameters):
@@ -100,7 +99,7 @@ def _rename_in_bulk_runs(connection: sa.Connection) -> None:
 def _batches(
     connection: sa.Connection, key: list[sa.ColumnClause[Any]], content: sa.ColumnClause[Any]
 ) -> Iterator[list[Any]]:
-    """All rows of a table by their primary key, some at a time: their JSON is long."""
+    """All rows of a table, sorted by primary key, in batches, because the JSON of a row is long."""
     place = sa.tuple_(*key)
     after = ("",) * len(key)
     while True:
@@ -118,7 +117,7 @@ def _renamed_details(details: dict[str, Any]) -> dict[str, Any]:
 
 
 def _renamed_parameters(parameters: dict[str, Any]) -> dict[str, Any]:
-    """With the new name of the picture, here and in the parameters that these contain."""
+    """The parameters with the new name of the picture, also in the parameters that they contain."""
     renamed = {NEW_PICTURE if name == OLD_PICTURE else name: value for name, value in parameters.items()}
     if isinstance(renamed.get("parameters"), dict):
         renamed["parameters"] = _renamed_parameters(renamed["parameters"])
