@@ -36,7 +36,11 @@ class Settings(BaseSettings):
     store_cache_mib: int = Field(
         20_480, ge=1, description="space in data_dir for cached copies of files in the object store, MiB"
     )
-    quota_mib: int = Field(0, ge=0, description="largest size of an owner's stored files, unless the owner has a limit of its own, MiB; 0: unlimited")
+    quota_mib: int = Field(
+        0,
+        ge=0,
+        description="largest size of an owner's stored files, unless the owner has a limit of its own, MiB; 0: unlimited",
+    )
     database_url: str | None = Field(
         None, description="SQLAlchemy URL of the database; default: SQLite in data_dir"
     )
@@ -44,7 +48,9 @@ class Settings(BaseSettings):
         EMBEDDED_BROKER, description="URL of the Celery broker; the default needs no server"
     )
     max_upload_mib: int = Field(160, ge=1, le=65_536, description="largest uploaded image or PSF file, MiB")
-    max_pixels: int = Field(4096 * 4096, ge=256, description="largest number of pixels of an image or PSF, as its header declares")
+    max_pixels: int = Field(
+        4096 * 4096, ge=256, description="largest number of pixels of an image or PSF, as its header declares"
+    )
     max_transit_mib: int = Field(4096, ge=1, le=1_048_576, description="largest uploaded transit, MiB")
     max_transit_unpacked_mib: int = Field(
         8192, ge=1, le=1_048_576, description="largest unpacked size of a transit, MiB"
@@ -67,7 +73,9 @@ class Settings(BaseSettings):
         description="time without a heartbeat after which a worker counts as lost and its job is queued again, s",
     )
     reconcile_s: float = Field(
-        2.0, gt=0, description="interval at which queued jobs that the broker may have lost are searched for, s"
+        2.0,
+        gt=0,
+        description="interval at which queued jobs that the broker may have lost are searched for, s",
     )
     resubmit_s: float = Field(
         30.0, gt=0, description="time after which a queued job is sent to the broker for the second time, s"
@@ -109,15 +117,21 @@ class Settings(BaseSettings):
         description="host names of the service besides localhost, separated by commas; *: any name",
     )
     max_body_mib: int = Field(16, ge=1, le=1024, description="largest request that is not an upload, MiB")
-    reads_per_minute: int = Field(12_000, ge=0, description="largest number of read requests of one caller per minute; 0: unlimited")
+    reads_per_minute: int = Field(
+        12_000, ge=0, description="largest number of read requests of one caller per minute; 0: unlimited"
+    )
     submissions_per_minute: int = Field(
-        3_000, ge=0, description="largest number of uploads and submitted jobs of one caller per minute; 0: unlimited"
+        3_000,
+        ge=0,
+        description="largest number of uploads and submitted jobs of one caller per minute; 0: unlimited",
     )
     upload_mib_per_minute: int = Field(
         16_384, ge=0, description="largest size of the uploads of one caller per minute, MiB; 0: unlimited"
     )
     streams_per_caller: int = Field(
-        32, ge=1, description="largest number of event streams that one caller may have open on one server at a time"
+        32,
+        ge=1,
+        description="largest number of event streams that one caller may have open on one server at a time",
     )
     stream_s: float = Field(
         3600.0, gt=0, description="longest duration of an event stream, s; then the client must connect again"

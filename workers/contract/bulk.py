@@ -98,7 +98,8 @@ class Treatment(_Strict):
 
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
-        None, description="noise figures of the images' gain mode; null: the noise figures of the instrument, if known"
+        None,
+        description="noise figures of the images' gain mode; null: the noise figures of the instrument, if known",
     )
     saturation_dn: float | None = Field(
         None,
@@ -114,7 +115,9 @@ class Treatment(_Strict):
 class BulkWork(_Strict):
     """The part of a request for a bulk run that is stored with the run: all except the ids of uploaded images."""
 
-    name: str = Field("", max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$", description="a name to show in lists")
+    name: str = Field(
+        "", max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$", description="a name to show in lists"
+    )
     files: list[FileSet] = Field(default_factory=list, max_length=MOST_SETS)
     psf_id: Identity | None = Field(None, description="a PSF of the catalogue")
     context: str | None = Field(

@@ -19,7 +19,10 @@ ContextName = Annotated[
 Identity = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256, 64 hexadecimal digits")]
 TransitId = Annotated[Identity, Field(description="id returned by the upload of the transit")]
 TransitNoise = Annotated[
-    NoiseFigures | None, Field(description="noise figures to use instead of the noise figures in transit.json; null: use transit.json")
+    NoiseFigures | None,
+    Field(
+        description="noise figures to use instead of the noise figures in transit.json; null: use transit.json"
+    ),
 ]
 Saturation = Annotated[
     float | None,
@@ -83,7 +86,8 @@ class Deconvolve(Parameters):
     )
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
-        None, description="noise figures of the image's gain mode; null: the noise figures of the instrument, if known"
+        None,
+        description="noise figures of the image's gain mode; null: the noise figures of the instrument, if known",
     )
     saturation_dn: float | None = Field(
         None,
@@ -129,7 +133,10 @@ class PsfFit(Parameters):
     noise: TransitNoise = None
     saturation_dn: Saturation = None
     seed: int = Field(
-        1, ge=0, lt=2**31, description="seed of the random numbers in the fit of free shells and in the published recipe"
+        1,
+        ge=0,
+        lt=2**31,
+        description="seed of the random numbers in the fit of free shells and in the published recipe",
     )
 
 

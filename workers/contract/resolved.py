@@ -50,7 +50,9 @@ class ResolvedGapDiagnose(GapDiagnose):
 
     diffraction_recipe: PsfBuild | None = None
     added_effects: tuple[str, ...] = ()
-    added_effects_sha256: tuple[str, ...] = ()  # hashes of the source texts of the added effects, because a changed text may change the diagnosis
+    added_effects_sha256: tuple[
+        str, ...
+    ] = ()  # hashes of the source texts of the added effects, because a changed text may change the diagnosis
 
 
 class ResolvedRerun(Rerun):

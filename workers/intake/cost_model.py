@@ -26,7 +26,9 @@ class Linear(_Frozen):
     pixel_bytes: float
     as_published: float = 1.0
     shapes: float = 1.0
-    run: dict[str, tuple[float, float]] = Field(default_factory=dict)  # time of one run, by scheme: s, and ns per pixel
+    run: dict[str, tuple[float, float]] = Field(
+        default_factory=dict
+    )  # time of one run, by scheme: s, and ns per pixel
 
 
 class Deconvolution(_Frozen):
@@ -39,7 +41,9 @@ class Deconvolution(_Frozen):
     margin_share: dict[
         str, float
     ]  # default margin divided by half the width of the PSF, measured with the PSF of HRI_EUV
-    psf_draws: int  # number of deconvolutions with other PSFs, for the errors of a fitted PSF: two per parameter
+    psf_draws: (
+        int  # number of deconvolutions with other PSFs, for the errors of a fitted PSF: two per parameter
+    )
     plane_bytes: float
     image_bytes: float
     errors_bytes: float  # further memory per pixel of the image, if errors are estimated

@@ -33,7 +33,10 @@ from workers.settings import Settings
 MIB = 2**20
 BYTES_A_PIXEL = 4.0  # assumed for the files of a transit, because only their length is known here
 
-FEWEST_JOBS, MOST_JOBS = 3, 30  # number of completed jobs of a kind from which the factor is computed, as a median
+FEWEST_JOBS, MOST_JOBS = (
+    3,
+    30,
+)  # number of completed jobs of a kind from which the factor is computed, as a median
 BOUNDS = 0.2, 5.0
 # A job that was faster than this share of its estimate found its result in the catalogue.
 FOUND = 0.05

@@ -91,7 +91,9 @@ def check_tables() -> None:
     from workers import checks
     from workers.catalogue.catalogue import Catalogue
 
-    catalogue = Catalogue(settings.catalogue_url)  # closed below, because no connection may be open at the fork
+    catalogue = Catalogue(
+        settings.catalogue_url
+    )  # closed below, because no connection may be open at the fork
     try:
         while True:
             try:

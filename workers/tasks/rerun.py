@@ -137,7 +137,9 @@ def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing,
         write_json(text, said)
         named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
         details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
-        context.report("comparing", 1, 1)  # raises an exception if the job was cancelled, so that no report is kept
+        context.report(
+            "comparing", 1, 1
+        )  # raises an exception if the job was cancelled, so that no report is kept
         keep_report(context, identity, KIND, text=text, details=details, about_id=request.id)
 
 

@@ -18,7 +18,9 @@ from threading import Lock
 from workers.catalogue.stage_times import MOST_LETTERS, Spent
 
 STARTING = "starting"  # the stage before the first report
-MOST_STAGES, OTHERS = 64, "others"  # limit per attempt, because the names of an operator's own effects may be stages too; the rest counts as OTHERS
+# The number of stages of one attempt is limited, because the names of an operator's own effects may be stages too.
+# The time of further stages counts for OTHERS.
+MOST_STAGES, OTHERS = 64, "others"
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
 
 
