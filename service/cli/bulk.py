@@ -215,7 +215,7 @@ def _said(found: dict[str, Any]) -> list[str]:
         + f", {images['failed']} failed, {images['at_work']} in progress, {images['waiting']} waiting"
     ]
     if images["to_look_at"]:
-        lines.append(f"{images['to_look_at']} to inspect: `heliopsf bulk report {found['id']}`")
+        lines.append(f"{images['to_look_at']} to look at: `heliopsf bulk report {found['id']}`")
     if found["images_an_hour"]:
         lines.append(f"{found['images_an_hour']:.0f} images per hour{_left(found['time_left_s'])}")
     if found["error"]:

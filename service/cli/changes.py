@@ -152,7 +152,7 @@ def _lines(content: dict[str, Any]) -> list[str]:
     lines += [f"not deconvolved: {failure['name']}: {failure['reason']}" for failure in content["failures"]]
     summary = content["summary"]
     lines.append(
-        f"{summary['images']} images, {summary['to_look_at']} to inspect, {summary['failures']} not deconvolved"
+        f"{summary['images']} images, {summary['to_look_at']} to look at, {summary['failures']} not deconvolved"
     )
     return lines
 

@@ -79,9 +79,7 @@ def check_writable(*paths: Path | None) -> None:
     """Raise ``ClickException`` before the work starts if the folder of an output file does not exist."""
     for path in paths:
         if path is not None and not path.resolve().parent.is_dir():
-            raise click.ClickException(
-                f"cannot write {path}: the folder {path.resolve().parent} does not exist"
-            )
+            raise click.ClickException(f"cannot write {path}: there is no folder {path.resolve().parent}")
 
 
 def check_fresh_folder(folder: Path, *, force: bool = False) -> None:

@@ -16,7 +16,7 @@ from workers.catalogue.schema import SchemaError, SchemaStatus
 
 SENTENCES = {
     "empty": "the database is empty; the first start of a server makes its tables at revision {wanted}",
-    "unversioned": "the database has tables of an early version, which had no revisions; this version needs revision {wanted}",
+    "unversioned": "the database has tables without a revision, as early versions made them; this version needs revision {wanted}",
     "older": "the database is at revision {revision}; this version needs {wanted}",
     "current": "the database is at revision {revision}, which this version needs",
     "newer": "the database is at revision {revision} of a later version of heliopsf; this version knows revisions up to {wanted}",

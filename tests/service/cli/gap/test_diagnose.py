@@ -156,7 +156,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     done = run(folder, "--local", "--corrected", psf, "--json", numbers)
     assert done.exit_code == 1 and not psf.exists()
     assert done.output.splitlines()[1] == "verdict: none"
-    assert "was not written: no effect was found that a PSF can include (verdict none)" in done.output
+    assert "was not written: the diagnosis found no effect for a corrected PSF (verdict none)" in done.output
     assert json.loads(numbers.read_text())["verdict"] == "none"
 
 
@@ -167,7 +167,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
         (["--corrected", "no/such/folder/p.fits", "--local"], "there is no folder"),
         (["--psf", "missing.fits", "--local"], "expected a PSF id (64 hexadecimal digits) or a file"),
         (["--psf", "0" * 64, "--local"], "expected the id of a PSF in the catalogue"),
-        (["--effects", "mine.py"], "--effects: expected --local with it"),
+        (["--effects", "mine.py"], "--effects: expected --local; got --effects without it"),
         (["--effects", "mine.py", "--local"], "effects of mine.py: expected a Python file"),
         (["--effects", "no_such_module_anywhere", "--local"], "No module named 'no_such_module_anywhere'"),
         (["--effects", "json", "--local"], "effects of json: expected EFFECTS to be a tuple of Effect"),
