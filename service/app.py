@@ -55,7 +55,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         version=software_version(),
         summary="Point-spread functions of solar EUV telescopes, and deconvolved images.",
         lifespan=lifespan,
-        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.operation.docs serves its own
+        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.operation.docs serves a page without them
         redoc_url=None,
     )
     problems.install(app)

@@ -78,7 +78,7 @@ class _Server(uvicorn.Server):
     """Tells the application about a shutdown. Requests that wait for a job are then answered at once."""
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Tell the application, then handle the signal as the server does."""
+        """Tell the application, then let the server handle the signal."""
         assert isinstance(self.config.app, FastAPI)
         self.config.app.state.stopping = True
         super().handle_exit(sig, frame)

@@ -277,7 +277,11 @@ def goes_on(row: BulkRow) -> bool:
 
 def _done(changed: bool, row: BulkRow, expected: str) -> None:
     if not changed:
-        raise Problem(409, "wrong-phase", f"expected a bulk run in phase {expected}; this one is {row.phase}")
+        raise Problem(
+            409,
+            "wrong-phase",
+            f"expected a bulk run in phase {expected}; this bulk run is in phase {row.phase}",
+        )
 
 
 def _after(cursor: str | None) -> int:

@@ -87,7 +87,7 @@ async def upload_transit(
 ) -> TransitDetails:
     """Upload one archive: the images of a transit, their transit.json and, optionally, the known part of the PSF.
 
-    The table of contents and transit.json are checked at upload. The pixels are read by the first job that uses the transit.
+    The table of contents and transit.json are checked at upload. The pixels are read by the jobs that use the transit.
     """
     settings, take = state.settings, Allowed(state, caller)
     async with uploads.receive_transit(

@@ -15,7 +15,7 @@ from service.client.versions import Progress
 
 
 @click.command()
-@click.option("--image", type=FILE, help="Your own image (FITS) [default: a simulated one]")
+@click.option("--image", type=FILE, help="Your own image (FITS) [default: a simulated image]")
 @click.option(
     "-o",
     "--output",

@@ -90,7 +90,7 @@ def check_fresh_folder(folder: Path, *, force: bool = False) -> None:
 
 
 def write_json(path: Path | None, content: dict[str, Any]) -> None:
-    """Write ``content`` to ``path``, if one is given. Raises ``ClickException`` if the file cannot be written."""
+    """Write ``content`` to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
     if path is None:
         return
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"

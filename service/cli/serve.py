@@ -58,8 +58,8 @@ def worker(
 ) -> None:
     """Run jobs from the broker until interrupted. Start one worker on each machine.
 
-    Jobs that people wait for (queue interactive) run first, then cross-validations (crossval), then bulk runs (bulk),
-    whatever the order of the queues in --queues.
+    Jobs that people wait for (queue interactive) run first, then cross-validations (crossval), then bulk runs (bulk).
+    The order of the queues in --queues has no effect.
     """
     from service.server import environment
 

@@ -79,7 +79,7 @@ def _no_cursor() -> Problem:
 
 
 def page(request: Request, rows: Sequence[Row], limit: int, view: Callable[[Row], Item]) -> Page[Item]:
-    """The page of ``limit`` rows. Callers query ``limit + 1`` rows: the last one shows that there is a next page."""
+    """The page of ``limit`` rows. Callers query ``limit + 1`` rows: the last row shows that there is a next page."""
     after = rows[limit - 1] if len(rows) > limit else None
     next_page = None if after is None else following(request, repr(after.created_at), after.id)
     return Page(items=[view(row) for row in rows[:limit]], next=next_page)

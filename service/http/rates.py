@@ -128,7 +128,7 @@ class Streams:
                 raise Problem(
                     429,
                     "too-many-streams",
-                    f"expected at most {self._most} open streams of events per caller; close one first",
+                    f"expected at most {self._most} open streams of events per caller; close a stream first",
                 )
             self._open[who] += 1
 

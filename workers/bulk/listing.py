@@ -109,7 +109,7 @@ def _path_error(path: Path, source: str) -> JobError | None:
     if source != str(path):
         code, message = (
             NOT_UTF_8,
-            f"expected a path in UTF-8; got one that ends in {source[-100:]}: rename the file",
+            f"expected a path in UTF-8; got a path that ends in {source[-100:]}: rename the file",
         )
     elif len(source) > MOST_LETTERS:
         code = TOO_LONG

@@ -105,7 +105,7 @@ class Kind:
         return REQUESTS[self.name]
 
     def load_task(self) -> Task:
-        """Import the task. Only workers may do this: it loads numerics."""
+        """Import the task. Only workers may do this, because the task loads numerical libraries."""
         task: Task = load(self.task)
         return task
 

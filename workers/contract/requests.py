@@ -29,7 +29,7 @@ Saturation = Annotated[
     Field(
         gt=0,
         allow_inf_nan=False,
-        description="saturation level in DN of one exposure; null: taken from the header or the instrument file, "
+        description="saturation level in DN of one exposure; null: the level is taken from the header or the instrument file, "
         "if known there",
     ),
 ]

@@ -113,7 +113,7 @@ def picked_for_image(
 ) -> Found | None:
     """The PSF for an image, if the request names no PSF; None if the series of the image has no certified PSF.
 
-    Raises ``DataError`` as ``look_for_image`` does, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
+    Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
     """
     instrument, channel = _seen_through(header)
     series = series_of(instrument, channel, TOTAL)

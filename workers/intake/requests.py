@@ -125,7 +125,7 @@ def resolve_deconvolve(asked: Asked) -> Parameters:
 def resolved_deconvolution(
     wanted: Deconvolve, header: dict[str, Any], catalogue: Catalogue, owner: str
 ) -> ResolvedDeconvolve:
-    """The resolved deconvolution of an image with this header, with its PSF. Raises ``DataError`` as ``resolve`` does."""
+    """The resolved deconvolution of an image with this header, with its PSF. Raises the same ``DataError`` as ``resolve``."""
     return ResolvedDeconvolve(
         **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
     )

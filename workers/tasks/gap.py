@@ -1,7 +1,7 @@
 """The task ``gap-diagnose``: diagnoses the gap of an uploaded transit; the result is a report, and a corrected PSF if an
 effect explains the gap.
 
-The gap is the rms of the residuals over the images, with the expected noise removed in quadrature. For the
+The gap is the rms of the residuals of the images, with the expected noise subtracted in quadrature. For the
 corrected PSF the fit is repeated with these effects in the model.
 """
 

@@ -74,7 +74,7 @@ def list_affected_by_psf(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[AffectedView]:
-    """Products made with this PSF, whatever its status, newest first."""
+    """Products made with this PSF, which may have any status. The newest product is listed first."""
     psf = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if psf is None:
         raise problem(

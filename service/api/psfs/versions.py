@@ -117,7 +117,7 @@ async def upload_psf(
 ) -> PsfView:
     """Upload a PSF: one 2-D image with its centre at [n//2, n//2] and a sum of at most 1.
 
-    The header is checked at upload. The pixels are checked by the first job that uses the PSF.
+    The header is checked at upload. The pixels are checked by the jobs that use the PSF.
     """
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
@@ -194,7 +194,7 @@ def get_psf_report(psf_id: Identity, request: Request, caller: Reading, state: S
         raise Problem(
             404,
             "no-report",
-            "expected a fitted PSF; this one was not fitted to a transit: the lineage of the PSF says how it was made",
+            "expected a fitted PSF; this PSF was not fitted to a transit: the lineage of the PSF says how it was made",
         )
     return files.send(request, state.store, digest, "application/json", f"psf-{psf_id[:12]}.json")
 

@@ -97,7 +97,7 @@ def list_keys(as_json: bool, data: Path | None) -> None:
         click.echo(json.dumps([_described(row) for row in rows], indent=1))
         return
     if not rows:
-        click.echo("no key yet; `heliopsf key create --owner NAME` makes one")
+        click.echo("no key yet; `heliopsf key create --owner NAME` makes a key")
     for row in rows:
         used = "never used" if row.last_used_at is None else f"used {_day(row.last_used_at)}"
         click.echo(

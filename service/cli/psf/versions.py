@@ -50,7 +50,7 @@ def list_psfs(server: str | None, **filters: str | None) -> None:
     with user_errors(), remote(server) as service:
         rows = list(service.psfs(**_given(filters)))
     if not rows and not _given(filters):
-        click.echo("no PSF yet; `heliopsf psf build` or the first deconvolution makes one")
+        click.echo("no PSF yet; `heliopsf psf build` or the first deconvolution makes a PSF")
     elif not rows:
         click.echo("no PSF with " + ", ".join(f"{name} {value}" for name, value in _given(filters).items()))
     for row in rows:
