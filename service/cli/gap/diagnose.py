@@ -88,7 +88,7 @@ def diagnose(
     check_writable(output, json_file, plot, corrected_file)
     if effects is not None and not local:
         raise click.UsageError(
-            "--effects: expected --local; got --effects without it: a service tests the effects in HELIOPSF_GAP_EFFECTS"
+            "--effects: expected --local with it; a service tests the effects in HELIOPSF_GAP_EFFECTS"
         )
     with (
         user_errors(),

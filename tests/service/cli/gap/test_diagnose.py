@@ -167,7 +167,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
         (["--corrected", "no/such/folder/p.fits", "--local"], "there is no folder"),
         (["--psf", "missing.fits", "--local"], "expected a PSF id (64 hexadecimal digits) or a file"),
         (["--psf", "0" * 64, "--local"], "expected the id of a PSF in the catalogue"),
-        (["--effects", "mine.py"], "--effects: expected --local; got --effects without it"),
+        (["--effects", "mine.py"], "--effects: expected --local with it"),
         (["--effects", "mine.py", "--local"], "effects of mine.py: expected a Python file"),
         (["--effects", "no_such_module_anywhere", "--local"], "No module named 'no_such_module_anywhere'"),
         (["--effects", "json", "--local"], "effects of json: expected EFFECTS to be a tuple of Effect"),
