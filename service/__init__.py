@@ -1,1 +1,1 @@
-"""HTTP: the application, the client and the command line."""
+"""The HTTP service, its Python client and the command line."""

@@ -1,4 +1,4 @@
-"""The application: its routers, middlewares, and what lives as long as it does."""
+"""The web application: its routers, its middlewares, and the objects that exist as long as it runs."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from workers.settings import Settings, software_version
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
-    """An application for these settings. Its start upgrades the database's tables and starts the reconciler.
+    """Make the application for these settings. When it starts, it upgrades the tables of the database and starts the reconciler.
 
-    bound_to: the address that it listens on. If the settings do not say whether requests need a key, this address decides.
+    bound_to: the address on which it listens. If the settings do not say whether requests need a key, this address decides.
     """
     access, rates = Access.of(settings, bound_to), Rates(settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        # Celery takes half a second to import, which the description of the interface does not need.
+        # Celery is imported only here: the import takes half a second, and writing the OpenAPI description does not need it.
         from workers.broker import app as queue
         from workers.broker.reconciler import Reconciler
 
@@ -55,7 +55,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         version=software_version(),
         summary="Point-spread functions of solar EUV telescopes, and deconvolved images.",
         lifespan=lifespan,
-        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.operation.docs serves its own
+        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.operation.docs serves a page without them
         redoc_url=None,
     )
     problems.install(app)

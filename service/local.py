@@ -1,6 +1,6 @@
-"""A service in this process, for ``--local``: the same requests and tasks, on a temporary catalogue.
+"""A service in this process, for ``--local``: it accepts the same requests and runs the same tasks, with a temporary catalogue.
 
-Images, PSFs and transits are read where they are; nothing is copied.
+Images, PSFs and transits are read from the user's paths and are not copied.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ _Seen = dict[Path, tuple[int, int]]
 
 
 class LocalStore(Store):
-    """A store that also serves files and folders of the user, read where they are.
+    """A store that also contains files and folders of the user, without copying them.
 
-    Each is found by its SHA-256. If it has changed since, reading it raises OSError.
+    Each file or folder is found by its SHA-256. If it has changed since it was added, reading it raises OSError.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -55,7 +55,7 @@ class LocalStore(Store):
         self._folders: dict[str, tuple[FolderTransit, _Seen]] = {}
 
     def add_file(self, file: Path) -> str:
-        """Serve a file; returns its SHA-256."""
+        """Add a file; returns its SHA-256."""
         file = file.resolve()
         seen = _states(file)
         digest = sha256_of(file)
@@ -64,7 +64,7 @@ class LocalStore(Store):
         return digest
 
     def add_folder(self, folder: Path) -> FolderTransit:
-        """Serve the transit in a folder. Raises DataError as ``transit_in``."""
+        """Add the transit in a folder. Raises the same DataError as ``transit_in``."""
         before = _states(*(path for path in folder.resolve().iterdir() if path.is_file()))
         found = transit_in(folder)
         seen = {path: before[path] for path in (found.folder / name for name in found.contents.files)}
@@ -99,14 +99,14 @@ def _states(*files: Path) -> _Seen:
 
 
 def _check(seen: _Seen) -> None:
-    """Raise OSError if a file changed since."""
+    """Raise OSError if a file has changed since ``seen`` was recorded."""
     for file, state in _states(*seen).items():
         if state != seen[file]:
             raise OSError(f"{file} changed while it was read; run the command again")
 
 
 class LocalService(Operations):
-    """The requests to a service, done at once in this process."""
+    """The requests to a service, which are executed in this process."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -120,7 +120,7 @@ class LocalService(Operations):
         self._catalogue.close()
 
     def upload_image(self, path: str | Path) -> dict[str, Any]:
-        """Add an image, after the check of its header that a service makes."""
+        """Add an image, after the same check of its header as in a service."""
         source = Path(path)
         summary = read_summary(source, FitsLimits(max_pixels=self._settings.max_pixels))
         sha256 = self._store.add_file(source)
@@ -129,7 +129,7 @@ class LocalService(Operations):
         return {"id": row.id, "header": row.summary}
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
-        """Add a transit, after the check of its table of contents that a service makes."""
+        """Add a transit, after the same check of its table of contents as in a service."""
         source = Path(path)
         if source.is_dir():
             try:
@@ -189,7 +189,8 @@ class LocalService(Operations):
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
         """Run the job; returns its description. Raises ``ServiceError`` if it fails."""
-        while not Phase(job["phase"]).ended:  # a transient fault is tried again, as often as the settings say
+        # After a transient fault the job is tried again, at most max_attempts times.
+        while not Phase(job["phase"]).ended:
             self._runner.run(job["id"], progress)
             row = self._catalogue.jobs.get(job["id"])
             assert row is not None
@@ -208,7 +209,7 @@ class LocalService(Operations):
                 return PsfView.of(row).model_dump(mode="json")
 
     def download(self, address: str, path: str | Path) -> None:
-        """Copy a file out."""
+        """Copy a file of the service to ``path``."""
         description, _, part = address.rpartition("/")
         row = self._row(description)
         digests = {
@@ -224,7 +225,7 @@ class LocalService(Operations):
         shutil.copyfile(self._store.path(digest), path)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """The answer of the PSF's tables."""
+        """The answer to a query from the tables of the PSF."""
         name, _, other = question.partition("/")
         tables = [self._tables(one) for one in (psf_id, other) if one]
         try:
@@ -269,7 +270,7 @@ class LocalService(Operations):
 
 @contextmanager
 def local_service(*, gap_effects: str = "") -> Iterator[LocalService]:
-    """A local service on a temporary folder. gap_effects: as the setting of that name."""
+    """A local service on a temporary folder. gap_effects: the same as the setting of this name."""
     with TemporaryDirectory(prefix="heliopsf-") as folder:
         service = LocalService(Settings.apart(Path(folder), gap_effects=gap_effects))
         try:

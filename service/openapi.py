@@ -1,4 +1,4 @@
-"""Write the OpenAPI description: ``python -m service.openapi openapi/openapi.json``."""
+"""Writes the OpenAPI description: ``python -m service.openapi openapi/openapi.json``."""
 
 from __future__ import annotations
 

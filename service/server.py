@@ -30,8 +30,8 @@ log = logging.getLogger(__name__)
 def serve(settings: Settings, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address.
 
-    On SIGTERM or Control-C it accepts no more connections, gives running requests ``stop_s`` seconds, and then stops the
-    embedded worker, which takes at most ``gone_s`` seconds.
+    On SIGTERM or Control-C the server accepts no more connections. Running requests may continue for ``stop_s`` seconds. Then
+    the server stops the embedded worker, which takes at most ``gone_s`` seconds.
     """
     logs.configure(settings)
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as listener:
@@ -50,7 +50,7 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
             )
         )
         _prepare(settings, host)
-        # The server raises the signal again after its shutdown; as an exception it lets the worker be stopped too.
+        # After its shutdown the server raises the signal again. It becomes an exception here, so that the worker is stopped too.
         signal.signal(signal.SIGTERM, _raise_exit)
         with embedded_worker(settings):
             announce(address)
@@ -75,10 +75,10 @@ def _prepare(settings: Settings, host: str) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Tells the application about a shutdown, so that requests that wait for a job are answered at once."""
+    """Tells the application about a shutdown. Requests that wait for a job are then answered at once."""
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Tell the application, then handle the signal as the server does."""
+        """Tell the application, then let the server handle the signal."""
         assert isinstance(self.config.app, FastAPI)
         self.config.app.state.stopping = True
         super().handle_exit(sig, frame)
@@ -132,9 +132,9 @@ def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
             [sys.executable, "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
             env=os.environ | environment(settings),
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # what Celery prints apart from the logs
+            stdout=subprocess.DEVNULL,  # Celery prints a banner here; the logs go to standard error
             stderr=output,
-            # So that Control-C reaches only this process, which then stops the worker.
+            # With this, Control-C reaches only this process, which then stops the worker.
             start_new_session=True,
         )
 
@@ -151,6 +151,6 @@ def _stop(worker: subprocess.Popen[bytes], within_s: float) -> None:
     try:
         worker.wait(within_s)
     except subprocess.TimeoutExpired:
-        # A worker normally ends before this. The next server queues its job again, so nothing is lost.
+        # A worker normally ends before this. If not, the next server queues its job again, so no job is lost.
         os.killpg(worker.pid, signal.SIGKILL)
         worker.wait()

@@ -1,4 +1,4 @@
-"""Checks what the service depends on. Each check raises ``Unusable`` with a short sentence.
+"""Checks the database, storage and broker on which the service depends. Each check raises ``Unusable`` with a short sentence.
 
 The sentences contain no address and no credentials, so they can be shown to anybody.
 """
@@ -55,7 +55,7 @@ def free_bytes(folder: Path) -> int:
 
 def broker(settings: Settings) -> None:
     """Check that the broker answers."""
-    if "://" not in settings.broker_url:  # Celery would use a broker in its own memory
+    if "://" not in settings.broker_url:  # for such a URL Celery would use a broker in its own memory
         raise Unusable("the broker's URL cannot be used (expected scheme://...)")
     from workers.broker import app as queue  # Celery takes half a second to import
 
@@ -68,7 +68,7 @@ def broker(settings: Settings) -> None:
         KeyError,
         ImportError,
         AttributeError,
-    ) as error:  # not a URL, or one of a transport that is not installed
+    ) as error:  # the text is not a URL, or the library for its scheme is not installed
         raise Unusable(f"the broker's URL cannot be used ({_kind(error)})") from error
 
 
@@ -99,12 +99,12 @@ def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, 
 
 _REASONS = {
     r"refused": "the connection is refused",
-    r"resolve|name or service|getaddrinfo": "the host's name is unknown",
+    r"resolve|name or service|getaddrinfo": "the host name is unknown",
     r"authentication failed|no password supplied|no pg_hba": "the user or the password is not accepted",
-    r'database ".*" does not exist': "there is no database of that name",
-    r"timeout|timed out": "no answer within seconds",
+    r'database ".*" does not exist': "there is no database with this name",
+    r"timeout|timed out": "no answer within the time limit",
     r"unable to open|readonly": "the file cannot be opened or written to",
-    r"not a database|malformed": "the file is no SQLite database",
+    r"not a database|malformed": "the file is not an SQLite database",
     r"locked": "the file is locked by another process",
 }
 
@@ -119,5 +119,5 @@ def database_said(error: SQLAlchemyError) -> str:
 
 
 def _kind(error: BaseException) -> str:
-    """The name of the error's class; that of its cause, if it has one, because it is more specific."""
+    """The name of the error's class. If the error has a cause, the name of the cause's class, because it is more specific."""
     return type(getattr(error, "orig", None) or error.__cause__ or error).__name__

@@ -1,6 +1,6 @@
 """Lineage of a product or a PSF: inputs, parameters, versions and jobs, back to the uploads.
 
-It repeats what was recorded when each thing was made. Deleted things are still named.
+The lineage repeats the record from the time when each thing was made. A thing that was deleted later is still listed, by its id.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Type = Literal["product", "psf", "image", "transit", "report", "instrument-file"
 
 
 class Made(BaseModel):
-    """How a thing was made; null: not recorded at that time."""
+    """How a thing was made. A field is null if it was not recorded at that time."""
 
     created_at: float
     name: str | None = None
@@ -39,18 +39,18 @@ class Made(BaseModel):
 
 
 class Ancestor(BaseModel):
-    """A thing and its parents: what it was made from."""
+    """A thing, and the things that it was made from (its parents)."""
 
     type: Type
     id: str = Field(description="id; for an upload or an instrument file the SHA-256 of its bytes")
     there: bool = Field(
-        description="whether the catalogue still holds it; false for an instrument file, whose text is in the PSF file"
+        description="whether the catalogue still contains the thing; false for an instrument file, because its text is in the PSF file"
     )
     made: Made | None = Field(None, description="null for an upload and for a deleted thing")
     parents: list[Ancestor] = []
     cut: bool = Field(
         False,
-        description="true if its parents are left out here: they are listed elsewhere in this answer, or there are too many",
+        description="true if the parents are left out here, because they are listed elsewhere in this answer or there are too many",
     )
 
 
@@ -60,7 +60,7 @@ def lineage(catalogue: Catalogue, row: ProductRow | PsfRow) -> Ancestor:
 
 
 def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
-    """The job that made a thing, so that it can run again.
+    """The parameters of the job that made a thing, so that this job can run again.
 
     Raises ``DataError`` "not-made-here" for an upload, "parameters-unknown" if the parameters were not recorded, and
     "parameters-outdated" if this version of the software does not accept them.
@@ -72,7 +72,7 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
     if isinstance(row, PsfRow) and row.origin == "uploaded":
         raise DataError(
             "not-made-here",
-            f"expected a PSF that this service made; PSF {row.id} was uploaded, so no job can run again",
+            f"expected a PSF that this service made; PSF {row.id} was uploaded, so no job made it",
         )
     if parameters is None:
         raise DataError(
@@ -91,7 +91,7 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
 
 
 def _job_of(row: ProductRow | PsfRow, parameters: dict[str, Any]) -> ResolvedRerun:
-    """The job with these parameters. The catalogue may keep only those that were given; defaults are filled in here."""
+    """The job with these parameters. The catalogue may contain only the parameters that the client gave; this function adds the defaults."""
     of: Literal["product", "psf"] = "product" if isinstance(row, ProductRow) else "psf"
     origin = _origin(row)
     kind = kind_of_origin(origin)
@@ -100,13 +100,13 @@ def _job_of(row: ProductRow | PsfRow, parameters: dict[str, Any]) -> ResolvedRer
     whole = {FORMER_NAMES.get(name, name): value for name, value in parameters.items()}
     if (
         origin != "built"
-    ):  # the instrument file's text, which a build requires, is in the file of the built PSF
+    ):  # a build also requires the text of the instrument file, which is in the file of the built PSF
         whole = kind.resolved.model_validate(whole).model_dump(mode="json")
     return ResolvedRerun(of=of, id=row.id, kind=kind.name, parameters=whole)
 
 
 def _origin(row: ProductRow | PsfRow) -> str:
-    """As ``workers.contract.kinds`` names it."""
+    """The origin of a thing, as ``workers.contract.kinds`` names it."""
     if isinstance(row, ProductRow):
         return "deconvolved"
     if row.origin == "built":
@@ -130,7 +130,7 @@ def _provenance(row: PsfRow) -> dict[str, Any]:
 
 
 class _Walk:
-    """One walk through a lineage. A thing met twice is named again, but its parents are not repeated."""
+    """One walk through a lineage. A thing that occurs twice is listed twice, but its parents only once."""
 
     def __init__(self, catalogue: Catalogue, owner: str) -> None:
         self._catalogue, self._owner = catalogue, owner

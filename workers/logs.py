@@ -1,6 +1,6 @@
-"""Logs of the service and its workers on standard error: one line a record, as JSON or as text.
+"""Logs of the service and its workers on standard error: one line for each record, as JSON or as text.
 
-The request, the job and its owner are bound once; every line that is written while they are bound contains them.
+``bind`` stores the request, the job or its owner once; all later log lines of the same context contain them.
 Headers, keys and contents of files are never logged.
 """
 
@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from workers.settings import Settings
 
-_ABOUT: ContextVar[dict[str, str]] = ContextVar("what log lines are about", default={})  # noqa: B039 - never changed in place
-# A client chooses its request id, so it may contain nothing that ends a line or looks like another entry.
+_ABOUT: ContextVar[dict[str, str]] = ContextVar("what log lines are about", default={})  # noqa: B039 - the dictionary is never changed in place
+# A client chooses its request id, so it must not contain characters that end a line or imitate another log entry.
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
@@ -32,7 +32,7 @@ def bind(**about: str) -> None:
 
 @contextmanager
 def bound(**about: str) -> Iterator[None]:
-    """Add these to all lines that are written in the block."""
+    """Add these values to all lines that are written in the ``with`` block."""
     token = _ABOUT.set({**_ABOUT.get(), **about})
     try:
         yield
@@ -41,17 +41,17 @@ def bound(**about: str) -> Iterator[None]:
 
 
 def about() -> dict[str, str]:
-    """What is bound at present."""
+    """The values that are bound at present."""
     return dict(_ABOUT.get())
 
 
 def request_id(sent: str | None) -> str:
-    """The id that a client sent, if it is a short plain word; otherwise a new one."""
+    """The id that a client sent, if it has at most 64 letters, digits, '.', '_' or '-'; otherwise a new id."""
     return sent if sent is not None and _REQUEST_ID.fullmatch(sent) else uuid.uuid4().hex
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line, with the keys of ``extra={"fields": {...}}``."""
+    """One JSON object per line, with the keys of ``extra={"fields": {...}}``."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as a line."""
@@ -70,7 +70,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Text for a terminal: time, level, message and what is bound."""
+    """Text for a terminal: time, level, message and the bound values."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as a line, followed by its traceback, if any."""
@@ -93,7 +93,7 @@ def configure(settings: Settings) -> None:
     handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-    # These log every request, connection and plug-in; our own lines have the same with the request id.
+    # These libraries log every request, connection and plug-in. Our own log lines say the same, with the request id.
     for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime.plugins"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     logging.captureWarnings(True)

@@ -1,6 +1,6 @@
 """Settings of the operator. Only this module reads ``HELIOPSF_*`` variables.
 
-The defaults give the embedded mode: a local folder with SQLite in it, and a broker without a server.
+The defaults give the embedded mode: a local folder that contains an SQLite database, and a broker that needs no server.
 Scientific choices are never settings; they are parameters of a job.
 """
 
@@ -36,7 +36,11 @@ class Settings(BaseSettings):
     store_cache_mib: int = Field(
         20_480, ge=1, description="space in data_dir for cached copies of files in the object store, MiB"
     )
-    quota_mib: int = Field(0, ge=0, description="default storage quota of an owner, MiB; 0: unlimited")
+    quota_mib: int = Field(
+        0,
+        ge=0,
+        description="largest size of an owner's stored files, unless the owner has a limit of its own, MiB; 0: unlimited",
+    )
     database_url: str | None = Field(
         None, description="SQLAlchemy URL of the database; default: SQLite in data_dir"
     )
@@ -44,7 +48,9 @@ class Settings(BaseSettings):
         EMBEDDED_BROKER, description="URL of the Celery broker; the default needs no server"
     )
     max_upload_mib: int = Field(160, ge=1, le=65_536, description="largest uploaded image or PSF file, MiB")
-    max_pixels: int = Field(4096 * 4096, ge=256, description="largest image or PSF by its header, pixels")
+    max_pixels: int = Field(
+        4096 * 4096, ge=256, description="largest number of pixels of an image or PSF, as its header declares"
+    )
     max_transit_mib: int = Field(4096, ge=1, le=1_048_576, description="largest uploaded transit, MiB")
     max_transit_unpacked_mib: int = Field(
         8192, ge=1, le=1_048_576, description="largest unpacked size of a transit, MiB"
@@ -55,7 +61,7 @@ class Settings(BaseSettings):
     )
     worker_queues: str = Field(
         ",".join(Queue),
-        description="queues that a worker serves, separated by commas; their priority is fixed, whatever the order",
+        description="queues that a worker serves, separated by commas; the order in this list does not change their priority",
     )
     psf_cache_mib: int = Field(
         1024, ge=0, description="memory of a worker process for prepared PSFs, which later jobs reuse, MiB"
@@ -67,16 +73,18 @@ class Settings(BaseSettings):
         description="time without a heartbeat after which a worker counts as lost and its job is queued again, s",
     )
     reconcile_s: float = Field(
-        2.0, gt=0, description="interval between comparisons of the job table with the broker, s"
+        2.0,
+        gt=0,
+        description="interval at which queued jobs that the broker may have lost are searched for, s",
     )
     resubmit_s: float = Field(
-        30.0, gt=0, description="time until a queued job is sent to the broker again for the first time, s"
+        30.0, gt=0, description="time after which a queued job is sent to the broker for the second time, s"
     )
     max_attempts: int = Field(3, ge=1, description="number of attempts after which a job fails")
     stop_s: float = Field(
         15.0,
         ge=0,
-        description="time that running requests and jobs have after SIGTERM, s; then jobs are handed back",
+        description="time after SIGTERM in which running requests and jobs may finish, s; then unfinished jobs are queued again",
     )
     log_format: Literal["text", "json"] | None = Field(
         None, description="format of the logs on standard error; default: text on a terminal, otherwise json"
@@ -106,21 +114,27 @@ class Settings(BaseSettings):
     )
     allowed_hosts: str = Field(
         "",
-        description="host names of the service besides the loopback ones, separated by commas; *: any name",
+        description="host names of the service besides localhost, separated by commas; *: any name",
     )
     max_body_mib: int = Field(16, ge=1, le=1024, description="largest request that is not an upload, MiB")
-    reads_per_minute: int = Field(12_000, ge=0, description="reads of one caller a minute; 0: unlimited")
+    reads_per_minute: int = Field(
+        12_000, ge=0, description="largest number of read requests of one caller per minute; 0: unlimited"
+    )
     submissions_per_minute: int = Field(
-        3_000, ge=0, description="uploads and jobs of one caller a minute; 0: unlimited"
+        3_000,
+        ge=0,
+        description="largest number of uploads and submitted jobs of one caller per minute; 0: unlimited",
     )
     upload_mib_per_minute: int = Field(
-        16_384, ge=0, description="uploads of one caller a minute, MiB; 0: unlimited"
+        16_384, ge=0, description="largest size of the uploads of one caller per minute, MiB; 0: unlimited"
     )
     streams_per_caller: int = Field(
-        32, ge=1, description="streams of events that one caller may have open at a time on one server"
+        32,
+        ge=1,
+        description="largest number of event streams that one caller may have open on one server at a time",
     )
     stream_s: float = Field(
-        3600.0, gt=0, description="longest duration of a stream of events, s; then its client connects again"
+        3600.0, gt=0, description="longest duration of an event stream, s; then the client must connect again"
     )
     max_job_memory_mib: int = Field(
         65_536, ge=1, description="largest estimated memory of a job, MiB; a job that needs more is refused"
@@ -128,12 +142,12 @@ class Settings(BaseSettings):
     max_job_s: float = Field(
         172_800.0,
         gt=0,
-        description="longest estimated time of a job, and longest time of one attempt, s; a longer job is refused or stopped",
+        description="longest time of a job, s; a job with a longer estimate is refused, and an attempt that takes longer is stopped",
     )
 
     gap_effects: str = Field(
         "",
-        description="modules, or .py files, with further effects for gap diagnoses, separated by commas; their code is executed",
+        description="modules or .py files, separated by commas, that define further effects for gap diagnoses; their code is executed",
     )
 
     @field_validator("worker_queues")
@@ -144,12 +158,12 @@ class Settings(BaseSettings):
 
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
-        """Default settings with this folder, independent of the environment: for work beside a running service."""
+        """Default settings with this data folder. They ignore the environment, so that they cannot touch a running service."""
         return cls(_env_prefix="HELIOPSF_APART_", data_dir=data_dir, gap_effects=gap_effects)
 
     @property
     def added_effects(self) -> tuple[str, ...]:
-        """Modules, or files, with effects that a diagnosis tests besides those of the library."""
+        """Modules or files with effects that a diagnosis tests in addition to the effects of the library."""
         return tuple(name.strip() for name in self.gap_effects.split(",") if name.strip())
 
     @property
@@ -177,20 +191,21 @@ class Settings(BaseSettings):
 
     @property
     def threads(self) -> int:
-        """Threads of one worker process: cores / worker processes, so that workers share the machine."""
+        """Threads of one worker process; default: cores divided by worker processes, so that the processes share the machine."""
         return self.worker_threads or max(1, cores() // self.worker_processes)
 
     @property
     def gone_s(self) -> float:
-        """Time after SIGTERM at which a worker exits in any case, s.
+        """Time after SIGTERM after which a worker exits even if its job is not finished, s.
 
-        The worker checks at each heartbeat whether it must hand back its job; then Celery needs a few seconds to end.
+        It is longer than ``stop_s``: a worker checks only at each heartbeat whether it must hand back its job, and then Celery
+        needs a few seconds to end.
         """
         return self.stop_s + self.heartbeat_s + 6.0
 
     @property
     def presence_s(self) -> float:
-        """Interval between announcements of a worker, s: short enough for its lease."""
+        """Interval at which a worker announces itself, s. It is shorter than the lease."""
         return max(self.heartbeat_s, self.lease_s / 3)
 
     @property

@@ -17,11 +17,11 @@ PREFIX = "HELIOPSF_"
 _BOUNDS = {Ge: ("≥", "ge"), Gt: (">", "gt"), Le: ("≤", "le"), Lt: ("<", "lt")}
 _INTRODUCTION = """# Settings
 
-Each setting is an environment variable. All are optional: with none set, `heliopsf serve` keeps everything in one
-folder and needs no other server. Set the same variables for servers, workers and operator commands.
+Each setting is an environment variable. All settings are optional: without them, `heliopsf serve` keeps all data in
+one folder and needs no other server. Set the same variables for servers, workers and operator commands.
 Scientific choices are never settings; they are parameters of a job.
 
-This page is made from the class `workers.settings.Settings` by `make settings`; a test compares the two.
+This page is generated from the class `workers.settings.Settings` by `make settings`; a test compares the two.
 
 | variable | type | default | meaning |
 |---|---|---|---|
@@ -32,7 +32,7 @@ Commands and the Python client read two more variables:
 | variable | meaning |
 |---|---|
 | `HELIOPSF_SERVER` | Address of the service, for example `http://127.0.0.1:8765`. |
-| `HELIOPSF_KEY` | API key that commands and client send. |
+| `HELIOPSF_KEY` | Access key that the commands and the Python client send. |
 """
 
 
@@ -75,7 +75,7 @@ def _default(value: Any) -> str:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write the page to the file named."""
+    """Write the page to the file whose path is the first argument."""
     (target,) = arguments
     Path(target).write_text(settings_table(), "utf-8")
 

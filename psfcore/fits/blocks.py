@@ -35,8 +35,6 @@ _BITPIX = (8, 16, 32, 64, -32, -64)
 _LARGEST_COUNT = 2**63 - 1
 _SKIP_BYTES = 1 << 20
 END_CARD = b"END" + b" " * 77
-# Exceptions that astropy raises for a damaged card. The kind of damage decides which one it raises.
-CARD_TROUBLE = (VerifyError, ValueError, TypeError, IndexError, OverflowError)
 _KNOWN_STARTS = (
     (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),
     (b"\xff\x4f\xff\x51", "a JPEG 2000 codestream"),

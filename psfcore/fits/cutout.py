@@ -58,7 +58,9 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
 
 
 def _header(file: BinaryIO) -> Header:
-    """Read the first header. Afterwards the file is positioned at the first byte of the data."""
+    """Read the first header; the file is then at the first byte of its data."""
+    from astropy.io.fits import Header  # see psfcore.fits.blocks: slow to import
+
     raw = bytearray()
     block = b""
     while not any(block[at : at + CARD_BYTES] == END_CARD for at in range(0, len(block), CARD_BYTES)):

@@ -23,7 +23,10 @@ from psfcore.fits.blocks import (
 )
 from psfcore.instruments.files import match_instrument
 
-# This module also exports FitsLimits, because every caller of `read_summary` needs it.
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+# FitsLimits is exported here too: every caller of `read_summary` needs it.
 __all__ = [
     "FitsLimits",
     "HeaderSummary",

@@ -23,7 +23,7 @@ from workers.contract.phases import JobError
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)
 BulkId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
-LOOK_FROM = 1.0  # images with this artefact score or more should be inspected
+LOOK_FROM = 1.0  # a person should inspect images with this artefact score or a higher one
 
 
 class Counts(BaseModel):
@@ -33,9 +33,13 @@ class Counts(BaseModel):
     waiting: int
     at_work: int
     done: int
-    reused: int = Field(description="done images whose product already existed")
+    reused: int = Field(
+        description="done images whose product already existed, so that they were not deconvolved"
+    )
     failed: int
-    to_look_at: int = Field(description=f"done images to inspect: artefact score {LOOK_FROM:g} or more")
+    to_look_at: int = Field(
+        description=f"done images that a person should inspect: artefact score {LOOK_FROM:g} or more"
+    )
 
 
 class BulkView(BaseModel):
@@ -46,16 +50,20 @@ class BulkView(BaseModel):
     phase: BulkPhase
     created_at: float
     ended_at: float | None
-    psf_id: str | None = Field(description="the PSF of all images; null: the context pins one for each image")
+    psf_id: str | None = Field(
+        description="id of the PSF of all images; null: the context pins a PSF for each image"
+    )
     context_id: str | None
     request: dict[str, Any] = Field(description="the request, without the ids of uploaded images")
     images: Counts
-    images_an_hour: float | None = Field(description="pace of the last hour; null: unknown")
-    time_left_s: float | None = Field(description="estimate; null: unknown or not running")
-    error: JobError | None = Field(description="why the run stopped; null: it did not stop with an error")
+    images_an_hour: float | None = Field(description="speed in the last hour; null: unknown")
+    time_left_s: float | None = Field(
+        description="estimated time left; null: unknown, or the run is not running"
+    )
+    error: JobError | None = Field(description="the error that stopped the run; null: no error stopped it")
     results: str = Field(description="address of the manifest of the done images")
     failures: str = Field(description="address of the failed images, with reasons")
-    events: str = Field(description="address of the progress as server-sent events")
+    events: str = Field(description="address at which progress is sent as server-sent events")
 
     @classmethod
     def of(cls, row: BulkRow, state: Shared) -> BulkView:
@@ -144,13 +152,16 @@ class Failed(BaseModel):
     status_code=202,
     summary="Start a bulk run",
     responses={
-        200: {"model": BulkView, "description": "An identical request is open; this is its bulk run."}
+        200: {
+            "model": BulkView,
+            "description": "A bulk run of an identical request is open; the answer is that run.",
+        }
     },
 )
 def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shared) -> BulkView:
-    """Deconvolve many images in the same way. Workers list the files and deconvolve the images, after all other jobs.
+    """Deconvolve many images in the same way. Workers list the files and deconvolve the images. All other jobs run first.
 
-    The PSF, or the context that pins a PSF for each image, is fixed now. An existing product is not made again.
+    The PSF, or the context that pins a PSF for each image, is fixed when the run starts. An existing product is not made again.
     """
     if body.keeps_products:
         check_room(state, caller.owner)
@@ -182,7 +193,7 @@ def list_bulks(
     return page(request, rows, limit, BulkLine.of)
 
 
-@router.get("/{bulk_id}", summary="One bulk run: progress, pace and time left")
+@router.get("/{bulk_id}", summary="One bulk run: progress, speed and time left")
 def get_bulk(bulk_id: BulkId, caller: Reading, state: Shared) -> BulkView:
     """The bulk run as it is now."""
     return BulkView.of(find(state, caller, bulk_id), state)
@@ -207,7 +218,7 @@ def list_failures(
 
 @router.post("/{bulk_id}/pause", summary="Pause a bulk run")
 def pause_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """Begin no more images. Images that workers have are finished."""
+    """Start no more images. Workers finish the images that they have started."""
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.pause(row.id), row, "LISTING or RUNNING")
     return BulkView.of(find(state, caller, bulk_id), state)
@@ -224,7 +235,7 @@ def resume_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
 
 @router.post("/{bulk_id}/cancel", summary="Cancel a bulk run")
 def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """End the run. Images that workers have stop at their next step; finished products stay."""
+    """End the run. Workers stop at the next step of their images. Finished products are kept."""
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.cancel(row.id), row, "LISTING, RUNNING, PAUSED or ERROR")
     bulk_turns.cancel_turns(state.catalogue, row.id)
@@ -233,9 +244,9 @@ def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
 
 @router.post("/{bulk_id}/retry", summary="Retry failed images")
 def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """Queue the failed images again. Done images stay done.
+    """Queue the failed images again. Done images are not processed again.
 
-    409 if the run has ended and an identical request is open as another bulk run; the message names that run.
+    The answer is 409 if this run has ended and another bulk run of an identical request is open. The message names that run.
     """
     row = find(state, caller, bulk_id)
     try:
@@ -260,13 +271,17 @@ def find(state: Shared, caller: Caller, bulk_id: str) -> BulkRow:
 
 
 def goes_on(row: BulkRow) -> bool:
-    """Whether the run may still change without a request."""
+    """Whether the run may still change although nobody sends a request."""
     return row.phase in AT_WORK
 
 
 def _done(changed: bool, row: BulkRow, expected: str) -> None:
     if not changed:
-        raise Problem(409, "wrong-phase", f"expected a bulk run in phase {expected}; this one is {row.phase}")
+        raise Problem(
+            409,
+            "wrong-phase",
+            f"expected a bulk run in phase {expected}; this bulk run is in phase {row.phase}",
+        )
 
 
 def _after(cursor: str | None) -> int:

@@ -1,4 +1,4 @@
-"""The results of a bulk run, image by image, as lines of JSON or as CSV: ``/v1/bulk/{id}/results``."""
+"""The results of a bulk run, image by image, as JSON lines or as CSV: ``/v1/bulk/{id}/results``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NDJSON, CSV = "application/x-ndjson", "text/csv"
 
 
 class Change(BaseModel):
-    """Change of the brightest or darkest 1 % of blocks of 4 x 4 pixels."""
+    """Change of the intensity in the brightest or the darkest 1 % of the blocks of 4 x 4 pixels."""
 
     sum_pct: float
     up_to_pct: float
@@ -39,23 +39,31 @@ class Result(BaseModel):
     image_sha256: str
     psf_id: str
     product_id: str
-    file: str | None = Field(description="address of the product; null: the service does not keep it")
-    output: str | None = Field(description="path of the product in the output folder; null: no output folder")
+    file: str | None = Field(
+        description="address of the product; null: the service does not keep the product"
+    )
+    output: str | None = Field(
+        description="path of the product in the output folder; null: the run has no output folder"
+    )
     sha256: str = Field(description="SHA-256 of the product's file")
     bytes: int
-    reused: bool = Field(description="whether the product already existed")
-    score: float = Field(description="artefact score; below 1: no artefacts found")
+    reused: bool = Field(
+        description="whether the product already existed, so that the image was not deconvolved"
+    )
+    score: float = Field(description="artefact score; below 1: no signs of artefacts were found")
     flux_change_pct: float
     bright: Change | None
     dark: Change | None
-    signs: dict[str, float | None] = Field(description="the signs of artefacts, each with its value")
+    signs: dict[str, float | None] = Field(
+        description="the signs of artefacts, and the measured value of each sign"
+    )
     steps_done: int
     stopped_because: str
     negative_pixels: int
     ended_at: float
     seconds: float | None = Field(description="time that the worker spent on the image; null: unknown")
     kernel_seconds: float | None = Field(
-        description="part of `seconds` spent on deconvolving and measuring changes; null: the product already existed"
+        description="part of `seconds` that was spent on deconvolving and on measuring changes; null: the product already existed"
     )
 
     @classmethod

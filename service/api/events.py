@@ -1,7 +1,8 @@
 """Progress as server-sent events: ``/v1/jobs/{id}/events`` and ``/v1/bulk/{id}/events``.
 
-A stream reads its row, which every server can see, once in ``LOOK_EVERY_S``. The id of an event is a hash of the row's
-state. A client that reconnects with this id (``Last-Event-ID``) gets only what has changed since.
+A stream reads the row of its job or bulk run from the database every ``LOOK_EVERY_S`` seconds, so any server can send it.
+The id of an event is a hash of the row's state. A client that reconnects with this id (``Last-Event-ID``) gets an event only
+if the state has changed since.
 """
 
 from __future__ import annotations
@@ -42,16 +43,16 @@ router = APIRouter(tags=["events"], responses=RESPONSES)
 LastId = Annotated[str | None, Header(alias="Last-Event-ID", max_length=64)]
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Events `progress`, each with the whole view as its data; the last event is `end`.",
+        "description": "Events `progress`. The data of each event is the complete job or bulk run. The last event is `end`.",
         "content": {TYPE: {}},
     },
-    204: {"description": "The client's last event was `end`: no more events follow."},
+    204: {"description": "The last event that the client received was `end`; no more events follow."},
 }
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The state of a row: its id as an event, its view, and whether it is the last."""
+    """The state of a row: the id of its event, its view, and whether it is the final state."""
 
     id: str
     view: Callable[[], BaseModel]
@@ -70,7 +71,7 @@ Look = Callable[[], Seen | None]  # None: the row was deleted
 async def follow_job(
     job_id: JobId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
 ) -> Response:
-    """The job now and at every change, until it ends."""
+    """Send the job now and after every change, until the job ends."""
     await run_in_threadpool(find_job, state, caller, job_id)
 
     def look() -> Seen | None:
@@ -92,7 +93,7 @@ async def follow_job(
 async def follow_bulk(
     bulk_id: BulkId, request: Request, caller: Reading, state: Shared, last_id: LastId = None
 ) -> Response:
-    """The bulk run now and at every change, until it ends. The stream of a paused run stays open."""
+    """Send the bulk run now and after every change, until the run ends. The stream of a paused run stays open."""
     await run_in_threadpool(find_bulk, state, caller, bulk_id)
 
     def look() -> Seen | None:
@@ -106,10 +107,10 @@ async def follow_bulk(
 
 
 class _Stream(StreamingResponse):
-    """A streaming response that calls ``close`` however it ends."""
+    """A streaming response that calls ``close`` at its end, also after an error."""
 
     def __init__(self, events: AsyncIterator[str], close: Callable[[], None]) -> None:
-        # Tells proxies not to buffer: a buffer would delay events.
+        # This header tells proxies not to buffer, because a buffer would delay events.
         super().__init__(events, media_type=TYPE, headers={"X-Accel-Buffering": "no"})
         self._close = close
 
@@ -143,7 +144,8 @@ async def _events(look: Look, over: Callable[[], bool], last_id: str | None) -> 
             text = await run_in_threadpool(_event, now, last_id)
         except SQLAlchemyError as error:
             log.warning(
-                "a stream of events cannot read the database and waits: %s", str(error).splitlines()[0]
+                "an event stream cannot read the database; it waits and tries again: %s",
+                str(error).splitlines()[0],
             )
             now, text = Seen(last_id or "", BaseModel, False), ""
         if text or time.monotonic() - said_at > ALIVE_EVERY_S:
@@ -156,7 +158,7 @@ async def _events(look: Look, over: Callable[[], bool], last_id: str | None) -> 
 
 
 def _event(now: Seen | None, last_id: str | None) -> str:
-    """The event for a state; empty if the client already has it."""
+    """The text of the event for a state; empty if the client already has this event."""
     if now is None:
         return "event: gone\ndata: {}\n\n"
     if now.id == last_id and not now.ended:

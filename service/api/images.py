@@ -46,7 +46,7 @@ class ImageView(BaseModel):
     responses={200: {"model": ImageView, "description": "The same file was already uploaded."}},
 )
 async def upload_image(request: Request, response: Response, caller: Submitting, state: Shared) -> ImageView:
-    """Upload one FITS file. The header is checked now; the pixels are read by the job that uses the image."""
+    """Upload one FITS file. The header is checked at upload. The pixels are read by the jobs that use the image."""
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
     async with uploads.receive(request, state.store, state.limits, limit, take) as upload:

@@ -37,7 +37,7 @@ class Progress(BaseModel):
 
 
 class Estimate(BaseModel):
-    """What a job was expected to need when it was accepted."""
+    """The time and memory that a job was expected to need when it was accepted."""
 
     memory_mib: int
     seconds: float
@@ -57,10 +57,10 @@ class JobView(BaseModel):
     cancel_requested: bool
     progress: Progress
     estimate: Estimate | None = Field(
-        description="what the job is expected to need; null until a UWS job is started"
+        description="expected time and memory of the job; null: a UWS job that has not been started"
     )
     parameters: dict[str, Any] = Field(
-        description="with every default and the PSF filled in; for a PENDING job as sent"
+        description="the parameters, with every default and the PSF filled in; for a PENDING job as the client sent them"
     )
     result: str | None = Field(description="address of the result; null until the job is COMPLETED")
     error: JobError | None
@@ -91,11 +91,14 @@ class JobView(BaseModel):
     status_code=202,
     summary="Submit a job: a deconvolution, a PSF build, a fit, a cross-validation, a report, a diagnosis or a rerun",
     responses={
-        200: {"model": JobView, "description": "An identical request was made before; this is its job."}
+        200: {
+            "model": JobView,
+            "description": "An identical request was made before; the answer is the job of that request.",
+        }
     },
 )
 def submit_job(body: JobRequest, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """Put a job into its queue. Identical jobs run once: an identical request gets the existing job."""
+    """Put a job into its queue. If an identical request was made before, the answer is the existing job."""
     check_room(state, caller.owner)
     try:
         parameters, request_key = resolve(
@@ -110,7 +113,7 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
     )
     if new:
         log.info("job %s: %s, submitted", row.id, body.kind, extra={"fields": {"job": row.id}})
-    if row.submitted_at is None:  # new, or moved to a queue of higher priority
+    if row.submitted_at is None:  # the job is new, or was moved to a queue of higher priority
         state.reconciler.wake()
     response.status_code = 202 if new else 200
     response.headers["Location"] = f"/v1/jobs/{row.id}"
@@ -141,14 +144,14 @@ def get_job(job_id: JobId, caller: Reading, state: Shared) -> JobView:
 
 @router.delete("/{job_id}", status_code=202, summary="Cancel a job")
 def cancel_job(job_id: JobId, caller: Submitting, state: Shared) -> JobView:
-    """Cancel a job. A queued job ends at once, an executing one at its next step; an ended one does not change."""
+    """Cancel a job. A queued job ends at once. An executing job ends at its next step. A job that has ended does not change."""
     find(state, caller, job_id)
     state.catalogue.jobs.cancel(job_id)
     return JobView.of(find(state, caller, job_id))
 
 
 def time_left_s(row: JobRow) -> float | None:
-    """Time that a running job still needs at its present speed; None if unknown."""
+    """Estimated time left of a running job at its present speed; None if unknown."""
     if (
         not KINDS[row.kind].counted_whole
         or row.phase != Phase.EXECUTING

@@ -21,7 +21,8 @@ router = APIRouter(tags=["lineage"], responses=RESPONSES)
 
 @router.get("/v1/psfs/{psf_id}/lineage", summary="The lineage of a PSF")
 def get_psf_lineage(psf_id: Identity, caller: Reading, state: Shared) -> Ancestor:
-    """Inputs by hash, parameters, versions of software and libraries, and job; also those of all PSFs that it was made from."""
+    """The inputs of the PSF (by hash), its parameters, the versions of software and libraries, and its job. The PSFs from which it
+    was made are described in the same way."""
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
         raise _missing("psf", psf_id)
@@ -30,7 +31,7 @@ def get_psf_lineage(psf_id: Identity, caller: Reading, state: Shared) -> Ancesto
 
 @router.get("/v1/products/{product_id}/lineage", summary="The lineage of a product")
 def get_product_lineage(product_id: Identity, caller: Reading, state: Shared) -> Ancestor:
-    """Image, parameters, versions of software and libraries, and job; also the lineage of its PSF."""
+    """The image, the parameters, the versions of software and libraries, and the job of the product; also the lineage of its PSF."""
     row = state.catalogue.get(ProductRow, product_id, caller.owner)
     if row is None:
         raise _missing("product", product_id)
@@ -39,13 +40,13 @@ def get_product_lineage(product_id: Identity, caller: Reading, state: Shared) ->
 
 @router.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again and compare")
 def rerun_psf(psf_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """Submit a job with the parameters of the PSF. Its result is a report on the differences from the first PSF."""
+    """Submit a job that makes the PSF again with the same parameters. The result is a report on the differences between both PSFs."""
     return _rerun("psf", psf_id, response, caller, state)
 
 
 @router.post("/v1/products/{product_id}/rerun", status_code=202, summary="Make a product again and compare")
 def rerun_product(product_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """Submit a job with the parameters of the product. Its result is a report on the differences from the first product."""
+    """Submit a job that makes the product again with the same parameters. The result is a report on the differences between both products."""
     return _rerun("product", product_id, response, caller, state)
 
 

@@ -30,12 +30,12 @@ class ProductView(BaseModel):
     bytes: int
     sha256: str = Field(description="SHA-256 of the file")
     details: dict[str, Any] = Field(
-        description="method, parameters, versions, and what changed in the image (`changes`)"
+        description="method, parameters, versions, and what the deconvolution changed in the image (`changes`)"
     )
     file: str = Field(description="address of the FITS file")
-    preview: str = Field(description="address of the picture of before, after and change")
+    preview: str = Field(description="address of a picture: the image before and after, and the change")
     changes: str | None = Field(
-        description="address of the picture of all changes; null: the job did not request it"
+        description="address of a picture of all changes; null: the request did not ask for it"
     )
 
     @classmethod
@@ -68,7 +68,7 @@ def list_products(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[ProductView]:
-    """Products, newest first. `image_id` and `psf_id` select those of one image or of one PSF."""
+    """Products, newest first. `image_id` and `psf_id` select the products of one image or of one PSF."""
     rows = state.catalogue.page(
         ProductRow,
         owner=caller.owner,
@@ -95,7 +95,11 @@ def get_product_file(product_id: Identity, request: Request, caller: Reading, st
     )
 
 
-@router.get("/{product_id}/preview", summary="Picture of before, after and change", response_class=Response)
+@router.get(
+    "/{product_id}/preview",
+    summary="Picture: the image before and after, and the change",
+    response_class=Response,
+)
 def get_product_preview(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The picture as PNG."""
     return files.send(
@@ -105,7 +109,7 @@ def get_product_preview(product_id: Identity, request: Request, caller: Reading,
 
 @router.get("/{product_id}/changes", summary="Picture of all changes", response_class=Response)
 def get_product_changes(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """Before, after, change, difference, ratio and histogram as PNG, if the job requested `changes_picture`."""
+    """A PNG that shows the image before and after, the change, difference, ratio and histogram, if the job had `changes_picture` true."""
     digest = _find(state, caller, product_id).details.get("changes_picture_sha256")
     if digest is None:
         raise Problem(

@@ -23,14 +23,14 @@ router = APIRouter(prefix="/v1/reports", tags=["reports"], responses=RESPONSES)
 
 
 class ReportView(BaseModel):
-    """The report of a job on a transit, or of a rerun."""
+    """The report of a job on a transit, or the report of a rerun."""
 
     id: str
     created_at: float
     kind: str
-    transit_id: str | None = Field(description="null: a report on a rerun")
+    transit_id: str | None = Field(description="id of the transit; null: the report is on a rerun")
     about_id: str | None = Field(
-        description="id of the PSF or product of a rerun; null: a report on a transit"
+        description="id of the PSF or product that was made again; null: the report is on a transit"
     )
     bytes: int
     details: dict[str, Any] = Field(description="the summary sentence and the main figures")
@@ -40,7 +40,7 @@ class ReportView(BaseModel):
         description="address of the report as a self-contained HTML page; null: the report has none"
     )
     output: str | None = Field(
-        description="address of the FITS file that a rerun made, which is in no list; null: not a rerun"
+        description="address of the FITS file that the rerun made; no list contains this file; null: the report is not on a rerun"
     )
 
     @classmethod
@@ -72,7 +72,7 @@ def list_reports(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[ReportView]:
-    """Reports, newest first. `transit_id` and `about_id` select those on one transit, PSF or product."""
+    """Reports, newest first. `transit_id` and `about_id` select the reports on one transit, PSF or product."""
     rows = state.catalogue.page(
         ReportRow,
         owner=caller.owner,
@@ -104,16 +104,18 @@ def get_report_preview(report_id: Identity, request: Request, caller: Reading, s
     """The figures of the report as PNG."""
     row = _find(state, caller, report_id)
     if row.preview_sha256 is None:
-        raise Problem(404, "no-preview", "expected a report with a picture; this one has none: read its file")
+        raise Problem(
+            404, "no-preview", "expected a report with a picture; this report has none: read its file"
+        )
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
 
 
 @router.get("/{report_id}/page", summary="The report as an HTML page", response_class=Response)
 def get_report_page(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """The report as HTML with its figures inside. Its headers forbid scripts and all other content."""
+    """The report as HTML with its figures inside. The headers of the answer forbid scripts and content from other addresses."""
     digest = _find(state, caller, report_id).details.get("page_sha256")
     if digest is None:
-        raise Problem(404, "no-page", "expected a report with a page; this one has none: read its file")
+        raise Problem(404, "no-page", "expected a report with a page; this report has none: read its file")
     answer = files.send(request, state.store, digest, "text/html; charset=utf-8", None)
     answer.headers["Content-Security-Policy"] = PAGE_POLICY
     return answer

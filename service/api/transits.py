@@ -35,7 +35,7 @@ class FileView(BaseModel):
 
 
 class TransitView(BaseModel):
-    """An uploaded transit: the content of its archive and of its transit.json."""
+    """An uploaded transit: properties of its archive, and the content of its transit.json."""
 
     id: str = Field(description="SHA-256 of the archive")
     created_at: float
@@ -45,7 +45,9 @@ class TransitView(BaseModel):
     instrument: str | None
     images: int
     pointings: list[PointingView]
-    noise: NoiseFigures | None = Field(description="noise figures; null: a job must give them")
+    noise: NoiseFigures | None = Field(
+        description="noise figures; null: the request for a job must give them"
+    )
     known_psf: str | None = Field(
         description="file of the known part of the PSF; null: the diffraction PSF of the instrument"
     )
@@ -85,7 +87,7 @@ async def upload_transit(
 ) -> TransitDetails:
     """Upload one archive: the images of a transit, their transit.json and, optionally, the known part of the PSF.
 
-    The table of contents and transit.json are checked now; the pixels are read by the job that uses the transit.
+    The table of contents and transit.json are checked at upload. The pixels are read by the jobs that use the transit.
     """
     settings, take = state.settings, Allowed(state, caller)
     async with uploads.receive_transit(

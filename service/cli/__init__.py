@@ -1,1 +1,1 @@
-"""The command line: one file for each command; `main` lists them."""
+"""The command line. Most files contain one command or one group of commands; `main` lists all commands."""

@@ -35,35 +35,37 @@ class _Condition(click.ParamType):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, str, Any]:
-        """Split a text such as WAVELNTH=174 into keyword, sign and value."""
+        """Split a text such as WAVELNTH=174 into keyword, comparison sign and value."""
         parts = _CONDITION.fullmatch(str(value).strip())
         if parts is None:
             self.fail(f"expected KEYWORD=VALUE, or != < <= > >= instead of =; got {value!r}", param, ctx)
         return parts[1], parts[2], _value(parts[3])
 
 
-@click.group()
+@click.group(short_help="Deconvolve many images on a service.")
 def bulk() -> None:
-    """Deconvolve many images on a service in the same way: uploads, or files of an archive that the service can read."""
+    """Deconvolve many images on a service in the same way: your own images, or files of an archive that the service can read."""
 
 
-@bulk.command("submit")
+@bulk.command("submit", short_help="Start a bulk run.")
 @click.argument("patterns", nargs=-1)
-@click.option("--psf", metavar="ID|FILE", help="PSF for all images: its id, or a file")
+@click.option("--psf", metavar="ID|FILE", help="PSF for all images: an id or a file")
 @click.option("--context", help="Choose the PSF of each image from this context: its id or name")
 @click.option("--upload", "uploads", multiple=True, type=click.Path(exists=True, path_type=Path),
-              help="FITS file, or folder of FITS files, to upload and deconvolve; may be given several times")  # fmt: skip
+              help="FITS file, or folder of FITS files, to upload and deconvolve; can be repeated")  # fmt: skip
 @click.option(
     "--image",
     "images",
     multiple=True,
     metavar="ID",
-    help="Image that was uploaded before; may be given several times",
+    help="Id of an uploaded image; can be repeated",
 )
 @click.option("--where", "conditions", multiple=True, type=_Condition(), metavar="KEYWORD=VALUE",
-              help="Take only files whose header says so; several conditions must all hold")  # fmt: skip
-@click.option("--output", help="Folder on the service's machine to write products to")
-@click.option("--only", is_flag=True, help="Write products only there; the service keeps no copy")
+              help="Use only files whose header meets this condition; several conditions must all be met")  # fmt: skip
+@click.option("--output", help="Write products to this folder on the machine of the service")
+@click.option(
+    "--only", is_flag=True, help="Write products only to the --output folder; the service keeps no copy"
+)
 @METHOD
 @STEPS
 @NOISE
@@ -88,7 +90,7 @@ def submit(
     wait: bool,
     server: str | None,
 ) -> None:
-    """Start a bulk run of the files that match PATTERNS on the machine of the service.
+    """Start a bulk run: deconvolve the files on the machine of the service that match PATTERNS.
 
     A pattern is an absolute path in a folder that the operator allows. * ? and [ab] match parts of a name, ** matches any
     number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context.
@@ -117,12 +119,12 @@ def submit(
         click.echo("\n".join(_said(made)))
 
 
-@bulk.command("status")
+@bulk.command("status", short_help="Show progress, speed and time left.")
 @click.argument("bulk_id", metavar="[ID]", required=False)
 @WAIT
 @SERVER
 def status(bulk_id: str | None, wait: bool, server: str | None) -> None:
-    """Show progress, speed and time left of a bulk run; without an ID, list all bulk runs."""
+    """Show the progress, speed and time left of a bulk run. Without an ID, list all bulk runs."""
     with user_errors(), remote(server) as service:
         if bulk_id is None:
             for row in service.bulks():
@@ -137,7 +139,7 @@ def status(bulk_id: str | None, wait: bool, server: str | None) -> None:
         click.echo("\n".join(_said(service.bulk(bulk_id))))
 
 
-@bulk.command("retry")
+@bulk.command("retry", short_help="Try failed images again.")
 @BULK_ID
 @SERVER
 def retry(bulk_id: str, server: str | None) -> None:
@@ -146,16 +148,16 @@ def retry(bulk_id: str, server: str | None) -> None:
         click.echo("\n".join(_said(service.retry_bulk(bulk_id))))
 
 
-@bulk.command("pause")
+@bulk.command("pause", short_help="Pause a bulk run.")
 @BULK_ID
 @SERVER
 def pause(bulk_id: str, server: str | None) -> None:
-    """Pause a bulk run: start no more images, but finish those in progress."""
+    """Pause a bulk run: start no more images, but finish the images in progress."""
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.pause_bulk(bulk_id))))
 
 
-@bulk.command("resume")
+@bulk.command("resume", short_help="Resume a paused or failed bulk run.")
 @BULK_ID
 @SERVER
 def resume(bulk_id: str, server: str | None) -> None:
@@ -164,16 +166,16 @@ def resume(bulk_id: str, server: str | None) -> None:
         click.echo("\n".join(_said(service.resume_bulk(bulk_id))))
 
 
-@bulk.command("cancel")
+@bulk.command("cancel", short_help="End a bulk run permanently.")
 @BULK_ID
 @SERVER
 def cancel(bulk_id: str, server: str | None) -> None:
-    """End a bulk run for good; products that are done stay."""
+    """End a bulk run permanently. Products that are done are kept."""
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.cancel_bulk(bulk_id))))
 
 
-@bulk.command("report")
+@bulk.command("report", short_help="Show artefact scores and failures.")
 @BULK_ID
 @click.option("-o", "--output", type=OUTPUT, help="Write the manifest of all products (.ndjson or .csv)")
 @click.option("--failures", type=OUTPUT, help="Write the failures with their reasons (.ndjson)")
@@ -182,7 +184,7 @@ def cancel(bulk_id: str, server: str | None) -> None:
 )
 @SERVER
 def report(bulk_id: str, output: Path | None, failures: Path | None, most: int, server: str | None) -> None:
-    """Show the results of a bulk run: images with the highest artefact score first, then failures."""
+    """Show the results of a bulk run: first the images, sorted by artefact score, then the failures."""
     check_writable(output, failures)
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.bulk(bulk_id))))
@@ -240,7 +242,7 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
-    """Conditions in the form of the request; several values of one keyword mean any of them."""
+    """The conditions as the request contains them. If a keyword has several values, any of them meets the condition."""
     where: dict[str, Any] = {}
     for key, sign, value in conditions:
         if sign == "=":
@@ -265,7 +267,8 @@ def _as_list(before: Any, key: str) -> list[Any]:
 
 
 def _value(text: str) -> bool | int | float | str:
-    """A value of T, F, a number, or else a text; quotation marks force a text."""
+    """The value of a text: T or F is a logical value, a number is a number, anything else is a text. Quotation marks make any value
+    a text."""
     if text in ("T", "F"):
         return text == "T"
     for kind in (int, float):

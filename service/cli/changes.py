@@ -1,4 +1,4 @@
-"""The command ``changes``: deconvolve several images and show what changed, the most doubtful first."""
+"""The command ``changes``: deconvolves several images and shows what changed, with the highest artefact scores first."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def changes(
     """Deconvolve IMAGES (FITS files, or folders of them); write a table of what changed and a contact sheet.
 
     Images with the highest artefact score come first. Images that cannot be deconvolved are listed with the reason.
-    Each image is deconvolved as by `heliopsf deconvolve`, with the same choice of PSF.
+    Each image gets the same PSF and the same treatment as by `heliopsf deconvolve`.
     """
     from psfcore.deconvolve.assess.contact_sheet import contact_sheet_png, table, treat_many
 
@@ -108,7 +108,7 @@ COMMANDS = (changes,)
 def _one_by_one(
     service: Operations, parameters: dict[str, Any], products: dict[str, dict[str, Any]]
 ) -> Callable[[str], Treated]:
-    """A function that deconvolves one image with the service and reads what changed; it adds the ids to ``products``."""
+    """A function that deconvolves one image with the service and measures what changed. It adds the ids of the products to ``products``."""
     from psfcore.deconvolve.assess.from_product import changes_in_product
 
     def one(name: str) -> Treated:

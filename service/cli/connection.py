@@ -1,4 +1,4 @@
-"""Where a command sends its request: to a service over HTTP, or to one inside this process."""
+"""Where a command sends its request: to a service over HTTP, or to a service inside this process."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def server_option(what: str) -> Callable[[Command], Command]:
         envvar="HELIOPSF_KEY",
         expose_value=False,
         callback=_remember,
-        help="Access key; better set HELIOPSF_KEY: other users can read command lines",
+        help="Access key. Other users can read command lines, so set HELIOPSF_KEY instead",
     )
     server = click.option("--server", envvar="HELIOPSF_SERVER", help=f"{what} [default: {DEFAULT_SERVER}]")
     return lambda command: server(key(command))
@@ -41,7 +41,7 @@ LOCAL = click.option("--local", is_flag=True, help="Run in this process, without
 PSF = click.option(
     "--psf",
     metavar="ID|FILE",
-    help="PSF: its id, or a file [default: the certified one for the image, else its instrument's]",
+    help="PSF: an id or a file [default: the certified PSF for the image, else the PSF built for its instrument]",
 )
 
 
@@ -54,7 +54,7 @@ def remote(server: str | None) -> Client:
 
 @contextmanager
 def connection(server: str | None, local: bool, *, gap_effects: str = "") -> Iterator[Operations]:
-    """A service over HTTP, or one in this process (``local``). gap_effects: further effects of the local one."""
+    """A service over HTTP, or with ``local`` a service in this process. gap_effects: further effects of the local service."""
     if not local:
         with remote(server) as service:
             service.health()

@@ -8,34 +8,34 @@ from service.cli.connection import SERVER, remote
 from service.cli.options import user_errors
 
 
-@click.group()
+@click.group(short_help="Pin sets of PSFs that never change.")
 def context() -> None:
     """Pin sets of PSFs that never change, so that years of work use the same PSFs."""
 
 
-@context.command("create")
+@context.command("create", short_help="Create a context from certified PSFs.")
 @click.argument("name")
 @click.option(
     "--psf",
     "psf_ids",
     multiple=True,
     metavar="ID",
-    help="Pin this PSF; may be given several times [default: all certified]",
+    help="Id of a PSF to pin; can be repeated [default: all certified PSFs]",
 )
 @click.option("--reason", default="", help="Reason, kept in the history")
 @SERVER
 def create(name: str, psf_ids: tuple[str, ...], reason: str, server: str | None) -> None:
-    """Make a context NAME of all PSFs that are certified now, or of the PSFs that you name."""
+    """Create a context NAME that pins all PSFs that are certified now, or the PSFs that you name."""
     pins = [{"psf_id": psf_id} for psf_id in psf_ids] or None
     with user_errors(), remote(server) as service:
         made = service.create_context(name, pins, reason=reason)
     click.echo(f"{made['id']}  {made['name']}  {made['size']} pinned")
 
 
-@context.command("list")
+@context.command("list", short_help="List contexts.")
 @SERVER
 def list_contexts(server: str | None) -> None:
-    """List contexts; * marks the default."""
+    """List contexts. A * marks the default context."""
     with user_errors(), remote(server) as service:
         default = service.default_context()["context"]
         rows = list(service.contexts())
@@ -46,7 +46,7 @@ def list_contexts(server: str | None) -> None:
         click.echo(f"{sign} {row['id']}  {row['name']}  {row['size']} pinned  {row['reason']}".rstrip())
 
 
-@context.command("show")
+@context.command("show", short_help="List the PSFs of a context.")
 @click.argument("name")
 @SERVER
 def show(name: str, server: str | None) -> None:
@@ -59,15 +59,18 @@ def show(name: str, server: str | None) -> None:
         click.echo(f"  {pin['line']}  {times}  {pin['version']}  {pin['psf_id']}")
 
 
-@context.command("use")
+@context.command("use", short_help="Set the default context.")
 @click.argument("name", required=False)
 @click.option(
-    "--none", "no_context", is_flag=True, help="Use no context: the PSFs that are certified at the moment"
+    "--none",
+    "no_context",
+    is_flag=True,
+    help="Set no default: use the PSFs that are certified at the time of a request",
 )
 @click.option("--reason", default="", help="Reason, kept in the history")
 @SERVER
 def use(name: str | None, no_context: bool, reason: str, server: str | None) -> None:
-    """Make the context NAME (or id) the default, which chooses the PSF if a request names no context."""
+    """Make the context NAME (or id) the default: the PSF is chosen from it if a request names no context."""
     if (name is None) != no_context:
         raise click.UsageError("expected either NAME or --none")
     with user_errors(), remote(server) as service:

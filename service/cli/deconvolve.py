@@ -1,4 +1,4 @@
-"""The command ``deconvolve``: one image."""
+"""The command ``deconvolve``: deconvolves one image."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CONTEXT = click.option("--context", help="Choose the PSF from this context: its 
 @click.option(
     "--edges",
     type=click.Choice(["zero", "symmetric", "extended"]),
-    help="What lies outside the image [default: the best for the method]",
+    help="Assumed scene outside the image [default: the method's own]",
 )
 @NOISE
 @SATURATION
@@ -44,7 +44,7 @@ CONTEXT = click.option("--context", help="Choose the PSF from this context: its 
     type=click.IntRange(0, 64),
     default=0,
     metavar="N",
-    help="Add a plane of errors from N >= 2 noise realisations; each costs one deconvolution",
+    help="Add an ERROR plane from N >= 2 noise realisations; each takes as long as one deconvolution",
 )
 @click.option("--plot", type=OUTPUT, help="Write the image before and after (PNG)")
 @click.option("--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG)")

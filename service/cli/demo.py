@@ -1,4 +1,4 @@
-"""The command ``demo``: one image from upload to product, on a service that is started for it and stopped afterwards."""
+"""The command ``demo``: starts a service, processes one image from upload to product, and stops the service."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.client.versions import Progress
 
 
 @click.command()
-@click.option("--image", type=FILE, help="Your own image (FITS) [default: a simulated one]")
+@click.option("--image", type=FILE, help="Your own image (FITS) [default: a simulated image]")
 @click.option(
     "-o",
     "--output",
@@ -32,7 +32,7 @@ def demo(image: Path | None, output: Path) -> None:
 
 
 def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
-    """Serve on a free port, upload, deconvolve, download, stop. Returns lines to print."""
+    """Start a service on a free port, upload and deconvolve an image, download the product, stop the service. Returns lines to print."""
     output.mkdir(parents=True, exist_ok=True)
     with (output / "server.log").open("w") as log:
         server = subprocess.Popen(
@@ -46,7 +46,7 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
                 "--data",
                 str(output / "data"),
             ],
-            # The demo uses a service of its own, whatever service the environment names.
+            # The demo uses its own service, even if the environment names another service.
             env={key: value for key, value in os.environ.items() if not key.startswith("HELIOPSF_")},
             stdout=subprocess.PIPE,
             stderr=log,
@@ -74,7 +74,7 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
 
 
 def _address(server: subprocess.Popen[str], output: Path) -> str:
-    """The address of the server, which it prints when it listens."""
+    """The address of the server, which the server prints when it starts to listen."""
     assert server.stdout is not None
     line = server.stdout.readline()
     if " serves " not in line:
@@ -87,7 +87,7 @@ def _address(server: subprocess.Popen[str], output: Path) -> str:
 
 def _simulated(service: Client, output: Path, progress: Progress) -> Path:
     """A simulated image, convolved with the PSF that the service builds."""
-    # Imported here: a demo with the user's own image does not need it.
+    # The simulation is imported here, because a demo with the user's own image does not need it.
     from psfcore.fits.header import FitsLimits
     from psfcore.fits.psfs import read_psf
     from psfcore.simulate.observe import demo_image

@@ -1,6 +1,6 @@
 """The studies ``fresnel``, ``arms`` and ``design``, which run in this process.
 
-A command imports what is numerical when it is called, so that the others start fast.
+A command imports numerical libraries only when it is called, so that other commands start fast.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ INSTRUMENT = click.option(
 @PLOT
 @click.option(
     "--distances",
-    help="Distances from filter wheel to detector, mm, such as 50,273,550 [default: the seven of the paper]",
+    help="Distances from filter wheel to detector, mm, such as 50,273,550 [default: the seven distances of the paper]",
 )
 @click.option(
     "--phases",
@@ -49,7 +49,7 @@ INSTRUMENT = click.option(
 @click.option(
     "--windows",
     type=click.IntRange(1),
-    help="Number of terms of the analytic series [default: the instrument's]",
+    help="Number of terms of the analytic series [default: from the instrument file]",
 )
 def fresnel(
     instrument: str,
@@ -79,7 +79,7 @@ def fresnel(
     focus = study.focus
     click.echo(
         f"best focus: mirrors {focus.separation_mm:.3f} mm apart, {focus.shift_mm:+.3f} mm from the distance in the drawing "
-        f"(which gives a blur of {focus.printed_blur_px:.0f} px); focal length {focus.focal_length_mm:.1f} mm"
+        f"(the drawing gives a blur of {focus.printed_blur_px:.0f} px); focal length {focus.focal_length_mm:.1f} mm"
     )
     click.echo("distance (mm)   largest difference, mean over phases   single phases")
     for at in study.distances:

@@ -1,4 +1,4 @@
-"""The command ``flare``: a PSF tested on the stray light of a flare."""
+"""The command ``flare``: tests a PSF on the stray light of a flare."""
 
 from __future__ import annotations
 

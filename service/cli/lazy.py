@@ -11,7 +11,7 @@ import click
 
 
 class Lazy(NamedTuple):
-    """A command that is not imported yet: the file and the name in it, and the line that ``--help`` shows."""
+    """A command that is not imported yet: its module, its name in the module, and the line that ``--help`` shows."""
 
     module: str
     name: str
@@ -21,8 +21,8 @@ class Lazy(NamedTuple):
 class LazyGroup(click.Group):
     """Commands under headings. A command's file is imported when the command is called.
 
-    sections: the rows of each heading by command name. renamed: old names of commands and options, with the new
-    names; whoever types an old one is told the new one.
+    sections: the commands under each heading, by name. renamed: from former names of commands and options to the new
+    names. The error about a former name names the new one.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that the arguments call. Raises ``UsageError`` that names the command the user may mean."""
+        """The command that the arguments call. If there is none, the ``UsageError`` names the command that the user may mean."""
         wanted = args[0]
         if wanted not in self.rows and not wanted.startswith("-"):
             meant = self._renamed.get(wanted) or next(iter(get_close_matches(wanted, self.rows, n=1)), None)
@@ -61,7 +61,7 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command. For an option that was renamed, the error names the new option."""
+        """Run a command. If the user gives the former name of an option, the error names the new option."""
         try:
             return super().invoke(ctx)
         except click.NoSuchOption as error:

@@ -1,4 +1,4 @@
-"""The ``heliopsf`` command: which commands there are, and in which file each is."""
+"""The ``heliopsf`` command: lists all commands, and the file of each command."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from service.cli.lazy import Lazy, LazyGroup
 SECTIONS = {
     "Images": {
         "deconvolve": Lazy("service.cli.deconvolve", "deconvolve", "Deconvolve one image."),
-        "changes": Lazy("service.cli.changes", "changes", "Deconvolve several images and show what changed."),
+        "changes": Lazy("service.cli.changes", "changes", "Deconvolve images and show what changed."),
     },
     "PSFs": {
         "psf": Lazy("service.cli.psf.group", "psf", "Build, fit, inspect, certify and list PSFs."),
         "context": Lazy("service.cli.context", "context", "Pin sets of PSFs that never change."),
     },
     "Transits": {
-        "report": Lazy("service.cli.report", "report", "Fit a PSF to a transit, or test one on it."),
-        "gap": Lazy("service.cli.gap.diagnose", "gap", "Find out why a fitted PSF and a transit differ."),
+        "report": Lazy("service.cli.report", "report", "Fit a PSF to a transit, or test a PSF on it."),
+        "gap": Lazy("service.cli.gap.diagnose", "gap", "Find why a fitted PSF and a transit differ."),
         "simulate": Lazy("service.cli.simulate", "simulate", "Simulate transits whose PSF is known."),
     },
     "Archives": {
@@ -26,7 +26,7 @@ SECTIONS = {
     "Service and operation": {
         "serve": Lazy("service.cli.serve", "serve", "Start a service."),
         "worker": Lazy("service.cli.serve", "worker", "Start a worker for a service with a broker."),
-        "demo": Lazy("service.cli.demo", "demo", "Try everything once, with a service of its own."),
+        "demo": Lazy("service.cli.demo", "demo", "Process one image with a temporary service."),
         "doctor": Lazy("service.cli.operator.doctor", "doctor", "Check settings, database, broker and disk."),
         "database": Lazy("service.cli.operator.database", "database", "Show or upgrade the database's tables."),
         "store": Lazy("service.cli.operator.store", "store", "Clean up stored files; set quotas."),
@@ -35,8 +35,8 @@ SECTIONS = {
     "Studies": {
         "arms": Lazy("service.cli.diffraction", "arms", "Measure the diffraction arms around a flare."),
         "flare": Lazy("service.cli.flare", "flare", "Test a PSF on the stray light of a flare."),
-        "fresnel": Lazy("service.cli.diffraction", "fresnel", "Compare the diffraction with Fresnel propagation."),
-        "design": Lazy("service.cli.diffraction", "design", "Tabulate diffraction by mesh pitch and wire width."),
+        "fresnel": Lazy("service.cli.diffraction", "fresnel", "Test the diffraction by Fresnel propagation."),
+        "design": Lazy("service.cli.diffraction", "design", "Tabulate diffraction for mesh designs."),
     },
 }  # fmt: skip
 RENAMED = {
@@ -58,6 +58,6 @@ RENAMED = {
 def main() -> None:
     """Determine the point-spread functions (PSFs) of solar EUV telescopes, and deconvolve images.
 
-    Most commands send a request to a service (--server; start one with `heliopsf serve`).
-    With --local they run in this process and need no service. Help on one: heliopsf COMMAND -h
+    Most commands send a request to a service (option --server). `heliopsf serve` starts a service.
+    With --local these commands run in this process and need no service. For help on a command: heliopsf COMMAND -h
     """

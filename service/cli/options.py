@@ -1,6 +1,6 @@
-"""What commands share: options, settings, errors in one line, checks of output files, and a progress bar.
+"""Code that commands share: options, settings, errors in one line, checks of output files, and a progress bar.
 
-This file imports nothing numerical, so that commands start fast.
+This file imports no numerical libraries, so that commands start fast.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ METHOD = click.option(
     "--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True, help="Deconvolution method"
 )
 STEPS = click.option(
-    "--steps", type=click.IntRange(1, 200), help="Iterations [default: the method's own; Richardson-Lucy: 20]"
+    "--steps",
+    type=click.IntRange(1, 200),
+    help="Number of iterations [default: depends on the method; Richardson-Lucy: 20]",
 )
 NOISE = click.option(
     "--noise",
@@ -50,7 +52,7 @@ SATURATION = click.option(
     "saturation_dn",
     type=float,
     metavar="DN",
-    help="Level from which pixels are saturated and ignored",
+    help="Pixels at or above this level are saturated and are ignored",
 )
 SEED = click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Seed of random numbers"
@@ -88,7 +90,7 @@ def check_fresh_folder(folder: Path, *, force: bool = False) -> None:
 
 
 def write_json(path: Path | None, content: dict[str, Any]) -> None:
-    """Write ``content`` to ``path``, if one is given. Raises ``ClickException`` if the file cannot be written."""
+    """Write ``content`` to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
     if path is None:
         return
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
@@ -99,7 +101,7 @@ def write_json(path: Path | None, content: dict[str, Any]) -> None:
 
 
 def fits_files(paths: Sequence[Path]) -> list[Path]:
-    """Files as named, each once; a folder stands for the FITS files in it, by name."""
+    """The named files, each once. A folder is replaced by the FITS files in it, sorted by name."""
     found: list[Path] = []
     for path in paths:
         found += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
@@ -111,7 +113,7 @@ def _is_fits(path: Path) -> bool:
 
 
 def is_psf_id(psf: str) -> bool:
-    """Whether a text is the id of a PSF; else it names a file."""
+    """Whether a text is the id of a PSF. Otherwise it is the name of a file."""
     return re.fullmatch(r"[0-9a-f]{64}", psf) is not None
 
 
@@ -134,7 +136,7 @@ def read_settings(data: Path | None = None) -> Settings:
 
 
 def limits() -> FitsLimits:
-    """The largest FITS file that a command reads, as HELIOPSF_MAX_PIXELS says."""
+    """The limits on FITS files that a command reads, from HELIOPSF_MAX_PIXELS."""
     from psfcore.fits.header import FitsLimits
 
     return FitsLimits(max_pixels=read_settings().max_pixels)
@@ -142,7 +144,7 @@ def limits() -> FitsLimits:
 
 @contextmanager
 def progress_bar() -> Iterator[Report]:
-    """A progress bar with the estimated time left; silent if standard error is not a terminal."""
+    """A progress bar with the estimated time left. It shows nothing if standard error is not a terminal."""
     if not sys.stderr.isatty():
         yield lambda stage, step, steps: None
         return

@@ -1,4 +1,4 @@
-"""The command ``report``: what a transit says about a PSF."""
+"""The command ``report``: tests a PSF on a transit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from service.cli.options import (
 @JSON
 @PLOT
 @click.option(
-    "--psf", metavar="ID|FILE", help="Test this PSF: its id, or a file [default: fit one to TRANSIT]"
+    "--psf", metavar="ID|FILE", help="Test this PSF: an id or a file [default: fit a PSF to TRANSIT]"
 )
 @click.option(
     "--dark-offsets/--no-dark-offsets",
@@ -38,7 +38,7 @@ from service.cli.options import (
 @click.option(
     "--shapes",
     is_flag=True,
-    help="Also compare shapes of the scatter kernel by held-out errors (slow); without --psf",
+    help="Also compare shapes of the scatter kernel by their residuals on held-out images (slow); not with --psf",
 )
 @SEED
 @NOISE
@@ -59,10 +59,10 @@ def report(
     server: str | None,
     local: bool,
 ) -> None:
-    """Fit a PSF to TRANSIT, or test one on it: compare simulated and observed light in the occulter's disc.
+    """Fit a PSF to TRANSIT, or test a PSF on it: compare simulated and observed light in the occulter's disc.
 
-    TRANSIT is a folder with a transit.json, or a .zip or .tar file of one. Without --psf every image is tested with a PSF
-    that was fitted without it. Name at least one output: -o, --json or --plot.
+    TRANSIT is a folder with a transit.json, or a .zip or .tar file of such a folder. Without --psf every image is tested with
+    a PSF that was fitted to other images. Name at least one output: -o, --json or --plot.
     """
     if output is None and json_file is None and plot is None:
         raise click.UsageError(
@@ -70,7 +70,7 @@ def report(
         )
     if shapes and psf is not None:
         raise click.UsageError(
-            "--shapes fits every shape itself, so it cannot be used with --psf; leave one out"
+            "--shapes fits every shape to TRANSIT, so it cannot be used with --psf: remove one of the two"
         )
     check_writable(output, json_file, plot)
     with (

@@ -20,8 +20,8 @@ from workers.contract.queues import Queue, queues_named
 def serve(host: str, port: int, data: Path | None) -> None:
     """Start a service over HTTP, and keep it running until it is interrupted.
 
-    Without a broker (HELIOPSF_BROKER_URL) it also starts a worker. If other machines can reach the address, every
-    request needs a key: `heliopsf key create`.
+    If no broker is set (HELIOPSF_BROKER_URL), the command also starts a worker. If other machines can reach the address, every
+    request needs a key; make keys with `heliopsf key create`.
     """
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -50,7 +50,7 @@ def serve(host: str, port: int, data: Path | None) -> None:
 
 @click.command()
 @click.option("--processes", type=click.IntRange(1), help="Number of worker processes [default: 1]")
-@click.option("--queues", help=f"Queues to serve, from {', '.join(Queue)}, with commas [default: all]")
+@click.option("--queues", help=f"Queues to serve, separated by commas: {', '.join(Queue)} [default: all]")
 @DATA
 @click.option("--stop-with-parent", type=int, metavar="PID", hidden=True)
 def worker(
@@ -58,8 +58,8 @@ def worker(
 ) -> None:
     """Run jobs from the broker until interrupted. Start one worker on each machine.
 
-    Jobs that people wait for (queue interactive) run first, then cross-validations (crossval), then bulk runs (bulk),
-    in whatever order you name the queues.
+    Jobs that people wait for (queue interactive) run first, then cross-validations (crossval), then bulk runs (bulk).
+    The order of the queues in --queues has no effect.
     """
     from service.server import environment
 

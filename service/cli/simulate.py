@@ -1,6 +1,6 @@
-"""The commands ``simulate transit`` and ``simulate bound``: transits whose PSF is known.
+"""The commands ``simulate transit`` and ``simulate bound``: simulate transits whose PSF is known.
 
-A command imports what is numerical when it is called, so that the others start fast.
+A command imports numerical libraries only when it is called, so that other commands start fast.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 THREADS = 2
 
 
-@click.group()
+@click.group(short_help="Simulate transits whose PSF is known.")
 def simulate() -> None:
-    """Simulate transits whose PSF is known, and compute how well it can be recovered."""
+    """Simulate transits whose PSF is known, and compute how exactly a fit can recover this PSF."""
 
 
-@simulate.command()
+@simulate.command(short_help="Write a simulated transit.")
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder to write to")
 @click.option(
     "--size",
@@ -68,7 +68,7 @@ def simulate() -> None:
     default="dark",
     show_default=True,
     type=click.Choice(["dark", "on"]),
-    help="Sky outside the field: dark, or the scene goes on",
+    help="Sky outside the field of view. dark: no light; on: the scene continues",
 )
 @click.option(
     "--saturation",
@@ -90,14 +90,14 @@ def simulate() -> None:
 @click.option(
     "--diffraction-size",
     type=int,
-    help="Width and height of the instrument's, px [default: 2 x size, at most 2048]",
+    help="Width and height of the instrument's diffraction PSF, px [default: 2 x size, at most 2048]",
 )
 @click.option(
     "--scene",
     "scene_files",
     multiple=True,
     type=FILE,
-    help="Take the scene from this image (FITS): one for all pointings, or one for each",
+    help="Take the scene from this image (FITS). Give one image, or one for each pointing",
 )
 @click.option("--force", is_flag=True, help="Write even if the folder is not empty")
 def transit(
@@ -148,11 +148,11 @@ def transit(
         f"{', '.join(f'{t:g}' for t in exposures)} s"
     )
     click.echo(
-        f"scatter b {b_px:g} px, c {c:g}, total {total:g}; the true values are in {output / 'truth.json'}"
+        f"scatter b {b_px:g} px, c {c:g}, total {total:g}; the file of true values is {output / 'truth.json'}"
     )
 
 
-@simulate.command()
+@simulate.command(short_help="Compute the smallest possible errors.")
 @click.argument("folder", type=FOLDER)
 @JSON
 def bound(folder: Path, json_file: Path | None) -> None:

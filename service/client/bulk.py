@@ -1,4 +1,4 @@
-"""The requests of a client about bulk runs, and how it follows jobs and bulk runs by their events."""
+"""The client's requests about bulk runs, and how the client follows jobs and bulk runs by their events."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0
 PATIENCE_S = 600.0
-PASSING = (None, 429, 502, 503)  # no answer, or an answer that asks to try again later
-QUIET_S = 60.0  # a stream sends at least one line in 15 s
+PASSING = (None, 429, 502, 503)  # statuses after which a request is tried again; None: no answer
+QUIET_S = (
+    60.0  # longest silence before the stream counts as broken; a stream sends a line at least every 15 s
+)
 
 
 class BulkClient(ABC):
@@ -60,11 +62,11 @@ class BulkClient(ABC):
         name: str = "",
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Start a bulk run and return its description. If an equal bulk run is open, return that one.
+        """Start a bulk run and return its description. If a bulk run of an identical request is open, return the description of that run.
 
         images: ids of uploaded images. files: patterns of paths on the machine of the service, or {"glob": pattern,
-        "where": conditions on the header}. Give either psf_id or context (id or name). output: folder on that machine;
-        only: write products only there. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
+        "where": conditions on the header}. Give either psf_id or context (id or name). output: folder on that machine for the
+        products. only: write the products only to this folder. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
         ``error_draws``.
         """
         return self._json(
@@ -98,11 +100,11 @@ class BulkClient(ABC):
         return self._json("POST", f"/v1/bulk/{bulk_id}/resume")
 
     def cancel_bulk(self, bulk_id: str) -> dict[str, Any]:
-        """End a bulk run for good; products that are done stay."""
+        """End a bulk run permanently. Products that are done are kept."""
         return self._json("POST", f"/v1/bulk/{bulk_id}/cancel")
 
     def retry_bulk(self, bulk_id: str) -> dict[str, Any]:
-        """Try the failed images again. ``ServiceError`` "equal-bulk-open": another bulk run of the same request is open."""
+        """Try the failed images again. Raises ``ServiceError`` "equal-bulk-open" if another bulk run of the same request is open."""
         return self._json("POST", f"/v1/bulk/{bulk_id}/retry")
 
     def bulk_failures(self, bulk_id: str) -> Iterator[dict[str, Any]]:
@@ -112,14 +114,14 @@ class BulkClient(ABC):
     def bulk_results(
         self, bulk_id: str, *, order: str = "bulk", limit: int | None = None
     ) -> Iterator[dict[str, Any]]:
-        """The images that are done, with checksums and changes; ``order="worst"``: highest artefact score first."""
+        """The images that are done, with checksums and changes. ``order="worst"`` puts the highest artefact score first."""
         query = {"order": order} | ({} if limit is None else {"limit": str(limit)})
         with self._streamed(f"/v1/bulk/{bulk_id}/results", params=query) as answer:
             for line in answer.iter_lines():
                 yield json.loads(line)
 
     def write_bulk_manifest(self, bulk_id: str, path: str | Path, *, format: str = "ndjson") -> None:
-        """Write the manifest of all products, as lines of JSON ("ndjson") or as a table ("csv")."""
+        """Write the manifest of all products, as JSON lines ("ndjson") or as a table ("csv")."""
         self.download(f"/v1/bulk/{bulk_id}/results?format={format}", path)
 
     def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> dict[str, Any]:
@@ -135,7 +137,8 @@ class BulkClient(ABC):
     def follow(self, address: str) -> Iterator[dict[str, Any]]:
         """Yield the description of a job or bulk run (address ``/v1/jobs/...``, ``/v1/bulk/...``) now and after each change.
 
-        Ends when the job or bulk run ends. Survives an absence of the service for some minutes, such as a restart.
+        The iteration ends when the job or bulk run ends. If the service does not answer for some minutes, for example during a
+        restart, the client tries again.
         """
         last_id: str | None = None
         wait_s, heard_at = FIRST_WAIT_S, time.monotonic()

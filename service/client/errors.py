@@ -7,7 +7,7 @@ class ServiceError(Exception):
     """A request was refused, a job failed, or no service answered. The message says why.
 
     status: HTTP status; None if there was no answer. code: the reason as a word, such as "no-such-psf".
-    retry_after_s: when the service asks to try again.
+    retry_after_s: time after which the service asks to try again, s.
     """
 
     def __init__(

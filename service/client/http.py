@@ -1,4 +1,4 @@
-"""A client for scripts: ``with Client("http://127.0.0.1:8765") as client: client.deconvolve("in.fits", "out.fits")``."""
+"""An HTTP client for scripts: ``with Client("http://127.0.0.1:8765") as client: client.deconvolve("in.fits", "out.fits")``."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class Client(VersionedPsfs, BulkClient, Operations):
         key: str | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        """server: its address; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY.
+        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY.
 
         Raises ``ServiceError`` "bad-key" if the key cannot be sent.
         """
         self.server = server or os.environ.get("HELIOPSF_SERVER", DEFAULT_SERVER)
         key = (key or os.environ.get("HELIOPSF_KEY", "")).strip()
         if not (key.isascii() and key.isprintable()) or " " in key:
-            # Checked here, because the HTTP library's message about a header that it cannot send shows the header.
+            # The key is checked here. Otherwise the HTTP library would print the key in its error about a bad header.
             raise ServiceError(
                 "expected a key of the form hpsf_ID_SECRET; got something else", code="bad-key"
             )
@@ -80,7 +80,7 @@ class Client(VersionedPsfs, BulkClient, Operations):
         return self._upload("/v1/images", Path(path), {})
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
-        """Upload a transit: a folder, or an archive of one. Returns its description, with its ``id``."""
+        """Upload a transit: a folder, or an archive of a folder. Returns the description of the transit, with its ``id``."""
         with as_archive(Path(path)) as archive:
             return self._upload("/v1/transits", archive, {}, media_type="application/octet-stream")
 
@@ -99,9 +99,9 @@ class Client(VersionedPsfs, BulkClient, Operations):
         return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
 
     def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """Submit a job; returns its description. If an equal job was done before, it has ended already.
+        """Submit a job; returns its description. If an identical job was done before, the description is of that job, which has already ended.
 
-        queue: "bulk" runs it after all jobs that people wait for; default: the queue of its kind.
+        queue: "bulk" runs the job after all jobs that people wait for; default: the queue of its kind.
         """
         body = {"kind": kind, "queue": queue, "parameters": parameters}
         return self._json("POST", "/v1/jobs", json=body)
@@ -119,7 +119,7 @@ class Client(VersionedPsfs, BulkClient, Operations):
     ) -> dict[str, Any]:
         """Wait until a job is completed; returns its description.
 
-        Raises ``ServiceError`` if it failed or was cancelled, ``TimeoutError`` after ``timeout_s``.
+        Raises ``ServiceError`` if the job failed or was cancelled, and ``TimeoutError`` after ``timeout_s``.
         """
         started = time.monotonic()
         while job["phase"] in ("QUEUED", "EXECUTING"):
@@ -132,7 +132,7 @@ class Client(VersionedPsfs, BulkClient, Operations):
         return self._ended(job)
 
     def _job_patiently(self, job_id: str) -> dict[str, Any]:
-        """The description of a job; tries again if the service does not answer for a moment, as in a restart."""
+        """The description of a job. If the service does not answer for a short time, as during a restart, the request is repeated."""
         deadline = time.monotonic() + PATIENCE_S
         while True:
             try:
@@ -163,7 +163,7 @@ class Client(VersionedPsfs, BulkClient, Operations):
         return self._all("/v1/products", filters)
 
     def download(self, address: str, path: str | Path) -> None:
-        """Download a file of the service. ``path`` appears only when it is complete."""
+        """Download a file of the service. The file appears at ``path`` only when it is complete."""
         target = Path(path)
         partial = target.with_name(target.name + ".part")
         try:
@@ -175,7 +175,7 @@ class Client(VersionedPsfs, BulkClient, Operations):
             partial.unlink(missing_ok=True)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """The answer of the service to a question about a PSF."""
+        """The answer of the service to a query about a PSF."""
         parameters = {
             name: ",".join(f"{number!r}" for number in value) if isinstance(value, list) else value
             for name, value in query.items()
@@ -234,7 +234,7 @@ class Client(VersionedPsfs, BulkClient, Operations):
 
 @contextmanager
 def as_archive(path: Path) -> Iterator[Path]:
-    """The archive at ``path``; for a folder, a temporary archive of it."""
+    """The archive at ``path``. If ``path`` is a folder, a temporary archive of this folder."""
     if not path.is_dir():
         yield path
         return

@@ -1,4 +1,4 @@
-"""The requests to a service, built on a few operations that differ between HTTP and a service in this process."""
+"""The requests to a service. They use a few abstract operations, which HTTP and a service in this process implement differently."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Operations(ABC):
 
     @abstractmethod
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
-        """Upload a transit: a folder, or an archive of one. Returns its description, with its ``id``.
+        """Upload a transit: a folder, or an archive of a folder. Returns the description of the transit, with its ``id``.
 
-        Of a folder, transit.json and the files that it names are sent, always as the same bytes.
+        From a folder, transit.json and the files that it names are sent. The same folder always gives the same bytes.
         """
 
     @abstractmethod
@@ -40,16 +40,16 @@ class Operations(ABC):
     ) -> dict[str, Any]:
         """Upload a PSF (FITS); returns its description, with its ``id``.
 
-        instrument, channel, kind: needed if the file does not say them; ``kind="total"`` is a total PSF.
+        instrument, channel, kind: needed if the file does not contain them; a total PSF has ``kind="total"``.
         """
 
     @abstractmethod
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
-        """Submit a job; returns its description. If an equal job was done before, it has ended already."""
+        """Submit a job; returns its description. If an identical job was done before, the description is of that job, which has already ended."""
 
     @abstractmethod
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
-        """Wait until a job is completed; returns its description. Raises ``ServiceError`` if it ends otherwise."""
+        """Wait until a job is completed; returns its description. Raises ``ServiceError`` if the job fails or is cancelled."""
 
     @abstractmethod
     def get(self, address: str) -> dict[str, Any]:
@@ -89,9 +89,9 @@ class Operations(ABC):
         """Upload an image, deconvolve it and download the product to ``output``; returns the description of the product.
 
         psf_id: default: the certified PSF for the image in ``context`` (id or name; default: the default context), else
-        that of its instrument. noise: photon gain (DN per photon) and read noise (DN rms). error_draws: number of noise
-        realisations for an ERROR plane, 0 or at least 2. preview, changes: where to write the pictures of before and
-        after, and of difference, ratio and histograms (PNG). method_parameters: as ``steps=20``,
+        the PSF that is built for the instrument. noise: photon gain (DN per photon) and read noise (DN rms). error_draws: number of noise
+        realisations for an ERROR plane, 0 or at least 2. preview, changes: where to write the picture of the image
+        before and after, and the picture of difference, ratio and histograms (PNG). method_parameters: for example ``steps=20``,
         ``stop="discrepancy"``, ``edges="zero"``.
         """
         wanted = {
@@ -124,8 +124,8 @@ class Operations(ABC):
         """Compute the PSF of an instrument and download it to ``output``; returns its description.
 
         instrument: the name of a known instrument, or the path of an instrument file (TOML). size: width and height, px.
-        component: one component alone, such as "diffraction". mask: the mask image (FITS) that the mount in an
-        instrument file names.
+        component: build only this component, such as "diffraction". mask: the mask image (FITS), if the
+        mount in the instrument file names one.
         """
         wanted: dict[str, Any] = {"size": size, "component": component}
         if isinstance(instrument, Path) or instrument.endswith(".toml"):
@@ -152,7 +152,7 @@ class Operations(ABC):
     ) -> dict[str, Any]:
         """Upload a transit (folder or archive), fit its scatter kernel and download the PSF; returns its description.
 
-        report, preview: where to write the report (JSON) and the plot (PNG). noise: as for ``deconvolve``. parameters: as
+        report, preview: where to write the report (JSON) and the plot (PNG). noise: as for ``deconvolve``. parameters: for example
         ``shape="stretched"``, ``as_published=True``.
         """
         psf = self._on_transit("psf-fit", transit, progress, noise, parameters)
@@ -193,7 +193,7 @@ class Operations(ABC):
         """Upload a transit, make a report on its PSF and download it; returns its description.
 
         report, page, preview: where to write the report as JSON, as HTML, and its plot (PNG). noise: as for
-        ``deconvolve``. parameters: ``psf_id`` of a PSF to test (default: fit one), ``seed``, ``dark_offsets``, ``shapes``.
+        ``deconvolve``. parameters: ``psf_id`` of a PSF to test (default: fit a PSF), ``seed``, ``dark_offsets``, ``shapes``.
         """
         found = self._on_transit("report", transit, progress, noise, parameters)
         self._fetch(found, report, preview)
@@ -212,7 +212,7 @@ class Operations(ABC):
         noise: tuple[float, float] | None = None,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, diagnose the gap between it and the fitted model, and download the report; its description.
+        """Upload a transit, diagnose the gap between it and the fitted model, and download the report; returns its description.
 
         report, page, preview, noise: as for ``report``. parameters: ``psf_id`` of a fitted PSF to start from, ``seed``,
         ``correct``. If an effect was found, ``details.corrected_psf_id`` is the id of the PSF that includes it.
@@ -237,11 +237,11 @@ class Operations(ABC):
         return self.get(self.wait(job, progress=progress)["result"])
 
     def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
-        """Light beyond radii (px) in percent, by component, with errors; without radii the whole table."""
+        """Light beyond radii (px) in percent, by component, with errors; without ``radii``, at all radii of the table."""
         return self.answer([psf_id], "curve", {} if radii is None else {"radii": list(radii)})
 
     def psf_profile(self, psf_id: str) -> dict[str, Any]:
-        """Mean weight of a pixel by radius, by component."""
+        """Mean weight of the pixels at each radius, for each component."""
         return self.answer([psf_id], "profile", {})
 
     def psf_encircled(self, psf_id: str, radius: float) -> dict[str, Any]:
@@ -257,7 +257,7 @@ class Operations(ABC):
         return self.answer([psf_id, other_id], f"compare/{other_id}", {})
 
     def answer(self, psf_ids: list[str], question: str, query: dict[str, Any]) -> dict[str, Any]:
-        """The answer to a question; missing tables, as those of an uploaded PSF, are made first."""
+        """The answer to a query. If tables are missing, for example of an uploaded PSF, they are made first."""
         try:
             return self.ask(psf_ids[0], question, **query)
         except ServiceError as error:
@@ -286,7 +286,7 @@ class Operations(ABC):
 
 
 def _given(parameters: dict[str, Any]) -> dict[str, Any]:
-    """The parameters that were given; the service has defaults for the others."""
+    """The parameters that are not None. The service has defaults for the others."""
     return {name: value for name, value in parameters.items() if value is not None}
 
 

@@ -1,4 +1,4 @@
-"""The requests of a client about PSF versions: status, best PSF, contexts, lineage, reruns."""
+"""The client's requests about PSF versions: status, best PSF, contexts, lineage, reruns."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class VersionedPsfs(ABC):
         """All items of a list."""
 
     def psf_status(self, psf_id: str) -> dict[str, Any]:
-        """The status of a PSF, the statuses that may follow, the next version of its series, and its history."""
+        """The status of a PSF, the status changes that are allowed, a free version of its series, and its history."""
         return self.get(f"/v1/psfs/{psf_id}/status")
 
     def certify_psf(
@@ -53,7 +53,7 @@ class VersionedPsfs(ABC):
         """Certify a draft under a version, or change the time range of a certified PSF. Returns its new status.
 
         supersedes: certified PSFs to deprecate in the same step. series: ``instrument``, ``channel`` and ``kind`` of an
-        uploaded PSF, if its file does not say them.
+        uploaded PSF, if its file does not contain them.
         """
         body = {
             "status": "certified",
@@ -67,14 +67,14 @@ class VersionedPsfs(ABC):
         return self._json("POST", f"/v1/psfs/{psf_id}/status", json=body)
 
     def deprecate_psf(self, psf_id: str, successor: str | None = None, *, reason: str = "") -> dict[str, Any]:
-        """Deprecate a certified PSF, or name the successor of a deprecated one. Returns its new status."""
+        """Deprecate a certified PSF, or name the successor of a deprecated PSF. Returns its new status."""
         body = {"status": "deprecated", "successor": successor, "reason": reason}
         return self._json("POST", f"/v1/psfs/{psf_id}/status", json=body)
 
     def best_psf(self, **filters: str | None) -> dict[str, Any]:
         """The one PSF that fits ``instrument``, ``channel``, ``kind``, ``version``, ``valid_at``, ``context``, ...
 
-        Its description is under "psf". Raises ``ServiceError`` "no-psf-fits" or "several-psfs-fit".
+        The description of the PSF is under the key "psf". Raises ``ServiceError`` "no-psf-fits" or "several-psfs-fit".
         """
         return self._json("GET", "/v1/psfs/best", params=_given(filters))
 
@@ -83,9 +83,9 @@ class VersionedPsfs(ABC):
         return self._json("GET", f"/v1/images/{image_id}/psf", params=_given(where))
 
     def affected(self, psf_id: str | None = None, *, superseded: bool = False) -> Iterator[dict[str, Any]]:
-        """Products made with a PSF; without ``psf_id``, those made with any deprecated PSF.
+        """Products made with a PSF. Without ``psf_id``: products made with any deprecated PSF.
 
-        superseded: of those, only products whose PSF has a successor.
+        superseded: list only products whose PSF has a successor.
         """
         if psf_id is not None:
             return self._all(f"/v1/psfs/{psf_id}/affected", {})
@@ -107,15 +107,15 @@ class VersionedPsfs(ABC):
         return self._json("POST", "/v1/contexts", json=body)
 
     def default_context(self) -> dict[str, Any]:
-        """The default context, which chooses the PSF if a request names no context, and its history."""
+        """The default context, from which the PSF is chosen if a request names no context, and the history of its changes."""
         return self.get("/v1/contexts/default")
 
     def use_context(self, id_or_name: str | None, *, reason: str = "") -> dict[str, Any]:
-        """Make a context the default; None: use the PSFs that are certified at the moment."""
+        """Make a context the default; None: use the PSFs that are certified at the time of each request."""
         return self._json("PUT", "/v1/contexts/default", json={"context": id_or_name, "reason": reason})
 
     def lineage(self, of: Literal["psf", "product"], identity: str) -> dict[str, Any]:
-        """What a PSF or a product was made from, back to the uploads."""
+        """The things from which a PSF or a product was made, back to the uploads."""
         return self.get(f"/v1/{of}s/{identity}/lineage")
 
     def rerun(

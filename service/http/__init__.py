@@ -1,1 +1,1 @@
-"""What every HTTP interface of the service shares: callers, limits, errors, uploads and downloads."""
+"""Code that all HTTP interfaces of the service share: callers, limits, errors, uploads and downloads."""

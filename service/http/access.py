@@ -22,14 +22,14 @@ class NoKeyYet(Exception):
 
 @dataclass(frozen=True)
 class Access:
-    """Whether requests need a key, and which host names they may use; hosts is None if any name is allowed."""
+    """Whether requests need a key, and which host names they may use. hosts is None if any name is allowed."""
 
     keys: bool
     hosts: frozenset[str] | None
 
     @classmethod
     def of(cls, settings: Settings, bound_to: str) -> Access:
-        """From the settings; without a setting, open only on a loopback address."""
+        """Read the settings. Without a setting, the service is open only on a loopback address."""
         keys = not is_loopback(bound_to) if settings.access is None else settings.access == "keys"
         named = frozenset(settings.host_names)
         if "*" in named or not (named or (not keys and is_loopback(bound_to))):
@@ -41,12 +41,12 @@ def is_loopback(host: str) -> bool:
     """Whether an address can be reached only from its own machine."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:  # a name, which may mean another address on another machine
+    except ValueError:  # the host is a name, which may stand for another address on another machine
         return False
 
 
 def check_can_serve(settings: Settings, host: str, catalogue: Catalogue) -> None:
-    """Call before a server listens. Raises ``NoKeyYet`` if it needs keys by default and none exists."""
+    """Check, before a server listens, that somebody can use it. Raises ``NoKeyYet`` if it needs keys by default and no key exists."""
     access = Access.of(settings, host)
     if not access.keys:
         if not is_loopback(host):
@@ -59,10 +59,10 @@ def check_can_serve(settings: Settings, host: str, catalogue: Catalogue) -> None
         return
     how = "heliopsf key create --owner NAME --scope read --scope submit"
     if settings.access == "keys":
-        log.warning("no key exists yet, so every request will be refused; make one: %s", how)
+        log.warning("no key exists yet, so every request will be refused; make a key: %s", how)
         return
     raise NoKeyYet(
-        f"{host} can be reached from other machines, so every request needs a key, and no key exists yet. Make one:\n"
+        f"{host} can be reached from other machines, so every request needs a key, and no key exists yet. Make a key:\n"
         f"  {how}\n"
         "To work without keys, serve on 127.0.0.1 (only this machine), or set HELIOPSF_ACCESS=open (everybody has access)."
     )

@@ -1,8 +1,8 @@
-"""Identifies the caller of a request and checks its scopes. Each route names the scope it needs.
+"""Identifies the caller of a request and checks its scopes. Each route names the scope that it needs.
 
 A request sends its key in ``Authorization``: as a bearer token, or as the password of HTTP Basic (with any user
-name), which browsers and clients of the Virtual Observatory support. An open service needs no key, and everything
-belongs to one owner.
+name), which browsers and clients of the Virtual Observatory support. An open service needs no key; everything
+in it belongs to one owner.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CHALLENGE = {"WWW-Authenticate": 'Bearer realm="heliopsf", Basic realm="heliopsf
 
 @dataclass(frozen=True)
 class Caller:
-    """The sender of a request: its owner sees and owns everything the request touches; its key has these scopes."""
+    """The sender of a request. ``owner`` owns everything that the request reads and makes; ``scopes`` are the scopes of the key."""
 
     owner: str
     scopes: frozenset[Scope]
@@ -43,7 +43,7 @@ class _Scheme(SecurityBase):
         self.scheme_name, self.model = name, model
 
     async def __call__(self) -> None:
-        """Do nothing: ``_caller`` checks the key, however it was sent."""
+        """Do nothing: ``_caller`` checks the key of every request."""
 
 
 _AS_BEARER = _Scheme("bearer", HTTPBearer(description="a key, hpsf_ID_SECRET"))
@@ -57,7 +57,7 @@ def _caller(
     _bearer: Annotated[None, Depends(_AS_BEARER)],
     _basic: Annotated[None, Depends(_AS_PASSWORD)],
 ) -> Caller:
-    """The caller. Raises ``Problem`` if the key lacks a scope that the route needs, or the caller reached its rate limit."""
+    """The caller of a request. Raises ``Problem`` if its key does not have a scope that the route needs, or if it reached its rate limit."""
     caller = _let_in(request, state)
     request.state.caller = caller
     for scope in map(Scope, needed.scopes):
@@ -65,7 +65,7 @@ def _caller(
             raise Problem(
                 403,
                 "scope-missing",
-                f"expected a key with the scope '{scope}'; this one has {', '.join(sorted(caller.scopes))}",
+                f"expected a key with the scope '{scope}'; this key has {', '.join(sorted(caller.scopes))}",
             )
         reading = scope in (Scope.READ, Scope.ADMIN)
         bucket = Bucket.READS if reading else Bucket.SUBMISSIONS
@@ -80,7 +80,7 @@ def _let_in(request: Request, state: State) -> Caller:
     try:
         row = state.catalogue.keys.check(_sent_key(request))
     except KeyRefused as refused:
-        state.rates.take(Bucket.READS, address)  # limits attempts to guess keys
+        state.rates.take(Bucket.READS, address)  # this limits attempts to guess keys
         raise Problem(401, refused.code, refused.message, headers=CHALLENGE) from refused
     caller = Caller(row.owner, frozenset(map(Scope, row.scopes)), row.id)
     owner = request.headers.get(ACT_FOR)

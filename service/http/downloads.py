@@ -12,7 +12,7 @@ KEPT = "private, max-age=31536000, immutable"  # the content at an address never
 
 
 def send(request: Request, store: Store, digest: str, media_type: str, filename: str | None) -> Response:
-    """The file, or 304 if the client has it already."""
+    """The file, or 304 if the client already has it."""
     headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT}
     if known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)

@@ -48,9 +48,9 @@ class _Guard:
         await self._app(scope, receive, kept)
 
     def _check_host(self, headers: Headers) -> None:
-        """Refuse unknown host names. Otherwise a foreign page could reach an open service by DNS rebinding.
+        """Refuse unknown host names. Otherwise a web page of another site could reach an open service by DNS rebinding.
 
-        Such a page lets its own name resolve to a loopback address; the browser then treats both as one site.
+        Such a page makes its own host name resolve to a loopback address. The browser then treats page and service as one site.
         """
         hosts = self._access.hosts
         if hosts is None:
@@ -66,19 +66,19 @@ class _Guard:
 
 
 def _check_origin(method: str, headers: Headers) -> None:
-    """Refuse changes requested by a page of another site: the browser would add its stored HTTP Basic password."""
+    """Refuse changes that a web page of another site requests, because the browser would add its stored HTTP Basic password."""
     if method in SAFE_METHODS:
         return
     site, origin = headers.get("sec-fetch-site"), headers.get("origin")
     if site is not None:
         foreign = site not in ("same-origin", "none")
-    else:  # an older browser, or no browser at all
+    else:  # an older browser, or a program
         foreign = origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower()
     if foreign:
         raise problems.Problem(
             403,
             "cross-site",
-            "expected a request from a program or from a page of this service; got one from a page of another site",
+            "expected a request from a program or from a page of this service; got a request from a page of another site",
         )
 
 
@@ -105,16 +105,14 @@ def _bounded(headers: Headers, receive: Receive, most: int) -> Receive:
         message = await receive()
         got += len(message.get("body", b""))
         if got > most:
-            raise HTTPException(
-                413, too_large
-            )  # the only exception that FastAPI passes on while it reads a body
+            raise HTTPException(413, too_large)  # FastAPI passes on no other exception while it reads a body
         return message
 
     return bounded
 
 
 def _keep(headers: MutableHeaders, scope: Scope) -> None:
-    """Add the headers that every answer has; headers that the route has set are kept."""
+    """Add the headers that every answer has. Headers that the route has set are not replaced."""
     for name, value in problems.SECURITY_HEADERS.items():
         headers.setdefault(name, value)
     if "etag" in headers:

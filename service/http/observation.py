@@ -14,7 +14,7 @@ from workers import logs
 
 log = logging.getLogger(__name__)
 REQUEST_ID = "X-Request-ID"
-# All other methods share one label, and so do all paths without a route. This bounds the number of labels.
+# All other methods share one label, and all paths without a route share one label. This limits the number of labels.
 METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 NOWHERE = "none"
 ROUTINE = {"/healthz", "/readyz", "/metrics"}
@@ -22,7 +22,7 @@ BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0
 
 
 class RequestMetrics:
-    """Requests of this process by route, method and status. They are not in the database."""
+    """Counts the requests of this process by route, method and status. The counts are not stored in the database."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -71,10 +71,10 @@ class _Observed:
             await self._app(scope, receive, send)
             return
         request_id = logs.request_id(Headers(scope=scope).get(REQUEST_ID))
-        # Each request has its own context. The id stays bound, so that the server's log of a failure has it too.
+        # Each request has its own context. The id stays bound, so that the server's log of a failure contains it too.
         logs.bind(request=request_id)
         started = time.perf_counter()
-        status, received = 500, 0  # 500 is the answer to an exception before any other answer
+        status, received = 500, 0  # the status is 500 if an exception occurs before an answer begins
 
         async def counted() -> Message:
             nonlocal received
@@ -100,7 +100,7 @@ class _Observed:
                 logging.DEBUG if routine else logging.INFO,
                 "%s %s %d",
                 scope["method"] if scope["method"] in METHODS else "other",
-                scope["path"],  # without the query
+                scope["path"],  # the path without the query
                 status,
                 extra={
                     "fields": {
@@ -114,6 +114,6 @@ class _Observed:
 
 
 def _caller(scope: Scope) -> dict[str, str]:
-    """The caller, if known: the owner, and the id of the key or the address. Never the key itself."""
+    """The caller, if known: the owner, and the id of the key, or the address. The key itself is never logged."""
     caller = scope.get("state", {}).get("caller")
     return {} if caller is None else {"owner": caller.owner, "caller": caller.name}

@@ -1,4 +1,4 @@
-"""Lists in pages, newest first. A cursor names a place in the order, not an offset, so new rows shift no page."""
+"""Lists in pages, newest first. A cursor names a row, not an offset. Therefore new rows do not shift the pages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Page(BaseModel, Generic[Item]):
     """One page of a list."""
 
     items: list[Item]
-    next: str | None = Field(description="address of the next page; null on the last")
+    next: str | None = Field(description="address of the next page; null: this is the last page")
 
 
 class _Ordered(Protocol):
@@ -40,7 +40,7 @@ def position(cursor: str | None) -> tuple[float, str] | None:
 
 
 def place(cursor: str | None, count: int) -> list[str] | None:
-    """The parts of a cursor; the last is an id. Raises ``Problem`` 422 if this service did not issue it."""
+    """The parts of a cursor; the last part is an id. Raises ``Problem`` 422 if this service did not issue it."""
     if cursor is None:
         return None
     try:
@@ -64,7 +64,7 @@ def number(part: str) -> float:
 
 
 def following(request: Request, *parts: str) -> str:
-    """The address of the page that starts after a place."""
+    """The address of the page that starts after the row that these parts name."""
     cursor = base64.urlsafe_b64encode(" ".join(parts).encode()).decode()
     query = request.url.include_query_params(cursor=cursor)
     return f"{query.path}?{query.query}"
@@ -79,7 +79,7 @@ def _no_cursor() -> Problem:
 
 
 def page(request: Request, rows: Sequence[Row], limit: int, view: Callable[[Row], Item]) -> Page[Item]:
-    """The page of ``limit`` rows. Callers query ``limit + 1`` rows: the last one shows that there is a next page."""
+    """The page of ``limit`` rows. Callers query ``limit + 1`` rows: the last row shows that there is a next page."""
     after = rows[limit - 1] if len(rows) > limit else None
     next_page = None if after is None else following(request, repr(after.created_at), after.id)
     return Page(items=[view(row) for row in rows[:limit]], next=next_page)

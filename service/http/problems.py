@@ -55,7 +55,8 @@ STATUS_OF = {
     "too-much-memory": 413,
     "not-an-archive": 415,
 }
-# On every answer, unless the route sets its own: no guessed media types, no frames, no referrer, no loaded content.
+# Headers of every answer, unless the route sets others. They forbid browsers to guess media types, to show the answer in a
+# frame, to send a referrer, and to load content.
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -73,11 +74,11 @@ class ProblemDocument(BaseModel):
     type: str = Field("about:blank", description="`urn:heliopsf:` and the error code, a stable short name")
     title: str
     status: int
-    detail: str = Field(description="what was expected, what came, and what to do next")
+    detail: str = Field(description="what was expected, what was received, and what to do next")
 
 
 class Problem(Exception):
-    """An error with its HTTP status. Any endpoint may raise it; the answer is a problem document."""
+    """An error with its HTTP status. Any endpoint may raise it. The answer is then a problem document."""
 
     def __init__(
         self, status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
@@ -88,7 +89,7 @@ class Problem(Exception):
 
 
 def problem(error: DataError, **more: Any) -> Problem:
-    """The problem for an error of the request or its data; ``more`` goes into the document."""
+    """The problem for an error of the request or its data; ``more``: further fields of the document."""
     return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **more)
 
 
@@ -124,7 +125,7 @@ def install(app: FastAPI) -> None:
         model = None if body is None else body.field_info.annotation
         errors = []
         for found in error.errors():
-            # What the client sent in the body has "body" before its location in the model.
+            # The location of a field of the body starts with "body", which is not part of the model.
             inside = cast(ErrorDetails, found | {"loc": found["loc"][1:]})
             [(_, message)] = explained([inside], model if found["loc"][:1] == ("body",) else None)
             errors.append({"at": "/".join(map(str, found["loc"])), "message": message})

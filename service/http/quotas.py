@@ -17,7 +17,7 @@ class Allowed:
         self._asked = 0
 
     def __call__(self, count: int) -> None:
-        """Count more bytes. Raises ``Problem`` 429 over the rate limit, 413 over the quota."""
+        """Count further bytes. Raises ``Problem`` 429 if they exceed the rate limit, and 413 if they exceed the quota."""
         self._asked += count
         usage = _usage(self._state, self._caller.owner)
         if not usage.allows(self._asked):
@@ -25,7 +25,7 @@ class Allowed:
         self._state.rates.take_bytes(self._caller.name, count)
 
     def add(self, row: Row) -> tuple[Row, bool]:
-        """``Catalogue.add`` of the upload's row. Raises ``Problem`` 413 if other uploads filled the quota meanwhile."""
+        """Add the row of the upload to the catalogue. Raises ``Problem`` 413 if other uploads have filled the quota meanwhile."""
         try:
             return self._state.catalogue.add(row, self._state.settings.quota_mib)
         except OverQuota as over:
@@ -33,7 +33,7 @@ class Allowed:
 
 
 def check_room(state: State, owner: str) -> None:
-    """Raise ``Problem`` 507 if the owner's quota is full, so that no result could be kept."""
+    """Raise ``Problem`` 507 if the owner's quota is full, because no result could be stored."""
     usage = _usage(state, owner)
     if usage.full:
         raise _exceeded(507, usage, NOT_KEPT)

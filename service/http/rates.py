@@ -1,7 +1,7 @@
-"""Limits for each caller: reads, submissions and uploaded bytes a minute, and streams open at a time.
+"""Limits for each caller: reads, submissions and uploaded bytes per minute, and streams that are open at the same time.
 
-If the broker is Redis, all servers count there together; otherwise each process counts for itself. Each caller has
-its own allowance, so that a runaway script does not delay the others.
+If the broker is Redis, all servers count together in Redis; otherwise each process counts alone. Each caller has
+an allowance of its own, so that a runaway script does not delay the others.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ WINDOW_S = 60
 MIB = 2**20
 _REDIS = ("redis://", "rediss://")
 _PATIENCE_S = 1.0
-_AWAY_S = 10.0  # until a Redis that did not answer is asked again
+_AWAY_S = 10.0  # time after which a Redis that did not answer is asked again
 
 
 class Bucket(StrEnum):
-    """What is counted."""
+    """The quantities that are limited."""
 
     READS = "reads"
     SUBMISSIONS = "submissions"
@@ -40,7 +40,7 @@ class Bucket(StrEnum):
 
 @dataclass(frozen=True)
 class Allowance:
-    """How much a caller may use in a minute, and how much of it is left."""
+    """The amount that a caller may use in a minute, and the amount that is left."""
 
     bucket: Bucket
     limit: int
@@ -75,9 +75,10 @@ class Rates:
         self._away_until = 0.0
 
     def take(self, bucket: Bucket, who: str, cost: int = 1) -> Allowance | None:
-        """Subtract a cost from a caller's allowance; None if there is no limit. Raises ``Problem`` 429 if it is used up.
+        """Subtract a cost from a caller's allowance; returns None if there is no limit. Raises ``Problem`` 429 if the allowance is
+        used up.
 
-        A request that costs more than the allowance of a minute takes all of it, so that it is possible at all.
+        A request that costs more than the allowance of a minute uses the whole allowance. Otherwise it would never be accepted.
         """
         item = self._items.get(bucket)
         if item is None or time.monotonic() < self._away_until:
@@ -87,8 +88,8 @@ class Rates:
             granted = limiter.hit(item, bucket, who, cost=min(cost, item.amount))
             reset_at, left = limiter.get_window_stats(item, bucket, who)
         except StorageError as error:
-            # Accept the request: limits only keep the service fast (keys protect it), so the service must work
-            # without them.
+            # Accept the request. The limits only keep the service fast, and keys protect it. Therefore the service must
+            # work without limits.
             self._away_until = time.monotonic() + _AWAY_S
             log.warning("no rate limits for %g s because Redis does not answer: %s", _AWAY_S, error)
             return None
@@ -98,7 +99,7 @@ class Rates:
         return allowance
 
     def take_bytes(self, who: str, count: int) -> Allowance | None:
-        """As ``take``, for uploaded bytes."""
+        """The same as ``take``, for uploaded bytes."""
         return self.take(Bucket.UPLOADS, who, math.ceil(count / MIB))
 
     def _limit_by(self) -> SlidingWindowCounterRateLimiter:
@@ -121,18 +122,18 @@ class Streams:
         self._lock = threading.Lock()
 
     def open(self, who: str) -> None:
-        """Count one more stream. Raises ``Problem`` 429 if the caller has the maximum open."""
+        """Count one more stream. Raises ``Problem`` 429 if the caller already has the largest number of streams open."""
         with self._lock:
             if self._open[who] >= self._most:
                 raise Problem(
                     429,
                     "too-many-streams",
-                    f"expected at most {self._most} open streams of events per caller; close one first",
+                    f"expected at most {self._most} open streams of events per caller; close a stream first",
                 )
             self._open[who] += 1
 
     def close(self, who: str) -> None:
-        """Count one stream less."""
+        """Count one stream fewer."""
         with self._lock:
             self._open[who] -= 1
             if not self._open[who]:
@@ -144,7 +145,7 @@ def _too_many(allowance: Allowance) -> Problem:
     return Problem(
         429,
         "too-many-requests",
-        f"expected at most {allowance.limit} {unit[allowance.bucket]} a minute; got more; try again in "
+        f"expected at most {allowance.limit} {unit[allowance.bucket]} per minute; got more; try again in "
         f"{allowance.reset_s} s",
         headers={"Retry-After": str(allowance.reset_s), **allowance.headers},
     )

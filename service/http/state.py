@@ -1,4 +1,4 @@
-"""What all endpoints share: settings, catalogue, store and reconciler. Each application makes them once."""
+"""The objects that all endpoints share: settings, catalogue, store and reconciler. Each application makes them once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class State:
-    """Objects that live as long as the application."""
+    """Objects that exist as long as the application runs."""
 
     settings: Settings
     catalogue: Catalogue

@@ -1,4 +1,5 @@
-"""Receives an upload: streams it to the store, and hashes, counts and checks it on the way. It is never held in memory."""
+"""Receives an upload: streams it to the store, and hashes, counts and checks its bytes meanwhile. The upload is never held in
+memory as a whole."""
 
 from __future__ import annotations
 
@@ -33,9 +34,9 @@ if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
-FORM_BYTES = 2**16  # the most that a form may add to the file
+FORM_BYTES = 2**16  # largest number of bytes that a form may add to the file
 LARGE = frozenset({"/v1/images", "/v1/psfs", "/v1/transits"})  # upload addresses; they have their own limits
-UNDECLARED_BYTES = 2**20  # counted at a time if the request does not declare its length
+UNDECLARED_BYTES = 2**20  # bytes that are counted in one step if the request does not declare its length
 Take = Callable[[int], object]
 
 
@@ -47,7 +48,7 @@ def _body(what: str, media_type: str) -> dict[str, Any]:
                 "name": "filename",
                 "in": "query",
                 "required": False,
-                "description": "file name shown to people, if the body is the file itself",
+                "description": "file name to show in lists, if the body is the file itself",
                 "schema": {"type": "string"},
             }
         ],
@@ -93,7 +94,7 @@ class _Format(Protocol[FoundOut]):
     start_bytes: int
 
     def recognise(self, start: bytes, *, whole: bool) -> None:
-        """Raise ``Problem`` if these first bytes cannot start such a file. whole: there are no further bytes."""
+        """Raise ``Problem`` if a file of this kind cannot start with these bytes. whole: there are no further bytes."""
 
     def inspect(self, path: Path) -> FoundOut:
         """Read the summary of the file. Raises ``Problem`` if the file cannot be used."""
@@ -105,8 +106,8 @@ async def receive(
 ) -> AsyncIterator[Upload[HeaderSummary]]:
     """Stream the request's FITS file to a temporary path and inspect its header.
 
-    take: counts bytes against the caller's allowance. Raises ``Problem`` 413 over the size limit, 415 if it is not
-    FITS, 400 for a broken form or an incomplete upload, and 422 for a header of a file that cannot be used.
+    take: counts bytes against the caller's allowance. Raises ``Problem`` 413 if the file exceeds the size limit, 415 if it
+    is not FITS, 400 for a broken form or an incomplete upload, and 422 if the header shows that the file cannot be used.
     """
     async with _receive(request, store, _Fits(limits), max_bytes, take) as upload:
         yield upload
@@ -118,8 +119,8 @@ async def receive_transit(
 ) -> AsyncIterator[Upload[ArchiveContents]]:
     """Stream a transit's archive to a temporary path and check its table of contents and its transit.json.
 
-    Raises ``Problem`` as ``receive`` does: also 413 if the unpacked files would exceed the limits, 415 if it is not
-    an archive, and 422 if the transit cannot be used.
+    Raises the same ``Problem`` as ``receive``. In addition: 413 if the unpacked files would exceed the limits, 415 if the file
+    is not an archive, and 422 if the transit cannot be used.
     """
     async with _receive(request, store, _Archive(limits), max_bytes, take) as upload:
         yield upload
@@ -131,7 +132,7 @@ async def _receive(
 ) -> AsyncIterator[Upload[Found]]:
     declared = _refuse_by_length(request, max_bytes)
     taken = declared
-    if declared:  # with a declared length the upload can be refused before it is sent
+    if declared:  # if the length is declared, the upload can be refused before it is sent
         await run_in_threadpool(take, declared)
     with store.temporary() as path:
         body = _Body(request, max_bytes)
@@ -238,7 +239,7 @@ class _Body:
             raise Problem(
                 400,
                 "upload-ended-early",
-                "expected the complete file; the connection closed before: upload it again",
+                "expected the complete file; the connection closed before the end: upload it again",
             ) from error
 
     async def _form(self, options: dict[bytes, bytes]) -> AsyncIterator[bytes]:

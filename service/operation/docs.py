@@ -1,7 +1,8 @@
 """The interactive API reference at ``/docs``: Swagger UI, served from this host.
 
-The package ``fastapi-swagger`` ships the scripts and the style sheet of Swagger UI. Its own page starts them with an
-inline script, which our content security policy forbids; so the page here is ours and starts them from a file.
+The package ``fastapi-swagger`` ships the scripts and the style sheet of Swagger UI. The page in that package starts
+them with an inline script, which our content security policy forbids. Therefore this module has a page of its own, which
+starts them from a file.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from importlib.resources import files
 
 from fastapi import APIRouter, HTTPException, Response
 
-# Swagger UI draws its icons from data: addresses in its style sheet, and writes styles through scripts.
+# Swagger UI loads its icons from data: addresses in its style sheet, and its scripts set styles.
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'"

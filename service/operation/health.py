@@ -11,7 +11,10 @@ from workers import checks
 from workers.settings import software_version
 
 router = APIRouter(tags=["operation"])
-NOT_READY = {"model": problems.ProblemDocument, "description": "A part does not answer; `parts` says which."}
+NOT_READY = {
+    "model": problems.ProblemDocument,
+    "description": "A part does not answer; `parts` says which part.",
+}
 
 
 class Health(BaseModel):
@@ -32,7 +35,7 @@ class Readiness(BaseModel):
 
 @router.get("/healthz", summary="Is the service up?", responses=problems.RESPONSES)
 def healthz(state: Shared) -> Health:
-    """200: process, reconciler and database work. 503: one of them does not."""
+    """200: process, reconciler and database work. 503: one of them does not work."""
     state.catalogue.ping()
     if not state.reconciler.alive:
         raise problems.Problem(
@@ -45,7 +48,7 @@ def healthz(state: Shared) -> Health:
 
 @router.get("/readyz", summary="Can the service do its work?", responses={503: NOT_READY})
 def readyz(state: Shared) -> Readiness:
-    """200: database, storage, and broker (or embedded worker) answer. 503: `parts` says which does not."""
+    """200: database, storage, and broker (or embedded worker) answer. 503: one of them does not answer; `parts` says which one."""
     parts = {}
     for name, check in checks.needed(state.settings, state.catalogue, state.store).items():
         try:

@@ -1,8 +1,9 @@
 """Metrics for Prometheus: ``/metrics``.
 
-Numbers about all processes (jobs, files, workers) are read from the database at each scrape, by queries that use only
-indexes. Numbers about this process (its requests) are counted in it. Jobs and files are gauges, because a destroyed job
-no longer counts. The time that jobs spent in their stages is a counter, which never decreases.
+Numbers about all processes (jobs, files, workers) are read from the database whenever Prometheus reads the
+metrics, by queries that use only indexes. Numbers about this process (its requests) are counted in the process. The numbers
+of jobs and files are gauges, because they decrease when a job is destroyed. The time that jobs spent in their stages is a
+counter, which never decreases.
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ class _Catalogued(Collector):
         self._state = state
 
     def describe(self) -> list[Metric]:
-        """Nothing: the metrics are collected only at the scrape."""
+        """Return nothing: the metrics are collected only when Prometheus reads them."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics of database and storage; if the database does not answer, only that and the free space."""
+        """The metrics of database and storage. If the database does not answer, only the free space and the metric that says so."""
         yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
         room = GaugeMetricFamily("heliopsf_storage_free_bytes", "Free space where files are stored")
         room.add_metric([], checks.free_bytes(self._state.settings.data_dir))
@@ -71,11 +72,15 @@ class _Catalogued(Collector):
         tallies = {(tally.kind, tally.phase): tally for tally in self._state.catalogue.census.tally()}
         kinds = sorted({*KINDS, *(kind for kind, _ in tallies)})
         jobs = GaugeMetricFamily("heliopsf_jobs", "Jobs", labels=["kind", "phase"])
-        attempts = GaugeMetricFamily("heliopsf_job_attempts", "Starts of jobs", labels=["kind"])
-        retries = GaugeMetricFamily("heliopsf_job_retries", "Starts of jobs after the first", labels=["kind"])
+        attempts = GaugeMetricFamily(
+            "heliopsf_job_attempts", "Number of times that jobs were started", labels=["kind"]
+        )
+        retries = GaugeMetricFamily(
+            "heliopsf_job_retries", "Number of times that jobs were started again", labels=["kind"]
+        )
         seconds = GaugeMetricFamily(
             "heliopsf_job_run_seconds",
-            "Time from the last start to the end, of all jobs that are COMPLETED",
+            "Sum over COMPLETED jobs of the time from the last start to the end",
             labels=["kind"],
         )
         for kind in kinds:

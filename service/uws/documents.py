@@ -1,6 +1,6 @@
-"""UWS 1.1 documents (job list, job, parameters, results) as XML of the IVOA schema.
+"""Writes UWS 1.1 documents (job list, job, parameters, results) as XML of the IVOA schema.
 
-Citation: REC-UWS-1.1 (24 October 2016), appendix B, which also fixes the order of elements. Times are UTC and end in Z.
+Citation: REC-UWS-1.1 (24 October 2016), appendix B, which also defines the order of elements. Times are UTC and end in Z.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _parameters(row: JobRow) -> ElementTree.Element:
 
 
 def _parameter_text(value: Any) -> str:
-    """A parameter as a form sends it: a text unchanged, anything else as JSON."""
+    """A parameter as a form contains it: a text is unchanged, any other value is written as JSON."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
@@ -122,7 +122,8 @@ def _link(address: str) -> dict[str, str]:
 
 def _add(parent: ElementTree.Element, name: str, text: str) -> ElementTree.Element:
     element = ElementTree.SubElement(parent, f"{{{UWS}}}{name}")
-    # Jobs that came as JSON may hold characters that XML cannot; they are shown as what stands for such.
+    # Parameters that were sent as JSON may contain characters that XML cannot contain. Each is written as a replacement
+    # character.
     element.text = NO_XML.sub("\ufffd", text)
     return element
 

@@ -1,4 +1,4 @@
-"""Reads what UWS clients send: forms, and job parameters as text, and checks them against the contract."""
+"""Reads the forms that UWS clients send, and checks the job parameters in them, which are texts, against the contract."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from workers.intake.requests import resolve
 MAX_FORM_BYTES = 2**20
 MAX_FIELDS = 64
 SHOWN = 120
-# The last four are phases of the standard that jobs of this service never have; clients may still ask for them.
+# The last four are phases of the standard. Jobs of this service are never in them, but clients may ask for them.
 PHASES = frozenset({*Phase, "HELD", "SUSPENDED", "UNKNOWN", "ARCHIVED"})
 INTEGER = re.compile(r"-?[0-9]{1,15}", re.ASCII)
 
 
 async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a form and of the address, by their names in lower case. Raises ``Problem`` if it is no form.
+    """The fields of a form and of the address, by their names in lower case. Raises ``Problem`` if the body is not a form.
 
     A field without a value counts as not sent.
     """
@@ -59,14 +59,14 @@ Form = Annotated[dict[str, str], Depends(read_form)]
 
 
 def query_of(request: Request, *several: str) -> dict[str, list[str]]:
-    """The fields of the address, by their names in lower case. Only those in ``several`` may be repeated."""
+    """The fields of the address, by their names in lower case. Only the fields in ``several`` may be repeated."""
     found: dict[str, list[str]] = {}
     for name, value in request.query_params.multi_items():
         if value:
             found.setdefault(name.lower(), []).append(value)
     for name, values in found.items():
         if len(values) > 1 and name not in several:
-            raise bad(f"expected {name.upper()} once, got it {len(values)} times")
+            raise bad(f"expected {name.upper()} once; got it {len(values)} times")
     return found
 
 
@@ -76,7 +76,7 @@ def bad(message: str, status: int = 400) -> Problem:
 
 
 def kind_of(form: dict[str, str]) -> str:
-    """Take KIND out of a form. Raises ``Problem`` if no client can request jobs of that kind."""
+    """Remove KIND from a form and return it. Raises ``Problem`` if clients cannot request jobs of this kind."""
     kind = form.pop("kind", None)
     if kind is None or kind not in REQUESTS:
         hint = did_you_mean(kind or "", REQUESTS)
@@ -120,7 +120,8 @@ def resolved(
 ) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Resolved parameters of a job, the identity of its result, and its estimate.
 
-    Raises ``Problem`` 400 if they are wrong or the job would need too much, and 507 if the owner's quota is full.
+    Raises ``Problem`` 400 if the parameters are wrong or the job would exceed the limits on memory or time, and 507 if the
+    owner's quota is full.
     """
     check_room(state, owner)
     values, errors = _understood(kind, given)
@@ -135,9 +136,9 @@ def resolved(
 
 
 def _understood(kind: str, given: dict[str, str]) -> tuple[dict[str, Any], list[ErrorDetails]]:
-    """The values that the contract accepts, and the errors of the others.
+    """The parameters, read from their texts, and the errors of the parameters that the contract does not accept.
 
-    A text that the contract accepts (a name, a number, true or false) stays a text; any other is read as JSON.
+    If the contract accepts a text (a name, a number, true or false), it remains a text. Otherwise the text is read as JSON.
     """
     for name, text in given.items():
         if NO_XML.search(text):

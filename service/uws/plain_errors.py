@@ -29,7 +29,7 @@ class PlainErrors(APIRoute):
 
 
 def query(**described: str) -> dict[str, Any]:
-    """OpenAPI description of query parameters. Upper and lower case of their names are equal."""
+    """OpenAPI description of query parameters. Their names may be written in upper or lower case."""
     return {
         "parameters": [
             {

@@ -1,9 +1,9 @@
-"""IVOA UWS 1.1 over the same jobs: ``/uws/jobs``, for clients of the Virtual Observatory.
+"""The jobs of the service by IVOA UWS 1.1, for clients of the Virtual Observatory: ``/uws/jobs``.
 
-Citation: REC-UWS-1.1 (24 October 2016), section 2.2. A job is PENDING until the client starts it, and has a limit
-on its execution and a time at which it is destroyed. Identical requests share their result, but each has its own
-job. Identical jobs run once: the others wait QUEUED, and then share the result, or run if there is none. Destroying
-a job does not delete its result. Errors are plain text.
+Citation: REC-UWS-1.1 (24 October 2016), section 2.2. A job is PENDING until the client starts it. It has a limit
+on its execution time, and a time at which it is destroyed. Each request has a job of its own, but identical requests share
+their result: one of the identical jobs runs, and the others wait in phase QUEUED. If that job fails, the next one runs.
+Destroying a job does not delete its result. Errors are plain text.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from workers.contract.phases import JobError, Phase
 
 MAX_RUN_ID = 256
 MOST = 2**31 - 1
-MOST_LISTED = 10_000  # jobs in one document, which is built in memory
-FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a waiting request checks its job less and less often
+MOST_LISTED = 10_000  # largest number of jobs in one document, because the document is built in memory
+FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a waiting request checks its job at growing intervals
 
 
 router = APIRouter(
@@ -39,7 +39,7 @@ router = APIRouter(
     responses={
         "4XX": {
             "content": {"text/plain": {}},
-            "description": "What was expected, what came, and what to do next.",
+            "description": "What was expected, what was received, and what to do next.",
         }
     },
 )
@@ -52,14 +52,14 @@ router = APIRouter(
     openapi_extra=routing.query(
         PHASE="list jobs in this phase; may be repeated",
         AFTER="list jobs created after this time (ISO 8601, UTC)",
-        LAST=f"list this number of newest jobs; at most {MOST_LISTED}, which is also the default",
+        LAST=f"list only this number of the newest jobs; at most {MOST_LISTED}, which is also the default",
     ),
 )
 def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
     """Your jobs, newest first. /v1/jobs lists all of them in pages."""
     query = query_of(request, "phase")
     after, last = query.get("after"), query.get("last")
-    # Times are shown to the millisecond, so "after" is the millisecond after.
+    # Documents show times to the millisecond. Therefore AFTER excludes the whole millisecond that the client names.
     from_time = None if after is None else (int(moment("AFTER", after[0]) * 1000) + 1) / 1000
     lines = state.catalogue.uws.lines(
         phases=[phase(text) for text in query.get("phase", ())],
@@ -90,7 +90,7 @@ def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shar
     if run_id is not None and (documents.NO_XML.search(run_id) or len(run_id) > MAX_RUN_ID):
         raise bad(f"expected RUNID of at most {MAX_RUN_ID} characters that XML can hold; got {run_id[:40]!a}")
     if start not in (None, "RUN"):
-        raise bad(f"expected PHASE=RUN or none, got {start[:40]!a}")
+        raise bad(f"expected PHASE=RUN or no PHASE; got {start[:40]!a}")
     check(kind, form)
     ready = resolved(state, caller.owner, kind, form) if start else None
     row = state.catalogue.uws.draft(
@@ -116,7 +116,7 @@ def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shar
     ),
 )
 async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Shared) -> Response:
-    """The job: at once, or with WAIT as soon as its phase changes."""
+    """Show the job: at once, or with WAIT as soon as its phase changes."""
     query = query_of(request)
     most = state.settings.uws_max_wait_s
     wait_s = integer("WAIT", query["wait"][0], -1) if "wait" in query else 0
@@ -137,7 +137,7 @@ async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Sha
 
 @router.delete("/{job_id}", summary="UWS: abort and destroy a job", **routing.TO_JOB)
 def delete_uws_job(job_id: str, request: Request, caller: Submitting, state: Shared) -> Response:
-    """Delete the job in any phase; a worker that runs it stops. Its result stays in the catalogue."""
+    """Delete the job in any phase. If a worker runs the job, the worker stops it. Its result stays in the catalogue."""
     _find(state, caller, job_id)
     state.catalogue.uws.destroy(job_id)
     return RedirectResponse(_jobs_url(request), 303)
@@ -167,7 +167,7 @@ def get_uws_phase(job_id: str, caller: Reading, state: Shared) -> Response:
     openapi_extra=routing.form(PHASE="RUN or ABORT"),
 )
 def post_uws_phase(job_id: str, caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
-    """RUN queues a PENDING job; ABORT stops a job that has not ended. A repeated request changes nothing."""
+    """RUN queues a PENDING job. ABORT stops a job that has not ended. A repeated request changes nothing."""
     row = _find(state, caller, job_id)
     match form.get("phase"):
         case "RUN":
@@ -194,7 +194,7 @@ def get_uws_duration(job_id: str, caller: Reading, state: Shared) -> Response:
 def post_uws_duration(
     job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
 ) -> Response:
-    """Set the limit. The service reduces it to the largest one that the operator allows."""
+    """Set the limit. If it exceeds the largest limit that the operator allows, the service sets that limit."""
     _find(state, caller, job_id)
     asked = _duration(state, _given(form, "EXECUTIONDURATION"))
     state.catalogue.uws.set_terms(job_id, execution_duration_s=asked)
@@ -203,7 +203,7 @@ def post_uws_duration(
 
 @router.get("/{job_id}/destruction", summary="UWS: when a job is destroyed", **routing.TEXT)
 def get_uws_destruction(job_id: str, caller: Reading, state: Shared) -> Response:
-    """A time; empty if the job is kept for ever."""
+    """A time; empty if the job is never destroyed."""
     at = _terms(state, caller, job_id)[1].destruction_at
     return _text("" if at is None else documents.time_text(at))
 
@@ -217,7 +217,7 @@ def get_uws_destruction(job_id: str, caller: Reading, state: Shared) -> Response
 def post_uws_destruction(
     job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
 ) -> Response:
-    """Set the time. The service replaces it by the latest one that the operator allows."""
+    """Set the time. If it is later than the latest time that the operator allows, the service sets that time."""
     _find(state, caller, job_id)
     at = _destruction(state, _given(form, "DESTRUCTION"))
     state.catalogue.uws.set_terms(job_id, destruction_at=at)
@@ -239,7 +239,7 @@ def get_uws_owner(job_id: str, caller: Reading, state: Shared) -> Response:
 
 @router.get("/{job_id}/parameters", summary="UWS: a job's parameters", **routing.XML)
 def get_uws_parameters(job_id: str, caller: Reading, state: Shared) -> Response:
-    """As sent while the job is PENDING; with every default filled in after it was started."""
+    """While the job is PENDING, the parameters as the client sent them. After its start, the parameters with every default filled in."""
     return _xml(documents.parameters(_find(state, caller, job_id)))
 
 
@@ -302,16 +302,16 @@ def get_uws_error(job_id: str, caller: Reading, state: Shared) -> Response:
 
 
 def _start(state: State, caller: Caller, row: JobRow) -> None:
-    """PENDING -> QUEUED. Raises ``Problem`` 400 for wrong parameters, 403 if the job has ended."""
+    """Move a job from PENDING to QUEUED. Raises ``Problem`` 400 for wrong parameters, 403 if the job has ended."""
     while row.phase == Phase.PENDING:
         if state.catalogue.uws.start(
             row.id, row.parameters, *resolved(state, row.owner, row.kind, row.parameters)
         ):
             state.reconciler.wake()
             return
-        row = _find(state, caller, row.id)  # another request changed the job meanwhile
+        row = _find(state, caller, row.id)  # another request changed the job in the meantime
     if Phase(row.phase).ended:
-        raise _not_now(row, "PHASE=RUN can start only a PENDING job: create a new one")
+        raise _not_now(row, "PHASE=RUN can start only a PENDING job: create a new job")
 
 
 def _not_now(row: JobRow, rule: str) -> Problem:

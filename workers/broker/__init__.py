@@ -1,1 +1,1 @@
-"""The queue of job ids between the web process and the workers."""
+"""The message queue that passes job ids from the web process to the workers."""

@@ -1,7 +1,7 @@
 """The broker: a Celery application, and the submission of job ids to it.
 
 The broker may lose messages or deliver them twice: lost jobs are submitted again from the job table, and a second
-delivery does nothing. So nothing here has to be durable. Jobs are submitted by the name of the Celery task, because
+delivery has no effect. Therefore messages need not be durable. Jobs are submitted by the name of the Celery task, because
 the web process must not import tasks.
 """
 
@@ -26,14 +26,14 @@ log = logging.getLogger(__name__)
 
 
 def make_app(settings: Settings) -> Celery:
-    """A Celery application for these settings. For the embedded broker its folders are made."""
+    """Make a Celery application for these settings, and the folders of the embedded broker if it is used."""
     app = Celery("heliopsf", broker=settings.broker_url, set_as_current=False)
     app.conf.update(
         task_serializer="json",
         accept_content=["json"],
         task_ignore_result=True,
-        # Acknowledge early: the job table decides what has to run, and a worker with unacknowledged messages does
-        # not survive the loss of its broker (kombu 5.7).
+        # Acknowledge early: the job table decides which jobs have to run, and a worker with unacknowledged messages
+        # crashes when it loses its broker (kombu 5.7).
         task_acks_late=False,
         worker_prefetch_multiplier=1,
         task_queues=[BrokerQueue(broker_name(queue), routing_key=broker_name(queue)) for queue in Queue],
@@ -58,7 +58,7 @@ def submit(app: Celery, job_id: str, queue: Queue = Queue.INTERACTIVE) -> bool:
 
 
 def call_for_help(app: Celery, job_id: str, workers: int) -> None:
-    """Ask idle workers to share the work of a job. If the messages are lost, its own worker does all of it."""
+    """Ask idle workers to share the work of a job. If the messages are lost, the worker that runs the job does all of the work."""
     try:
         for _ in range(workers):
             app.send_task(ASSIST, args=[job_id], queue=broker_name(Queue.CROSSVAL), retry=False)
@@ -67,9 +67,9 @@ def call_for_help(app: Celery, job_id: str, workers: int) -> None:
 
 
 def check(settings: Settings) -> None:
-    """Raise an error if the broker, which must not be the embedded one, does not answer within seconds.
+    """Raise an error if the broker does not answer within seconds. Do not call it for the embedded broker.
 
-    It is one of ``AWAY``, or for a bad URL what its transport raises.
+    The error is one of ``AWAY``; for a bad URL it is the error of the transport library.
     """
     options = {"socket_connect_timeout": 2, "socket_timeout": 2}
     with Connection(settings.broker_url, transport_options=options, connect_timeout=2) as connection:

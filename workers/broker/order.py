@@ -1,7 +1,7 @@
 """Makes a worker take messages from the queue of highest priority, and only when one of its processes is idle.
 
-By default Celery and kombu do neither. They serve the queues in turn, whatever their priority. And with early
-acknowledgement they fetch one message more than they can start; a more urgent job would then wait for two jobs
+By default Celery and kombu do not do this. They serve the queues in turn and ignore their priority. With early
+acknowledgement they also fetch one message more than they can start. A more urgent job would then wait for two jobs
 instead of one.
 """
 
@@ -27,7 +27,7 @@ from workers.contract.queues import by_urgency
 
 
 class MostUrgentFirst(priority_cycle):
-    """For Redis: the order of the queues in one BRPOP."""
+    """For Redis: orders the queues in a BRPOP command."""
 
     def consume(self, n: int) -> list[str]:
         """The queues to read, highest priority first."""
@@ -35,7 +35,7 @@ class MostUrgentFirst(priority_cycle):
 
 
 class _InOrder(FairCycle):
-    """For the folder: reads the first queue that has a message."""
+    """For the folder broker: reads the first queue that has a message."""
 
     def get(self, callback: Callable[..., Any], **options: Any) -> Any:
         """Pass one message to the callback. Raises ``predicate`` if there is none."""
@@ -48,7 +48,7 @@ class _InOrder(FairCycle):
 
 
 class _FolderChannel(filesystem.Channel):
-    """Writes files atomically. Kombu's own channel would hang at a file that is empty or was read too early."""
+    """Writes files atomically. Kombu's own channel would hang if a file is empty or incompletely written."""
 
     def get_table(self, exchange: str) -> list[Any]:
         """The queues bound to an exchange; empty if the file is damaged, for example by a power failure."""
@@ -88,14 +88,15 @@ class FolderTransport(filesystem.Transport):
     Channel = _FolderChannel
 
     def drain_events(self, connection: Any, timeout: float | None = None, **_: Any) -> None:
-        """Deliver one message. Raises ``TimeoutError`` if none arrives in time, or at once if the worker must stop.
+        """Deliver one message. Raises ``TimeoutError`` if no message arrives in time, or at once if the worker must stop.
 
-        Kombu's own version would sleep for seconds, twice: Celery checks whether to stop only between two calls.
+        Celery checks only between two calls whether the worker must stop. Kombu's own version would delay a stop, because it
+        sleeps for seconds, twice.
         """
         until = None if timeout is None else time.monotonic() + timeout
         channels: Any = self.cycle
         while True:
-            # should_stop is an exit code: 0 also means that the worker must stop.
+            # should_stop is an exit code, or None. The code 0 also means that the worker must stop.
             if state.should_stop is not None and state.should_stop is not False:
                 raise TimeoutError
             try:
@@ -116,7 +117,7 @@ class TakeWhatCanStart(bootsteps.StartStopStep):
     requires = ("celery.worker.consumer.tasks:Tasks",)
 
     def start(self, consumer: Any) -> None:
-        """Make the channel check the pool before its own limit of messages."""
+        """Make the channel check first whether the pool has an idle process, and then its own limit of messages."""
         qos = consumer.task_consumer.channel.qos
         within_limit = qos.can_consume
         qos.can_consume = lambda: (

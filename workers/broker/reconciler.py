@@ -14,12 +14,12 @@ from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
-# Few enough that an urgent job, which arrives during a pass, does not wait for many others.
+# Few, so that an urgent job that arrives during a pass does not wait for many other jobs.
 AT_ONCE = 50
 
 
 def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
-    """One pass. Returns the number of submitted jobs, at most ``AT_ONCE``. Several processes may do this at the same time."""
+    """Make one pass. Returns the number of submitted jobs, at most ``AT_ONCE``. Several processes may make passes at the same time."""
     for job_id in catalogue.jobs.give_up_silent(settings.lease_s, settings.max_attempts):
         log.warning("job %s: no heartbeat from its worker; queued again", job_id)
     for job_id in catalogue.uws.end_by_terms():
@@ -36,7 +36,7 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
 
 
 class Reconciler:
-    """A thread that reconciles every ``settings.reconcile_s`` seconds, and at once after ``wake``."""
+    """A thread that reconciles every ``settings.reconcile_s`` seconds, and immediately after ``wake``."""
 
     def __init__(self, catalogue: Catalogue, app: Celery, settings: Settings) -> None:
         self._catalogue, self._app, self._settings = catalogue, app, settings
@@ -55,7 +55,7 @@ class Reconciler:
         self._thread.join()
 
     def wake(self) -> None:
-        """Start a pass now: there is a job to submit."""
+        """Start a pass now, because there is a job to submit."""
         self._wake.set()
 
     @property
@@ -70,7 +70,7 @@ class Reconciler:
             try:
                 submitted = reconcile(self._catalogue, self._app, self._settings)
             except SQLAlchemyError as error:
-                # The database may be restarting; the next pass finds out.
+                # The database may be restarting; the next pass tries again.
                 log.warning("reconciler: the database does not answer: %s", error)
             if submitted < AT_ONCE:
                 self._wake.wait(self._settings.reconcile_s)

@@ -1,4 +1,4 @@
-"""One image of a bulk run: from an upload or a file to a product in the service, a file in a folder, or both."""
+"""Deconvolves one image of a bulk run, which is an upload or a file. The product goes into the service, into a folder, or both."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from workers.tasks.context import Context
 from workers.tasks.data import product
 from workers.tasks.psf_build import requested_psf
 
-# The structures that summarise the changes of an image: blocks of 4 px, tails of 1 %.
+# The changes of an image are summarised for blocks of 4 × 4 px: the brightest and the darkest 1 % of the blocks.
 BLOCK_PX, TAIL_PCT = 4, 1.0
 LOOK_AGAIN_S = 0.5
 
@@ -83,16 +83,16 @@ def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Ta
 
 
 def _waited(context: Context, request: BulkWork, identity: str) -> bool:
-    """Wait while another job makes this product; whether there was one.
+    """Wait while another job makes this product. Returns whether there was such a job.
 
-    A run whose products the service does not keep never waits: no job makes the same file.
+    If the service keeps no products of the run, it never waits, because no other job makes the same file.
     """
     waited = False
     if not request.keeps_products:
         return False
     while context.catalogue.jobs.at_work_on(context.owner, identity):
         waited = True
-        context.report("waiting for an equal job", 0, 1)  # raises if the bulk run must stop
+        context.report("waiting for an equal job", 0, 1)  # raises an exception if the bulk run must stop
         _rest()
     return waited
 
@@ -127,7 +127,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
 
 
 def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Source) -> ResolvedDeconvolve:
-    """The deconvolution with its PSF: that of the bulk run, or the one that its context pins for the image."""
+    """The deconvolution with its PSF. This is the PSF of the bulk run, or the PSF that its context pins for the image."""
     wanted = Deconvolve(
         image_id=source.sha256,
         psf_id=bulk.psf_id,
@@ -183,7 +183,7 @@ def _done_now(
     needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
     estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
     psf_row = requested_psf(context, wanted)
-    # Only now: the store's local copy may be gone after waiting for another job or building the PSF.
+    # The path is taken only now, because the store's local copy may have been removed during a wait or a PSF build.
     image_file = source.copy or context.store.path(source.sha256)
     image = deconvolve_task.load(context, wanted, image_file, source.summary)
     started = time.perf_counter()
@@ -232,7 +232,7 @@ def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: boo
 
 
 def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
-    """A summary of the changes and artefacts that a product's details hold in full."""
+    """A summary of the changes and artefacts in the details of a product."""
     found = details["changes"]
     changes = {
         row["kind"]: {"sum_pct": row["sum_pct"], "up_to_pct": row["up_to_pct"]}
@@ -258,7 +258,7 @@ def _remove_partial_files(target: Path) -> None:
 
 
 def _make_folder(folder: Path) -> None:
-    """Make the output folder before the image is deconvolved, so that no work is lost.
+    """Make the output folder before the image is deconvolved, so that no work is lost if this fails.
 
     Raises DataError "output-not-written".
     """
@@ -269,7 +269,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _put(source: Path, target: Path) -> None:
-    """Copy a file to its place in one step: a reader sees the whole file or none.
+    """Copy a file to its path in one step: a reader sees either the whole file or no file.
 
     Raises DataError "output-not-written".
     """
@@ -277,7 +277,7 @@ def _put(source: Path, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         with source.open("rb") as file, whole_file(target) as copy:
             shutil.copyfileobj(file, copy, 2**20)
-        sync(target.parent)  # the file name must be on the disk too before the image counts as done
+        sync(target.parent)  # the folder entry must also be on the disk before the image counts as done
 
 
 @contextmanager

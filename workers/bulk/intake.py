@@ -1,4 +1,4 @@
-"""From a request for a bulk run to its row: check images and paths, and fix the PSF or the context."""
+"""Makes the row of a bulk run from its request: checks images and paths, and fixes the PSF or the context."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from workers.settings import Settings
 
 
 def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Settings) -> tuple[BulkRow, bool]:
-    """A new bulk run, or the open one of an identical request; and whether it is new.
+    """A new bulk run, or the open bulk run of an identical request. Also returns whether it is new.
 
     Raises ``DataError``: "no-such-psf", "no-such-context", "no-such-image", "bad-path", "path-not-allowed".
     """
@@ -77,5 +77,5 @@ def _check_places(request: BulkRequest, settings: Settings) -> None:
 
 
 def _key(asked: Mapping[str, Any], images: Sequence[str]) -> str:
-    """The key of the request: identical requests have the same key, whatever their names."""
+    """The key of the request: requests that differ only in their names have the same key."""
     return canonical_hash({**asked, "name": None, "images": list(images)})

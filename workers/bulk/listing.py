@@ -1,4 +1,4 @@
-"""Listing the files of a bulk run: from the patterns of its request to its images in the catalogue."""
+"""Lists the files that match the patterns of a bulk run, and adds them to the catalogue as its images."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from workers.tasks.context import Context
 
 LIST_AT_ONCE = 200
 MOST_IMAGES = 1_000_000
-TELL_EVERY_S = 1.0  # how often a turn reports its progress and looks whether it must stop
+TELL_EVERY_S = 1.0  # interval at which a turn reports its progress and checks whether it must stop
 
 
 def work_of(bulk: BulkRow) -> BulkWork:
-    """The request of a bulk run, without the uploaded images."""
+    """The request of a bulk run, without the ids of uploaded images."""
     return BulkWork.model_validate(bulk.request)
 
 
@@ -43,7 +43,7 @@ def list_files(context: Context, bulk: BulkRow, lease: Lease) -> bool:
         if there is not None and there.total == 0:
             raise DataError(
                 "no-images",
-                "expected files that match the patterns and the header conditions; found none: check the globs and `where`",
+                "expected files that match the patterns and the header conditions; found no files: check the globs and `where`",
             )
     except DataError as error:
         bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code=error.code, message=error.message))
@@ -63,7 +63,7 @@ def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
         context.report("listing", len(seen), max(looked_at, len(seen) + 1))
 
     def tick() -> None:
-        """Report during a long walk that finds nothing, so that it can be stopped like any other work."""
+        """Report while a long search finds no files, so that the search can be stopped."""
         if time.monotonic() - told_at >= TELL_EVERY_S:
             tell()
 
@@ -86,7 +86,7 @@ def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
 
 
 def _listed_one(context: Context, found: archive_files.Found, where: dict[str, Condition]) -> Listed | None:
-    """The found file as an image of the run, with the error if it cannot be used; None if its header does not match."""
+    """The found file as an image of the run, with an error if the file cannot be used; None if its header does not match."""
     error = None
     try:
         if found.error is not None:
@@ -105,11 +105,11 @@ def _listed_one(context: Context, found: archive_files.Found, where: dict[str, C
 
 
 def _path_error(path: Path, source: str) -> JobError | None:
-    """The error if the catalogue cannot store this path, so that the file could not be found later; None if it can."""
+    """The error for a path that the catalogue cannot store; None if the catalogue can store it."""
     if source != str(path):
         code, message = (
             NOT_UTF_8,
-            f"expected a path in UTF-8; got one that ends in {source[-100:]}: rename the file",
+            f"expected a path in UTF-8; got a path that ends in {source[-100:]}: rename the file",
         )
     elif len(source) > MOST_LETTERS:
         code = TOO_LONG

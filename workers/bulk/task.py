@@ -1,7 +1,7 @@
 """The task ``bulk``: one turn of a bulk run. A turn deconvolves images one after the other.
 
-A turn ends when no image is left, or when other jobs wait. A product that already exists is not made again, whoever
-requested it. An image that cannot be deconvolved is noted as failed, with the reason; the run continues.
+A turn ends when no image is left, or when other jobs wait. A product that already exists is not made again, even if
+another job made it. An image that cannot be deconvolved is recorded as failed, with the reason; the run continues.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from workers.contract.phases import Fault, JobError
 from workers.tasks.context import Context, TurnOver
 from workers.tasks.stage_timer import STARTING
 
-BETWEEN = "between images"  # the stage of noting the result of one image and taking the next
-TURN_S = 60.0  # after this time another bulk run may have its turn; far below the time limit of an attempt
+BETWEEN = "between images"  # the stage between two images: record the result of one, take the next
+TURN_S = 60.0  # a turn ends after this time, so that other bulk runs get turns; far below the time limit of an attempt
 
 
 def bulk_turn(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Deconvolve images of a bulk run; returns its id. Raises ``TurnOver`` if images are left and other jobs wait."""
+    """Deconvolve images of a bulk run; returns the id of the run. Raises ``TurnOver`` if images are left but the turn must end."""
     bulk_id: str = parameters["bulk_id"]
     ends_at = time.monotonic() + TURN_S
     assert context.lease is not None
@@ -48,7 +48,7 @@ def bulk_turn(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def _stopped_for_quota(context: Context, bulk: BulkRow) -> bool:
-    """Stop the bulk run if its owner's quota is used up; whether it was stopped. It can be resumed once there is room."""
+    """Stop the bulk run if its owner's quota is used up. Returns whether it was stopped. The run can be resumed when there is room."""
     usage = context.catalogue.owners.usage(context.owner, context.settings.quota_mib)
     if not usage.full or not work_of(bulk).keeps_products:
         return False
@@ -63,7 +63,7 @@ def _stopped_for_quota(context: Context, bulk: BulkRow) -> bool:
 
 
 def _do(context: Context, bulk: BulkRow, taken: Taken) -> None:
-    """Deconvolve one image and note its result. If the turn itself must stop, the image is released."""
+    """Deconvolve one image and record its result. If the turn itself must stop, the image is released for another turn."""
     bulks, done = context.catalogue.bulks, bulk.done + bulk.failed
 
     told_s = told_at = 0.0
@@ -77,7 +77,7 @@ def _do(context: Context, bulk: BulkRow, taken: Taken) -> None:
                 told_at = time.perf_counter()
                 told_s += told_at - began
 
-    # Products name the bulk run as their job: the job of a turn is deleted soon.
+    # Products name the bulk run as their job, because the job of a turn is soon deleted.
     of_image = dataclasses.replace(context, report=report, job_id=bulk.id)
     found: list[Outcome] = []
     context.times.begin(STARTING)
@@ -94,6 +94,6 @@ def _do(context: Context, bulk: BulkRow, taken: Taken) -> None:
         return
     values = vars(found[0])
     statistics = {**values["statistics"], "seconds": round(time.perf_counter() - started, 3)}
-    if "kernel_seconds" in statistics:  # the time of reporting does not count for the image
+    if "kernel_seconds" in statistics:  # the time of reporting does not count as time of the image
         statistics["kernel_seconds"] = round(statistics["kernel_seconds"] - told_s, 3)
     bulks.finish(taken, **{**values, "statistics": statistics})

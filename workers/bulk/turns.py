@@ -1,7 +1,7 @@
 """Turns of bulk runs: jobs in the queue ``bulk`` in which a worker deconvolves one image after the other.
 
 A bulk run has as many turns as there are worker processes, but never more than images left. Turns are ordinary jobs:
-one worker has a turn, a lost turn is queued again, and a worker that stops hands its turn back. After each image a turn
+each turn is run by one worker, a lost turn is queued again, and a worker that stops hands its turn back. After each image a turn
 ends if jobs of other kinds wait; after a minute it ends so that turns of other bulk runs can follow. When the run has
 no work left, its turns are deleted.
 """
@@ -41,7 +41,7 @@ def keep_turns(catalogue: Catalogue, settings: Settings) -> None:
 
 
 def cancel_turns(catalogue: Catalogue, bulk_id: str) -> None:
-    """Cancel the turns of a bulk run; each stops at its next report of progress."""
+    """Cancel the turns of a bulk run. Each turn stops at its next report of progress."""
     for turn in catalogue.jobs.of_kind(KIND):
         if turn.parameters["bulk_id"] == bulk_id:
             catalogue.jobs.cancel(turn.id)
@@ -54,7 +54,7 @@ def _wanted(bulk: BulkRow, processes: int) -> int:
 
 
 def _forget(catalogue: Catalogue, turn: JobRow) -> None:
-    """Delete an ended turn. If it failed for a reason that the next turn would meet too, stop the bulk run."""
+    """Delete an ended turn. If it failed with an error that the next turn would also meet, stop the bulk run."""
     error = JobError.model_validate(turn.error) if turn.error else None
     if error is not None and error.fault != Fault.TRANSIENT and error.code != "worker-lost":
         bulk_id = turn.parameters["bulk_id"]

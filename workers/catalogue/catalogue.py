@@ -80,8 +80,9 @@ class Catalogue:
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row with this identity, and whether it is new.
 
-        quota_mib: the limit for owners who have no individual limit; None: the limit is not checked. If the row exceeds
-        the limit, it is not added, and ``workers.catalogue.owners.OverQuota`` is raised.
+        quota_mib: the limit for owners without one of their own; None: no limit applies. Raises
+        ``workers.catalogue.owners.OverQuota`` and adds nothing if the row exceeds the limit even without the owner's
+        kept solutions. If it exceeds the limit with them, the oldest solutions are removed.
         """
         try:
             with self._database.writing.begin() as session:

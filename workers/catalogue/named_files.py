@@ -28,8 +28,11 @@ class NamedFiles:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def all(self) -> Iterator[str]:
-        """Every hash in the database; a hash may occur more than once. Rows are read in batches."""
+    def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
+        """Every hash in the database, some of them more than once; rows are read in batches.
+
+        solutions_from: without the kept solutions that were made before this time.
+        """
         for table in Base.metadata.sorted_tables:
             if table.name not in _SKIPPED:
                 yield from self._in(table, solutions_from)

@@ -1,7 +1,10 @@
 """The number of bytes that each owner keeps, and the owner's quota.
 
-The files of the owner's uploads, PSFs, products and reports are counted; their pictures are not. The transaction that
-adds a row also changes the count.
+The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The count changes
+in the transaction that adds the row.
+
+A solution can be made again, so it never takes room from anything else: the oldest solutions are removed if an upload or
+another solution needs their room.
 """
 
 from __future__ import annotations
@@ -32,7 +35,10 @@ NOT_KEPT = "the result of this job could not be kept"  # a reason for Usage.no_r
 
 @dataclass(frozen=True)
 class Usage:
-    """The bytes that an owner keeps, and the limit. limit_bytes None: no limit."""
+    """The bytes that an owner keeps, and the limit; limit_bytes None: no limit.
+
+    removable_bytes: the part of used_bytes that kept solutions take.
+    """
 
     owner: str
     used_bytes: int
@@ -40,8 +46,10 @@ class Usage:
     removable_bytes: int = 0
 
     def allows(self, more_bytes: int = 0) -> bool:
-        """Whether ``more_bytes`` can be added without exceeding the limit."""
-        return self.limit_bytes is None or self.used_bytes + more_bytes <= self.limit_bytes
+        """Whether this many more bytes fit, if need be without the kept solutions."""
+        if self.limit_bytes is None:
+            return True
+        return self.used_bytes - self.removable_bytes + more_bytes <= self.limit_bytes
 
     @property
     def full(self) -> bool:
@@ -135,11 +143,11 @@ def add_bytes(session: Session, owner: str, count: int) -> None:
     )
 
 
-def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int) -> None:
-    """Raise OverQuota if ``count`` bytes do not fit into the quota. The usage already includes these bytes.
+def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, removable: bool) -> None:
+    """Raise OverQuota if ``count`` bytes, which are counted already, did not fit; remove solutions that are in the way.
 
-    Other transactions of the owner wait until this one ends. Several uploads at once may exceed the limit although each
-    of them would fit; the last ones are then refused.
+    removable: whether they are the bytes of a solution. Other transactions of the owner wait until this one ends. If
+    several uploads fit one by one but not together, the last ones are refused.
     """
     counted = _usage(session, owner, quota_mib)
     before = replace(

@@ -1,1 +1,1 @@
-"""What the web process and the workers agree on: job kinds, parameters, phases, errors and identities."""
+"""The interface between the web process and the workers: job kinds, parameters, phases, errors and identities."""

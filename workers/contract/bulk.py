@@ -26,17 +26,17 @@ TEXT = r"^[^\x00-\x1f\x7f]+$"
 class BulkPhase(StrEnum):
     """Phases of a bulk run."""
 
-    LISTING = "LISTING"  # its files are being listed
+    LISTING = "LISTING"  # the files are being listed
     RUNNING = "RUNNING"
     PAUSED = "PAUSED"
-    COMPLETED = "COMPLETED"  # every image is done or has failed
+    COMPLETED = "COMPLETED"  # every image is done or failed
     CANCELLED = "CANCELLED"
-    ERROR = "ERROR"  # stopped by an error that is not an error of a single image
+    ERROR = "ERROR"  # stopped by an error that concerns the whole run, not one image
 
 
 AT_WORK = frozenset({BulkPhase.LISTING, BulkPhase.RUNNING})
 STOPPED = frozenset({BulkPhase.PAUSED, BulkPhase.ERROR})
-OPEN = AT_WORK | STOPPED  # an identical request gets the run that is in one of these phases
+OPEN = AT_WORK | STOPPED  # while a run is in one of these phases, an identical request gets this run
 BULK_ENDED = frozenset({BulkPhase.COMPLETED, BulkPhase.CANCELLED})
 
 
@@ -88,40 +88,43 @@ class Output(_Strict):
         min_length=2,
         max_length=1000,
         pattern=TEXT,
-        description="absolute path below a folder that the operator allows; made if it does not exist",
+        description="absolute path below a folder that the operator allows; the folder is created if it does not exist",
     )
     only: bool = Field(False, description="true: write products only to the folder; the service keeps none")
 
 
 class Treatment(_Strict):
-    """How each image is deconvolved."""
+    """The parameters with which each image is deconvolved."""
 
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
-        None, description="noise figures of the images' gain mode; null: the instrument's, if known"
+        None,
+        description="noise figures of the images' gain mode; null: the noise figures of the instrument, if known",
     )
     saturation_dn: float | None = Field(
         None,
         gt=0,
         allow_inf_nan=False,
-        description="saturation level in DN of one exposure; null: the instrument's, if known",
+        description="saturation level in DN of one exposure; null: the saturation level of the instrument, if known",
     )
     error_draws: int = Field(
-        0, ge=0, le=64, description="number of noise realisations for an ERROR plane (4 or more)"
+        0, ge=0, le=64, description="number of noise realisations for an ERROR plane: 0, or 2 or more"
     )
 
 
 class BulkWork(_Strict):
-    """A request for a bulk run without its uploaded images, which are listed from the start."""
+    """The part of a request for a bulk run that is stored with the run: all except the ids of uploaded images."""
 
-    name: str = Field("", max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$", description="a label for people")
+    name: str = Field(
+        "", max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$", description="a name to show in lists"
+    )
     files: list[FileSet] = Field(default_factory=list, max_length=MOST_SETS)
     psf_id: Identity | None = Field(None, description="a PSF of the catalogue")
     context: str | None = Field(
         None,
         min_length=1,
         max_length=64,
-        description="the context to choose each image's PSF from: its id or name",
+        description="id or name of the context from which the PSF of each image is chosen",
     )
     parameters: Treatment = Field(default_factory=lambda: Treatment())
     output: Output | None = None

@@ -1,4 +1,4 @@
-"""Identities: what a job makes has the SHA-256 of everything that determines it as its id."""
+"""Identities: the id of a job's result is the SHA-256 of everything that determines the result."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def canonical_hash(content: dict[str, Any]) -> str:
 
 
 def instrument_text(build: PsfBuild) -> str:
-    """The text of a build's instrument file: the user's own, or the shipped one.
+    """The text of the instrument file of a build: the user's own file, or a shipped file.
 
-    Raises DataError "unknown-instrument" if no instrument of that name is shipped.
+    Raises DataError "unknown-instrument" if no instrument file with this name is shipped.
     """
     if build.instrument_file is not None:
         return build.instrument_file
@@ -41,7 +41,7 @@ def instrument_text(build: PsfBuild) -> str:
 def psf_identity(build: PsfBuild) -> str:
     """Identity of a built PSF: bytes of the instrument file, parameters, version of the algorithm.
 
-    Raises DataError "unknown-instrument" if no instrument of that name is shipped.
+    Raises DataError "unknown-instrument" if no instrument file with this name is shipped.
     """
     return canonical_hash(
         {
@@ -55,7 +55,7 @@ def psf_identity(build: PsfBuild) -> str:
 
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, version of the algorithm."""
-    # The id of the PSF determines it. The recipe only says how to build it, and the context where it was found.
+    # The id of the PSF determines the PSF. The recipe only says how to build the PSF, and the context where it was found.
     excluded = {"psf_recipe", "context_id"} | ({"picked_for"} if request.picked_for is None else set())
     hashed = request.model_dump(mode="json", exclude=excluded)
     # This parameter was called effects_picture when the first products were made. Hashing it under that name keeps
@@ -84,7 +84,7 @@ def gap_identity(request: ResolvedGapDiagnose) -> str:
 
 
 def diffraction_identity(request: ResolvedOnTransit) -> str | None:
-    """Identity of the diffraction PSF to build for a request; None if the transit or the given PSF brings it."""
+    """Identity of the diffraction PSF to build for a request; None if the transit contains a known PSF or the request names a PSF."""
     return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
 
 
@@ -93,7 +93,7 @@ def _transit_identity(kind: str, request: ResolvedOnTransit, excluded: tuple[str
     return canonical_hash(
         {
             "kind": kind,
-            # The identity of the diffraction PSF determines it; the recipe only says how to build it.
+            # The identity of the diffraction PSF determines this PSF; the recipe only says how to build it.
             "request": request.model_dump(mode="json", exclude={"diffraction_recipe", *excluded}),
             "diffraction": diffraction_identity(request),
             "algorithm_version": request.algorithm_version,
@@ -112,10 +112,10 @@ def request_identity(kind: str) -> Callable[[Any], str]:
 
 
 def rerun_identity(request: ResolvedRerun, job_id: str) -> str:
-    """Identity of the report of a rerun. It contains the job's id: every rerun runs anew."""
+    """Identity of the report of a rerun. It contains the job's id, so that every rerun is executed."""
     return canonical_hash({"kind": "rerun", "of": request.of, "id": request.id, "job": job_id})
 
 
 def corrected_psf_identity(diagnosis: str) -> str:
-    """Identity of the PSF that a diagnosis adds, with the effect that explains the gap in its model."""
+    """Identity of the corrected PSF that a diagnosis adds: the fit with the effects of the answer in the model."""
     return canonical_hash({"kind": "gap-corrected-psf", "diagnosis": diagnosis})

@@ -1,7 +1,7 @@
-"""The table of job kinds, one row a kind. Everything else that depends on the kind is read from it.
+"""The table of job kinds, with one row for each kind. All code that depends on the kind of a job reads this table.
 
-To add a kind: its parameters in ``workers.contract.requests``, a row here, a task in ``workers/tasks``, and a test.
-The web process imports this module, so a task is named here and imported by the worker alone.
+To add a kind, write its parameters in ``workers.contract.requests``, a row here, a task in ``workers/tasks``, and a test.
+The web process imports this module. Therefore a row contains only the name of its task, and only workers import the task.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Assistant = Callable[[Any, Mapping[str, Any]], None]
 
 
 class Result(StrEnum):
-    """What a job makes; the value is its place in the interface."""
+    """The type of a job's result. The value is the beginning of the address of such a result."""
 
     PRODUCT = "/v1/products"
     PSF = "/v1/psfs"
@@ -72,16 +72,16 @@ class Kind:
 
     | field | meaning |
     |---|---|
-    | task, assistant | dotted names; an assistant is what other workers run for a job that calls for help |
-    | result | what the job makes |
-    | parameters, resolved | models: as the client sends them, and as the worker gets them; none: clients cannot request this kind |
-    | identity | of what the job makes, from its resolved parameters; none: every job makes something new |
-    | resolver | dotted name of the function that turns parameters into resolved ones, if checking the ids and adding the recipe of the diffraction PSF is not enough |
-    | queue | where jobs of this kind wait by default |
-    | origin | how the PSFs and products of this kind came about; a rerun finds the kind to run by it |
+    | task, assistant | dotted names of functions; other workers run the assistant when a job asks for help |
+    | result | type of the result |
+    | parameters, resolved | models of the parameters: as the client sends them, and as the worker gets them; None: clients cannot request this kind |
+    | identity | function from the resolved parameters to the identity of the result; None: every job makes a new result |
+    | resolver | dotted name of the function that resolves the parameters; the default checks the ids and adds the recipe of the diffraction PSF |
+    | queue | the queue in which jobs of this kind wait by default |
+    | origin | the origin of the PSFs or products that this kind makes; from the origin a rerun finds the kind to run |
     | needs_room | whether the owner's quota must have room before the job starts |
-    | counted_whole | whether the steps count the whole job, so that the time left follows from them |
-    | time_advice, memory_advice | what to change in a request that needs more than the operator's limits |
+    | counted_whole | whether the reported steps count the whole job, so that the time left can be estimated from them |
+    | time_advice, memory_advice | advice for a request that needs more than the operator's limits |
     """
 
     name: str
@@ -105,12 +105,12 @@ class Kind:
         return REQUESTS[self.name]
 
     def load_task(self) -> Task:
-        """Import the task. Only workers may do this: it loads numerics."""
+        """Import the task. Only workers may do this, because the task loads numerical libraries."""
         task: Task = load(self.task)
         return task
 
     def load_assistant(self) -> Assistant | None:
-        """Import what other workers run for a job of this kind; None if they cannot help."""
+        """Import the function that other workers run to help with a job of this kind; None if they cannot help."""
         return None if self.assistant is None else load(self.assistant)
 
 
@@ -169,7 +169,7 @@ _ROWS = (
         resolved=ResolvedCrossValidate,
         identity=psf_fit_identity,
         assistant="workers.tasks.crossval:assist_cross_validation",
-        queue=Queue.CROSSVAL,  # takes long: quick jobs go first
+        queue=Queue.CROSSVAL,  # these jobs take long, so quick jobs run first
         counted_whole=True,
         time_advice="use fewer runs, scheme 'shared', or fewer or smaller images",
         memory_advice="use fewer runs, scheme 'shared', or fewer or smaller images",
@@ -202,7 +202,7 @@ _ROWS = (
         resolved=ResolvedRerun,
         resolver="workers.intake.requests:resolve_rerun",
     ),
-    # Made by /v1/bulk, which has its own requests; the task checks the quota before each image.
+    # /v1/bulk makes these jobs from requests of its own; the task checks the quota before each image.
     Kind(
         "bulk",
         task="workers.bulk.task:bulk_turn",
@@ -247,6 +247,6 @@ def kind_of_origin(origin: str) -> Kind:
 
 
 def load(dotted: str) -> Any:
-    """What a name such as ``workers.tasks.rerun:rerun`` means; imports its module."""
+    """Import the function of a name such as ``workers.tasks.rerun:rerun``."""
     module, _, name = dotted.partition(":")
     return getattr(import_module(module), name)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Parameters(BaseModel):
-    """Parameters of a job or of a part of it. Unknown names are refused; values cannot be changed afterwards."""
+    """Base class of the parameters of a job, or of a part of a job. Unknown names are refused; values cannot be changed afterwards."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -22,8 +22,8 @@ class _Method(Parameters):
     algorithm_version: ClassVar[int]
     stop: Literal["fixed", "discrepancy"] = Field(
         "fixed",
-        description="`fixed`: stop after `steps` iterations; `discrepancy`: stop earlier, when the residual has fallen to "
-        "the noise (needs noise figures)",
+        description="`fixed`: stop after `steps` iterations; `discrepancy`: stop earlier, when the residual is as small "
+        "as the noise (needs noise figures)",
     )
     edges: Literal["zero", "symmetric", "extended"] | None = Field(
         None, description="the assumed scene beyond the field of view; null: the method's default"
@@ -32,7 +32,7 @@ class _Method(Parameters):
         None,
         ge=0,
         le=4096,
-        description="width of the estimated margin around the field of view; null: derived from the PSF",
+        description="width of the margin around the field of view in which the scene is also estimated; null: derived from the PSF",
     )
 
 

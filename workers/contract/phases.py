@@ -1,4 +1,4 @@
-"""Phases of a job, and the errors that end one."""
+"""Phases of a job, and the error with which a job fails."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LIVE = frozenset({Phase.QUEUED, Phase.EXECUTING, Phase.COMPLETED})
 
 
 class Fault(StrEnum):
-    """What caused an error: the user's data or request, a temporary failure, or the software itself."""
+    """The cause of an error: the user's data or request, a temporary failure, or the software itself."""
 
     USER = "user"
     TRANSIENT = "transient"

@@ -1,4 +1,4 @@
-"""The queues that jobs wait in, in the order in which workers take jobs from them."""
+"""The queues in which jobs wait. The order of the queues is the order in which workers take jobs from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Queue(StrEnum):
 
 
 def queues_named(names: str) -> tuple[Queue, ...]:
-    """The queues in a text such as ``interactive,bulk``, highest priority first; ValueError if it names another."""
+    """The queues in a text such as ``interactive,bulk``, highest priority first; ValueError if the text names an unknown queue."""
     wanted = {name.strip() for name in names.split(",") if name.strip()}
     if not wanted or wanted - set(Queue):
         raise ValueError(f"expected queues of {', '.join(Queue)}, separated by commas; got {names!r}")
@@ -23,7 +23,7 @@ def queues_named(names: str) -> tuple[Queue, ...]:
 
 
 def by_urgency(names: Iterable[str]) -> list[str]:
-    """Names of the broker's queues, highest priority first; Celery's own control queues come before all."""
+    """Names of the broker's queues, highest priority first; Celery's own control queues come before all others."""
     order = {broker_name(queue): place for place, queue in enumerate(Queue)}
     return sorted(names, key=lambda name: order.get(name, -1))
 

@@ -1,7 +1,7 @@
-"""Parameters of every job kind, as a client sends them.
+"""Parameters of every job kind as a client sends them.
 
-The web process and the workers both import this module, so it must not load numerics. Parameters of the methods of
-deconvolution are in ``workers.contract.methods``; ``workers.contract.kinds`` makes the requests from these models.
+The web process and the workers both import this module, so it must not load numerical libraries. The parameters of the
+deconvolution methods are in ``workers.contract.methods``. ``workers.contract.kinds`` makes the requests from these models.
 """
 
 from __future__ import annotations
@@ -19,14 +19,17 @@ ContextName = Annotated[
 Identity = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256, 64 hexadecimal digits")]
 TransitId = Annotated[Identity, Field(description="id returned by the upload of the transit")]
 TransitNoise = Annotated[
-    NoiseFigures | None, Field(description="replaces the noise figures of transit.json; null: use those")
+    NoiseFigures | None,
+    Field(
+        description="noise figures to use instead of the noise figures in transit.json; null: use transit.json"
+    ),
 ]
 Saturation = Annotated[
     float | None,
     Field(
         gt=0,
         allow_inf_nan=False,
-        description="saturation level in DN of one exposure; null: taken from the header or the instrument file, "
+        description="saturation level in DN of one exposure; null: the level is taken from the header or the instrument file, "
         "if known there",
     ),
 ]
@@ -43,7 +46,7 @@ ShapeName = Literal[
 
 
 class PsfBuild(Parameters):
-    """Build a PSF from a shipped instrument file or from your own."""
+    """Build a PSF from a shipped instrument file or from your own instrument file."""
 
     algorithm_version: ClassVar[int] = 2
     instrument: str | None = Field(None, description="name of a shipped instrument file, for example hri_euv")
@@ -74,28 +77,29 @@ class Deconvolve(Parameters):
     image_id: Identity = Field(description="id returned by the upload of the image")
     psf_id: Identity | None = Field(
         None,
-        description="a PSF of the catalogue; null: the certified PSF that fits the image, else the PSF built from "
-        "the instrument's file",
+        description="id of a PSF of the catalogue; null: the certified PSF that fits the image, else the PSF built from "
+        "the instrument file",
     )
     context: ContextName | None = Field(
         None,
-        description="the context to choose the PSF from: its id, its name, or `now`; null: the default context",
+        description="the context from which the PSF is chosen: its id, its name, or `now`; null: the default context",
     )
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
-        None, description="noise figures of the image's gain mode; null: the instrument's, if known"
+        None,
+        description="noise figures of the image's gain mode; null: the noise figures of the instrument, if known",
     )
     saturation_dn: float | None = Field(
         None,
         gt=0,
         allow_inf_nan=False,
-        description="saturation level in DN of one exposure; null: the instrument's, if known",
+        description="saturation level in DN of one exposure; null: the saturation level of the instrument, if known",
     )
     error_draws: int = Field(
         0,
         ge=0,
         le=64,
-        description="number of noise realisations for an ERROR plane: 0, or 2 and more; each costs one deconvolution",
+        description="number of noise realisations for an ERROR plane: 0, or 2 or more; each realisation takes as long as one deconvolution",
     )
     changes_picture: bool = Field(
         False, description="also draw the difference, the ratio and the histogram of the changes"
@@ -105,7 +109,7 @@ class Deconvolve(Parameters):
     def _a_spread(self) -> Deconvolve:
         if self.error_draws == 1:
             raise ValueError(
-                "error_draws: expected 0, or 2 and more; got 1, and one realisation shows no spread"
+                "error_draws: expected 0, or 2 or more; got 1: the spread cannot be estimated from one realisation"
             )
         return self
 
@@ -117,48 +121,51 @@ class Deconvolve(Parameters):
 
 
 class PsfFit(Parameters):
-    """Fit the diffuse scatter to an uploaded transit. The result is a PSF version with errors, curves and a report."""
+    """Fit the diffuse scatter to an uploaded transit. The result is a PSF version with the errors of the fit, its curves and a report."""
 
     algorithm_version: ClassVar[int] = 1
     transit_id: TransitId
     shape: ShapeName = Field("softened-power-law", description="formula of the scatter kernel")
     as_published: bool = Field(
         False,
-        description="also run the published recipe and measure the effect of each of its four biases (slow)",
+        description="also run the published recipe and measure each of its four biases (slow)",
     )
     noise: TransitNoise = None
     saturation_dn: Saturation = None
     seed: int = Field(
-        1, ge=0, lt=2**31, description="seed of the noise realisations of the free and published fits"
+        1,
+        ge=0,
+        lt=2**31,
+        description="seed of the random numbers in the fit of free shells and in the published recipe",
     )
 
 
 class CrossValidate(PsfFit):
-    """Cross-validate a fit: hold out blocks of images and bootstrap the rest, in many runs."""
+    """Cross-validate a fit: hold out blocks of images and bootstrap the other images, in many runs."""
 
     algorithm_version: ClassVar[int] = 2
     as_published: Literal[False] = False
     scheme: Literal["shared", "exact"] = Field(
         "shared",
-        description="`shared`: all folds use the same reconstructions; `exact`: each fold is a fit of its own "
-        "(slow; spread over several workers)",
+        description="`shared`: all folds use the same reconstructions; `exact`: each fold makes its own reconstructions "
+        "(slow; several workers share the folds)",
     )
     runs: int = Field(
-        10, ge=1, le=50, description="number of runs; each holds every block out once (the paper uses 10)"
+        10, ge=1, le=50, description="number of runs; each run holds out every block once (the paper uses 10)"
     )
 
 
 class Report(Parameters):
     """Report on an uploaded transit and its PSF.
 
-    Without ``psf_id`` the PSF is fitted to the transit, cross-validated and evaluated on held-out images; with it
-    that PSF is evaluated.
+    Without ``psf_id`` the PSF is fitted to the transit, cross-validated and evaluated on held-out images. With
+    ``psf_id`` the PSF with this id is evaluated.
     """
 
     algorithm_version: ClassVar[int] = 1
     transit_id: TransitId
     psf_id: Identity | None = Field(
-        None, description="a PSF of the catalogue to evaluate; null: fit one to the transit"
+        None, description="id of the PSF to evaluate; null: fit a PSF to the transit"
     )
     noise: TransitNoise = None
     saturation_dn: Saturation = None
@@ -169,7 +176,7 @@ class Report(Parameters):
     )
     shapes: bool = Field(
         False,
-        description="also compare the scatter shapes by their held-out residuals; only where the transit is fitted",
+        description="also compare the scatter shapes by their residuals on held-out images; only without psf_id",
     )
 
     @model_validator(mode="after")
@@ -183,32 +190,33 @@ class Report(Parameters):
 
 
 class GapDiagnose(Parameters):
-    """Diagnose the gap between an uploaded transit and the model fitted to it: its size, its place, and which effect explains it."""
+    """Diagnose the gap between an uploaded transit and the model that was fitted to it. The report says how large the gap is,
+    where in the data it appears, and which effects explain it."""
 
     algorithm_version: ClassVar[int] = 4
     transit_id: TransitId
     psf_id: Identity | None = Field(
         None,
-        description="a PSF of the catalogue that was fitted to a transit; the fit starts from it",
+        description="id of a PSF that was fitted to a transit; the fit starts from the parameters of this PSF",
     )
     noise: TransitNoise = None
     saturation_dn: Saturation = None
     seed: int = Field(1, ge=0, lt=2**31, description="seed of the simulation and of the confidence intervals")
     correct: bool = Field(
         True,
-        description="if an effect explains the gap, also add a PSF with that effect in the model to the catalogue",
+        description="if the diagnosis finds an effect, also add a corrected PSF to the catalogue: a fit with this effect in the model",
     )
 
 
 class PsfTables(Parameters):
-    """Make the lookup tables of a PSF. A PSF built or fitted by this service has them already."""
+    """Make the lookup tables of a PSF. A PSF that this service built or fitted already has tables."""
 
     algorithm_version: ClassVar[int] = 1
-    psf_id: Identity = Field(description="a PSF of the catalogue, for example an uploaded one")
+    psf_id: Identity = Field(description="id of a PSF of the catalogue, for example an uploaded PSF")
 
 
 class Rerun(Parameters):
-    """Make a product or a PSF again with the same parameters, and compare. Existing results do not change."""
+    """Make a product or a PSF again with the same parameters, and compare it with the first one. Existing results do not change."""
 
-    of: Literal["product", "psf"] = Field(description="what to make again")
+    of: Literal["product", "psf"] = Field(description="type of the result to make again")
     id: Identity = Field(description="id of the product or PSF; an uploaded PSF cannot be made again")

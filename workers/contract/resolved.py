@@ -1,6 +1,6 @@
-"""Parameters of every job kind as the worker gets them: every default filled in, the PSF chosen.
+"""Parameters of every job kind as the worker gets them: defaults are filled in, and the PSF is chosen.
 
-A kind that is not here is run with the parameters of ``workers.contract.requests`` as they are.
+A job of a kind that is not in this module runs with its parameters in ``workers.contract.requests``, unchanged.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from workers.contract.requests import CrossValidate, GapDiagnose, Identity, PsfB
 
 
 class ResolvedDeconvolve(Parameters):
-    """A deconvolution with its PSF, and with the recipe of that PSF if it may still have to be built."""
+    """A deconvolution with the id of its PSF. It also contains the recipe of the PSF, if the PSF may still have to be built."""
 
     image_id: Identity
     psf_id: Identity
     psf_recipe: PsfBuild | None = None
-    picked_for: str | None = None  # the image's instrument, if the service chose the PSF
-    context_id: str | None = None  # the context that the service chose it from
+    picked_for: str | None = None  # the instrument of the image, if the service chose the PSF
+    context_id: str | None = None  # the context from which the service chose the PSF
     method: Method
     noise: NoiseFigures | None = None
     saturation_dn: float | None = None
@@ -28,13 +28,13 @@ class ResolvedDeconvolve(Parameters):
 
 
 class ResolvedPsfFit(PsfFit):
-    """A fit with the recipe of the diffraction PSF, if the transit does not bring that PSF."""
+    """A fit with the recipe of the diffraction PSF, if the transit does not contain it."""
 
     diffraction_recipe: PsfBuild | None = None
 
 
 class ResolvedCrossValidate(CrossValidate):
-    """A cross-validation with the recipe of the diffraction PSF, if the transit does not bring that PSF."""
+    """A cross-validation with the recipe of the diffraction PSF, if the transit does not contain it."""
 
     diffraction_recipe: PsfBuild | None = None
 
@@ -50,11 +50,13 @@ class ResolvedGapDiagnose(GapDiagnose):
 
     diffraction_recipe: PsfBuild | None = None
     added_effects: tuple[str, ...] = ()
-    added_effects_sha256: tuple[str, ...] = ()  # of their source texts: a changed text is another diagnosis
+    added_effects_sha256: tuple[
+        str, ...
+    ] = ()  # hashes of the source texts of the added effects, because a changed text may change the diagnosis
 
 
 class ResolvedRerun(Rerun):
-    """A rerun with the kind of the job that made the thing, and with that job's own parameters."""
+    """A rerun with the kind and the parameters of the job that made the product or PSF."""
 
     kind: str
     parameters: dict[str, Any]

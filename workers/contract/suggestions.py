@@ -1,4 +1,4 @@
-"""What to tell a client whose request names something unknown: which names exist, and the one probably meant."""
+"""Messages for a request with an unknown name: which names exist, and which name the client probably meant."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
-# Names of earlier versions that are too different from today's to be guessed.
+# Former names that are too different from the present names to be guessed.
 FORMER_NAMES = {"evaluate": "report", "effects_picture": "changes_picture"}
 SHOWN = 60
 
@@ -24,9 +24,9 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def explained(errors: Iterable[ErrorDetails], model: Any) -> Iterator[tuple[ErrorDetails, str]]:
-    """Each validation error with its message; errors about unknown names say which names are known.
+    """Each validation error with its message. The message of an error about an unknown name lists the known names.
 
-    model: the type that was validated; the errors' locations start there.
+    model: the type that was validated. The locations of the errors are relative to it.
     """
     for error in errors:
         yield error, _message(error, model)
@@ -59,9 +59,9 @@ def _members(kind: Any) -> list[type[BaseModel]]:
 
 
 def _at(kind: Any, location: Iterable[str | int]) -> Any:
-    """The type at a location. Besides fields, a location names the tag that chose a member of a union."""
+    """The type at a location. A location consists of field names, list indices, and the tags that select a member of a union."""
     for step in location:
-        if isinstance(step, int):  # a place in a list
+        if isinstance(step, int):  # an index of a list
             continue
         members = _members(kind)
         field = next((m.model_fields[step] for m in members if step in m.model_fields), None)

@@ -1,8 +1,9 @@
 """Remove files to which no row of the catalogue refers. A job leaves such files if it is killed before it adds its row.
 
-Recent files stay, because an upload stores its file before it adds its row. A file may be stored again at the moment at
-which it is removed; its row then appears a little later. Therefore the rows are read a second time before a file is
-deleted permanently.
+Recent files stay, because an upload stores its file before its row. If a file is stored again at the moment of its
+removal, its row appears a little later: the rows are therefore read a second time before the file is deleted for good.
+
+Kept solutions of transits can be made again. Those that were made before the same time are removed with their rows.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ def collect(
     even_most: bool = False,
     second_look_after_s: float = SECOND_LOOK_AFTER_S,
 ) -> Collected:
-    """Remove files that were last stored more than ``older_than_s`` seconds ago and to which no row refers.
+    """Remove files that were last stored more than ``older_than_s`` ago and to which no row, or only the row of an
+    old solution, refers.
 
     Run only one collection at a time. Raises DataError "nothing-named" if no row refers to any file of the store: the
     database then probably belongs to another store. Raises DataError "most-unnamed" if more than half of the files would

@@ -1,1 +1,1 @@
-"""From what a user sends to catalogue rows and resolved jobs, with estimates of their cost."""
+"""Turns uploads and requests of users into catalogue rows and resolved jobs, and estimates the cost of jobs."""

@@ -1,6 +1,6 @@
-"""Start values of the estimates: ``estimates.json``, measured by ``python -m benchmarks.estimates --write``.
+"""Initial values of the estimates, from ``estimates.json``. They were measured by ``python -m benchmarks.estimates --write``.
 
-Seconds are processor time of one core in 2026. Times per pixel are in ns, memory per pixel in bytes.
+Times in seconds are processor time on one core of a machine of 2026. Times per pixel are in ns, memory per pixel in bytes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ class _Frozen(BaseModel):
 
 
 class Linear(_Frozen):
-    """A base, and a part for each pixel that the job reads. The factors apply if the request sets the parameter."""
+    """Time and memory as a constant plus a part that is proportional to the number of pixels that the job reads.
+
+    as_published, shapes: factors of the time, if the request sets the parameter with this name.
+    """
 
     base_s: float
     pixel_ns: float
@@ -23,32 +26,37 @@ class Linear(_Frozen):
     pixel_bytes: float
     as_published: float = 1.0
     shapes: float = 1.0
-    run: dict[str, tuple[float, float]] = Field(default_factory=dict)  # per run, by scheme: s, ns a pixel
+    run: dict[str, tuple[float, float]] = Field(
+        default_factory=dict
+    )  # time of one run, by scheme: s, and ns per pixel
 
 
 class Deconvolution(_Frozen):
-    """Time of a step for each pixel of the plane (the image with its margins), by method."""
+    """Time and memory of a deconvolution. ``step_ns``, by method: time of one step per pixel of the plane (the image with its
+    margins)."""
 
     base_s: float
     image_ns: float
     step_ns: dict[str, float]
     margin_share: dict[
         str, float
-    ]  # default margin as a share of half the PSF, measured with the PSF of HRI_EUV
-    psf_draws: int  # deconvolutions with other PSFs, for the errors of a fitted PSF: two for each parameter
+    ]  # default margin divided by half the width of the PSF, measured with the PSF of HRI_EUV
+    psf_draws: (
+        int  # number of deconvolutions with other PSFs, for the errors of a fitted PSF: two per parameter
+    )
     plane_bytes: float
     image_bytes: float
-    errors_bytes: float  # more for each pixel of the image, if errors are estimated
+    errors_bytes: float  # further memory per pixel of the image, if errors are estimated
     psf_bytes: float
 
 
 class Build(_Frozen):
-    """Time for each spectral line of the bandpass. A mask is transformed at S^2 places a pixel, S in ``samples``."""
+    """Time of a PSF build for each spectral line of the bandpass. A mask is sampled at S^2 points per pixel; ``samples`` limits S."""
 
     disc_s: float
     mesh_s: float
     mask_s: float
-    samples: tuple[int, int]  # fewest and most; a mask that needs more is treated as a disc
+    samples: tuple[int, int]  # smallest and largest S; a mask that needs a larger S is treated as a disc
     samples_exponent: float
     grid_px: int
     grid_exponent: float
@@ -57,10 +65,10 @@ class Build(_Frozen):
 
 
 class Costs(_Frozen):
-    """The content of ``estimates.json``. ``threads_exponent`` p: n threads need n ** -p of the time of one."""
+    """The content of ``estimates.json``. ``threads_exponent`` p: n threads need the time of one thread times n ** -p."""
 
     class Kinds(BaseModel):
-        """By kind of job. Every other kind is Linear; a kind without an entry uses "other"."""
+        """The models by kind of job. Every kind except ``deconvolve`` and ``psf-build`` is Linear; a kind without an entry uses "other"."""
 
         model_config = ConfigDict(frozen=True, extra="allow")
         __pydantic_extra__: dict[str, Linear]
@@ -69,12 +77,12 @@ class Costs(_Frozen):
         psf_build: Build = Field(alias="psf-build")
         other: Linear
 
-    worker_mib: float  # of a worker with its libraries, before its first job
+    worker_mib: float  # memory of a worker with its libraries, before its first job
     threads_exponent: float
     kinds: Kinds
 
     def linear(self, kind: str) -> Linear:
-        """The model of a kind that has no model of its own."""
+        """The linear model of a kind; the model "other" if the kind has no entry."""
         return (self.kinds.__pydantic_extra__ or {}).get(kind, self.kinds.other)
 
 

@@ -1,8 +1,8 @@
-"""Estimates what a job will need, from the sizes of its inputs, before the job is accepted.
+"""Estimates the time and memory of a job from the sizes of its inputs, before the job is accepted.
 
-The start values are in ``workers.intake.cost_model``. The time is then multiplied by a factor that this machine
-showed for completed jobs of the same kind. A wrong estimate costs little: a job that takes too long is stopped, and
-memory that is not needed is not used.
+The initial values are in ``workers.intake.cost_model``. The time is then multiplied by a factor that was measured on
+completed jobs of the same kind in this catalogue. A wrong estimate does little harm: a job that takes too long is
+stopped, and memory is not reserved.
 
 | symbol | name | unit |
 |---|---|---|
@@ -31,9 +31,12 @@ from workers.intake.cost_model import COSTS
 from workers.settings import Settings
 
 MIB = 2**20
-BYTES_A_PIXEL = 4.0  # of a transit's files, of which only the length is known here
+BYTES_A_PIXEL = 4.0  # assumed for the files of a transit, because only their length is known here
 
-FEWEST_JOBS, MOST_JOBS = 3, 30  # completed jobs of a kind that the factor is the median of
+FEWEST_JOBS, MOST_JOBS = (
+    3,
+    30,
+)  # number of completed jobs of a kind from which the factor is computed, as a median
 BOUNDS = 0.2, 5.0
 # A job that was faster than this share of its estimate found its result in the catalogue.
 FOUND = 0.05
@@ -43,14 +46,14 @@ _factors: WeakKeyDictionary[Catalogue, dict[str, tuple[float, float]]] = WeakKey
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a job is expected to need. ``start_s``: without the factor of this machine."""
+    """The expected time and memory of a job. ``start_s``: the time before it is multiplied by the measured factor."""
 
     memory_mib: int
     seconds: float
     start_s: float
 
     def as_json(self) -> dict[str, Any]:
-        """The form kept with the job."""
+        """The estimate as JSON, as it is stored with the job."""
         return {"memory_mib": self.memory_mib, "seconds": self.seconds, "start_s": self.start_s}
 
 
@@ -80,7 +83,7 @@ def checked(
 def estimate(
     kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str, threads: int
 ) -> Estimate:
-    """What a job with these resolved parameters will need with this number of threads."""
+    """The estimated time and memory of a job with these resolved parameters and this number of threads."""
     if kind == "rerun":
         kind, parameters = parameters["kind"], parameters["parameters"]
     if kind == "deconvolve":
@@ -98,7 +101,7 @@ def estimate(
 
 
 def factor(kind: str, catalogue: Catalogue) -> float:
-    """Measured over estimated time of completed jobs of this kind on this machine; 1 until there are enough."""
+    """The median of measured time divided by estimated time, for completed jobs of this kind; 1 if they are too few."""
     known = _factors.setdefault(catalogue, {})
     value, until = known.get(kind, (1.0, -math.inf))
     if time.monotonic() < until:
@@ -117,7 +120,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     cost = COSTS.kinds.deconvolve
     image = catalogue.get(ImageRow, parameters["image_id"], owner)
     psf = catalogue.get(PsfRow, parameters["psf_id"], owner)
-    # An image of a bulk run may not be an upload; its request then has the shape.
+    # An image of a bulk run may be a file that was not uploaded; the parameters then contain its shape.
     ny, nx = parameters.get("image_shape") or ((0, 0) if image is None else image.summary["shape"])
     built_s, built_mib, psf_shape = 0.0, 0.0, (ny, nx)
     if psf is not None:
@@ -157,7 +160,7 @@ def _build(parameters: Mapping[str, Any]) -> tuple[float, float]:
     cost = COSTS.kinds.psf_build
     grid = max(parameters["size"], cost.grid_px) / cost.grid_px
     if not (parameters.get("instrument") or parameters.get("instrument_file")):
-        # A rerun: the text of the instrument file is in the file of the PSF, which is not read here.
+        # This is a rerun. The text of the instrument file is in the file of the PSF, which is not read here.
         return cost.mask_s, cost.meshes_mib + cost.grid_mib * grid**2
     build = PsfBuild.model_validate(parameters)
     instrument = parse_instrument(instrument_text(build), build.instrument or "instrument_file")
@@ -194,7 +197,7 @@ def _linear(
 
 
 def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> float:
-    """Pixels of the job's transit; else of its image; else of its PSF."""
+    """Number of pixels of the job's transit; without a transit, of its image; without an image, of its PSF."""
     if parameters.get("transit_id"):
         transit = catalogue.get(TransitRow, parameters["transit_id"], owner)
         return 0.0 if transit is None else transit.summary["unpacked_bytes"] / BYTES_A_PIXEL

@@ -1,4 +1,4 @@
-"""Chooses the one PSF that fits filters or the header of an image, or says why there is not exactly one."""
+"""Finds the one PSF that meets filters or fits the header of an image. If there is not exactly one, the error says why."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Found:
 
     wanted: PsfFilter
     context: PsfContextRow | None  # None: all PSFs were searched
-    psfs: Sequence[PsfRow]  # MOST_NAMED + 1 at most
-    emptied_by: str | None  # the first filter that excluded all PSFs, if none was found
+    psfs: Sequence[PsfRow]  # at most MOST_NAMED + 1 PSFs
+    emptied_by: str | None  # the first filter that excluded all remaining PSFs; None if PSFs were found
 
     def one(self) -> PsfRow:
         """The PSF. Raises ``DataError`` "no-psf-fits" or "several-psfs-fit"."""
@@ -69,7 +69,9 @@ class Found:
 
 
 def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | None) -> Found:
-    """The PSFs that fit in a context (an id, a name or "now"; None: the owner's default). Without a context: certified PSFs.
+    """The PSFs that meet the filters. context: an id, a name or "now"; None: the owner's default context.
+
+    If there is no context, and the filters name no status, only certified PSFs are searched.
 
     Raises ``DataError`` "no-such-context".
     """
@@ -85,7 +87,7 @@ def look(catalogue: Catalogue, wanted: PsfFilter, owner: str, context: str | Non
 def look_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str = TOTAL
 ) -> Found:
-    """The PSFs of an image's instrument, channel and time. header: the summary stored with its upload.
+    """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the upload.
 
     Raises ``DataError`` "no-instrument", "no-date" or "no-such-context".
     """
@@ -93,7 +95,7 @@ def look_for_image(
     if instrument is None:
         raise DataError(
             "no-instrument",
-            "expected DETECTOR or INSTRUME in the image's header; got neither: name the PSF yourself",
+            "expected DETECTOR or INSTRUME in the image's header; got neither: name the PSF in the request",
         )
     at = _observed_at(header)
     found = look(catalogue, PsfFilter(instrument, channel, kind, valid_at=at), owner, context)
@@ -109,9 +111,9 @@ def look_for_image(
 def picked_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None
 ) -> Found | None:
-    """The PSF for an image if the request names none; None if the series of the image has no certified PSF.
+    """The PSF for an image, if the request names no PSF; None if the series of the image has no certified PSF.
 
-    Raises ``DataError`` as ``look_for_image`` does, and "no-psf-fits" if the series has PSFs, but none in the context.
+    Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
     """
     instrument, channel = _seen_through(header)
     series = series_of(instrument, channel, TOTAL)
@@ -136,7 +138,7 @@ def _seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
 def _observed_at(header: Mapping[str, Any]) -> float | None:
     try:
         return seconds(header["date_obs"] or "")
-    except DataError:  # a keyword may contain anything; the caller reports a missing time
+    except DataError:  # the keyword contains a text that is not a time; the caller reports a missing time
         return None
 
 

@@ -1,4 +1,4 @@
-"""From the request for a job to resolved parameters: every default filled in, every id checked, the PSF chosen."""
+"""Resolves the parameters of a request for a job: fills in the defaults, checks the ids and chooses the PSF."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from workers.lineage import made_by
 
 @dataclass(frozen=True)
 class Asked:
-    """The parameters of a request, and what resolving them needs."""
+    """The parameters of a request, and the objects that are needed to resolve them."""
 
     kind: Kind
     parameters: Any
@@ -33,7 +33,7 @@ class Asked:
     added_effects: tuple[str, ...]
 
     def resolved(self, **more: Any) -> Parameters:
-        """The resolved model with the parameters and these further fields."""
+        """The resolved model: the parameters of the request, and these further fields."""
         assert self.kind.resolved is not None
         return self.kind.resolved.model_validate(self.parameters.model_dump(mode="json") | more)
 
@@ -41,7 +41,7 @@ class Asked:
 def resolve(
     request: JobRequest, catalogue: Catalogue, owner: str, *, added_effects: tuple[str, ...] = ()
 ) -> tuple[dict[str, Any], str]:
-    """Resolved parameters, and the identity of what the job makes.
+    """Resolved parameters, and the identity of the job's result.
 
     added_effects: modules with effects that the operator adds to the library of a gap diagnosis. Raises
     ``DataError`` "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument",
@@ -52,7 +52,7 @@ def resolve(
     resolver = load(kind.resolver)
     resolved: Parameters = resolver(Asked(kind, request.parameters, catalogue, owner, added_effects))
     if kind.identity is None:
-        # A random identity: every job of this kind makes something new.
+        # A random identity, because every job of this kind makes a new result.
         identity = canonical_hash({"kind": kind.name, "asked": uuid.uuid4().hex})
     else:
         identity = kind.identity(resolved)
@@ -83,18 +83,18 @@ def resolve_psf_build(asked: Asked) -> Parameters:
 
 
 def resolve_report(asked: Asked) -> Parameters:
-    """A report on a given PSF needs no fit, so no diffraction PSF and no dark offsets."""
+    """Resolve a report. A report on a given PSF needs no fit, and therefore no diffraction PSF and no dark offsets."""
     if asked.parameters.psf_id is None:
         return resolve_by_ids(asked)
     summary = _transit(asked.catalogue, asked.parameters.transit_id, asked.owner).summary
     _psf(asked.catalogue, asked.parameters.psf_id, asked.owner)
     _check_noise(summary, asked.parameters.noise)
-    # Requests that differ only in an ignored parameter share one report.
+    # The ignored parameter is set to a fixed value, so that requests that differ only in it share one report.
     return asked.resolved(dark_offsets=False)
 
 
 def resolve_gap_diagnose(asked: Asked) -> Parameters:
-    """A diagnosis also records the effects that the operator adds, and the SHA-256 of their source texts."""
+    """Resolve a diagnosis: also record the effects that the operator adds, and the SHA-256 of their source texts."""
     added = asked.added_effects
     fields = {"added_effects": added, "added_effects_sha256": tuple(map(sha256_of_source, added))}
     resolved = resolve_by_ids(asked)
@@ -102,7 +102,7 @@ def resolve_gap_diagnose(asked: Asked) -> Parameters:
 
 
 def resolve_rerun(asked: Asked) -> Parameters:
-    """The job that made a product or a PSF."""
+    """Resolve a rerun: find the job that made the product or PSF."""
     again = asked.parameters
     row: ProductRow | PsfRow | None
     if again.of == "psf":
@@ -117,7 +117,7 @@ def resolve_rerun(asked: Asked) -> Parameters:
 
 
 def resolve_deconvolve(asked: Asked) -> Parameters:
-    """A deconvolution with its PSF."""
+    """Resolve a deconvolution: also choose its PSF."""
     image = _image(asked.catalogue, asked.parameters.image_id, asked.owner)
     return resolved_deconvolution(asked.parameters, image.summary, asked.catalogue, asked.owner)
 
@@ -125,7 +125,7 @@ def resolve_deconvolve(asked: Asked) -> Parameters:
 def resolved_deconvolution(
     wanted: Deconvolve, header: dict[str, Any], catalogue: Catalogue, owner: str
 ) -> ResolvedDeconvolve:
-    """A deconvolution, with its PSF, of an image with this header. Raises ``DataError`` as ``resolve`` does."""
+    """The resolved deconvolution of an image with this header, with its PSF. Raises the same ``DataError`` as ``resolve``."""
     return ResolvedDeconvolve(
         **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
     )
@@ -161,7 +161,7 @@ def _check_noise(summary: dict[str, Any], noise: NoiseFigures | None) -> None:
 
 
 def _diffraction_of(summary: dict[str, Any], noise: NoiseFigures | None) -> PsfBuild | None:
-    """The recipe of the diffraction PSF of a transit; None if the transit brings that PSF."""
+    """The recipe of the diffraction PSF of a transit; None if the transit contains this PSF."""
     _check_noise(summary, noise)
     if summary["known_psf"] is not None:
         return None
@@ -175,7 +175,7 @@ def _diffraction_of(summary: dict[str, Any], noise: NoiseFigures | None) -> PsfB
 
 
 def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, owner: str) -> dict[str, Any]:
-    """The PSF named in the request; else the certified one that fits the image; else the instrument's, as built."""
+    """The PSF that the request names; else the certified PSF that fits the image; else the PSF that is built for the instrument."""
     if wanted.psf_id is not None:
         _psf(catalogue, wanted.psf_id, owner)
         return {"psf_id": wanted.psf_id}
@@ -196,7 +196,7 @@ def _default_psf(header: dict[str, Any]) -> PsfBuild:
         named = " ".join(str(header[k]) for k in ("telescop", "instrume", "detector") if header[k])
         raise DataError(
             "no-psf-for-instrument",
-            f"expected an image of an instrument with a shipped instrument file; got one by "
+            f"expected an image of an instrument with a shipped instrument file; got an image of "
             f"'{named or 'an unnamed instrument'}': upload a PSF and name it as psf_id",
         )
     return PsfBuild(instrument=header["instrument"])

@@ -1,4 +1,4 @@
-"""Catalogue rows of what users upload: images, transits and PSFs."""
+"""Makes the catalogue rows of uploaded images, transits and PSFs."""
 
 from __future__ import annotations
 
@@ -66,7 +66,8 @@ def uploaded_psf_row(
 ) -> PsfRow:
     """The row of an uploaded PSF, with status draft.
 
-    What the request does not name (name, version, series) is taken from the header, then from the file's name.
+    A name, version, instrument or channel that the request does not give is taken from the header. Without a name in the
+    header, the PSF gets the name of the file.
     """
     header = dataclasses.asdict(summary)
     instrument = instrument or instrument_of(header)

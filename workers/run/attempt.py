@@ -29,18 +29,18 @@ class TookTooLong(Exception):
 
     def __init__(self, limit_s: float) -> None:
         super().__init__(
-            f"expected a job to run for at most {limit_s:g} s (HELIOPSF_MAX_JOB_S); this one was stopped after that "
+            f"expected a job to run for at most {limit_s:g} s (HELIOPSF_MAX_JOB_S); this job was stopped after that "
             f"time: send a smaller request, or ask the operator for a higher limit"
         )
 
 
 class Cancelled(Exception):
-    """The job was cancelled, or this worker lost its lease: stop, and write nothing."""
+    """The job was cancelled, or this worker lost its lease. The task must stop and write no result."""
 
 
 @dataclass
 class Attempt:
-    """A claimed job while it runs. ``limit_s`` is the longest time from ``started`` to a report of progress."""
+    """A claimed job while it runs. A report of progress later than ``limit_s`` after ``started`` stops the job."""
 
     catalogue: Catalogue
     lease: Lease
@@ -68,7 +68,7 @@ class Attempt:
             heart.join()
 
     def _beat(self) -> None:
-        """Send heartbeats until the attempt ends or is cancelled; hand the job back if the worker has to stop."""
+        """Send heartbeats until the attempt ends or is cancelled. If the worker has to stop, hand the job back."""
         while not self.ended.wait(self.heartbeat_s):
             try:
                 if self.stopping.due and self.catalogue.jobs.hand_back(self.lease):
@@ -77,7 +77,7 @@ class Attempt:
                     return
                 alive = self.catalogue.jobs.heartbeat(self.lease)
             except SQLAlchemyError as error:
-                # If this lasts, the lease expires and another worker gets the job. Nothing to do here.
+                # Try again at the next heartbeat. If the database stays away, the lease expires and another worker gets the job.
                 log.warning("job %s: could not write the heartbeat: %s", self.lease.job_id, error)
                 continue
             if not alive:
@@ -97,7 +97,7 @@ class Attempt:
                 if not self.catalogue.jobs.progress(self.lease, stage, step, steps):
                     self.stopped.set()
             except SQLAlchemyError as error:
-                # The database may be back in a moment; finished work must not be lost until then.
+                # The database may answer again soon, so the task continues: its work must not be lost.
                 log.warning("job %s: could not write the progress: %s", self.lease.job_id, error)
         if self.stopped.is_set():
             raise Cancelled(self.lease.job_id)
@@ -109,7 +109,7 @@ class Attempt:
 
 @dataclass
 class Assistance:
-    """Help with a job that runs in another worker: it ends when that job ends."""
+    """Help with a job that another worker runs. The help ends when the job ends."""
 
     catalogue: Catalogue
     job_id: str

@@ -1,4 +1,5 @@
-"""Runs one job: claim, heartbeat, task, outcome. Only here does an exception become the error of a job."""
+"""Runs one job: claims it, sends heartbeats, runs its task and records the outcome. Only this module turns an exception into
+the error of a job."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
 
 
 def worker_name() -> str:
-    """The name of this process in jobs and in the list of workers."""
+    """The name of this process, as jobs and the list of workers show it."""
     return f"{socket.gethostname()}:{os.getpid()}"
 
 
@@ -48,13 +49,13 @@ class Runner:
         stopping: Stopping | None = None,
         submit: Callable[[str, Queue], bool] = lambda job_id, queue: False,
     ) -> None:
-        """submit: sends an unfinished job to the broker again; if it returns False, the reconciler does that."""
+        """submit: function that sends an unfinished job to the broker again. If it returns False, the reconciler sends the job."""
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit
         self._stopping = stopping or Stopping()
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
-        """Run the job if it is queued. Otherwise do nothing: it was delivered twice, cancelled or claimed."""
+        """Run the job if it is queued. Otherwise do nothing: the message was delivered twice, or the job was cancelled or claimed."""
         if self._stopping.asked:
             self._catalogue.jobs.forget_submission(job_id)
             log.info("job %s: left in the queue because this worker is stopping", job_id)
@@ -80,7 +81,7 @@ class Runner:
                 self._keep_times(job, attempt.times)
 
     def assist(self, job_id: str) -> None:
-        """Share the work of a job that runs in another worker, until no part is left or the job ends."""
+        """Share the work of a job that another worker runs, until no part is left or the job ends."""
         job = self._catalogue.jobs.get(job_id)
         if self._stopping.asked or job is None or job.phase != Phase.EXECUTING:
             return
@@ -149,8 +150,8 @@ class Runner:
     def _check_room(self, job: JobRow) -> None:
         """Raise DataError "quota-exceeded" if the owner's quota has no room for the result of the job.
 
-        The quota was checked when the job was submitted, but other jobs may have filled it since. A result that
-        exists needs no room.
+        The quota was checked when the job was submitted, but other jobs may have filled it since then. A result that
+        already exists needs no room.
         """
         if not KINDS[job.kind].needs_room:
             return
@@ -159,7 +160,7 @@ class Runner:
             raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
 
     def _is_there(self, job: JobRow) -> bool:
-        """Whether the result exists: made by an identical job, or by an earlier attempt that could not record its end."""
+        """Whether the result already exists. An identical job may have made it, or an earlier attempt that could not record its end."""
         made, find = job.work_key, self._catalogue.get
         if made is None:
             return False
@@ -171,16 +172,15 @@ class Runner:
         return any(row is not None for row in found)
 
     def _keep_times(self, job: JobRow, times: StageTimer) -> None:
-        """Add the stage times of an attempt to the sums. Its outcome is recorded already, so a failure here is only logged."""
+        """Add the stage times of an attempt to the sums. The outcome of the attempt is already recorded, so a failure here is only logged."""
         try:
             self._catalogue.stage_times.add(job.kind, times.end())
         except SQLAlchemyError as error:
             log.warning("job %s: could not keep its stage times: %s", job.id, error)
 
     def _guarded(self, job: JobRow, attempt: Attempt, piece: Callable[[], None]) -> JobError | None:
-        """Do one piece of a job of many pieces, and return its error. Errors that concern the whole job are raised.
-
-        Each piece may take as long as a whole job.
+        """Do one piece of a job that has many pieces, and return the error of the piece. Errors that concern the whole job are
+        raised. The time limit of a job applies to each piece separately.
         """
         attempt.started = time.monotonic()
         try:
@@ -226,12 +226,12 @@ class Runner:
             except TRANSIENT as error:
                 if time.monotonic() > deadline:
                     raise
-                log.warning("could not write the outcome, trying again: %s", error)
+                log.warning("could not write the outcome of a job, trying again: %s", error)
                 time.sleep(0.5)
 
 
 def _internal(job: JobRow, error: Exception) -> JobError:
-    """An error of the software. Its text may name files and statements, so only the operator's log gets it."""
+    """An error of the software. Only the operator's log gets the text of the exception, because it may contain names of files and SQL statements."""
     message = (
         f"the software failed ({type(error).__name__}): send the job id {job.id} to the operator, whose worker log has "
         "the details"

@@ -7,15 +7,15 @@ from multiprocessing.sharedctypes import RawValue
 
 
 class Stopping:
-    """Shared with children that are forked later: the parent gets the signal, and a child runs the job.
+    """The stop flag, shared with child processes that are forked later: the parent gets the signal, and a child runs the job.
 
-    It is one number in shared memory. It has no lock, because a signal handler writes it.
+    The flag is one number in shared memory. It has no lock, because a signal handler writes it.
     """
 
     def __init__(self) -> None:
         self._let_go_at = RawValue(
             "d", 0.0
-        )  # time.monotonic(), the same clock in all processes; 0: not asked to stop
+        )  # the deadline by time.monotonic(), a clock that all processes share; 0: not asked to stop
 
     def ask(self, within_s: float) -> None:
         """Take no more jobs, and hand back the running one after ``within_s`` seconds. Repeated calls change nothing."""

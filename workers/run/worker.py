@@ -1,9 +1,9 @@
 """The worker process: ``celery -A workers.run.worker`` or ``heliopsf worker``.
 
-The parent loads no numerics: each child loads them after the fork, with its share of the threads.
+The parent loads no numerical libraries. Each child loads them after the fork, with its share of the threads.
 
 On SIGTERM, or one Control-C, the worker takes no more jobs. The running job may continue for ``stop_s`` seconds;
-then it is handed back and queued as if it had not started. After ``gone_s`` seconds the worker exits in any case.
+then it is handed back and queued as if it had not started. After ``gone_s`` seconds the worker exits even if this has not succeeded.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ app = queue.make_app(settings)
 app.select_queues([broker_name(name) for name in settings.queues])
 app.steps["consumer"].add(TakeWhatCanStart)
 LOOK_EVERY_S = 0.5
-WAIT_S = 2.0  # until a database that does not answer is tried again
-stopping = Stopping()  # made before the fork, so that the children see when their parent is told to stop
+WAIT_S = 2.0  # time after which a database that does not answer is tried again
+stopping = Stopping()  # made before the fork, so that the children share it with their parent
 
 
 @app.task(name=queue.RUN_JOB)
@@ -53,7 +53,7 @@ def assist(job_id: str) -> None:
 
 @setup_logging.connect
 def _logs(**_: object) -> None:
-    """Celery leaves logging alone if a function is connected to this signal."""
+    """Do nothing. Celery does not configure the logs if a function is connected to this signal."""
     logs.configure(settings)
 
 
@@ -66,7 +66,7 @@ def _watch(**_: object) -> None:
 
     try:
         check_tables()
-    # After an Exception here Celery would continue; SystemExit ends it.
+    # Celery would log an Exception and continue; SystemExit ends the worker.
     except SchemaError as error:
         raise SystemExit(f"Error: {error}") from error
     except SQLAlchemyError as error:
@@ -91,7 +91,9 @@ def check_tables() -> None:
     from workers import checks
     from workers.catalogue.catalogue import Catalogue
 
-    catalogue = Catalogue(settings.catalogue_url)  # closed below: no connection may be open at the fork
+    catalogue = Catalogue(
+        settings.catalogue_url
+    )  # closed below, because no connection may be open at the fork
     try:
         while True:
             try:
@@ -109,7 +111,7 @@ def _end_at_the_latest() -> None:
         time.sleep(LOOK_EVERY_S)
     time.sleep(settings.gone_s)
     log.warning("still running %g s after the signal to stop: exiting now", settings.gone_s)
-    # The kernel ends the children with their parent, where Celery could ask for that.
+    # When the parent exits, the kernel ends the children, on systems where Celery can request this.
     os._exit(0)
 
 
@@ -145,7 +147,7 @@ def _be_present() -> None:
 
 @lru_cache(maxsize=1)
 def _runner() -> Runner:
-    # Set before numba is imported: its omp layer kills forked children.
+    # Set this before numba is imported, because numba's omp layer kills forked children.
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
     from workers.files.opened import open_store
@@ -184,7 +186,7 @@ def main(parent: int | None = None) -> None:
         app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])
     except SystemExit as ended:
         if ended.code == 0 and stopping.asked:
-            # Everything has ended in order. Leaving through the interpreter would wait for idle threads of the pool.
+            # All work has ended. A normal exit of the interpreter would wait for idle threads of the pool.
             logging.shutdown()
             os._exit(0)
         raise

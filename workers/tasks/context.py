@@ -1,4 +1,4 @@
-"""What a task may use: the catalogue, the store, the settings, and the functions of its runner."""
+"""The context of a task: the catalogue, the store, the settings, and functions of the runner."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workers.tasks.stage_timer import StageTimer
 
 
 class TurnOver(Exception):
-    """A turn of a bulk run ends early so that other jobs can run; its job is queued again as if it had not started."""
+    """A turn of a bulk run ends early so that other jobs can run; the job of the turn is queued again as if it had not started."""
 
 
 def _not_alone(_work: Callable[[], None]) -> JobError | None:
@@ -24,14 +24,15 @@ def _not_alone(_work: Callable[[], None]) -> JobError | None:
 
 @dataclass(frozen=True)
 class Context:
-    """What a task may use.
+    """The objects and functions that a task may use.
 
-    report(stage, step, steps): reports progress; raises if the job must stop.
-    call_for_help(n): asks up to n idle workers to share the job's parts.
-    guarded(work): for a job of many pieces: runs one piece and returns its error, or None.
-    others_wait(): for a job of many pieces: True if the task should raise ``TurnOver``.
+    report(stage, step, steps): reports progress; raises an exception if the job must stop.
+    call_for_help(n): asks up to n idle workers to share the parts of the job.
+    guarded(work): runs one piece of a job that has many pieces; returns the error of the piece, or None.
+    others_wait(): True if other jobs wait, so that a job of many pieces should raise ``TurnOver``.
     lease: the lease under which a job takes its pieces.
-    times: times the reported stages. A job whose pieces report their own stages times those instead.
+    times: measures the time of the reported stages. If the pieces of a job report stages of their own, the time of these
+    stages is measured instead.
     anew: compute everything anew, as a rerun must: use no solution that an earlier job kept.
     """
 

@@ -1,8 +1,8 @@
-"""The task ``cross-validate``: how well a transit determines the fit, by fitting folds of its images.
+"""The task ``cross-validate``: determines the uncertainty of a fit to a transit by fitting folds of its images.
 
-Idle workers share the folds. A fold is a part in the catalogue: a worker takes it by compare-and-set under a lease, does
-it once, and its result stays if the job is tried again. The job's own worker does all folds that no other worker takes,
-so the job needs no help.
+Idle workers share the folds. A fold is a part in the catalogue: a worker takes it by compare-and-set under a lease and
+computes it. If the job is tried again, finished folds are not computed again. The worker that runs the job computes all
+folds that no other worker takes, so the job does not depend on help.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> None:
-    """Do folds of a job that runs on another worker, until no fold is left."""
+    """Compute folds of a job that another worker runs, until no fold is left."""
     request = ResolvedCrossValidate.model_validate(parameters)
     identity = psf_fit_identity(request)
     part = context.catalogue.parts.take(context.owner, identity, context.settings.lease_s)
@@ -81,7 +81,7 @@ def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit
 def _exact(
     context: Context, identity: str, solution: Solution, wanted: tuple[FoldSample, ...]
 ) -> tuple[FoldFit, ...]:
-    """Fit every fold anew, here or on the workers that help."""
+    """Fit every fold with its own reconstructions, here or on the workers that help."""
     catalogue, owner = context.catalogue, context.owner
     catalogue.parts.open(owner, identity, len(wanted))
     context.call_for_help(min(MOST_HELPERS, len(wanted) - 1))
@@ -92,7 +92,7 @@ def _exact(
             return tuple(FoldFit.from_json(result) for result in done)
         part = catalogue.parts.take(owner, identity, context.settings.lease_s)
         if part is None:
-            time.sleep(WAIT_S)  # other workers have the remaining folds
+            time.sleep(WAIT_S)  # other workers compute the remaining folds
             continue
         _one(context, solution, wanted, part, done=len(done))
 
@@ -100,7 +100,7 @@ def _exact(
 def _one(
     context: Context, solution: Solution, wanted: tuple[FoldSample, ...], part: Part, *, done: int
 ) -> None:
-    """Do one fold. If it raises, the fold is released for another worker."""
+    """Compute one fold. After an exception the fold is released for another worker."""
     try:
         fit = exact_fit(solution, wanted[part.number], progress=_heartbeat(context, part, done, len(wanted)))
     except BaseException:
@@ -110,7 +110,7 @@ def _one(
 
 
 def _heartbeat(context: Context, part: Part, done: int, folds: int) -> Callable[[str, int, int], None]:
-    """A progress function for a fold: renews the part's lease, and raises if the job must stop."""
+    """A progress function for a fold. It renews the lease of the part, and raises an exception if the job must stop."""
     last = time.monotonic()
 
     def report(_stage: str, _step: int, _steps: int) -> None:
@@ -169,7 +169,7 @@ def sentence(found: Bands, folds: int) -> str:
 
 
 def _free_shells(found: Bands) -> str:
-    """How the fit of free shells, which assumes no formula, compares with the fit of the formula."""
+    """A sentence that compares the fit of free shells, which assumes no formula, with the fit of the formula."""
     if found.shells is None:
         return ""
     near, largest = found.shells.near_centre, found.shells.largest

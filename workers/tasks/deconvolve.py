@@ -1,4 +1,4 @@
-"""The task ``deconvolve``: an uploaded image and a PSF in, an image product out."""
+"""The task ``deconvolve``: deconvolves an uploaded image with a PSF; the result is a product."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ _CONDITIONS = {"name", "edges", "margin_px"}
 def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
     """Deconvolve an uploaded image and add the product to the catalogue; returns the product's id.
 
-    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "no-noise-figures", and whatever reading
-    the image and the method raise.
+    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "no-noise-figures", and the errors of reading
+    the image and of the method.
     """
     request = ResolvedDeconvolve.model_validate(parameters)
     identity = product_identity(request)
@@ -86,13 +86,13 @@ def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
 
 @lru_cache(maxsize=1)
 def _prepared(max_bytes: int) -> PreparedPsfs:
-    """The prepared PSFs of this process. Its jobs run one after the other and often use the same PSF."""
+    """The prepared PSFs of this process. The jobs of a process run one after the other and often use the same PSF."""
     return PreparedPsfs(max_bytes)
 
 
 @dataclass(frozen=True)
 class _Work:
-    """One deconvolution: its inputs, and how to run it, once for the image or many times for its errors."""
+    """One deconvolution with its inputs. It runs once for the image, and again for each noise realisation and each possible PSF."""
 
     inputs: Inputs
 
@@ -117,7 +117,7 @@ class _Work:
 
     @cached_property
     def noise(self) -> Noise | None:
-        """The noise figures of the request; without them, those of the instrument that took the image."""
+        """The noise figures of the request; if there are none, the noise figures of the instrument that took the image."""
         if self.request.noise is not None:
             return self.request.noise.noise()
         recipe = self.request.psf_recipe
@@ -128,7 +128,7 @@ class _Work:
 
     @cached_property
     def possible_psfs(self) -> list[Psf]:
-        """PSFs that are possible within the PSF's errors, on the image's pixels; empty if its file holds no errors."""
+        """PSFs that differ from the PSF by its errors, on the image's pixels; empty if the file of the PSF contains no errors."""
         psf = read_psf(self.context.store.path(self.inputs.psf_row.file_sha256), self.context.limits)
         if psf.fitted is None:
             return []
@@ -201,7 +201,7 @@ def make(
     edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
     draw = partial(save_preview, inputs, result)
     with ThreadPoolExecutor(1) as beside:
-        # A worker with one thread draws in its own thread: a second thread would slow down the worker beside it.
+        # A worker with one thread draws the picture in this thread: a second thread would slow down the other workers.
         picture = beside.submit(draw).result if preview and context.settings.threads > 1 else draw
         found = measure_changes(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
         quality = quality_plane(

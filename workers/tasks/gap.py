@@ -1,7 +1,8 @@
-"""The task ``gap-diagnose``: an uploaded transit in, a report on its gap out, and a corrected PSF if one is found.
+"""The task ``gap-diagnose``: diagnoses the gap of an uploaded transit; the result is a report, and a corrected PSF if an
+effect explains the gap.
 
-The gap is the rms of the residuals over the images, with the expected noise removed in quadrature. The corrected PSF is
-that of a model which contains the effects that explain the gap.
+The gap is the rms of the residuals of the images, with the expected noise subtracted in quadrature. For the
+corrected PSF the fit is repeated with these effects in the model.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
         try:
             corrected = _save_psf(context, identity, found, provenance)
         except DataError as error:
-            # An added effect may be defined for images but not for a point source. The diagnosis itself stays valid.
+            # An added effect may be defined for images but not for a point source. The diagnosis itself remains valid.
             caution = f"The corrected PSF could not be made: {error.message}"
             found = replace(found, cautions=(*found.cautions, caution))
     _save(context, request, identity, found, provenance, corrected)
@@ -67,9 +68,9 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def _added(context: Context, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
-    """The operator's own effects. A worker runs code that its own settings name, never code that a job names.
+    """The operator's own effects. A worker runs only code that its own settings name, never code that a job names.
 
-    Raises DataError "effects-changed" if they are not those of the time when the job was submitted.
+    Raises DataError "effects-changed" if the effects have changed since the job was submitted.
     """
     if request.added_effects != context.settings.added_effects:
         raise DataError(

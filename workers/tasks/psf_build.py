@@ -1,4 +1,4 @@
-"""The task ``psf-build``: an instrument file in, a PSF version out."""
+"""The task ``psf-build``: builds a PSF version from an instrument file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def psf_build(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
-    """The row of the PSF that a deconvolution names; built first if the catalogue lacks it and the recipe is known.
+    """The row of the PSF that a deconvolution names. If the catalogue does not contain this PSF and its recipe is known, the PSF is
+    built first.
 
     Raises DataError "no-such-psf", and "instrument-changed" if the recipe now gives another PSF.
     """
@@ -52,7 +53,7 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
 
 
 def built_psf(context: Context, build: PsfBuild) -> PsfRow:
-    """The row of a recipe's PSF. If the catalogue lacks the PSF, build and add it."""
+    """The row of the PSF of a recipe. If the catalogue does not contain this PSF, build it and add it."""
     identity = psf_identity(build)
     row = context.catalogue.get(PsfRow, identity, context.owner)
     if row is not None:
@@ -108,7 +109,7 @@ def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> N
     if named is None:
         raise DataError(
             "mask-not-named",
-            "mask_id: expected an instrument file that sets mount.mask_image; this one does not: leave mask_id out",
+            "mask_id: expected an instrument file that sets mount.mask_image; this file does not: leave mask_id out",
         )
     if build.mask_id is None:
         raise DataError(

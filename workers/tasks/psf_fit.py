@@ -1,4 +1,4 @@
-"""The task ``psf-fit``: an uploaded transit in, a PSF with its errors and a report out."""
+"""The task ``psf-fit``: fits the scatter to an uploaded transit; the result is a PSF with its errors and a report."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
 def _save(
     context: Context, request: ResolvedPsfFit, identity: str, fit: TransitFit, prepared: Prepared
 ) -> None:
-    """Write the PSF's file, report and picture into the store, and add its row to the catalogue."""
+    """Write the file, report and picture of the PSF into the store, and add the PSF's row to the catalogue."""
     provenance = {
         "psf_id": identity,
         "inputs_sha256": fit.transit.sha256,

@@ -1,4 +1,4 @@
-"""The task ``report``: an uploaded transit in, a report on it and its PSF out, as JSON, page and picture."""
+"""The task ``report``: makes a report on an uploaded transit and its PSF, as JSON, HTML page and picture."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def _point() -> Kernel:
-    """A diffraction PSF that changes nothing. A given PSF already contains the diffraction."""
+    """A diffraction PSF that changes nothing (a point), for a given PSF that already contains the diffraction."""
     point = np.zeros((POINT_PX, POINT_PX))
     point[POINT_PX // 2, POINT_PX // 2] = 1.0
     return point
 
 
 def _shapes(context: Context, request: ResolvedReport, report: PsfReport) -> dict[str, Any]:
-    """The comparison of the scatter shapes by their held-out residuals."""
-    assert report.fit is not None  # a request for shapes names no PSF, so the transit was fitted
+    """The comparison of the scatter shapes by their residuals on held-out images."""
+    assert report.fit is not None  # a request that compares shapes names no PSF, so the transit was fitted
     return compare_shapes_by_errors(report.fit.solution, seed=request.seed, progress=context.report).to_json()
 
 
@@ -68,7 +68,7 @@ def _save(
     report: PsfReport,
     shapes: dict[str, Any] | None,
 ) -> None:
-    """JSON, page and picture into the store, the row into the catalogue."""
+    """Write JSON, page and picture into the store, and the row into the catalogue."""
     provenance = {"report_id": identity, **provenance_of(context, request)}
     said = report_json(report, provenance)
     if shapes is not None:

@@ -1,6 +1,6 @@
-"""The task ``rerun``: make a product or a PSF again from its stored parameters, and compare it with the first one.
+"""The task ``rerun``: makes a product or a PSF again from its stored parameters, and compares it with the first one.
 
-The catalogue is not changed: the new file is kept with the report only.
+The rows of products and PSFs in the catalogue are not changed: only the report refers to the new file.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Thing = ProductRow | PsfRow
 
 
 class _RerunCatalogue(Catalogue):
-    """The catalogue with some rows hidden, as if they had not been made yet. Added rows go to ``made`` only."""
+    """The catalogue with some rows hidden, as if they had not been made yet. Rows that are added go into the list ``made``, not into the database."""
 
     def __init__(self, real: Catalogue, hidden: frozenset[str]) -> None:
         vars(self).update(vars(real))  # the same database connection and tables
@@ -41,11 +41,11 @@ class _RerunCatalogue(Catalogue):
         self.made: list[object] = []
 
     def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
-        """The row of this identity; None if there is none or it is hidden."""
+        """The row of this identity; None if it does not exist or is hidden."""
         return None if identity in self._hidden else super().get(table, identity, owner)
 
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
-        """Remember the row; write nothing and count nothing."""
+        """Remember the row. Nothing is written to the database, and the quota is not used."""
         self.made.append(row)
         return row, True
 
@@ -75,7 +75,7 @@ def _first(context: Context, request: ResolvedRerun) -> Thing:
 
 
 def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing:
-    """The product or PSF as it is made today. Its file is in the store; its row is not in the catalogue."""
+    """The product or PSF as this version makes it. Its file is in the store; its row is not in the catalogue."""
     named = first.details.get("parents") or {}
     rerun_catalogue = _RerunCatalogue(
         context.catalogue, frozenset({first.id, *([named["report"]] if "report" in named else [])})
@@ -86,12 +86,12 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
     KINDS[request.kind].load_task()(
         dataclasses.replace(context, catalogue=rerun_catalogue, anew=True), parameters
     )
-    # Last comes what was asked for; before it what it needed and nobody has any more.
+    # The last row is the requested thing. Rows before it are things that it needed and that had been deleted.
     made = [row for row in rerun_catalogue.made if isinstance(row, type(first))]
     if not made:
         raise DataError(
             "not-made-again",
-            f"expected the rerun to make a {request.of} as the first run did; it made none: compare the versions of software "
+            f"expected the rerun to make a {request.of}; it made no {request.of}: compare the versions of software "
             "and libraries in the lineage",
         )
     found = made[-1]
@@ -100,7 +100,7 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
 
 
 def _instrument_text(context: Context, first: Thing) -> str:
-    """The text of the instrument file that the first run used: shipped files change with the software."""
+    """The text of the instrument file that the first run used, because shipped files can change with the software."""
     psf = read_psf(context.store.path(first.file_sha256), context.limits)
     text: str = psf.provenance["instrument_toml"]
     return text
@@ -139,7 +139,9 @@ def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing,
         write_json(text, said)
         named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
         details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
-        context.report("comparing", 1, 1)  # raises if the job was cancelled: then no report is kept
+        context.report(
+            "comparing", 1, 1
+        )  # raises an exception if the job was cancelled, so that no report is kept
         keep_report(context, identity, KIND, text=text, details=details, about_id=request.id)
 
 
@@ -151,7 +153,7 @@ def _made(context: Context, row: Thing) -> dict[str, Any]:
 
 
 def _largest(compared: Mapping[str, Comparison]) -> float | None:
-    """The largest of the arrays' relative differences; None if one of them has no measure."""
+    """The largest relative difference of the arrays; None if an array differs in shape or missing values."""
     each = [one.largest_relative for one in compared.values()]
     return None if None in each else max((one for one in each if one is not None), default=0.0)
 
@@ -161,7 +163,7 @@ def _sentence(request: ResolvedRerun, first: Thing, again: Thing, compared: Mapp
     if first.file_sha256 == again.file_sha256:
         return f"The new {what} is the same file, bit for bit."
     if all(one.same for one in compared.values()):
-        return f"The new {what} has the same values, bit for bit; only the headers of its file differ."
+        return f"The new {what} has the same values, bit for bit; only the headers of the two files differ."
     differ = sorted(name for name, one in compared.items() if not one.same)
     largest = _largest(compared)
     by = "in shape or missing values" if largest is None else f"by at most {largest:.3g} of the largest value"

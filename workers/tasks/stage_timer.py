@@ -1,8 +1,9 @@
-"""Timing the stages that a job reports while it runs.
+"""Measures the time of the stages that a job reports while it runs.
 
-A report of step n > 0 means that work on its stage was done since the previous report: the seconds in between count for
-that stage. A report of step 0 means that its stage begins: the seconds before it count for the previous stage. The time
-that reporting itself takes, such as writing the progress to the database, counts for no stage.
+A report of step n > 0 means that the job has worked on this stage since the previous report: the time between the two
+reports counts for this stage. A report of step 0 means that a stage begins: the time since the previous report counts
+for the previous stage. The time that reporting itself takes, such as writing the progress to the database, counts for no
+stage.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from threading import Lock
 from workers.catalogue.stage_times import MOST_LETTERS, Spent
 
 STARTING = "starting"  # the stage before the first report
-MOST_STAGES, OTHERS = 64, "others"  # in one attempt: the names of an operator's own effects may be stages too
+# The number of stages of one attempt is limited, because the names of an operator's own effects may be stages too.
+# The time of further stages counts for OTHERS.
+MOST_STAGES, OTHERS = 64, "others"
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
 
 
@@ -52,12 +55,12 @@ class StageTimer:
             self._reporting.release()
 
     def begin(self, stage: str) -> None:
-        """Begin a stage: later work counts for it until another stage is reported."""
+        """Begin a stage: the time from now on counts for this stage, until another stage is reported."""
         with self.step(stage, 0):
             pass
 
     def end(self) -> Mapping[str, Spent]:
-        """All stages, including the work since the last report."""
+        """The times of all stages, including the time since the last report."""
         self._add(self._stage)
         self._since = time.perf_counter()
         return self.spent

@@ -1,4 +1,4 @@
-"""The task ``psf-tables``: make the tables and the picture of a PSF that has none, such as an uploaded one."""
+"""The task ``psf-tables``: makes the tables and the picture of a PSF that has none yet, for example an uploaded PSF."""
 
 from __future__ import annotations
 

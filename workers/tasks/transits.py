@@ -23,7 +23,7 @@ def load_transit(
 
     diffraction: the diffraction PSF to use if the transit contains none; None: build it from the request's recipe.
 
-    Raises DataError "no-such-transit", "no-known-psf", and whatever unpacking and preparing raise.
+    Raises DataError "no-such-transit", "no-known-psf", and the errors of unpacking and preparing.
     """
     upload = context.catalogue.get(TransitRow, request.transit_id, context.owner)
     if upload is None:
@@ -53,7 +53,7 @@ def _built_diffraction(
 ) -> Kernel:
     """The diffraction PSF of the transit's instrument, from the catalogue or built now.
 
-    It is not cut to the field: its kernel sums to 1 on 2048 px.
+    The PSF is not cropped to the field of view: its kernel of 2048 × 2048 px sums to 1.
     """
     if request.diffraction_recipe is None:
         raise DataError(

@@ -21,7 +21,7 @@ router = APIRouter(tags=["PSFs"], responses=RESPONSES)
 
 
 class AffectedView(BaseModel):
-    """A product, its PSF, and its replacement PSF, if any."""
+    """A product, the PSF that made it, and the replacement of this PSF, if there is one."""
 
     product_id: str
     image_id: str
@@ -31,7 +31,7 @@ class AffectedView(BaseModel):
     psf_status: str
     successor: str | None
     redo_with: str | None = Field(
-        description="id of the replacement PSF: the certified PSF at the end of the chain of successors; null: there is none"
+        description="id of the replacement PSF, which is the certified PSF at the end of the chain of successors; null: there is no replacement"
     )
 
     @classmethod
@@ -58,7 +58,7 @@ def list_affected(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[AffectedView]:
-    """Products whose PSF is deprecated, sorted by PSF, then newest first."""
+    """Products whose PSF is deprecated, sorted by PSF; the products of each PSF are listed newest first."""
     at = paging.place(cursor, 3)
     after = None if at is None else Place(at[0], paging.number(at[1]), at[2])
     found = state.catalogue.affected.page(caller.owner, superseded=superseded, limit=limit + 1, after=after)
@@ -74,7 +74,7 @@ def list_affected_by_psf(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[AffectedView]:
-    """Products made with this PSF, whatever its status, newest first."""
+    """Products made with this PSF, which may have any status. The newest product is listed first."""
     psf = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if psf is None:
         raise problem(

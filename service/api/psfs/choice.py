@@ -1,4 +1,4 @@
-"""The one PSF that meets filters, ``/v1/psfs/best``, or fits an image, ``/v1/images/{id}/psf``."""
+"""Finds the one PSF that meets filters (``/v1/psfs/best``) or fits an image (``/v1/images/{id}/psf``)."""
 
 from __future__ import annotations
 
@@ -27,18 +27,23 @@ class Choice(BaseModel):
     """The one PSF that fits, and the filters of the search."""
 
     psf: PsfView
-    context: str | None = Field(description="id of the context of the search; null: all PSFs were searched")
+    context: str | None = Field(
+        description="id of the context that was searched; null: all PSFs were searched"
+    )
     instrument: str | None
     channel: str | None
     kind: str | None
-    valid_at: str | None = Field(description="time of observation of the search; null: not given")
+    valid_at: str | None = Field(
+        description="time of observation for which the PSF must be valid; null: not given"
+    )
 
 
 @router.get("/v1/psfs/best", summary="The one PSF that meets filters")
 def get_best_psf(caller: Reading, state: Shared, filters: Filters, context: InContext = None) -> Choice:
     """The PSF with these properties. Without a status and a context, only certified PSFs are searched.
 
-    404 names the filter that left no PSF; 409 lists the PSFs if several are left.
+    404: no PSF meets all filters; the message names the filter that excluded the last PSFs. 409: several PSFs meet the filters; the
+    message lists them.
     """
     return _choice(lambda: look(state.catalogue, filters, caller.owner, context))
 

@@ -30,7 +30,7 @@ IdOrName = Annotated[
 
 
 class PinAsked(BaseModel):
-    """A PSF to pin; default range: that of the PSF."""
+    """A PSF to pin. The default of its time range is the validity of the PSF."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -40,7 +40,7 @@ class PinAsked(BaseModel):
 
 
 class ContextAsked(BaseModel):
-    """A context to create, of these PSFs or of all PSFs that are certified now."""
+    """A context to create: it pins the given PSFs, or all PSFs that are certified now."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -52,7 +52,7 @@ class ContextAsked(BaseModel):
 
 
 class PinView(BaseModel):
-    """The PSF of a series for a range of times of observation."""
+    """The PSF that is used for a series in a range of observation times."""
 
     series: str = Field(description="instrument/channel/kind")
     valid_from: str | None = Field(description="null: no lower limit")
@@ -73,9 +73,9 @@ class PinView(BaseModel):
 
 
 class ContextView(BaseModel):
-    """A context. It never changes: other pins make another context."""
+    """A context. It never changes; for other pins, create another context."""
 
-    id: str = Field(description="SHA-256 of its name and its pins")
+    id: str = Field(description="SHA-256 of the name and the pins of the context")
     name: str
     created_at: float
     created_by: str
@@ -98,11 +98,11 @@ class ContextView(BaseModel):
 class WholeContext(ContextView):
     """A context with its pins."""
 
-    pins: list[PinView] = Field(description="sorted by series and time")
+    pins: list[PinView] = Field(description="PSFs of the context, sorted by series and time")
 
 
 class DefaultAsked(BaseModel):
-    """The new default context, in which PSFs for images are looked up."""
+    """The new default context, from which the PSF for an image is chosen."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -113,7 +113,7 @@ class DefaultAsked(BaseModel):
 
 
 class Move(BaseModel):
-    """A change of the default context."""
+    """A past change of the default context."""
 
     context: str | None
     at: float
@@ -142,7 +142,7 @@ class DefaultView(BaseModel):
     responses={200: {"model": WholeContext, "description": "The same context already exists."}},
 )
 def create_context(body: ContextAsked, response: Response, caller: Certifying, state: Shared) -> WholeContext:
-    """Pin PSFs under a name: the given ones, or all that are certified now."""
+    """Pin PSFs under a name: the given PSFs, or all PSFs that are certified now."""
     contexts = state.catalogue.contexts
     try:
         pins = None if body.pins is None else [_pin(asked) for asked in body.pins]
@@ -165,7 +165,7 @@ def list_contexts(
 
 @router.get("/default", summary="The default context")
 def get_default_context(caller: Reading, state: Shared) -> DefaultView:
-    """The context in which the PSF for an image is looked up if a request names no context."""
+    """The context from which the PSF for an image is chosen if a request names no context."""
     contexts = state.catalogue.contexts
     row = contexts.default(caller.owner)
     return DefaultView(
@@ -176,7 +176,7 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
 
 @router.put("/default", summary="Change the default context")
 def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
-    """Set the default context; `context` null: no default. The history of changes is kept."""
+    """Set the default context. If `context` is null, there is no default. The history of changes is kept."""
     try:
         state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)
     except DataError as error:

@@ -1,7 +1,7 @@
-"""Curves and weights of a PSF, under ``/v1/psfs/{id}``, answered from its stored tables.
+"""Curves and weights of a PSF, under ``/v1/psfs/{id}``, read from its stored tables.
 
-A job makes the tables when it builds or fits a PSF. An uploaded or old PSF has no tables until a job ``psf-tables`` makes
-them: the web process does no numerical work, and an upload must not wait for it.
+A job makes the tables when it builds or fits a PSF. An uploaded PSF, or a PSF of an early version, has no tables until a job
+``psf-tables`` makes them. The upload does not make them, because the web process does no numerical work.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from service.http.state import Shared
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
 
-# Part of every ETag. Increase it when the same tables give another answer.
+# This number is part of every ETag. Increase it when a new version of the code answers differently from the same tables.
 ANSWERS_VERSION = 1
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
@@ -34,7 +34,7 @@ ByComponent = dict[str, list[float]]
 
 
 class PsfSaid(BaseModel):
-    """Part of every answer: the PSF, and the array of its weights."""
+    """The fields that every answer has: the PSF, and properties of its array."""
 
     name: str
     version: str
@@ -46,12 +46,12 @@ class PsfSaid(BaseModel):
 
 
 class CurveAnswer(PsfSaid):
-    """1 - encircled energy at radii, in percent, for TOTAL and each component."""
+    """1 - encircled energy at the given radii, in percent, for the total PSF (TOTAL) and each component."""
 
     radii_px: list[float]
     light_beyond_pct: ByComponent
     sigma_points: ByComponent = Field(description="1-sigma errors; only for a fitted PSF")
-    resolution: str = Field(description="resolution of the table, and the largest error of interpolation")
+    resolution: str = Field(description="resolution of the table, and the largest error of the interpolation")
 
 
 class ProfileAnswer(PsfSaid):
@@ -62,13 +62,13 @@ class ProfileAnswer(PsfSaid):
     mean_weight: ByComponent
     sigma: ByComponent = Field(description="1-sigma errors; only for a fitted PSF")
     azimuthal_rms_over_mean: list[float] = Field(
-        description="rms variation of TOTAL along a ring, over its mean"
+        description="rms variation of TOTAL along a ring, divided by its mean on the ring"
     )
     resolution: str
 
 
 class EncircledAnswer(PsfSaid):
-    """Encircled energy: light within a radius, as a fraction of all light."""
+    """Encircled energy: the fraction of the light within a radius."""
 
     radius_px: float
     light_within: dict[str, float]
@@ -77,7 +77,7 @@ class EncircledAnswer(PsfSaid):
 
 
 class AnnulusAnswer(PsfSaid):
-    """Light between two radii, as a fraction of all light."""
+    """The fraction of the light between two radii."""
 
     inner_px: float
     outer_px: float
@@ -87,7 +87,7 @@ class AnnulusAnswer(PsfSaid):
 
 
 class ComparisonAnswer(BaseModel):
-    """Differences of two PSFs, `other` minus `one`."""
+    """Differences between two PSFs: `other` minus `one`."""
 
     one: PsfSaid
     other: PsfSaid
@@ -124,7 +124,7 @@ def get_curve(
 
 @router.get("/{psf_id}/profile", summary="Mean weight by radius", response_model=ProfileAnswer)
 def get_profile(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """The radial profile, and the variation of the PSF along each ring."""
+    """The mean weight in each ring, and the variation of the weights along the ring."""
     return _answer(request, caller, state, [psf_id], psf_lookup.profile)
 
 
@@ -134,7 +134,7 @@ def get_profile(psf_id: Identity, request: Request, caller: Reading, state: Shar
 def get_encircled(
     psf_id: Identity, radius: Radius, request: Request, caller: Reading, state: Shared
 ) -> Response:
-    """Encircled energy, as a fraction of all light."""
+    """The encircled energy as a fraction of all light."""
     return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.encircled(tables, radius))
 
 
@@ -150,19 +150,19 @@ def get_annulus(
 def get_comparison(
     psf_id: Identity, other_id: Identity, request: Request, caller: Reading, state: Shared
 ) -> Response:
-    """Differences of curves, in percentage points, and of totals: the second PSF minus the first."""
+    """The second PSF minus the first: differences of the curves, in percentage points, and of the sums."""
     return _answer(request, caller, state, [psf_id, other_id], psf_lookup.compare)
 
 
 @router.get("/{psf_id}/cutout", summary="The central part of a PSF as FITS", response_class=Response)
 def get_cutout(
     psf_id: Identity,
-    size: Annotated[int, Query(ge=1, description="edge length in px, at most that of the PSF")],
+    size: Annotated[int, Query(ge=1, description="edge length in px, at most the edge length of the PSF")],
     request: Request,
     caller: Reading,
     state: Shared,
 ) -> Response:
-    """The central weights, not renormalised; the centre is at [size // 2, size // 2]."""
+    """The central part of the PSF, not renormalised. Its centre is at [size // 2, size // 2]."""
     row = _find(state, caller, psf_id)
     headers = _headers(f"{row.file_sha256} cutout {size}")
     if files.known(request, headers["ETag"]):
@@ -178,7 +178,7 @@ def get_cutout(
 def _answer(
     request: Request, caller: Caller, state: Shared, psf_ids: list[str], ask: Callable[..., dict[str, Any]]
 ) -> Response:
-    """The answer from the tables of these PSFs, or 304 if the client already has it."""
+    """The answer from the tables of these PSFs, or 304 if the client already has this answer."""
     rows = [_find(state, caller, psf_id) for psf_id in psf_ids]
     digests = [_tables_of(row) for row in rows]
     headers = _headers(f"{' '.join(digests)} {request.url.path} {request.url.query}")

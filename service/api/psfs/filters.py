@@ -53,7 +53,7 @@ def _filter(
         raise Problem(
             422,
             "not-valid-at-any-time",
-            f"valid_at: expected it only with certified PSFs; got it with status {status}: leave one of the two out",
+            f"valid_at: expected it only with certified PSFs; got valid_at with status {status}: remove valid_at or status",
         )
     try:
         at = None if valid_at is None else seconds(valid_at, "valid_at")

@@ -35,15 +35,21 @@ class StatusChange(BaseModel):
     status: PsfStatus
     reason: str = Field("", max_length=400, pattern=TEXT, description="the reason, stored for later readers")
     version: str | None = Field(
-        None, max_length=40, description="for a draft: three numbers such as 1.2.0, new in the series"
+        None,
+        max_length=40,
+        description="for a draft: a version of three numbers such as 1.2.0, which the series does not have yet",
     )
-    valid_from: Time | None = Field(None, description="first time of observation; null: no lower limit")
+    valid_from: Time | None = Field(
+        None, description="start of the range of observation times; null: no lower limit"
+    )
     valid_to: Time | None = Field(None, description="end of the range, excluded; null: no upper limit")
     supersedes: list[Identity] = Field(
-        [], max_length=100, description="certified PSFs of the series to deprecate in the same step"
+        [],
+        max_length=100,
+        description="ids of certified PSFs of the series that are deprecated in the same step",
     )
     successor: Identity | None = Field(
-        None, description="for a deprecated PSF: the certified PSF to use instead"
+        None, description="for a deprecated PSF: id of the certified PSF to use instead"
     )
     instrument: Word | None = Field(None, description="for a draft whose file names no instrument")
     channel: Word | None = Field(None, description="for a draft whose file names no wavelength")
@@ -87,7 +93,9 @@ class StatusView(BaseModel):
     id: str
     status: PsfStatus
     version: str
-    series: str | None = Field(description="instrument/channel/kind; null: the instrument is unknown")
+    series: str | None = Field(
+        description="instrument, channel and kind, as instrument/channel/kind; null: the instrument is unknown"
+    )
     valid_from: str | None = Field(description="null: no lower limit, or never certified")
     valid_to: str | None = Field(description="null: no upper limit, or never certified")
     successor: str | None
@@ -98,7 +106,7 @@ class StatusView(BaseModel):
 
 @router.get("/{psf_id}/status", summary="A PSF's status and its history")
 def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusView:
-    """The status of a PSF, its allowed changes, and who changed it, when and why."""
+    """The status of a PSF, the changes that are allowed now, and the past changes: who made each change, when and why."""
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
         raise problem(
@@ -113,7 +121,8 @@ def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusVi
 def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, state: Shared) -> StatusView:
     """Certify a draft, change the range of a certified PSF, deprecate it, or name the successor of a deprecated PSF.
 
-    The ranges of certified PSFs of a series must not overlap: 409 names the PSF whose range overlaps.
+    The time ranges of the certified PSFs of a series must not overlap. If they would, the answer is 409; the message names the PSF
+    whose range overlaps.
     """
     try:
         row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)

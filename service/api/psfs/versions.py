@@ -31,7 +31,7 @@ router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
 
 class PsfView(BaseModel):
-    """A PSF. Its content never changes (another content has another id); its status may change."""
+    """A PSF. Its content never changes, because the id depends on the content. Its status may change."""
 
     id: str
     created_at: float
@@ -44,7 +44,7 @@ class PsfView(BaseModel):
     )
     status: PsfStatus
     valid_from: str | None = Field(
-        description="time of observation; null: no lower limit, or never certified"
+        description="start of the range of observation times; null: no lower limit, or never certified"
     )
     valid_to: str | None = Field(description="null: no upper limit, or never certified")
     successor: str | None = Field(description="for a deprecated PSF: id of the PSF to use instead")
@@ -52,8 +52,10 @@ class PsfView(BaseModel):
     bytes: int
     details: dict[str, Any] = Field(description="shape, curve, parameters and provenance")
     file: str = Field(description="address of the FITS file")
-    preview: str | None = Field(description="address of the picture; null: an uploaded PSF without tables")
-    report: str | None = Field(description="address of the fit's report; null: not a fitted PSF")
+    preview: str | None = Field(
+        description="address of the picture; null: the PSF was uploaded and has no tables yet"
+    )
+    report: str | None = Field(description="address of the report on the fit; null: the PSF was not fitted")
 
     @classmethod
     def of(cls, row: PsfRow) -> PsfView:
@@ -115,7 +117,7 @@ async def upload_psf(
 ) -> PsfView:
     """Upload a PSF: one 2-D image with its centre at [n//2, n//2] and a sum of at most 1.
 
-    The header is checked now. The pixels are checked by the job that uses the PSF.
+    The header is checked at upload. The pixels are checked by the jobs that use the PSF.
     """
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
@@ -149,7 +151,7 @@ def list_psfs(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[PsfView]:
-    """PSFs, newest first. With `valid_at`: those certified for that time, or pinned for it by the context."""
+    """PSFs, newest first. With `valid_at`: only PSFs that are certified for this time, or that the context pins for this time."""
     try:
         wanted = _in_context(state, caller, filters, context)
     except DataError as error:
@@ -173,13 +175,13 @@ def get_psf_file(psf_id: Identity, request: Request, caller: Reading, state: Sha
 
 @router.get("/{psf_id}/preview", summary="The PSF's picture", response_class=Response)
 def get_psf_preview(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
-    """The PSF, its radial profile and its cumulative curve as PNG."""
+    """A PNG that shows the PSF, its radial profile and its cumulative curve."""
     row = _find(state, caller, psf_id)
     if row.preview_sha256 is None:
         raise Problem(
             404,
             "no-preview",
-            "expected a PSF with a picture; an uploaded PSF has none until a job psf-tables draws it: submit that job",
+            "expected a PSF with a picture; an uploaded PSF has no picture until a job psf-tables draws it: submit that job",
         )
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
 
@@ -192,7 +194,7 @@ def get_psf_report(psf_id: Identity, request: Request, caller: Reading, state: S
         raise Problem(
             404,
             "no-report",
-            "expected a fitted PSF; this one was not fitted to a transit: its lineage says how it was made",
+            "expected a fitted PSF; this PSF was not fitted to a transit: the lineage of the PSF says how it was made",
         )
     return files.send(request, state.store, digest, "application/json", f"psf-{psf_id[:12]}.json")
 

@@ -1,1 +1,1 @@
-"""The command `heliopsf gap`: diagnose a transit, and judge the diagnosis on blind sets."""
+"""The command `heliopsf gap`: diagnoses a transit, and measures how often the diagnosis is right on blind sets."""

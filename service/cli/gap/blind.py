@@ -1,6 +1,7 @@
-"""``heliopsf gap blind``: make transits with a withheld effect, seal the effects, diagnose the transits, score the answers.
+"""``heliopsf gap blind``: makes transits with a withheld effect, seals the effects, diagnoses the transits, and compares the
+answers with the effects.
 
-The command imports what is numerical when it is called, so that the others start fast.
+The command imports numerical libraries only when it is called, so that other commands start fast.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import click
 from psfcore.errors import DataError
 from service.cli.options import FILE, OUTPUT_FOLDER, limits, user_errors
 
-# The diagnosis runs as a command in another process, which knows nothing about the set.
+# The diagnosis runs as a command in another process, which does not know the withheld effects.
 DIAGNOSE = (
     sys.executable,
     "-c",
@@ -26,7 +27,7 @@ DIAGNOSE = (
 )
 
 
-@click.command()
+@click.command(short_help="Test the diagnosis on simulated cases.")
 @click.option("--cases", default=24, show_default=True, type=click.IntRange(1, 9999), help="Number of cases")
 @click.option("--seed", default=1, show_default=True, type=click.IntRange(0), help="Seed of random numbers")
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder of the set")
@@ -37,7 +38,11 @@ DIAGNOSE = (
     "--images", default=18, show_default=True, type=click.IntRange(6, 200), help="Images per transit"
 )
 @click.option(
-    "--processes", default=2, show_default=True, type=click.IntRange(1, 64), help="Diagnoses at the same time"
+    "--processes",
+    default=2,
+    show_default=True,
+    type=click.IntRange(1, 64),
+    help="Number of diagnoses that run at the same time",
 )
 @click.option("--keep", is_flag=True, help="Keep each transit after its diagnosis")
 @click.option("--scenes", multiple=True, type=FILE, help="Take scenes from these images (FITS), in turn")
@@ -50,16 +55,16 @@ DIAGNOSE = (
     multiple=True,
     type=click.FloatRange(0.05, 50),
     metavar="PCT",
-    help="Residual that an effect leaves in the discs after a refit, in turn [default: random, 0.5 to 10]",
+    help="Residual that the effect of a case leaves in the discs after a refit; repeat to vary it [default: random, 0.5 to 10]",
 )
 @click.option("--clean-only", is_flag=True, help="Make only cases without an effect, to count false alarms")
 @click.option(
     "--synthetic",
     is_flag=True,
-    help="Use a synthetic diffraction PSF instead of the instrument's; starts faster",
+    help="Use a synthetic diffraction PSF, which is made faster than the PSF of the instrument",
 )
 @click.option(
-    "--make-only", is_flag=True, help="Make and seal the cases, but diagnose nothing; keeps the transits"
+    "--make-only", is_flag=True, help="Make and seal the cases and keep the transits, but diagnose nothing"
 )
 def blind(
     cases: int,
@@ -76,7 +81,7 @@ def blind(
     synthetic: bool,
     make_only: bool,
 ) -> None:
-    """Test the diagnosis on simulated cases whose effect it does not know. Resumes a run that was stopped."""
+    """Test the diagnosis on simulated cases whose effect is withheld from it. Run it again to continue a stopped run."""
     from psfcore.blind.case_set import SetPlan, alone_in, make_set
     from psfcore.blind.run_set import run_set
     from psfcore.blind.score_set import write_score

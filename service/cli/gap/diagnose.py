@@ -1,4 +1,4 @@
-"""``heliopsf gap``: where fitted model and images of a transit differ, and which effect explains the difference."""
+"""``heliopsf gap``: diagnoses where the fitted model and the images of a transit differ, and which effect explains the difference."""
 
 from __future__ import annotations
 
@@ -37,29 +37,30 @@ class _DiagnosisByDefault(click.Group):
 
 @click.group(
     cls=_DiagnosisByDefault,
-    help="Find out why a fitted PSF and a transit differ. `heliopsf gap TRANSIT` is short for `heliopsf gap diagnose TRANSIT`; "
-    "its options: `heliopsf gap diagnose -h`.",
+    help="Find out why a fitted PSF and a transit differ. `heliopsf gap TRANSIT` is short for `heliopsf gap diagnose TRANSIT`. "
+    "`heliopsf gap diagnose -h` lists its options.",
+    short_help="Find why a fitted PSF and a transit differ.",
 )
 def gap() -> None:
     """The gap between a fitted model and the images of a transit."""
 
 
-@gap.command()
+@gap.command(short_help="Find the effects that explain a gap.")
 @click.argument("transit", type=click.Path(exists=True, path_type=Path))
 @click.option("-o", "--output", type=OUTPUT, help="Write a page to read and print (HTML)")
 @JSON
 @PLOT
-@click.option("--psf", metavar="ID|FILE", help="Start from this fitted PSF: refit its shape from its values")
+@click.option("--psf", metavar="ID|FILE", help="Fit the shape of this PSF, starting from its parameters")
 @click.option(
     "--corrected",
     "corrected_file",
     type=OUTPUT,
-    help="Write the PSF fitted with the effect found in the model (FITS); in a tie, with the best effect",
+    help="Write the corrected PSF (FITS): the fit with the answer in the model; for a tie, with the best effect",
 )
 @click.option(
     "--effects",
     metavar="FILE.py|MODULE[,...]",
-    help="Also test effects of your own; this runs their code. Needs --local (a service has HELIOPSF_GAP_EFFECTS)",
+    help="Also test the effects in these files, whose code is executed. Only with --local; in a service set HELIOPSF_GAP_EFFECTS",
 )
 @SEED
 @NOISE
@@ -82,7 +83,7 @@ def diagnose(
 ) -> None:
     """Diagnose the gap between TRANSIT and the model fitted to it: which effect explains the residuals.
 
-    TRANSIT is a folder with a transit.json, or a .zip or .tar file of one.
+    TRANSIT is a folder with a transit.json, or a .zip or .tar file of such a folder.
     """
     check_writable(output, json_file, plot, corrected_file)
     if effects is not None and not local:
@@ -106,7 +107,7 @@ def diagnose(
             psf_id=named_psf(service, psf),
             saturation_dn=saturation_dn,
             seed=seed,
-            # A service keeps the corrected PSF for the next request.
+            # A service always makes the corrected PSF and keeps it, so that later requests find it.
             correct=corrected_file is not None or not local,
         )
         report = json.loads(numbers.read_text("utf-8"))
@@ -116,12 +117,12 @@ def diagnose(
     click.echo("\n".join(_lines(report)))
     if corrected_file is not None and corrected is None:
         raise click.ClickException(
-            f"{corrected_file} was not written: no effect was found that a PSF can include (verdict {report['verdict']})"
+            f"{corrected_file} was not written: the diagnosis found no effect for a corrected PSF (verdict {report['verdict']})"
         )
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    """A report as lines to print."""
+    """The report as lines to print."""
     so_far = "best so far: " if report["verdict"] == "inconclusive" else ""
     answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
     out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]

@@ -1,1 +1,1 @@
-"""The commands of an operator: database, store, keys, and `doctor`."""
+"""The commands for operators: `database`, `store`, `key` and `doctor`."""

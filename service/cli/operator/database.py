@@ -15,23 +15,23 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.schema import SchemaError, SchemaStatus
 
 SENTENCES = {
-    "empty": "the database is empty; the first start makes its tables at revision {wanted}",
-    "unversioned": "the database has tables without a revision, from before revisions existed; this version needs {wanted}",
+    "empty": "the database is empty; the first start of a server makes its tables at revision {wanted}",
+    "unversioned": "the database has tables without a revision, as early versions made them; this version needs revision {wanted}",
     "older": "the database is at revision {revision}; this version needs {wanted}",
-    "current": "the database is at revision {revision}, as this version needs it",
-    "newer": "the database is at revision {revision}, of a later version; this version knows revisions up to {wanted}",
+    "current": "the database is at revision {revision}, which this version needs",
+    "newer": "the database is at revision {revision} of a later version of heliopsf; this version knows revisions up to {wanted}",
 }
 
 
-@click.group()
+@click.group(short_help="Show or upgrade the database's tables.")
 def database() -> None:
     """Show or upgrade the revision of the database's tables."""
 
 
-@database.command("status")
+@database.command("status", short_help="Show the revision of the tables.")
 @DATA
 def status(data: Path | None) -> None:
-    """Show the revision of the database and the revision that this version needs. Exit status 1: they differ."""
+    """Show the revision of the database and the revision that this version needs. If they differ, the exit status is 1."""
     with opened_catalogue(data) as catalogue:
         found = catalogue.schema.status()
     click.echo(sentence(found))
@@ -39,12 +39,12 @@ def status(data: Path | None) -> None:
         raise click.exceptions.Exit(1)
 
 
-@database.command("upgrade")
+@database.command("upgrade", short_help="Upgrade the tables.")
 @DATA
 def upgrade(data: Path | None) -> None:
     """Upgrade the tables to the revision of this version, as the next `heliopsf serve` would.
 
-    It also restores missing tables and indexes. Make a copy of the database first.
+    The command also restores missing tables and indexes. Make a copy of the database first.
     """
     with opened_catalogue(data) as catalogue:
         before = catalogue.schema.status()
@@ -63,7 +63,7 @@ def sentence(found: SchemaStatus) -> str:
 
 @contextmanager
 def opened_catalogue(data: Path | None) -> Iterator[Catalogue]:
-    """The catalogue of a data folder, not upgraded. An error of its database becomes a ``ClickException``."""
+    """The catalogue of a data folder. Its database is not upgraded; an error of the database becomes a ``ClickException``."""
     settings = read_settings(data)
     if settings.database_url is None:
         settings.data_dir.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
-"""``heliopsf doctor``: check everything that an operator would check first, in one command.
+"""``heliopsf doctor``: checks in one command everything that an operator would check first.
 
-It makes and changes nothing, and works if nothing runs: what is missing is a finding.
+The command changes nothing. It also works if no server and no worker run: a missing part is a finding.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LITTLE_ROOM_BYTES = 5 * 2**30
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: its subject, its state, what was found, and what to do (empty: nothing)."""
+    """The result of one check: its subject, its state, what was found, and the advice (empty: nothing to do)."""
 
     what: str
     state: State
@@ -53,7 +53,7 @@ class Finding:
 @DATA
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def doctor(data: Path | None, as_json: bool) -> None:
-    """Check versions, settings, disk, database, broker and workers, and say what to do. Exit status 1: something is broken."""
+    """Check versions, settings, disk, database, broker and workers, and say what to do. If something is broken, the exit status is 1."""
     findings = examine(read_settings(data))
     broken = any(finding.state == "broken" for finding in findings)
     if as_json:
@@ -65,7 +65,7 @@ def doctor(data: Path | None, as_json: bool) -> None:
 
 
 def examine(settings: Settings) -> list[Finding]:
-    """All findings, in the order in which one would repair them."""
+    """All findings, in the order in which problems should be corrected."""
     findings = [versions(), threads(settings), storage(settings)]
     findings += [object_store(settings)] if settings.store_url else []
     findings.append(broker(settings))
@@ -85,7 +85,7 @@ def examine(settings: Settings) -> list[Finding]:
 
 
 def table(findings: list[Finding], width: int) -> Iterator[str]:
-    """The findings as lines: subject, state and what was found; below it what to do."""
+    """The findings as lines: subject, state and what was found. The next line gives the advice."""
     names = max(len(finding.what) for finding in findings)
     indent = " " * (names + 11)
     for finding in findings:
@@ -103,7 +103,7 @@ def table(findings: list[Finding], width: int) -> Iterator[str]:
 
 
 def versions(pins: Path = PINS) -> Finding:
-    """Are the installed libraries as declared, and (if constraints.txt is here) as tested?"""
+    """Do the installed libraries have the required versions, and (if constraints.txt is here) the tested versions?"""
     wrong, other, count = [], [], 0
     tested = _pinned(pins)
     for requirement in map(Requirement, requires("heliopsf") or []):
@@ -126,7 +126,11 @@ def versions(pins: Path = PINS) -> Finding:
     if other:
         advice = "install with `-c constraints.txt` to get the tested versions"
         return Finding("versions", "warning", f"{about}; {'; '.join(other)}", advice)
-    as_what = "as tested" if tested else "as declared (no constraints.txt here to compare them with)"
+    as_what = (
+        "with tested versions"
+        if tested
+        else "with required versions (there is no constraints.txt with tested versions here)"
+    )
     return Finding("versions", "ok", f"{about}; {count} libraries {as_what}")
 
 
@@ -145,7 +149,7 @@ def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
         if value is None:
             continue
         found += f"; {name}={value}"
-        if name == "NUMBA_NUM_THREADS":  # a worker sets this variable itself
+        if name == "NUMBA_NUM_THREADS":  # a worker sets this variable by itself
             continue
         first = value.split(",")[0].strip()
         if not first.isdecimal() or int(first) < 1:
@@ -155,13 +159,13 @@ def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
     if wanted > may_use:
         fit = max(1, int(may_use // settings.worker_processes))
         more.append(
-            f"more threads than cores slow each other down: set HELIOPSF_WORKER_THREADS={fit}, or start fewer processes"
+            f"if there are more threads than cores, they slow each other down: set HELIOPSF_WORKER_THREADS={fit}, or start fewer processes"
         )
     return Finding("threads", "warning" if more else "ok", found, "; ".join(more))
 
 
 def storage(settings: Settings) -> Finding:
-    """Can files be written, and is there room for them?"""
+    """Can files be written to the data folder, and is there room for them?"""
     folder = settings.data_dir.resolve()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir() or (there != folder and not os.access(there, os.W_OK | os.X_OK)):
@@ -224,7 +228,7 @@ def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
         case "newer":
             return Finding("schema", "broken", said, "run the version of heliopsf that upgraded it")
         case "unversioned" | "older":
-            advice = "copy the database, then run `heliopsf database upgrade` (the next `heliopsf serve` upgrades it too)"
+            advice = "copy the database, then run `heliopsf database upgrade` (or start `heliopsf serve`, which also upgrades it)"
             return Finding("schema", "warning", said, advice)
         case "current":
             faults = catalogue.schema.faults()
@@ -302,7 +306,7 @@ def address(url: str) -> str:
         where = f"{parts.hostname}:{parts.port}" if parts.port else parts.hostname or ""
     except ValueError:
         return "the URL that is set"
-    # A text that is not a URL may hold a password in any part; a password with / in it ends the host early.
+    # A text that is not a URL may contain a password in any part. A / in a password ends the host part too early.
     beyond = parts.path + parts.query + parts.fragment
     if "@" in beyond or not (parts.hostname or parts.scheme.startswith("sqlite")):
         return "the URL that is set"
@@ -313,7 +317,7 @@ def address(url: str) -> str:
 def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]:
     """The catalogue (None if the database does not answer), and the finding about the database."""
     where, own = _database(settings)
-    if own and not Path(where).exists():  # opening it would create it
+    if own and not Path(where).exists():  # opening the database would create the file
         yield None, Finding("database", "warning", f"{where} does not exist yet", "`heliopsf serve` makes it")
         return
     advice = "correct the permissions of the file" if own else "start it, or correct HELIOPSF_DATABASE_URL"
@@ -356,7 +360,7 @@ def _start(settings: Settings) -> str:
 
 
 def _pinned(file: Path) -> dict[str, str]:
-    """Name -> version of a file of pins; empty if there is no such file."""
+    """The versions in a file of pinned versions, by library name; empty if there is no such file."""
     if not file.is_file():
         return {}
     pairs = (line.split("==", 1) for line in file.read_text().splitlines() if "==" in line and line[0] != "#")

@@ -19,7 +19,7 @@ from workers.catalogue.tables import KeyRow
 UNITS_S = {"h": 3600, "d": 86_400, "w": 604_800}
 DEFAULT_SCOPES = (Scope.READ, Scope.SUBMIT)
 MEANINGS = {
-    Scope.READ: "see and download the files of the owner",
+    Scope.READ: "read and download the owner's data",
     Scope.SUBMIT: "upload files, submit jobs, cancel them",
     Scope.CERTIFY: "certify and deprecate PSFs, and change contexts",
     Scope.BULK: "start bulk runs",
@@ -40,27 +40,33 @@ class Duration(click.ParamType):
         return int(parts[1]) * UNITS_S[parts[2]]
 
 
-@click.group()
+@click.group(short_help="Create, list and revoke access keys.")
 def key() -> None:
     """Create, list and revoke access keys for people and programs."""
 
 
-@key.command("create", epilog="Scopes: " + "; ".join(f"{name}: {text}" for name, text in MEANINGS.items()))
+@key.command(
+    "create",
+    short_help="Create a key and print it once.",
+    epilog="Scopes: " + "; ".join(f"{name}: {text}" for name, text in MEANINGS.items()),
+)
 @click.option(
-    "--owner", required=True, help="Owner of all that is made with the key; an owner may have several keys"
+    "--owner",
+    required=True,
+    help="Owner of all data that is made with this key; an owner may have several keys",
 )
 @click.option(
     "--scope",
     "scopes",
     multiple=True,
     type=click.Choice([scope.value for scope in Scope]),
-    help=f"What the key allows; may be given several times [default: {', '.join(DEFAULT_SCOPES)}]",
+    help=f"Scope of the key; can be repeated [default: {', '.join(DEFAULT_SCOPES)}]",
 )
 @click.option("--expires", type=Duration(), metavar="30d", help="Lifetime [default: until it is revoked]")
-@click.option("--label", default="", help="Note that the list shows, such as what the key is for")
+@click.option("--label", default="", help="Note that `key list` shows, for example the purpose of the key")
 @DATA
 def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: str, data: Path | None) -> None:
-    """Make a key and show it once; only its hash is stored, so it cannot be shown again."""
+    """Create a key and print it once. Only its hash is stored, so it cannot be shown again."""
     if not OWNER.fullmatch(owner):
         raise click.BadParameter(
             "expected lower-case letters, digits, '.', '_' and '-', at most 64", param_hint="--owner"
@@ -80,18 +86,18 @@ def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: st
     )
 
 
-@key.command("list")
+@key.command("list", short_help="List all keys.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 @DATA
 def list_keys(as_json: bool, data: Path | None) -> None:
-    """List all keys by their ids, also expired and revoked ones."""
+    """List all keys by their ids, including expired and revoked keys."""
     with opened_catalogue(data) as catalogue:
         rows = catalogue.keys.all()
     if as_json:
         click.echo(json.dumps([_described(row) for row in rows], indent=1))
         return
     if not rows:
-        click.echo("no key yet; `heliopsf key create --owner NAME` makes one")
+        click.echo("no key yet; `heliopsf key create --owner NAME` makes a key")
     for row in rows:
         used = "never used" if row.last_used_at is None else f"used {_day(row.last_used_at)}"
         click.echo(
@@ -100,12 +106,12 @@ def list_keys(as_json: bool, data: Path | None) -> None:
         )
 
 
-@key.command("revoke")
+@key.command("revoke", short_help="Revoke a key.")
 @click.argument("identity", metavar="ID")
 @DATA
 def revoke(identity: str, data: Path | None) -> None:
-    """Revoke the key with this id: its next request is refused. Jobs that it submitted continue."""
-    # Also accepts the key itself.
+    """Revoke the key with this id: further requests with it are refused. Jobs that were submitted with it continue."""
+    # The whole key is also accepted instead of its id.
     identity = identity.removeprefix("hpsf_").partition("_")[0]
     with opened_catalogue(data) as catalogue:
         if not catalogue.keys.revoke(identity):

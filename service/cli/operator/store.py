@@ -1,4 +1,4 @@
-"""``heliopsf store``: remove files that nothing refers to, show what each owner stores, and set quotas."""
+"""``heliopsf store``: removes files that nothing refers to, shows how much each owner stores, and sets quotas."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from workers.files.opened import open_store
 DAY_S = 86_400
 
 
-@click.group()
+@click.group(short_help="Clean up stored files; set quotas.")
 def store() -> None:
     """Clean up the files of a service. Run it on the machine of the service, with its settings."""
 
 
-@store.command("collect")
-@click.option("--dry-run", is_flag=True, help="Show what would be removed, but remove nothing")
+@store.command("collect", short_help="Remove files that nothing refers to.")
+@click.option("--dry-run", is_flag=True, help="List the files that would be removed, but remove nothing")
 @click.option(
     "--older-than",
     "older_than_s",
@@ -35,22 +35,22 @@ def store() -> None:
 @click.option("--even-most", is_flag=True, help="Remove even more than half of all files")
 @DATA
 def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: Path | None) -> None:
-    """Remove files that no upload, PSF, product, report or job refers to; killed processes leave such files behind.
+    """Remove files that no upload, PSF, product, report or job refers to. Killed processes leave such files.
 
-    Young files stay: uploads and running jobs store a file before the database refers to it. If two databases share one
-    store, this removes the files of the other database; use one store for one database.
+    Recent files are kept, because uploads and running jobs store a file before the database refers to it. If two databases
+    share one store, this command removes the files of the other database. Therefore use a store for one database only.
     """
     settings = read_settings(data)
     if older_than_s < settings.max_job_s:
         days = -(-settings.max_job_s // DAY_S)
         raise click.BadParameter(
-            f"expected {days:.0f}d or more, because a job may run for that long (HELIOPSF_MAX_JOB_S)",
+            f"expected {days:.0f}d or more, because a job may run for this time (HELIOPSF_MAX_JOB_S)",
             param_hint="--older-than",
         )
     with user_errors(), opened_catalogue(data) as catalogue:
         if catalogue.schema.status().state != "current":
             raise click.ClickException(
-                "the database is not at the revision of this version, so its references may not be known here; see "
+                "the database is not at the revision of this version, so this command may not find all references to files; see "
                 "`heliopsf database status`"
             )
         found = collect(catalogue, open_store(settings), older_than_s, dry_run=dry_run, even_most=even_most)
@@ -66,23 +66,23 @@ def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: P
         click.echo(f"corrected the byte count of {', '.join(recounted)}")
 
 
-@store.command("usage")
+@store.command("usage", short_help="Show how much each owner stores.")
 @DATA
 def usage(data: Path | None) -> None:
-    """Show how much each owner stores, and may store."""
+    """Show how much each owner stores, and the quota of each owner."""
     settings = read_settings(data)
     with opened_catalogue(data) as catalogue:
         for one in catalogue.owners.all(settings.quota_mib):
             click.echo(_line(one))
 
 
-@store.command("quota")
+@store.command("quota", short_help="Set the quota of an owner.")
 @click.argument("owner")
 @click.argument("mib", type=click.IntRange(0), required=False)
-@click.option("--default", "as_all", is_flag=True, help="Back to the default limit (HELIOPSF_QUOTA_MIB)")
+@click.option("--default", "as_all", is_flag=True, help="Use the default limit again (HELIOPSF_QUOTA_MIB)")
 @DATA
 def quota(owner: str, mib: int | None, as_all: bool, data: Path | None) -> None:
-    """Set how many MIB an OWNER may store; 0: unlimited."""
+    """Set the quota of an OWNER to MIB; 0: unlimited."""
     if (mib is None) != as_all:
         raise click.UsageError("expected either a number of MiB or --default")
     if not OWNER.fullmatch(owner):

@@ -1,4 +1,4 @@
-"""The group ``heliopsf psf``: which commands it has, and in which file each is."""
+"""The group ``heliopsf psf``: lists its commands, and the file of each command."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ SECTIONS = {
     "Make": {
         "build": Lazy("service.cli.psf.make", "build", "Compute the PSF of an instrument."),
         "fit": Lazy("service.cli.psf.make", "fit", "Fit the scattered light of a transit."),
-        "crossval": Lazy("service.cli.psf.make", "crossval", "Estimate the uncertainty of such a fit."),
+        "crossval": Lazy("service.cli.psf.make", "crossval", "Estimate the uncertainty of a fit."),
     },
     "Read": {
         "show": Lazy("service.cli.psf.make", "show", "Show what a PSF file contains."),
-        "query": Lazy("service.cli.psf.query", "query", "Show how much light lies beyond which radius."),
+        "query": Lazy("service.cli.psf.query", "query", "Show the light beyond given radii."),
         "cutout": Lazy("service.cli.psf.query", "cutout", "Write the central part of a PSF."),
         "rebin": Lazy("service.cli.psf.query", "rebin", "Write the PSF for binned images."),
     },

@@ -40,7 +40,9 @@ SHAPE = click.option(
 )
 @click.option("--size", default=2048, show_default=True, help="Width and height of the array, px")
 @click.option(
-    "--component", type=click.Choice(get_args(Component)), help="One component alone [default: the total PSF]"
+    "--component",
+    type=click.Choice(get_args(Component)),
+    help="Build only this component [default: the total PSF]",
 )
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
 @PLOT
@@ -77,7 +79,9 @@ def build(
 @JSON
 @PLOT
 @SHAPE
-@click.option("--as-published", is_flag=True, help="Also run the published recipe and show its biases (slow)")
+@click.option(
+    "--as-published", is_flag=True, help="Also run the published recipe and measure its biases (slow)"
+)
 @NOISE
 @SATURATION
 @SERVER
@@ -94,7 +98,7 @@ def fit(
     server: str | None,
     local: bool,
 ) -> None:
-    """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of one."""
+    """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of such a folder."""
     check_writable(output, json_file, plot)
     with user_errors(), connection(server, local) as service, progress_bar() as say:
         fitted = service.fit_psf(
@@ -129,10 +133,12 @@ def fit(
 @click.option(
     "--scheme",
     type=click.Choice(["shared", "exact"]),
-    help="exact: fit every fold to the end (slow) [default: shared]",
+    help="exact: each fold makes its own reconstructions (slow); shared: all folds use the same [default: shared]",
 )
 @click.option(
-    "--runs", type=click.IntRange(1, 50), help="Runs; each holds out every block once [default: 10]"
+    "--runs",
+    type=click.IntRange(1, 50),
+    help="Number of runs; each run holds out every block once [default: 10]",
 )
 @SHAPE
 @NOISE
@@ -149,7 +155,7 @@ def crossval(
     server: str | None,
     local: bool,
 ) -> None:
-    """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the rest, in many runs."""
+    """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many runs."""
     check_writable(json_file, plot)
     with user_errors(), connection(server, local) as service, progress_bar() as report:
         found = service.cross_validate(
@@ -169,7 +175,7 @@ def crossval(
 @click.argument("file", type=FILE)
 @PLOT
 def show(file: Path, plot: Path | None) -> None:
-    """Show what the PSF in FILE (FITS) contains: its size, sum, and the light beyond a number of radii."""
+    """Show what the PSF in FILE (FITS) contains: its size, its sum, and the light beyond some radii."""
     import numpy as np
 
     from psfcore.fits.psfs import read_psf

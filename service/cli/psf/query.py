@@ -1,6 +1,6 @@
 """The commands ``psf query``, ``psf cutout`` and ``psf rebin``, for a PSF in a file or on a service.
 
-The tables of a file are computed here; a service keeps the tables of its PSFs. Both answer the same questions.
+For a file the tables are computed in this process; for an id the service reads its stored tables. Both give the same answers.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from service.cli.options import JSON, OUTPUT, check_writable, is_psf_id, limits,
 if TYPE_CHECKING:
     from psfcore.psf import Psf
 
-SERVER = server_option("Address of the service that knows an ID")
+SERVER = server_option("Address of the service, if PSF is an id")
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @click.command("query")
 @click.argument("psf", metavar="PSF_ID|FILE")
-@click.option("--radius", "radii", multiple=True, type=float, help="Radius, px; may be given several times")
+@click.option("--radius", "radii", multiple=True, type=float, help="Radius, px; can be repeated")
 @click.option(
     "--annulus", nargs=2, type=float, metavar="INNER OUTER", help="Show the light between two radii, px"
 )
@@ -34,7 +34,7 @@ SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 @click.option(
     "--compare",
     metavar="PSF_ID|FILE",
-    help="Show the difference of this PSF from the first (this minus first)",
+    help="Compare with this PSF; shows this PSF minus the first",
 )
 @JSON
 @SERVER
@@ -47,7 +47,7 @@ def query(
     json_file: Path | None,
     server: str | None,
 ) -> None:
-    """Show how much light of a PSF lies beyond radii or in an annulus, and how it differs from another PSF."""
+    """Show the light of a PSF beyond radii or in an annulus, and the difference from another PSF."""
     check_writable(json_file)
     answers: dict[str, Any] = {}
     with user_errors(), _asking(server, psf, compare) as ask:
@@ -75,7 +75,7 @@ def query(
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the part (FITS)")
 @SERVER
 def cutout(psf: str, size: int, output: Path, server: str | None) -> None:
-    """Write the central part of a PSF, not renormalised. For a file, with its components."""
+    """Write the central part of a PSF, not renormalised. If the PSF is a file, the components are written too."""
     from psfcore.central_part import central_part
 
     check_writable(output)
@@ -115,12 +115,12 @@ COMMANDS = (query, cutout, rebin)
 
 @contextmanager
 def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
-    """A function that answers questions about the named PSFs: the service answers for ids, tables made here for files."""
+    """A function that answers queries about the named PSFs: the service answers for ids; for files the tables are computed here."""
     ids = [psf for psf in psfs if psf is not None and _is_id(psf)]
     files = [psf for psf in psfs if psf is not None and not _is_id(psf)]
     if ids and files:
         raise click.UsageError(
-            "expected two PSF ids or two files; got one of each. Upload the file first: heliopsf psf upload FILE"
+            "expected two PSF ids or two files; got an id and a file. Upload the file first: heliopsf psf upload FILE"
         )
     if not ids:
         tables = {file: _tables(file) for file in files}

@@ -19,8 +19,8 @@ FROM = click.option(
     "--from", "valid_from", metavar="TIME", help="Start of its time range (included) [default: no start]"
 )
 TO = click.option("--to", "valid_to", metavar="TIME", help="End of its time range (excluded) [default: open]")
-CONTEXT = click.option("--context", help="Context: its id or name; now: the PSFs certified at the moment")
-PRODUCT = click.option("--product", is_flag=True, help="The id is that of a product, not of a PSF")
+CONTEXT = click.option("--context", help="Context: its id or name; now: the PSFs that are certified now")
+PRODUCT = click.option("--product", is_flag=True, help="The ID is of a product, not of a PSF")
 
 
 def _line_options(command: Command) -> Command:
@@ -50,7 +50,7 @@ def list_psfs(server: str | None, **filters: str | None) -> None:
     with user_errors(), remote(server) as service:
         rows = list(service.psfs(**_given(filters)))
     if not rows and not _given(filters):
-        click.echo("no PSF yet; `heliopsf psf build` makes one, and so does the first deconvolution")
+        click.echo("no PSF yet; `heliopsf psf build` or the first deconvolution makes a PSF")
     elif not rows:
         click.echo("no PSF with " + ", ".join(f"{name} {value}" for name, value in _given(filters).items()))
     for row in rows:
@@ -66,7 +66,7 @@ def list_psfs(server: str | None, **filters: str | None) -> None:
 @_line_options
 @SERVER
 def upload_psf(file: Path, server: str | None, **said: str | None) -> None:
-    """Upload a PSF from FILE (FITS). Once certified, a PSF of kind total serves for images of its instrument."""
+    """Upload a PSF from FILE (FITS). A PSF of kind total is used for images of its instrument when it is certified."""
     with user_errors(), remote(server) as service:
         row = service.upload_psf(file, **said)
     line = f"{row['instrument'] or 'unknown instrument'} {row['channel'] or '-'} {row['kind']}"
@@ -75,14 +75,17 @@ def upload_psf(file: Path, server: str | None, **said: str | None) -> None:
 
 @click.command("certify")
 @click.argument("psf_id", metavar="PSF_ID")
-@click.option("--version", help="Version such as 1.2.0, new in its series; a certified PSF keeps its version")
+@click.option(
+    "--version",
+    help="Version of a draft, such as 1.2.0, which the series does not have yet; a certified PSF keeps its version",
+)
 @FROM
 @TO
 @click.option(
     "--supersedes",
     multiple=True,
     metavar="PSF_ID",
-    help="Also deprecate this certified PSF; may be given several times",
+    help="Also deprecate this certified PSF; can be repeated",
 )
 @REASON
 @_line_options
@@ -132,7 +135,7 @@ def deprecate(psf_id: str, successor: str | None, reason: str, server: str | Non
 @JSON
 @SERVER
 def best(image: Path | None, json_file: Path | None, server: str | None, **filters: str | None) -> None:
-    """Find the PSF that fits an image, or the one with the given properties."""
+    """Find the PSF that fits an image, or the PSF that has the given properties."""
     check_writable(json_file)
     given = _given(filters)
     if image is not None and set(given) - {"context", "kind"}:
@@ -155,7 +158,7 @@ def best(image: Path | None, json_file: Path | None, server: str | None, **filte
 @JSON
 @SERVER
 def lineage(identity: str, product: bool, json_file: Path | None, server: str | None) -> None:
-    """Show what a PSF or a product was made from, back to the uploads."""
+    """Show the things from which a PSF or a product was made, back to the uploads."""
     check_writable(json_file)
     with user_errors(), remote(server) as service:
         told = service.lineage("product" if product else "psf", identity)
@@ -170,7 +173,7 @@ def lineage(identity: str, product: bool, json_file: Path | None, server: str | 
 @JSON
 @SERVER
 def rerun(identity: str, product: bool, json_file: Path | None, server: str | None) -> None:
-    """Make a PSF or a product again and compare. Exit status 1: the result differs."""
+    """Make a PSF or a product again and compare both results. If they differ, the exit status is 1."""
     check_writable(json_file)
     with user_errors(), remote(server) as service, progress_bar() as report:
         found = service.rerun("product" if product else "psf", identity, progress=report)
@@ -195,7 +198,7 @@ def _validity(row: dict[str, Any]) -> str:
 
 
 def _tree(told: dict[str, Any], depth: int) -> Iterator[str]:
-    """A lineage as lines; inputs are indented below what was made from them."""
+    """A lineage as lines. Below each thing, the things from which it was made are indented."""
     made = told["made"] or {}
     named = " ".join(str(made[key]) for key in ("name", "version", "status") if made.get(key))
     by = [f"heliopsf {made['software_version']}"] if made.get("software_version") else []

@@ -222,7 +222,7 @@ BAD_CREATIONS = [
     ("no XML", BUILD | {"instrument_file": "a\x00b"}, "characters that XML can hold"),
     ("RUNID no XML", BUILD | {"RUNID": "a\x0bb"}, "RUNID"),
     ("RUNID too long", BUILD | {"RUNID": "a" * 300}, "RUNID"),
-    ("PHASE", BUILD | {"PHASE": "NONSENSE"}, "expected PHASE=RUN or none, got 'NONSENSE'"),
+    ("PHASE", BUILD | {"PHASE": "NONSENSE"}, "expected PHASE=RUN or no PHASE; got 'NONSENSE'"),
     ("ABORT at once", BUILD | {"PHASE": "ABORT"}, "expected PHASE=RUN"),
     ("duration", BUILD | {"EXECUTIONDURATION": "-1"}, "EXECUTIONDURATION"),
     ("destruction", BUILD | {"DESTRUCTION": "2001-01-01"}, "a time in the future"),

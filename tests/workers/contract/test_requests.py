@@ -35,7 +35,7 @@ def test_error_draws_are_zero_or_enough_to_show_a_spread() -> None:
     asked = {"image_id": "a" * 64, "psf_id": "b" * 64, "method": {"name": "linear"}}
     for draws in range(SMALLEST_DRAWS + 1):
         if 0 < draws < SMALLEST_DRAWS:
-            with pytest.raises(ValidationError, match="shows no spread"):
+            with pytest.raises(ValidationError, match="the spread cannot be estimated"):
                 Deconvolve.model_validate(asked | {"error_draws": draws})
         else:
             assert Deconvolve.model_validate(asked | {"error_draws": draws}).error_draws == draws

@@ -1,6 +1,6 @@
-"""A cache of PSFs that were read, resampled to an image's pixels and transformed, for the images that follow.
+"""A cache of PSFs that were already read, resampled to the pixels of an image and Fourier-transformed, for later images.
 
-The cache is not shared between threads: a worker process works on one image at a time, and so does an engine.
+The cache must not be shared between threads: a worker process and an engine both work on one image at a time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Thing = TypeVar("Thing", Psf, tuple[Psf, Engine])
 
 
 class PreparedPsfs:
-    """Keeps the PSFs and engines used last, up to ``max_bytes``; the last one always stays."""
+    """Keeps the PSFs and engines that were used last, up to ``max_bytes``; it always keeps the last one."""
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
@@ -46,7 +46,7 @@ class PreparedPsfs:
         def make() -> tuple[Psf, Engine]:
             return psf, new_engine(psf, shape, span, threads)
 
-        # The PSF is kept with its engine, so that Python cannot give its id() to another PSF.
+        # The PSF is kept together with its engine, so that Python cannot give the id() of the PSF to another object.
         return self._once((id(psf), shape, span, threads), make, lambda made: made[1].nbytes)[1]
 
     def _once(self, key: Hashable, make: Callable[[], Thing], size: Callable[[Thing], int]) -> Thing:
@@ -56,7 +56,7 @@ class PreparedPsfs:
         self._kept.move_to_end(key)
         while len(self._kept) > 1 and sum(nbytes for _, nbytes in self._kept.values()) > self.max_bytes:
             self._kept.popitem(last=False)
-        return self._kept[key][0]  # type: ignore[return-value]  # stored under this key above
+        return self._kept[key][0]  # type: ignore[return-value]  # the object that was stored under this key above
 
 
 def _kernel_bytes(psf: Psf) -> int:

@@ -38,7 +38,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Made:
-    """A finished deconvolution that is not yet written. preview_sha256: None if no preview was drawn."""
+    """A finished deconvolution whose file is not yet written. preview_sha256: None if no preview was drawn."""
 
     inputs: Inputs
     result: Deconvolved
@@ -113,7 +113,7 @@ def _save_changes_picture(made: Made) -> str:
 def _cards(
     inputs: Inputs, identity: str, result: Deconvolved, errors: ErrorPlanes | None
 ) -> dict[str, tuple[Any, str]]:
-    # A hash fills its card, so these cards have no comment.
+    # A hash fills its card, so cards with a hash have no comment.
     cards: dict[str, tuple[Any, str]] = {
         "PRODID": (identity, ""),
         "PSFID": (inputs.psf_row.id, ""),
@@ -122,15 +122,15 @@ def _cards(
         "PSFSTAT": (inputs.psf_row.status, "PSF status"),
         "DCNVMETH": (inputs.request.method.name, "deconvolution method"),
         "DCNVITER": (result.steps_done, "deconvolution steps done"),
-        "DCNVSTOP": (result.stopped_because, "why it stopped"),
-        "DCNVEDGE": (result.edges, "what was taken beyond the edges"),
-        "DCNVBAND": (result.edge_band_px, "[px] edge band that leans on it"),
+        "DCNVSTOP": (result.stopped_because, "why the iteration stopped"),
+        "DCNVEDGE": (result.edges, "assumed scene beyond the edges"),
+        "DCNVBAND": (result.edge_band_px, "[px] width of band affected by DCNVEDGE"),
         "DCNVALGV": (inputs.request.method.algorithm_version, "algorithm version"),
         "SWHELIO": (software_version(), "heliopsf version"),
         "INPSHA": (inputs.request.image_id, ""),
     }
     if errors is not None and errors.amplification is not None:
-        cards["DCNVAMPL"] = (errors.amplification, "noise of the result over that of the input")
+        cards["DCNVAMPL"] = (errors.amplification, "noise of result / noise of input")
     return cards
 
 

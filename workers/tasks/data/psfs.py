@@ -34,12 +34,12 @@ def no_such_psf(psf_id: str) -> DataError:
     """The error for an id that is not in the catalogue."""
     return DataError(
         "no-such-psf",
-        f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs, or upload yours",
+        f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs, or upload your PSF",
     )
 
 
 def given_psf(context: Context, psf_id: str | None) -> Psf | None:
-    """The PSF that a request names, with its components and errors; None if it names none.
+    """The PSF that a request names, with its components and errors; None if the request names no PSF.
 
     Raises DataError "no-such-psf".
     """
@@ -63,7 +63,7 @@ def psf_row(
 ) -> PsfRow:
     """The catalogue's row of a draft PSF whose file is in the store. Writes the PSF's tables into the store too.
 
-    details: entries to add to those that follow from the kernel.
+    details: further entries for the details of the row.
     """
     channel = channel_of(psf.instrument, psf.wavelength_angstrom)
     curve = cumulative_curve(psf.kernel, np.array(CURVE_RADII_PX, dtype=float))
@@ -97,7 +97,7 @@ def psf_row(
 
 
 def keep_tables(psf: Psf, store: Store, threads: int) -> str:
-    """Write the tables from which the service answers questions about a PSF; returns the file's SHA-256."""
+    """Write the tables from which the service answers queries about a PSF; returns the SHA-256 of their file."""
     with store.temporary() as path:
         path.write_text(json.dumps(tables_of(psf, threads=threads), separators=(",", ":"), allow_nan=False))
         return store.keep(path)

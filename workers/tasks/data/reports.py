@@ -15,7 +15,7 @@ from workers.tasks.context import Context
 
 
 def provenance_of(context: Context, request: ResolvedOnTransit) -> dict[str, Any]:
-    """The inputs, parameters and versions from which a job makes its result."""
+    """The inputs, parameters and software versions with which a job makes its result."""
     return {
         "transit_sha256": request.transit_id,
         "parameters": request.model_dump(mode="json", exclude_none=True),
@@ -38,7 +38,7 @@ def keep_report(
     transit_id: str | None = None,
     about_id: str | None = None,
 ) -> None:
-    """Move a report's written files into the store and add its row, with these details, to the catalogue."""
+    """Move the written files of a report into the store, and add a row with these details to the catalogue."""
     file_sha256 = context.store.keep(text)
     of_page = {} if page is None else {"page_sha256": context.store.keep(page)}
     context.catalogue.add(

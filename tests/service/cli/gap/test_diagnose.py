@@ -156,7 +156,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     done = run(folder, "--local", "--corrected", psf, "--json", numbers)
     assert done.exit_code == 1 and not psf.exists()
     assert done.output.splitlines()[1] == "verdict: none"
-    assert "was not written: no effect was found that a PSF can include (verdict none)" in done.output
+    assert "was not written: the diagnosis found no effect for a corrected PSF (verdict none)" in done.output
     assert json.loads(numbers.read_text())["verdict"] == "none"
 
 

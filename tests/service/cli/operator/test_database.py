@@ -42,7 +42,7 @@ def test_status_upgrade_status() -> None:
     done = ask("database", "upgrade")
     assert done.exit_code == 0 and "upgraded from no revision to" in done.output
     after = ask("database", "status")
-    assert after.exit_code == 0 and "as this version needs it" in after.output
+    assert after.exit_code == 0 and "which this version needs" in after.output
     assert "upgraded" not in ask("database", "upgrade").output
 
 

@@ -101,7 +101,7 @@ def test_a_broken_url_is_a_plain_sentence_without_its_password(
 def test_a_file_that_is_no_database_is_broken(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "catalogue.sqlite").write_bytes(b"Dear editor," * 1000)
-    assert "no SQLite database" in findings()["database"]["found"]
+    assert "not an SQLite database" in findings()["database"]["found"]
 
 
 def test_storage_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
