@@ -41,7 +41,7 @@ def bound(**about: str) -> Iterator[None]:
 
 
 def about() -> dict[str, str]:
-    """The values that are bound at present."""
+    """The values that are now added to each log line."""
     return dict(_ABOUT.get())
 
 

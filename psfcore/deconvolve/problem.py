@@ -82,7 +82,7 @@ def pose(
 
 
 def first_estimate(problem: Problem) -> NDArray[np.float32]:
-    """The first estimate [y, x]: the observation on the domain.
+    """The first estimate [y, x]: the observation, on the field and its margin (the domain).
 
     A pixel without a finite value starts from the mean of the trusted pixels around it, weighted by the PSF; if there
     are too few, from the mean of all trusted pixels.

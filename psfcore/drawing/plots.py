@@ -192,7 +192,7 @@ def _square(value: Any) -> Any:
 
 
 def change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:
-    """100 (after / before - 1); NaN where before is not positive."""
+    """100 (after / before - 1); NaN where `before` is not positive."""
     ratio = np.full(before.shape, np.nan)
     np.divide(after, before, out=ratio, where=before > 0)
     return np.asarray(100 * (ratio - 1))

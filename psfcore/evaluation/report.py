@@ -33,7 +33,7 @@ from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 Vector = NDArray[np.float64]
 
 SCHEMA = "evaluation/1"
-TREND_PX = 100.0  # the unit of a slope is the change over this number of pixels
+TREND_PX = 100.0  # slopes are given as the change over this number of pixels
 LEAST_TREND_FRAMES = 3
 
 

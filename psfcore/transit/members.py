@@ -37,7 +37,9 @@ _PAX_TYPES = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
 _PAX_RECORD = re.compile(rb"([1-9]\d{0,5}) [^=\n]+=")
 _MANY_DIGITS = re.compile(rb"\d{65}")
 _ZIP_ENTRY = b"PK\1\2"
-_DIRECTORY_BYTES_PER_MEMBER = 512  # generous mean size of an entry in the central directory of a zip
+_DIRECTORY_BYTES_PER_MEMBER = (
+    512  # upper estimate of the mean size of an entry in the central directory of a zip file
+)
 _ZIP_ENCRYPTED = 0x1 | 0x40 | 0x2000
 _ZIP_METHODS = {zipfile.ZIP_STORED: "stored", zipfile.ZIP_DEFLATED: "deflated"}
 # The exceptions that a damaged archive raises, depending on where the damage is.

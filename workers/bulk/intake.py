@@ -1,4 +1,4 @@
-"""Makes the row of a bulk run from its request: checks images and paths, and fixes the PSF or the context."""
+"""Makes the row of a bulk run from its request: checks images and paths, and records the id of the PSF or of the context."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Contexts: named, fixed sets of PSFs. A lookup in a context always gives the same PSF."""
+"""Contexts: named, fixed sets of PSFs. The same lookup in a context always gives the same PSF."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def look_for_image(
     if at is None and any(not _always(psf) for psf in found.psfs):
         raise DataError(
             "no-date",
-            f"expected DATE-BEG or DATE-OBS as 2024-03-01T12:00:00 in the image's header, since PSFs of "
+            f"expected DATE-BEG or DATE-OBS in the image's header, in the form 2024-03-01T12:00:00, because PSFs of "
             f"{series_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}",
         )
     return found

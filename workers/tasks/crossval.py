@@ -74,7 +74,7 @@ def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> 
 
 
 def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit) -> Solution:
-    """The fit of all images, from which every fold starts. Workers that help read the one that the job's worker kept."""
+    """The fit of all images, from which every fold starts. A worker that helps reads the fit that the job's worker kept."""
     return solved(context, request, transit, shape_named(request.shape), progress=context.report)
 
 

@@ -187,7 +187,8 @@ class DarkCurrentDrift(Effect):
 class BrighterFatter(Effect):
     """Collected charge repels new charge into fainter neighbouring pixels. Not in the library.
 
-    strength: the fraction of the difference between two neighbouring pixels that moves if their mean is 1000 DN.
+    strength: what moves from the brighter to the fainter of two neighbouring pixels, as a fraction of their difference,
+    if their mean is 1000 DN.
     """
 
     name: ClassVar[str] = "brighter_fatter"

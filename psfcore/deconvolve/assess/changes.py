@@ -3,7 +3,7 @@
 Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images": "bright features
 intensify by up to 40 %, while dark regions decrease by up to 85 %". The paper does not define a feature, the number
 of pixels over which it is averaged, or the meaning of "up to". This module therefore tabulates several definitions.
-Structures are blocks of n x n pixels (BLOCKS_PX). The brightest and the darkest blocks (TAILS_PCT) are selected by
+Here a feature is a block of n x n pixels (BLOCKS_PX); the code calls it a structure. The brightest and the darkest blocks (TAILS_PCT) are selected by
 percentiles of the image before deconvolution. Each row of the table gives three numbers: the change of the summed
 light of these blocks, the median change, and the largest change without the most extreme 1 % of the blocks.
 

@@ -22,7 +22,7 @@ Kernel = NDArray[np.float64]
 Steps = tuple[tuple[int, int], ...]
 Halo = Callable[
     [int], Kernel
-]  # for a size: weights [y, x] with the centre at size // 2; their sum is 1 on an infinite plane
+]  # maps the size of an array to weights [y, x] with the centre at size // 2; their sum on an infinite plane is 1
 HALO_SCALES_PX = (20.0, 40.0, 80.0, 160.0, 320.0)
 MOFFAT = 1.5  # exponent of the Moffat profile: the halo falls off as r^-3
 GHOST_TRIALS = 300  # about the number of distinguishable copies in a field of 512 px

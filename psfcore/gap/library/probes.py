@@ -140,7 +140,7 @@ def _read_pattern(view: View) -> Sequence[Change]:
     over, under, shown = (sum(some) for some in zip(*_in_pointings(view, readouts), strict=True))
     least = max(RIDGE * float(np.max(under)), 1e-300)  # damps pixels that few images show
     pattern = gaussian_filter(over / (under + least), STRUCTURE_PX / COARSE_PX)
-    pattern -= pattern.mean()  # the effect dark_offset describes the mean
+    pattern -= pattern.mean()  # the mean is left to the effect dark_offset
     plane = on_pixels(pattern / max(float(pattern.std()), 1e-9), view.solution.transit.shape)
     return [
         Change(lambda n, _: plane * np.float32(readouts[n]), disc=False, numbers=int(np.count_nonzero(shown)))

@@ -62,7 +62,8 @@ def where(
 
     favoured: the axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the best axis
     explains, because more data than the position on the track identified this effect. explained: the fit of an effect that explains the gap.
-    If given, the shares are computed from the part of the residuals that this effect explains, which contains no noise.
+    If `explained` is given, the shares are computed from the part of the residuals that this effect explains. This part
+    contains no noise.
     """
     designs = _designs(model.evidence)
     cells, unocculted = _of_cells(model, designs), _of_unocculted(model, designs)

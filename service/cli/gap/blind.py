@@ -1,4 +1,4 @@
-"""``heliopsf gap blind``: makes transits with a withheld effect, seals the effects, diagnoses the transits, and compares the
+"""``heliopsf gap blind``: makes transits with a withheld effect, stores a hash of each effect (the seal), diagnoses the transits, and compares the
 answers with the effects.
 
 The command imports numerical libraries only when it is called, so that other commands start fast.
