@@ -44,8 +44,8 @@ _UM_PER_ANGSTROM = 1e-4
 _UM_PER_MM = 1e3
 _FINEST_CELL_PX = 0.02
 _LARGEST_CELL_PX = 0.4
-# The density of cells is proportional to the square root of light times width. _CELLS_AN_ORDER cells go to one order and
-# _CELLS_IN_ALL cells to all light. An order that holds less than _FAINT_SHARE of all light gets fewer cells.
+# The density of cells is proportional to the square root of light times width. _CELLS_AN_ORDER sets how many cells
+# are distributed over the light of one order, _CELLS_IN_ALL how many more over the light of the whole axis. An order that holds less than _FAINT_SHARE of all light gets fewer cells.
 _CELLS_AN_ORDER = 30
 _CELLS_IN_ALL = 600
 _FAINT_SHARE = 1e-4

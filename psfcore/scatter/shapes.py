@@ -88,7 +88,7 @@ class Parameter:
 
 
 Falloff = Callable[[Values, int], Kernel]  # parameters and size to f on a (size, size) array; not normalised
-Radial = Callable[[Vector], Vector]  # radii (px) to f at these radii; not normalised
+Radial = Callable[[Vector], Vector]  # maps radii (px) to f at these radii; f is not normalised
 
 
 @dataclass(frozen=True)

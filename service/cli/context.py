@@ -56,7 +56,7 @@ def show(name: str, server: str | None) -> None:
     click.echo(f"{found['id']}  {found['name']}")
     for pin in found["pins"]:
         times = f"[{pin['valid_from'] or 'always'}, {pin['valid_to'] or 'open'})"
-        click.echo(f"  {pin['line']}  {times}  {pin['version']}  {pin['psf_id']}")
+        click.echo(f"  {pin['series']}  {times}  {pin['version']}  {pin['psf_id']}")
 
 
 @context.command("use", short_help="Set the default context.")

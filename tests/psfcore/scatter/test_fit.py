@@ -118,7 +118,7 @@ def test_an_effect_that_the_model_lacks_is_reported(monkeypatch: pytest.MonkeyPa
     fit = fit_of(monkeypatch, with_an_offset())
     assert fit.overdispersion > 4
     words = "; ".join(fit.limits)
-    assert f"scatter {math.sqrt(fit.overdispersion):.1f} times as much as noise explains" in words
+    assert f"vary {math.sqrt(fit.overdispersion):.1f} times as much as noise explains" in words
     np.testing.assert_allclose(fit.covariance, fit.overdispersion * fit.inversion.covariance)
     assert fit.value_sigma["c"] == pytest.approx(
         math.sqrt(fit.overdispersion) * fit.inversion.value_sigma["c"]

@@ -18,7 +18,7 @@ def test_deconvolution_removes_scatter_from_the_disc_of_venus(shared: Path) -> N
         assert seen_core > cores[0] > cores[1] > cores[2] > cores[3] >= 0
         assert rows[name, "scatter of 10 %"][1] == pytest.approx(seen_ring, rel=0.02)
     # The peer's own deconvolution of the XRT image takes as much out as five percent of scatter would.
-    peer_core, _ = rows["XRT", "the peer's deconvolution"]
+    peer_core, _ = rows["XRT", "published deconvolution"]
     assert rows["XRT", "scatter of 10 %"][0] < peer_core < rows["XRT", "as observed"][0]
 
 

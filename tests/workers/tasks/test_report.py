@@ -91,7 +91,7 @@ def test_its_page_stands_alone_and_shows_every_image(made: dict[str, Any]) -> No
     cells = {t.text for t in read_page(html) if t.name == "td"}
     assert {f["file"] for f in made["json"]["evaluation"]["frames"]} <= cells
     assert set(made["json"]["inputs"]["sha256"].values()) <= cells
-    assert "Not shown: what wrong dark levels do; it was not asked for." in html
+    assert "Not shown: the effect of wrong dark levels, because it was not requested" in html
     assert (made["folder"] / "r.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -111,7 +111,7 @@ def test_a_given_psf_is_evaluated_without_a_fit(
     assert "fit" not in report and report["psf"]["given"] and row["details"]["psf_id"] == psf_id
     whole = report["evaluation"]["all"]
     assert abs(whole["mean_pct"]) < 4 * whole["mean_noise_pct"]
-    assert any("nothing was fitted" in missing["why"] for missing in report["not_shown"])
+    assert any("no fit was made" in missing["why"] for missing in report["not_shown"])
     check_stands_alone((tmp_path / "r.html").read_text("utf-8"))
     # Dark offsets are of fits: asking for them or not is the same request here.
     again = service.report(transit, psf_id=psf_id, dark_offsets=False)

@@ -66,13 +66,13 @@ def test_folds_do_not_change_the_solution() -> None:
 def test_a_fold_reports_progress_before_every_image(monkeypatch: pytest.MonkeyPatch) -> None:
     """So a worker can renew its lease between images, and notices a cancellation."""
     since_report, most = 0, 0
-    undo = Optics.invert
+    invert = Optics.invert
 
     def counted(optics: Optics, observed: Lanes, start: Lanes | None = None, *, steps: int) -> Lanes:
         nonlocal since_report, most
         since_report += 1
         most = max(most, since_report)
-        return undo(optics, observed, start, steps=steps)
+        return invert(optics, observed, start, steps=steps)
 
     stages: dict[str, list[int]] = {}
 
@@ -82,7 +82,7 @@ def test_a_fold_reports_progress_before_every_image(monkeypatch: pytest.MonkeyPa
         stages.setdefault(stage, []).append(step)
         assert 0 <= step < steps
 
-    monkeypatch.setattr(Optics, "undo", counted)
+    monkeypatch.setattr(Optics, "invert", counted)
     draw = bootstrap_samples(IMAGES, runs=1)[1]
     exact_fit(solved(), draw, progress=progress)
     assert most == 1

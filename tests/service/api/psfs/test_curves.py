@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -23,7 +22,7 @@ from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from service.app import create_app
-from service.cli.psf.query import COMMANDS
+from service.cli.main import main
 from service.client.http import Client, ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
@@ -342,8 +341,7 @@ def test_in_this_process_missing_tables_are_made_automatically(
 
 
 def run(*arguments: str | Path) -> Result:
-    group = click.Group("psf", commands={command.name or "": command for command in COMMANDS})
-    return CliRunner().invoke(group, [str(argument) for argument in arguments])
+    return CliRunner().invoke(main, ["psf", *[str(argument) for argument in arguments]])
 
 
 def test_the_command_asks_a_file(psf_file: Path, tmp_path: Path) -> None:

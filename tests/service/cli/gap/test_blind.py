@@ -33,10 +33,10 @@ def test_a_set_is_made_and_sealed_and_another_is_not_mixed_in(tmp_path: Path) ->
     assert len(list((folder / "cases" / "0000" / "transit").glob("0*.fits"))) == 9
     other = run("--cases", 1, "--seed", 9, "--clean-only", "--make-only", "-o", folder, *SMALL)
     assert other.exit_code == 1
-    assert "holds a set made with" in other.output
+    assert "contains a set that was made" in other.output
     drawn = run("--cases", 1, "--clean-only", "--make-only", "-o", folder, *SMALL)
     assert drawn.exit_code == 1, "scenes of that image are not mixed with drawn ones"
-    assert "other-set" not in drawn.output and "holds a set made with" in drawn.output
+    assert "other-set" not in drawn.output and "contains a set that was made" in drawn.output
     again = run("--cases", 1, "--clean-only", "--make-only", "--scenes", image, "-o", folder, *SMALL)
     assert again.exit_code == 0 and "made case" not in again.output
 
