@@ -17,7 +17,7 @@ from service.http.state import Shared
 from workers.bulk import turns as bulk_turns
 from workers.bulk.intake import begin
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
-from workers.contract.bulk import AT_WORK, BulkPhase, BulkRequest, ItemState
+from workers.contract.bulk import BulkPhase, BulkRequest, ItemState
 from workers.contract.phases import JobError
 
 log = logging.getLogger(__name__)
@@ -268,11 +268,6 @@ def find(state: Shared, caller: Caller, bulk_id: str) -> BulkRow:
             f"expected the id of one of your bulk runs; got {bulk_id}: list your bulk runs",
         )
     return row
-
-
-def goes_on(row: BulkRow) -> bool:
-    """Whether the run may still change although nobody sends a request."""
-    return row.phase in AT_WORK
 
 
 def _done(changed: bool, row: BulkRow, expected: str) -> None:
