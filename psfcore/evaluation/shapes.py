@@ -123,11 +123,11 @@ def compare_shapes_by_errors(
         )
     samples = _fold_samples(len(solution.transit.frames))
     named: dict[str, tuple[Solution | None, KernelOf]] = {
-        SOFTENED_POWER_LAW.name: (solution, _fold_kernels(solution, samples))
+        SOFTENED_POWER_LAW.name: (solution, held_out_kernels(solution))
     }
     for name in STRETCHED:
         stretched = _fit_of(solution, name, progress)
-        named[name] = stretched, _fold_kernels(stretched, samples)
+        named[name] = stretched, held_out_kernels(stretched)
     named[FREE_SHELLS] = None, _free_fold_kernels(solution, samples, progress)
     evaluations = {
         name: _evaluated(solution, kernel_of, name, progress) for name, (_, kernel_of) in named.items()
@@ -180,9 +180,13 @@ def _fold_samples(images: int) -> tuple[FoldSample, ...]:
     )
 
 
-def _fold_kernels(solution: Solution, samples: tuple[FoldSample, ...]) -> KernelOf:
-    """For each image, the total PSF [y, x] of the fold that holds it out."""
-    at = solution.inversion.coordinates
+def held_out_kernels(solution: Solution) -> KernelOf:
+    """For each image index, the total PSF [y, x] fitted without that image.
+
+    Each fold takes one step from the fit to all images (`psfcore.scatter.validation.cross_validation.shared_step`). Raises
+    DataError "too-few-frames" if there are too few images for two folds.
+    """
+    samples, at = _fold_samples(len(solution.transit.frames)), solution.inversion.coordinates
     kernels = [solution.total.kernel(at + shared_step(solution, sample)) for sample in samples]
     return _by_image(samples, kernels)
 

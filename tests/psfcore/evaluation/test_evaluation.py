@@ -10,7 +10,8 @@ import pytest
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import evaluate
-from psfcore.evaluation.report import lines, summaries
+from psfcore.evaluation.report import report, summaries
+from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import LEAST_DARK_PIXELS
 from psfcore.scatter.noise_transfer import noise_covariance
@@ -149,7 +150,7 @@ def test_images_that_cannot_be_evaluated_are_left_out_with_a_reason() -> None:
     assert [f.index for f in found.frames] == [1, 3, 4, 5, 7, 8, 9, 10, 11]
     # A frame without occulter does not affect its neighbours in time.
     assert max(abs(f.residual_pct) for f in found.frames) < 0.3
-    assert any("002.fits" in line for line in lines(found))
+    assert any("002.fits" in line for line in summary_lines(report(found)))
 
 
 def test_a_transit_without_any_occulter_is_refused() -> None:

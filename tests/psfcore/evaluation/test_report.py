@@ -12,7 +12,8 @@ import pytest
 from psfcore.convolution.convolver import Convolver
 from psfcore.evaluation.evaluation import evaluate
 from psfcore.evaluation.frame import FrameEvaluation
-from psfcore.evaluation.report import lines, report, slope_of, summary_of, trends
+from psfcore.evaluation.report import report, slope_of, summary_of, trends
+from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.transit.occulter import FoundPlace
 from psfcore.transit.transit import Place
 from tests.psfcore.evaluation.small_evaluations import exact_scene, judged, kernel_with, noisy, offsets
@@ -133,7 +134,7 @@ def test_a_residual_is_relative_to_the_mean_observed_intensity() -> None:
     assert frame.noise_pct == pytest.approx(5.0)
 
 
-def test_the_report_is_json_with_the_values_of_the_text_lines() -> None:
+def test_the_report_is_json_with_the_values_of_the_summary_lines() -> None:
     found = noisy(11)
     said = json.loads(json.dumps(report(found, offsets()), allow_nan=False))
     assert said["schema"] == "evaluation/1"
@@ -143,7 +144,7 @@ def test_the_report_is_json_with_the_values_of_the_text_lines() -> None:
     maps = said["superposed"]
     middle = maps["centre_index"]
     assert maps["mape_pct"][middle][middle] > 0 and maps["mape_pct"][0][0] is None
-    text = "\n".join(lines(found, offsets()))
+    text = "\n".join(summary_lines(report(found, offsets())))
     assert f"all pointings: 12 images, mean {said['all']['mean_pct']:+.2f} %" in text
     assert f"MAPE {maps['mape_mean_pct']:.2f} %" in text
     assert f"at most {said['dark_offsets']['largest_weight_change_pct']:.1f} %" in text
