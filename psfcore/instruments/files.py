@@ -1,11 +1,10 @@
-"""Finds the instrument files: by name, by the hash of their bytes, and by the header of an image.
+"""Finds the instrument files: by name, and by the header of an image.
 
 This module imports no numerical library, so that the web process can import it.
 """
 
 from __future__ import annotations
 
-import hashlib
 import tomllib
 from collections.abc import Mapping
 from functools import cache
@@ -27,11 +26,6 @@ def instrument_path(name: str) -> Path:
         known = ", ".join(instrument_names())
         raise DataError("unknown-instrument", f"expected one of: {known}; got {name!r}")
     return _FOLDER / f"{name}.toml"
-
-
-def instrument_digest(name: str) -> str:
-    """SHA-256 (hex) of the bytes of the file of instrument `name`."""
-    return hashlib.sha256(instrument_path(name).read_bytes()).hexdigest()
 
 
 def match_instrument(cards: Mapping[str, object]) -> str | None:

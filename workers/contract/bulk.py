@@ -13,9 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-from psfcore.noise_figures import NoiseFigures
-from workers.contract.methods import Method, RichardsonLucy
-from workers.contract.requests import Identity
+from workers.contract.requests import Identity, Treatment
 
 MOST_UPLOADED = 100_000
 MOST_SETS = 100
@@ -91,25 +89,6 @@ class Output(_Strict):
         description="absolute path below a folder that the operator allows; the folder is created if it does not exist",
     )
     only: bool = Field(False, description="true: write products only to the folder; the service keeps none")
-
-
-class Treatment(_Strict):
-    """The parameters with which each image is deconvolved."""
-
-    method: Method = Field(default_factory=lambda: RichardsonLucy())
-    noise: NoiseFigures | None = Field(
-        None,
-        description="noise figures of the images' gain mode; null: the noise figures of the instrument, if known",
-    )
-    saturation_dn: float | None = Field(
-        None,
-        gt=0,
-        allow_inf_nan=False,
-        description="saturation level in DN of one exposure; null: the saturation level of the instrument, if known",
-    )
-    error_draws: int = Field(
-        0, ge=0, le=64, description="number of noise realisations for an ERROR plane: 0, or 2 or more"
-    )
 
 
 class BulkWork(_Strict):

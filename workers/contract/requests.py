@@ -71,19 +71,9 @@ class PsfBuild(Parameters):
         return self
 
 
-class Deconvolve(Parameters):
-    """Deconvolve an uploaded image with a PSF."""
+class Treatment(Parameters):
+    """How an image is deconvolved: the same for one image and for each image of a bulk run."""
 
-    image_id: Identity = Field(description="id returned by the upload of the image")
-    psf_id: Identity | None = Field(
-        None,
-        description="id of a PSF of the catalogue; null: the certified PSF that fits the image, else the PSF built from "
-        "the instrument file",
-    )
-    context: ContextName | None = Field(
-        None,
-        description="the context from which the PSF is chosen: its id, its name, or `now`; null: the default context",
-    )
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
         None,
@@ -101,17 +91,32 @@ class Deconvolve(Parameters):
         le=64,
         description="number of noise realisations for an ERROR plane: 0, or 2 or more; each realisation takes as long as one deconvolution",
     )
-    changes_picture: bool = Field(
-        False, description="also draw the difference, the ratio and the histogram of the changes"
-    )
 
     @model_validator(mode="after")
-    def _a_spread(self) -> Deconvolve:
+    def _a_spread(self) -> Treatment:
         if self.error_draws == 1:
             raise ValueError(
                 "error_draws: expected 0, or 2 or more; got 1: the spread cannot be estimated from one realisation"
             )
         return self
+
+
+class Deconvolve(Treatment):
+    """Deconvolve an uploaded image with a PSF."""
+
+    image_id: Identity = Field(description="id returned by the upload of the image")
+    psf_id: Identity | None = Field(
+        None,
+        description="id of a PSF of the catalogue; null: the certified PSF that fits the image, else the PSF built from "
+        "the instrument file",
+    )
+    context: ContextName | None = Field(
+        None,
+        description="the context from which the PSF is chosen: its id, its name, or `now`; null: the default context",
+    )
+    changes_picture: bool = Field(
+        False, description="also draw the difference, the ratio and the histogram of the changes"
+    )
 
     @model_validator(mode="after")
     def _one_choice(self) -> Deconvolve:

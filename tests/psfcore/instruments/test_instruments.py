@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
-from psfcore.instruments.files import instrument_digest, instrument_names, instrument_path, match_instrument
+from psfcore.instruments.files import instrument_names, instrument_path, match_instrument
 from psfcore.instruments.model import SpectralLine, load_instrument, parse_instrument
 from tests.conftest import SMALL_INSTRUMENT
 
@@ -19,10 +18,6 @@ def test_every_shipped_instrument_loads_under_its_own_name() -> None:
     assert "hri_euv" in instrument_names()
     for name in instrument_names():
         assert load_instrument(name).name == name
-
-
-def test_the_digest_is_that_of_the_files_bytes() -> None:
-    assert instrument_digest("hri_euv") == hashlib.sha256(instrument_path("hri_euv").read_bytes()).hexdigest()
 
 
 @pytest.mark.parametrize(

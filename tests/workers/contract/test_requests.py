@@ -6,6 +6,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from psfcore.deconvolve.assess.error_planes import SMALLEST_DRAWS
+from workers.contract.bulk import BulkWork
 from workers.contract.kinds import JobRequest
 from workers.contract.requests import Deconvolve, Report
 
@@ -37,6 +38,8 @@ def test_error_draws_are_zero_or_enough_to_show_a_spread() -> None:
         if 0 < draws < SMALLEST_DRAWS:
             with pytest.raises(ValidationError, match="the spread cannot be estimated"):
                 Deconvolve.model_validate(asked | {"error_draws": draws})
+            with pytest.raises(ValidationError, match="the spread cannot be estimated"):
+                BulkWork.model_validate({"parameters": {"error_draws": draws}})
         else:
             assert Deconvolve.model_validate(asked | {"error_draws": draws}).error_draws == draws
 
