@@ -104,10 +104,13 @@ def judgement(
 
 
 class Iteration:
-    """One step of a method, in two parts.
+    """One step of a method, in two parts. `run` calls them in turn, reports progress, and decides when to stop.
 
-    `measure` computes H x from the estimate x, stores the sums of chi2 in the judgement, and writes the input of `update`
-    into the engine's spectrum. `update` makes the next estimate from that spectrum.
+    The engine's spectrum carries the data from call to call:
+
+    - Before `measure` it holds the transformed rows of the estimate x: call `engine.rows_forward(x)` at the start.
+    - `measure` computes H x from it, stores the sums of chi2 in `judgement.sums`, and leaves the input of `update` in it.
+    - `update` makes the next x from it. Unless `last` is true, it leaves the transformed rows of the new x in it.
     """
 
     def measure(self) -> None:

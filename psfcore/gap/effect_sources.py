@@ -1,12 +1,21 @@
-"""The source text that defines added effects, in a Python file or a module: find and hash it, without running it."""
+"""The source text that defines effects, of the library or added ones: find and hash it, without running it."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
+from functools import cache
 from pathlib import Path
 
 from psfcore.errors import DataError
+
+_LIBRARY = Path(__file__).parent / "library"
+
+
+@cache
+def library_sha256() -> str:
+    """SHA-256 (hex) of the source texts of the library of effects."""
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(_LIBRARY.glob("*.py")))).hexdigest()
 
 
 def is_file(source: str) -> bool:

@@ -1,4 +1,4 @@
-"""Reports on transits and reruns: ``/v1/reports``."""
+"""Reports, for example on transits and reruns: ``/v1/reports``."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ router = APIRouter(prefix="/v1/reports", tags=["reports"], responses=RESPONSES)
 
 
 class ReportView(BaseModel):
-    """The report of a job on a transit, or the report of a rerun."""
+    """The report of a job, for example on a transit or a rerun."""
 
     id: str
     created_at: float
     kind: str
-    transit_id: str | None = Field(description="id of the transit; null: the report is on a rerun")
+    transit_id: str | None = Field(description="id of the transit; null: the report is not on a transit")
     about_id: str | None = Field(
-        description="id of the PSF or product that was made again; null: the report is on a transit"
+        description="id of the PSF or product; null: the report is not on a PSF or product"
     )
     bytes: int
     details: dict[str, Any] = Field(description="the summary sentence and the main figures")

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from typing import Any
 
+from psfcore.gap.effect_sources import library_sha256
 from psfcore.instruments.files import instrument_path
 from workers.contract.methods import Parameters
 from workers.contract.requests import PsfBuild
@@ -77,10 +78,11 @@ def report_identity(request: ResolvedReport) -> str:
 
 
 def gap_identity(request: ResolvedGapDiagnose) -> str:
-    """Identity of a diagnosis: bytes of the transit, parameters, PSF, diffraction PSF, version of the algorithm."""
+    """Identity of a diagnosis: bytes of the transit, parameters, PSF, diffraction PSF, source text of the library of
+    effects, version of the algorithm."""
     # Diagnoses without added effects keep the ids that they had before the texts of added effects were hashed.
     excluded = () if request.added_effects_sha256 else ("added_effects_sha256",)
-    return _transit_identity("gap-diagnose", request, excluded)
+    return _transit_identity("gap-diagnose", request, excluded, library=library_sha256())
 
 
 def diffraction_identity(request: ResolvedOnTransit) -> str | None:
@@ -88,8 +90,10 @@ def diffraction_identity(request: ResolvedOnTransit) -> str | None:
     return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
 
 
-def _transit_identity(kind: str, request: ResolvedOnTransit, excluded: tuple[str, ...] = ()) -> str:
-    """excluded: fields of the request that do not change the result."""
+def _transit_identity(
+    kind: str, request: ResolvedOnTransit, excluded: tuple[str, ...] = (), **more: str
+) -> str:
+    """excluded: fields of the request that do not change the result. more: what else determines the result."""
     return canonical_hash(
         {
             "kind": kind,
@@ -97,6 +101,7 @@ def _transit_identity(kind: str, request: ResolvedOnTransit, excluded: tuple[str
             "request": request.model_dump(mode="json", exclude={"diffraction_recipe", *excluded}),
             "diffraction": diffraction_identity(request),
             "algorithm_version": request.algorithm_version,
+            **more,
         }
     )
 
@@ -105,7 +110,7 @@ def request_identity(kind: str) -> Callable[[Any], str]:
     """The identity function of a kind whose result depends only on its parameters and its ``algorithm_version``."""
 
     def identity(request: Parameters) -> str:
-        version = {"algorithm_version": request.algorithm_version}  # type: ignore[attr-defined]
+        version = {"algorithm_version": request.algorithm_version}
         return canonical_hash({"kind": kind, **request.model_dump(mode="json"), **version})
 
     return identity

@@ -60,12 +60,16 @@ def resolve(
 
 
 def resolve_by_ids(asked: Asked) -> Parameters:
-    """Check the ids in the parameters, and add the recipe of the diffraction PSF if the kind needs one."""
+    """Check the ids in the parameters, and add the recipe of the diffraction PSF if the kind needs one.
+
+    A parameter is an id if its name is ``image_id``, ``psf_id`` or ``transit_id``, or ends in ``_image_id``, ``_psf_id`` or
+    ``_transit_id``.
+    """
     parameters = asked.parameters
-    for name, check in (("image_id", _image), ("psf_id", _psf), ("transit_id", _transit)):
-        identity = getattr(parameters, name, None)
-        if identity is not None:
-            check(asked.catalogue, identity, asked.owner)
+    for name, identity in parameters:
+        for of, check in _CHECKS.items():
+            if identity is not None and f"_{name}".endswith(f"_{of}_id"):
+                check(asked.catalogue, identity, asked.owner)
     assert asked.kind.resolved is not None
     if "diffraction_recipe" not in asked.kind.resolved.model_fields:
         return asked.resolved()
@@ -150,6 +154,9 @@ def _psf(catalogue: Catalogue, psf_id: str, owner: str) -> PsfRow:
     if row is None:
         raise DataError("no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}")
     return row
+
+
+_CHECKS = {"image": _image, "psf": _psf, "transit": _transit}
 
 
 def _check_noise(summary: dict[str, Any], noise: NoiseFigures | None) -> None:

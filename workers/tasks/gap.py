@@ -16,6 +16,7 @@ from psfcore.errors import DataError
 from psfcore.fits.psfs import write_psf
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
+from psfcore.gap.effect_sources import library_sha256
 from psfcore.gap.library.added import Added, added_effects, library_with
 from psfcore.gap.report.page import gap_page
 from psfcore.gap.report.plot import gap_png
@@ -108,6 +109,7 @@ def _provenance(
         "started_from_psf": started,
         "diffraction_psf_id": diffraction_identity(request),
         "seed": request.seed,
+        "library_sha256": library_sha256(),
         "added_effects": {one.source: one.sha256 for one in added},
         **provenance_of(context, request),
     }

@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from workers.catalogue.tables import ReportRow
-from workers.contract.resolved import ResolvedOnTransit
+from workers.contract.methods import Parameters
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
 
 
-def provenance_of(context: Context, request: ResolvedOnTransit) -> dict[str, Any]:
-    """The inputs, parameters and software versions with which a job makes its result."""
+def provenance_of(context: Context, request: Parameters) -> dict[str, Any]:
+    """The inputs, parameters and software versions with which a job makes its result. request: the resolved parameters."""
+    transit_id = getattr(request, "transit_id", None)
     return {
-        "transit_sha256": request.transit_id,
+        **({} if transit_id is None else {"transit_sha256": transit_id}),
         "parameters": request.model_dump(mode="json", exclude_none=True),
         "algorithm_version": request.algorithm_version,
         "software_version": software_version(),
@@ -38,7 +39,11 @@ def keep_report(
     transit_id: str | None = None,
     about_id: str | None = None,
 ) -> None:
-    """Move the written files of a report into the store, and add a row with these details to the catalogue."""
+    """Move the written files of a report into the store, and add a row with these details to the catalogue.
+
+    text: the report as JSON. details: the entry "sentence" and the main figures; lists of reports show them. transit_id,
+    about_id: the transit, or the PSF or product, that the report is about; reports can be listed by these ids.
+    """
     file_sha256 = context.store.keep(text)
     of_page = {} if page is None else {"page_sha256": context.store.keep(page)}
     context.catalogue.add(
