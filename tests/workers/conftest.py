@@ -7,11 +7,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from sqlalchemy import text
 
 from service.local import LocalService
 from tests.tables import copied_tables
 from tests.whole.stack import Missing, postgres_database
 from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import Base
 from workers.settings import Settings
 
 
@@ -35,28 +37,36 @@ def local(settings: Settings) -> Iterator[LocalService]:
 
 @pytest.fixture(scope="session")
 def postgres_tables() -> Iterator[str]:
-    """A PostgreSQL database with this version's tables, to be copied."""
+    """The URL of a PostgreSQL database with this version's tables. Tests share it: to make one takes a second."""
     with ExitStack() as resources:
         try:
             url = resources.enter_context(postgres_database())
         except Missing as missing:
             pytest.skip(str(missing))
-        catalogue = Catalogue(Settings(database_url=url).catalogue_url)
+        catalogue_url = Settings(database_url=url).catalogue_url
+        catalogue = Catalogue(catalogue_url)
         catalogue.upgrade()
         catalogue.close()
-        yield url
+        yield catalogue_url
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalogue]:
+    """A catalogue without rows."""
     if request.param == "sqlite":
         catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
-        catalogue.upgrade()
-        yield catalogue
-        catalogue.close()
-        return
-    with postgres_database(template=request.getfixturevalue("postgres_tables")) as url:
-        catalogue = Catalogue(Settings(database_url=url).catalogue_url)
-        catalogue.upgrade()
-        yield catalogue
-        catalogue.close()
+    else:
+        catalogue = Catalogue(request.getfixturevalue("postgres_tables"))
+    catalogue.upgrade()
+    yield catalogue
+    if request.param == "postgresql":
+        _delete_all_rows(catalogue)
+    catalogue.close()
+
+
+def _delete_all_rows(catalogue: Catalogue) -> None:
+    with catalogue._engine.begin() as connection:
+        # A transaction that a test left open would let this wait for ever.
+        connection.execute(text("SET LOCAL lock_timeout = '10s'"))
+        for table in reversed(Base.metadata.sorted_tables):
+            connection.execute(table.delete())
