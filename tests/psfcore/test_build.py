@@ -281,6 +281,7 @@ def test_a_mask_image_replaces_the_bars_of_the_mount() -> None:
         build_psf(changed(mount=mount), size=64)
 
 
+@pytest.mark.slow  # tests/workers/run has the fast case
 def test_progress_is_reported_and_may_stop_the_work() -> None:
     reported: list[tuple[int, int]] = []
 

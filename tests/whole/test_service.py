@@ -122,6 +122,7 @@ def test_what_was_queued_while_everything_was_down_is_done(
     assert len(list(stack.client.products())) == 3
 
 
+@pytest.mark.slow  # tests/workers/catalogue has the fast cases of lost messages
 def test_a_broker_killed_at_work_costs_nothing(tmp_path: Path, psf_file: Path) -> None:
     """The running job ends, the worker lives on, and what was queued meanwhile is done once Redis is back."""
     with ExitStack() as resources:

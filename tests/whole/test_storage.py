@@ -14,6 +14,7 @@ from tests.s3 import s3_bucket
 from tests.whole import stack as stacks
 
 
+@pytest.mark.slow  # tests/workers/files runs store and collection on S3
 def test_files_are_kept_in_s3_and_found_there_again(
     tmp_path: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -89,6 +89,7 @@ def test_a_dark_offset_is_found_with_its_size_and_taken_out(
     assert abs(straight - TRUTH.total) < abs(bent - TRUTH.total) + 0.01
 
 
+@pytest.mark.slow  # gap/library tests its change; the tests below run the same path
 def test_a_gain_mismatch_shows_in_the_unocculted_field_and_hardly_in_the_discs(
     clean: Transit,
 ) -> None:
@@ -100,6 +101,7 @@ def test_a_gain_mismatch_shows_in_the_unocculted_field_and_hardly_in_the_discs(
     assert found.where[0].name in ("gain_mode", "exposure")
 
 
+@pytest.mark.slow  # gap/library tests its change; other effects run the same path
 def test_persistence_is_found_whatever_its_decay_time(clean: Transit) -> None:
     frames = clean.frames
     fades_s = 1.6 * (frames[-1].time_s - frames[0].time_s) / (len(frames) - 1)
@@ -118,6 +120,7 @@ def test_persistence_is_found_whatever_its_decay_time(clean: Transit) -> None:
     assert sum(value for value, _, _ in best.values.values()) == pytest.approx(0.06, rel=0.3)
 
 
+@pytest.mark.slow  # the read pattern below is the fast case of structure that no effect explains
 def test_a_patchy_flat_field_error_is_found(clean: Transit) -> None:
     uneven = 1 + 0.15 * patches(clean.shape[0], seed=3, patch=0.2)
     found = verdict(changed(clean, lambda n, f: f.pixels * uneven))
@@ -130,6 +133,7 @@ def test_a_patchy_flat_field_error_is_found(clean: Transit) -> None:
     assert f"{len(best.values)} parameters" in gap_report(found)["sentence"]
 
 
+@pytest.mark.slow  # gap/evidence/test_search.py has the fast case of a Sun that changes
 def test_a_sun_that_changes_faster_than_the_images_follow_is_still_named() -> None:
     plan = default_plan(18, 128, oversampling=1, brightness=4.0)
     one, other = (patches(128, seed=seed, patch=0.1) for seed in (3, 4))
@@ -143,6 +147,7 @@ def test_a_sun_that_changes_faster_than_the_images_follow_is_still_named() -> No
     assert found.judgement.answer == ("scene_evolution",)
 
 
+@pytest.mark.slow  # the read pattern below is the fast case of an unknown effect
 def test_a_patch_of_light_is_not_attributed_to_an_effect(clean: Transit) -> None:
     ny, nx = clean.shape
     glow = 40 * np.exp(-0.5 * ((np.arange(nx) - 60) / 14) ** 2) * np.ones((ny, 1))
