@@ -131,14 +131,16 @@ def alone(folder: Path) -> Iterator[Stack]:
 
 
 @contextmanager
-def served(folder: Path, workers: int = 1) -> Iterator[Stack]:
-    """A service on Redis and PostgreSQL, with workers of its own; ``Missing`` where either is not there."""
+def served(folder: Path, workers: int = 1, changes: dict[str, str] | None = None) -> Iterator[Stack]:
+    """A service on Redis and PostgreSQL, with workers of its own; ``Missing`` where either is not there.
+
+    changes: further environment variables.
+    """
     with ExitStack() as resources:
         redis = resources.enter_context(Redis(folder))
         database_url = resources.enter_context(postgres_database())
-        stack = Stack(
-            folder / "data", {"HELIOPSF_BROKER_URL": redis.url, "HELIOPSF_DATABASE_URL": database_url}
-        )
+        urls = {"HELIOPSF_BROKER_URL": redis.url, "HELIOPSF_DATABASE_URL": database_url}
+        stack = Stack(folder / "data", urls | (changes or {}))
         stack.redis = redis
         resources.enter_context(_running(stack))
         for _ in range(workers):
