@@ -19,7 +19,7 @@ import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
-from service.client.errors import ServiceError
+from service.client.errors import ServiceError, error_lines
 from workers.contract.methods import Method
 
 if TYPE_CHECKING:
@@ -70,8 +70,10 @@ def user_errors() -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        raise click.ClickException(error.message) from error
-    except (ServiceError, OSError) as error:
+        raise click.ClickException("\n".join(error_lines(error.message, error.fields))) from error
+    except ServiceError as error:
+        raise click.ClickException("\n".join(error_lines(str(error), error.fields))) from error
+    except OSError as error:
         raise click.ClickException(str(error)) from error
 
 
