@@ -18,6 +18,7 @@ from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
 from psfcore.fits.images import write_image
+from psfcore.drawing.units import unit_label
 from psfcore.image import Image, MaskBit
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.identities import product_identity
@@ -99,14 +100,22 @@ def keep(made: Made, path: Path) -> ProductRow:
 def save_preview(inputs: Inputs, result: Deconvolved) -> str:
     """Draw the preview (before, after, change) into the store; returns its SHA-256."""
     with inputs.context.store.temporary() as picture:
-        plots.preview_png(inputs.image.pixels, result.pixels, picture, title=_title(inputs))
+        image = inputs.image
+        plots.preview_png(image.pixels, result.pixels, picture, title=_title(inputs), unit=unit_label(image))
         return inputs.context.store.keep(picture)
 
 
 def _save_changes_picture(made: Made) -> str:
     inputs = made.inputs
     with inputs.context.store.temporary() as picture:
-        changes_png(inputs.image.pixels, made.result.pixels, made.found, picture, title=_title(inputs))
+        changes_png(
+            inputs.image.pixels,
+            made.result.pixels,
+            made.found,
+            picture,
+            title=_title(inputs),
+            unit=unit_label(inputs.image),
+        )
         return inputs.context.store.keep(picture)
 
 
