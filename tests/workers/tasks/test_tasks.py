@@ -11,7 +11,7 @@ import pytest
 from astropy.io import fits
 
 from psfcore.deconvolve.methods.registry import method_names
-from psfcore.fits.images import read_planes
+from psfcore.fits.planes import read_planes
 from psfcore.instruments.model import parse_instrument
 from service.cli.options import METHODS
 from service.client.http import ServiceError
@@ -200,7 +200,8 @@ def test_every_method_of_the_contract_runs_and_says_what_it_did(
     assert abs(details["flux_change_pct"]) < 5
     with fits.open(tmp_path / "o.fits") as hdus:
         assert hdus[0].header["DCNVMETH"] == method and hdus[0].header["DCNVEDGE"] == details["edges"]
-        assert "QUALITY" in hdus
+        assert [hdu.name for hdu in hdus] == ["PRIMARY", "QUALITY"]
+        assert hdus["QUALITY"].data.shape == hdus[0].data.shape
 
 
 def test_the_contract_holds_the_methods_that_psfcore_has() -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from psfcore.deconvolve.assess.changes import Changes
 from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 from psfcore.deconvolve.assess.plots import changes_png
-from psfcore.deconvolve.assess.quality import QualityBit
+from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
 from psfcore.fits.images import write_image
@@ -67,10 +67,9 @@ def write(made: Made, path: Path) -> None:
         path,
         dataclasses.replace(inputs.image, pixels=result.pixels),
         cards=_cards(inputs, made.identity, result, errors),
-        history=_history(inputs, result),
-        mask=inputs.image.mask,
+        history=_history(inputs, result, made.warnings),
         planes=planes,
-        plane_bits={"QUALITY": QualityBit},
+        plane_bits={"QUALITY": MEANINGS},
     )
 
 
