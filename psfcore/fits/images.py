@@ -27,9 +27,6 @@ from psfcore.image import Image, MaskBit
 CardValue = str | int | float | bool
 Cards = Mapping[str, tuple[CardValue, str]]
 
-_SATURATION_KEYS = ("SATURATE", "DATASAT")
-_TABLE_FORMAT = {np.dtype(np.uint8): "B", np.dtype(np.uint16): "I", np.dtype(np.float32): "E"}
-_BITS_STORED = {1: np.uint8, 2: np.uint16}
 _FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 15, 16))
 # Cards that say how the input file stores its pixels, and cards with statistics of these pixels.
 _STORAGE_CARD = re.compile(
@@ -74,17 +71,16 @@ def _saturation_level(
     header: fits.Header, unit: str | None, exposure_s: float | None, saturation_dn: float | None
 ) -> float | None:
     """Lowest saturated value in the unit of the image; None if no level is known."""
-    levels = [optional_number(header, key) for key in _SATURATION_KEYS]
+    levels = list(card_levels(header).values())
     if saturation_dn is not None:
-        if (unit or "").replace(" ", "").lower() != "dn/s":
+        if not per_second(unit):
             levels.append(saturation_dn)
         elif exposure_s is not None:
             levels.append(saturation_dn / exposure_s)
         else:
             message = "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s; got neither of them"
             raise DataError("no-exposure", message)
-    known = [level for level in levels if level is not None and level > 0]
-    return min(known, default=None)
+    return min(levels, default=None)
 
 
 def _check_signal(image: Image, *, stored_as_integer: bool) -> None:

@@ -22,6 +22,7 @@ from psfcore.fits.gain import noise_for, saturation_for
 from psfcore.fits.images import read_image
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image
+from psfcore.fits.saturation import with_saturation
 from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
 from psfcore.psf import Psf
@@ -73,8 +74,9 @@ def _load_upload(context: Context, request: ResolvedDeconvolve) -> Image:
 def load(context: Context, request: ResolvedDeconvolve, path: Path, summary: Mapping[str, Any]) -> Image:
     """Read an image file; ``summary`` is the summary of its header, from which the saturation level follows."""
     context.report("reading", 0, request.method.steps)
-    level = request.saturation_dn or _known_saturation_dn(summary)
-    return read_image(path, context.limits, saturation_dn=level)
+    known = _known_saturation_dn(summary)
+    image = read_image(path, context.limits, saturation_dn=request.saturation_dn or known)
+    return with_saturation(image, requested_dn=request.saturation_dn, instrument_dn=known)
 
 
 def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
