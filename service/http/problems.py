@@ -32,6 +32,7 @@ STATUS_OF = {
     "no-such-psf": 404,
     "no-such-transit": 404,
     "changed-meanwhile": 409,
+    "channel-mismatch": 409,
     "cutout-not-plain": 409,
     "line-known": 409,
     "name-taken": 409,

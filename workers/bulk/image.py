@@ -247,6 +247,7 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
         "negative_pixels": details["negative_pixels"],
         "steps_done": details["steps_done"],
         "stopped_because": details["stopped_because"],
+        "warnings": [one["code"] for one in details["warnings"]],
     }
 
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_vali
 
 from psfcore.noise_figures import NoiseFigures
 from workers.contract.methods import Method, RichardsonLucy
-from workers.contract.requests import Identity
+from workers.contract.requests import Identity, OtherChannel
 
 MOST_UPLOADED = 100_000
 MOST_SETS = 100
@@ -110,6 +110,7 @@ class Treatment(_Strict):
     error_draws: int = Field(
         0, ge=0, le=64, description="number of noise realisations for an ERROR plane: 0, or 2 or more"
     )
+    other_channel: OtherChannel = False
 
 
 class BulkWork(_Strict):

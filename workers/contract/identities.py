@@ -62,6 +62,8 @@ def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, versions of algorithm and file."""
     # The id of the PSF determines the PSF. The recipe only says how to build the PSF, and the context where it was found.
     excluded = {"psf_recipe", "context_id"} | ({"picked_for"} if request.picked_for is None else set())
+    if not request.other_channel:
+        excluded.add("other_channel")
     hashed = request.model_dump(mode="json", exclude=excluded)
     # This parameter was called effects_picture when the first products were made. Hashing it under that name keeps
     # the ids of existing products valid.

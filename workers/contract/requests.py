@@ -34,6 +34,12 @@ Saturation = Annotated[
     ),
 ]
 Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
+OtherChannel = Annotated[
+    bool,
+    Field(
+        description="whether the PSF may be of another telescope, channel or filter than the image; false: such an image is refused"
+    ),
+]
 ShapeName = Literal[
     "softened-power-law",
     "stretched-along-x",
@@ -104,6 +110,7 @@ class Deconvolve(Parameters):
     changes_picture: bool = Field(
         False, description="also draw the difference, the ratio and the histogram of the changes"
     )
+    other_channel: OtherChannel = False
 
     @model_validator(mode="after")
     def _a_spread(self) -> Deconvolve:

@@ -54,10 +54,11 @@ def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: py
         identity(noise={"photon_gain_dn": 6.0, "read_noise_dn": 2.0}),
         identity(saturation_dn=4000.0),
         identity(error_draws=8),
+        identity(other_channel=True),
     }
     monkeypatch.setattr(RichardsonLucy, "algorithm_version", RichardsonLucy.algorithm_version + 1)
     others.add(identity())
-    assert len(others) == 9 and base not in others
+    assert len(others) == 10 and base not in others
 
 
 def test_a_built_psf_is_identified_by_its_parameters() -> None:
