@@ -13,12 +13,8 @@ from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.fits.channel import check_channel
-from psfcore.fits.gain import saturation_for
-from psfcore.fits.header import first_image_header, read_summary
-from psfcore.fits.images import read_image
-from psfcore.fits.saturation import with_saturation
+from psfcore.fits.observation import read_observation
 from psfcore.image import Image
-from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
@@ -53,7 +49,7 @@ def deconvolve(
     "unknown-method". Gives a ``UserWarning`` if saturated pixels may be missed, or if the channels cannot be compared.
     """
     if not isinstance(image, Image):
-        image = _read(image, saturation_dn)
+        image = read_observation(image, LIMITS, saturation_dn=saturation_dn)
     if not isinstance(psf, Psf):
         psf = read_psf(psf)
     said = [check_channel(psf, image.header, other_channel=other_channel)]
@@ -68,11 +64,3 @@ def deconvolve(
         progress=progress,
     )
     return method_named(method)(image, psf_for_image(psf, image.header), conditions, **parameters)
-
-
-def _read(path: str | Path, saturation_dn: float | None) -> Image:
-    """Read an image file and mask its saturated pixels."""
-    name = read_summary(path, LIMITS).instrument
-    known = None if name is None else saturation_for(load_instrument(name), first_image_header(path, LIMITS))
-    image = read_image(path, LIMITS, saturation_dn=saturation_dn or known)
-    return with_saturation(image, requested_dn=saturation_dn, instrument_dn=known)

@@ -9,8 +9,6 @@ from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from astropy.io.fits import Header
-
 from psfcore.deconvolve.assess.changes import measure_changes
 from psfcore.deconvolve.assess.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
 from psfcore.deconvolve.assess.quality import quality_plane
@@ -19,10 +17,9 @@ from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.errors import DataError
 from psfcore.fits.channel import check_channel
-from psfcore.fits.gain import noise_for, saturation_for
-from psfcore.fits.images import read_image
+from psfcore.fits.gain import noise_for
+from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
-from psfcore.fits.saturation import with_saturation
 from psfcore.image import Image
 from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
@@ -69,22 +66,13 @@ def _load_upload(context: Context, request: ResolvedDeconvolve) -> Image:
             f"expected the id of an uploaded image; got {request.image_id}, which is not in the catalogue: upload the "
             "image first",
         )
-    return load(context, request, context.store.path(request.image_id), upload.summary)
+    return load(context, request, context.store.path(request.image_id))
 
 
-def load(context: Context, request: ResolvedDeconvolve, path: Path, summary: Mapping[str, Any]) -> Image:
-    """Read an image file and mask its saturated pixels. ``summary`` is the summary of the file's header."""
+def load(context: Context, request: ResolvedDeconvolve, path: Path) -> Image:
+    """Read an image file and mask its saturated pixels."""
     context.report("reading", 0, request.method.steps)
-    known = _known_saturation_dn(summary)
-    image = read_image(path, context.limits, saturation_dn=request.saturation_dn or known)
-    return with_saturation(image, requested_dn=request.saturation_dn, instrument_dn=known)
-
-
-def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
-    """The saturation level of the instrument's gain mode in the header; None if either is unknown."""
-    if summary["instrument"] is None or summary["gain_mode"] is None:
-        return None
-    return saturation_for(load_instrument(summary["instrument"]), Header({"GAINCOMB": summary["gain_mode"]}))
+    return read_observation(path, context.limits, saturation_dn=request.saturation_dn)
 
 
 @lru_cache(maxsize=1)
