@@ -151,7 +151,7 @@ def main() -> None:
         core_s = seconds(lambda: default(image, psf, conditions))
         row("the same by default (mirrored edges, PSF prepared)", core_s, f_s)
         picture_s = seconds(
-            lambda: preview_png(image.pixels, results[0].pixels, folder / "p.png", title="bench")
+            lambda: preview_png(image.pixels, results[0].pixels, folder / "p.png", title="bench", unit="DN/s")
         )
         row("preview, 2048 px", picture_s, f_s)
         http_round_trip(path, psf, core_s, f_s, folder)

@@ -36,7 +36,7 @@ def calls(folder: Path) -> dict[str, tuple[Callable[[], object], float]]:
     pitches_um = [300.0 + 300 * step for step in range(8)]
     return {
         "preview of an image of 2048 px": (
-            lambda: preview_png(plane, plane * 1.1, folder / "preview.png", title="timed"),
+            lambda: preview_png(plane, plane * 1.1, folder / "preview.png", title="timed", unit="DN/s"),
             4.0,
         ),
         "orders of a rotated mesh, 2048 px": (

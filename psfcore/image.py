@@ -22,9 +22,23 @@ class MaskBit(IntFlag):
 
 
 @dataclass(frozen=True)
+class Saturation:
+    """How the saturated pixels of an image were found, see `psfcore.fits.saturation`.
+
+    level: pixels at or above it are saturated, in the unit of the image; None: unknown. found: the source of the level,
+    such as a card, "request", "instrument file" or "pixels". warning: a sentence if pixels may be marked wrongly.
+    """
+
+    level: float | None
+    found: str | None
+    warning: str | None
+
+
+@dataclass(frozen=True)
 class Image:
     """Pixels [y, x] (float64, in `unit`), mask [y, x] (bits of MaskBit), header, and exposure time in seconds.
 
+    saturation: how the saturated pixels were found; None: this was not recorded.
     Raises DataError: "not-2d", "too-small", "mask-shape", "unmasked-nonfinite".
     """
 
@@ -33,6 +47,7 @@ class Image:
     header: Header
     unit: str | None
     exposure_s: float | None
+    saturation: Saturation | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pixels", np.ascontiguousarray(self.pixels, dtype=np.float64))

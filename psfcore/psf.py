@@ -11,6 +11,7 @@ away. A smaller array holds the part of the light that falls on it; its sum is b
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -48,7 +49,8 @@ class Psf:
 
     kernel: a weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2].
     components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON.
-    fitted: the fitted formula of SCATTER. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative", "psf-sum",
+    fitted: the fitted formula of SCATTER. cards: texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER that
+    say which images the PSF is for. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative", "psf-sum",
     "psf-not-centred".
     """
 
@@ -62,6 +64,7 @@ class Psf:
     components: dict[str, Kernel] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     fitted: FittedShape | None = None
+    cards: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", np.ascontiguousarray(self.kernel, dtype=np.float64))

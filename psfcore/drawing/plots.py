@@ -51,8 +51,11 @@ INK = "#222222"
 Plane = NDArray[np.floating]
 
 
-def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str = "DN/s") -> None:
-    """Draw three panels [y, x], first row at the bottom: before, after (same stretch), change in percent."""
+def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str) -> None:
+    """Draw three panels [y, x], first row at the bottom: before, after (same stretch), change in percent.
+
+    unit: unit of the pixels, see `psfcore.drawing.units`.
+    """
     step = max(1, -(-max(before.shape) // PANEL_PX))
     small_before, small_after = binned(before, step), binned(after, step)
     stretch = square_root_stretch(small_before, small_after)

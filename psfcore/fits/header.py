@@ -38,8 +38,20 @@ __all__ = [
     "optional_value",
     "plate_scale_arcsec",
     "read_summary",
+    "wavelength_angstrom",
 ]
 
+# WAVEUNIT is the name of a unit, or the power of ten of a metre.
+_ANGSTROM_PER_UNIT = {
+    "angstrom": 1.0,
+    "a": 1.0,
+    "0.1nm": 1.0,
+    "-10": 1.0,
+    "nm": 10.0,
+    "-9": 10.0,
+    "um": 1e4,
+    "m": 1e10,
+}
 _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0}
 
 
@@ -133,6 +145,18 @@ def plate_scale_arcsec(header: Header, axis: int = 1) -> float | None:
     step = optional_number(header, f"CDELT{axis}")
     factor = _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{axis}") or "arcsec").lower())
     return None if not step or factor is None else abs(step) * factor
+
+
+def wavelength_angstrom(header: Header) -> float | None:
+    """Wavelength of an image in angstrom: WAVELNTH in the unit WAVEUNIT.
+
+    If WAVEUNIT is missing, the unit is angstrom. Returns None if WAVELNTH is missing or not above 0, or if the unit is
+    unknown.
+    """
+    value = optional_number(header, "WAVELNTH")
+    unit = str(_lenient(header, "WAVEUNIT") or "angstrom").replace(" ", "").lower()
+    factor = _ANGSTROM_PER_UNIT.get(unit)
+    return None if value is None or value <= 0 or factor is None else value * factor
 
 
 def optional_exposure_s(header: Header) -> float | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from enum import IntFlag
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,14 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.fits.blocks import card_trouble
 from psfcore.fits.hdus import ascii_text, read_pixels, write_hdus
-from psfcore.fits.header import FitsLimits, optional_exposure_s, optional_number, optional_text, read_summary
+from psfcore.fits.header import FitsLimits, optional_exposure_s, optional_text, read_summary
+from psfcore.fits.planes import Meanings, check_plane, plane_hdu
+from psfcore.fits.saturation import card_levels, per_second
 from psfcore.image import Image, MaskBit
 
 CardValue = str | int | float | bool
 Cards = Mapping[str, tuple[CardValue, str]]
 
-_SATURATION_KEYS = ("SATURATE", "DATASAT")
-_TABLE_FORMAT = {np.dtype(np.uint8): "B", np.dtype(np.uint16): "I", np.dtype(np.float32): "E"}
-_BITS_STORED = {1: np.uint8, 2: np.uint16}
 _FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 15, 16))
 # Cards that say how the input file stores its pixels, and cards with statistics of these pixels.
 _STORAGE_CARD = re.compile(
@@ -73,17 +71,16 @@ def _saturation_level(
     header: fits.Header, unit: str | None, exposure_s: float | None, saturation_dn: float | None
 ) -> float | None:
     """Lowest saturated value in the unit of the image; None if no level is known."""
-    levels = [optional_number(header, key) for key in _SATURATION_KEYS]
+    levels = list(card_levels(header).values())
     if saturation_dn is not None:
-        if (unit or "").replace(" ", "").lower() != "dn/s":
+        if not per_second(unit):
             levels.append(saturation_dn)
         elif exposure_s is not None:
             levels.append(saturation_dn / exposure_s)
         else:
             message = "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s; got neither of them"
             raise DataError("no-exposure", message)
-    known = [level for level in levels if level is not None and level > 0]
-    return min(known, default=None)
+    return min(levels, default=None)
 
 
 def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
@@ -110,18 +107,15 @@ def write_image(
     *,
     cards: Cards,
     history: Sequence[str] = (),
-    mask: NDArray[np.uint8] | None = None,
     planes: Mapping[str, NDArray[Any]] | None = None,
-    plane_bits: Mapping[str, type[IntFlag]] | None = None,
+    plane_bits: Mapping[str, Meanings] | None = None,
 ) -> None:
-    """Write a product: float32 pixels, the input's header with its WCS, `cards`, `history`, mask and planes.
+    """Write a product: float32 pixels, the input's header with its WCS, `cards`, `history` and planes.
 
     Cards that say how the input file stores its pixels are removed. DATAMIN, DATAMAX and DATAMEAN are computed again;
     the cards with median, rms and percentiles of the input are removed.
-    mask: plane [y, x] to store instead of image.mask.
-    planes: further planes [y, x] by name (ERROR, PSF_ERROR, QUALITY). Planes of bits are stored as uint8 or uint16,
-    planes of numbers as float32 in the unit of the image.
-    plane_bits: for each plane of bits, the meaning of its bits.
+    planes: planes [y, x] by name (QUALITY, ERROR, PSF_ERROR), see `psfcore.fits.planes`. The image is the first HDU, and
+    each plane is an image extension after it. plane_bits: for each plane of bits, what its bits mean.
     Raises DataError "bad-plane" for a wrong shape, a wrong type or a name that is used twice.
     """
     header = _kept_header(image.header)
@@ -135,11 +129,11 @@ def write_image(
         header[key] = (ascii_text(value) if isinstance(value, str) else value, ascii_text(comment))
     for line in history:
         header.add_history(ascii_text(line))
-    plane = image.mask if mask is None else np.ascontiguousarray(mask, dtype=np.uint8)
-    hdus = [fits.PrimaryHDU(pixels, header), _plane_hdu("MASK", plane, bits=MaskBit, bit_key="MBIT")]
-    for name, extra in (planes or {}).items():
-        _check_plane(name, extra, pixels.shape, taken=[hdu.name for hdu in hdus])
-        hdus.append(_plane_hdu(name, extra, unit=image.unit, bits=(plane_bits or {}).get(name)))
+    hdus: list[Any] = [fits.PrimaryHDU(pixels, header)]
+    for name, plane in (planes or {}).items():
+        check_plane(name, plane, pixels.shape, taken=[hdu.name for hdu in hdus])
+        meanings = (plane_bits or {}).get(name)
+        hdus.append(plane_hdu(name, plane, header, unit=image.unit, meanings=meanings))
     write_hdus(path, hdus)
 
 
@@ -150,64 +144,6 @@ def write_plane(path: str | Path, pixels: NDArray[Any], *, cards: Cards) -> None
         header[key] = (ascii_text(value) if isinstance(value, str) else value, ascii_text(comment))
     stored = pixels.astype(np.int32 if pixels.dtype.kind in "iu" else np.float32)
     write_hdus(path, [fits.PrimaryHDU(stored, header)])
-
-
-def read_planes(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read the planes [y, x] of a product, by name, except the mask. Floats are float32."""
-    planes: dict[str, NDArray[Any]] = {}
-    with fits.open(path, memmap=False) as hdus:
-        for hdu in hdus[1:]:
-            if isinstance(hdu, fits.BinTableHDU) and hdu.header.get("PLANE") is True:
-                data = np.asarray(hdu.data[hdu.name][0])
-                planes[hdu.name] = data.astype(data.dtype.newbyteorder("="))
-    return planes
-
-
-def read_mask(path: str | Path) -> NDArray[np.uint8] | None:
-    """Read the mask plane [y, x] of a product; None if the file has no mask."""
-    with fits.open(path, memmap=False) as hdus:
-        if "MASK" not in hdus:
-            return None
-        return np.array(hdus["MASK"].data["MASK"][0], dtype=np.uint8)
-
-
-def _plane_hdu(
-    name: str,
-    plane: NDArray[Any],
-    *,
-    unit: str | None = None,
-    bits: type[IntFlag] | None = None,
-    bit_key: str = "QBIT",
-) -> fits.BinTableHDU:
-    # sunpy.map.Map makes a map of every HDU whose data have two or more axes. If a plane were an image extension,
-    # sunpy would open the product as a list of maps. The data of a table have one axis, and TDIM stores the shape.
-    ny, nx = plane.shape
-    is_bits = plane.dtype.kind in "ub"
-    stored = plane.astype(_BITS_STORED.get(plane.dtype.itemsize, np.uint16) if is_bits else np.float32)
-    column = fits.Column(
-        name=name,
-        format=f"{plane.size}{_TABLE_FORMAT[stored.dtype]}",
-        dim=f"({nx},{ny})",
-        unit=None if is_bits or unit is None else ascii_text(unit),
-        bzero=2**15 if stored.dtype == np.uint16 else None,
-        array=stored[None],
-    )
-    hdu = fits.BinTableHDU.from_columns([column], name=name)
-    if name != "MASK":
-        hdu.header["PLANE"] = (True, "one value a pixel of the image")
-    for bit in bits or ():
-        hdu.header[f"{bit_key}{bit.bit_length() - 1}"] = (bit.name or "", f"meaning of value {int(bit)}")
-    return hdu
-
-
-def _check_plane(name: str, plane: NDArray[Any], shape: tuple[int, ...], *, taken: Sequence[str]) -> None:
-    if not re.fullmatch(r"[A-Z][A-Z0-9_]{0,31}", name) or name in taken:
-        message = f"expected a plane name in capitals, other than {', '.join(taken)}; got {name!r:.40}"
-        raise DataError("bad-plane", message)
-    if plane.shape != shape:
-        raise DataError("bad-plane", f"expected plane {name} to have {shape} pixels; got {plane.shape}")
-    if plane.dtype.kind not in "ubf" or (plane.dtype.kind == "u" and plane.dtype.itemsize > 2):
-        raise DataError("bad-plane", f"expected plane {name} as floats, uint8 or uint16; got {plane.dtype}")
 
 
 def _kept_header(source: fits.Header) -> fits.Header:

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.hdus import PIXEL_TROUBLE, ascii_text, read_pixels, write_hdus
-from psfcore.fits.header import FitsLimits, check_all_headers, optional_text, plate_scale_arcsec, read_summary
+from psfcore.fits.header import (
+    FitsLimits,
+    check_all_headers,
+    optional_text,
+    plate_scale_arcsec,
+    read_summary,
+    wavelength_angstrom,
+)
 from psfcore.psf import (
     FittedShape,
     Psf,
@@ -22,6 +29,8 @@ from psfcore.psf import (
     encircled_energy,
     radial_profile,
 )
+
+ORIGIN_CARDS = ("TELESCOP", "INSTRUME", "DETECTOR", "FILTER")
 
 
 def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = None) -> None:
@@ -138,11 +147,18 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
         instrument=optional_text(header, "INSTRUME") if own else summary.instrument,
         status=optional_text(header, "PSFSTAT") or "user",
         plate_scale_arcsec=plate_scale_arcsec(header),
-        wavelength_angstrom=summary.wavelnth,
+        wavelength_angstrom=wavelength_angstrom(header),
         components=components,
         provenance={"file": Path(path).name, **provenance},
         fitted=fitted,
+        cards=_origin_cards(header, own=own),
     )
+
+
+def _origin_cards(header: fits.Header, *, own: bool) -> dict[str, str]:
+    """The cards that say which images a PSF is for. INSTRUME of a file of `write_psf` is the name of an instrument file."""
+    cards = {key: optional_text(header, key) for key in ORIGIN_CARDS if not (own and key == "INSTRUME")}
+    return {key: text for key, text in cards.items() if text is not None}
 
 
 def _read_extras(

@@ -18,8 +18,8 @@ from psfcore.flare.arms import ArmMeasurement
 _COLOURS = ("#c2402f", "#1b4f8a", "#2b8a6e", "#e0a100", "#7b3fa0", "#1b1b1b")
 
 
-def arms_png(image: NDArray[np.float64], found: ArmMeasurement, path: str | Path) -> None:
-    """Plot the image [y, x] (DN, or a difference), the fitted orders, and cuts along each arm."""
+def arms_png(image: NDArray[np.float64], found: ArmMeasurement, path: str | Path, *, unit: str) -> None:
+    """Plot the image [y, x] in `unit`, the fitted orders, and cuts along each arm."""
     layout = ConstrainedLayoutEngine(w_pad=0.08)
     figure = Figure(figsize=(15.6, 6.2), dpi=100, facecolor="white", layout=layout)
     spacing = f"{found.spacing_px:.4f} +- {found.spacing_sigma_px:.4f} px"
@@ -30,12 +30,14 @@ def arms_png(image: NDArray[np.float64], found: ArmMeasurement, path: str | Path
         weight="bold",
     )
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.35))
-    _draw_image(figure, left, image, found)
+    _draw_image(figure, left, image, found, unit)
     _draw_cuts(right, image, found)
     FigureCanvasAgg(figure).print_png(str(path))
 
 
-def _draw_image(figure: Figure, axes: Any, image: NDArray[np.float64], found: ArmMeasurement) -> None:
+def _draw_image(
+    figure: Figure, axes: Any, image: NDArray[np.float64], found: ArmMeasurement, unit: str
+) -> None:
     lit = np.abs(found.model[found.fitted])
     top = float(np.percentile(lit, 99.5)) * 3 if lit.size else 1.0
     norm = SymLogNorm(top / 100, vmin=-top / 100, vmax=top)
@@ -48,7 +50,7 @@ def _draw_image(figure: Figure, axes: Any, image: NDArray[np.float64], found: Ar
         axes.plot(x, y, "o", markersize=6, markerfacecolor="none", color=colour, label=name)
     axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.legend(fontsize=9, loc="upper right")
-    figure.colorbar(drawn, ax=axes, shrink=0.8, label="DN")
+    figure.colorbar(drawn, ax=axes, shrink=0.8, label=unit)
 
 
 def _draw_cuts(axes: Any, image: NDArray[np.float64], found: ArmMeasurement) -> None:

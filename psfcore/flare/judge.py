@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.drawing.units import rate_label, unit_label
 from psfcore.errors import DataError
 from psfcore.flare.arm_profile import BOX_PX, FlareComparison, compare_on_flare, flare_centre
 from psfcore.flare.arms import measure_arms
@@ -70,20 +71,20 @@ def judge_on_flare(
 
 
 def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
-    """Both images [y, x], 0 where a pixel has no value, and their unit: DN/s if the exposures are known."""
+    """Both images [y, x], 0 where a pixel has no value, and their unit: per second if the exposures are known."""
     if flaring.pixels.shape != before.pixels.shape:
         shapes = f"{flaring.pixels.shape} and {before.pixels.shape}"
         raise DataError("flare-shapes", f"expected two images of the same shape; got {shapes}")
     rates = [_rate(image) for image in (flaring, before)]
     if flaring.exposure_s is None and before.exposure_s is None and flaring.unit == before.unit:
-        rates, unit = [flaring.pixels, before.pixels], flaring.unit or "image unit"
+        rates, unit = [flaring.pixels, before.pixels], unit_label(flaring)
     elif rates[0] is None or rates[1] is None:
         exposures = f"{flaring.exposure_s} and {before.exposure_s} s"
         raise DataError(
             "flare-units", f"expected the exposure time of both images or of neither; got {exposures}"
         )
     else:
-        unit = "DN/s"
+        unit = rate_label(flaring)
     light, quiet = (np.nan_to_num(rate, posinf=0.0, neginf=0.0) for rate in rates if rate is not None)
     return light, quiet, unit
 

@@ -31,14 +31,15 @@ def instrument_path(name: str) -> Path:
 def match_instrument(cards: Mapping[str, object]) -> str | None:
     """Name of the first instrument whose cards in the table [match] all equal the given header cards, or None."""
     for name in instrument_names():
-        wanted = _match_table(name)
+        wanted = match_table(name)
         if wanted and all(_same(cards.get(key), value) for key, value in wanted.items()):
             return name
     return None
 
 
 @cache
-def _match_table(name: str) -> dict[str, str]:
+def match_table(name: str) -> dict[str, str]:
+    """The table [match] of the file of instrument `name`: header cards and their values; empty if there is none."""
     return dict(tomllib.loads(instrument_path(name).read_text("utf-8")).get("match", {}))
 
 

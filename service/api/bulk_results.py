@@ -60,6 +60,10 @@ class Result(BaseModel):
     steps_done: int
     stopped_because: str
     negative_pixels: int
+    warnings: list[str] = Field(
+        default_factory=list,
+        description="codes of the product's warnings; the product's details have their texts",
+    )
     ended_at: float
     seconds: float | None = Field(description="time that the worker spent on the image; null: unknown")
     kernel_seconds: float | None = Field(
@@ -77,7 +81,7 @@ class Result(BaseModel):
 
     def flat(self) -> dict[str, Any]:
         """The values of a CSV row."""
-        told = self.model_dump(exclude=NESTED)
+        told = self.model_dump(exclude=NESTED) | {"warnings": " ".join(self.warnings)}
         for kind in CHANGES:
             change: Change | None = getattr(self, kind)
             told[f"{kind}_sum_pct"] = None if change is None else change.sum_pct

@@ -14,6 +14,7 @@ from service.cli.connection import SERVER, named_psf, remote
 from service.cli.options import (
     METHOD,
     NOISE,
+    OTHER_CHANNEL,
     OUTPUT,
     SATURATION,
     STEPS,
@@ -51,6 +52,7 @@ def bulk() -> None:
 @click.argument("patterns", nargs=-1)
 @click.option("--psf", metavar="ID|FILE", help="PSF for all images: an id or a file")
 @click.option("--context", help="Choose the PSF of each image from this context: its id or name")
+@OTHER_CHANNEL
 @click.option("--upload", "uploads", multiple=True, type=click.Path(exists=True, path_type=Path),
               help="FITS file, or folder of FITS files, to upload and deconvolve; can be repeated")  # fmt: skip
 @click.option(
@@ -77,6 +79,7 @@ def submit(
     patterns: tuple[str, ...],
     psf: str | None,
     context: str | None,
+    other_channel: bool,
     uploads: tuple[Path, ...],
     images: tuple[str, ...],
     conditions: tuple[tuple[str, str, Any], ...],
@@ -111,6 +114,7 @@ def submit(
             method={"name": method} | ({} if steps is None else {"steps": steps}),
             noise=figures,
             saturation_dn=saturation_dn,
+            other_channel=other_channel or None,
         )
         click.echo(f"bulk {made['id']}")
         if wait:
@@ -238,7 +242,8 @@ def _line(row: dict[str, Any]) -> str:
         for kind in ("bright", "dark")
         if row[kind] is not None
     )
-    return f"{row['score']:8.2f}  {changes}  {row['source']}"
+    warnings = f"  (warnings: {', '.join(row['warnings'])})" if row.get("warnings") else ""
+    return f"{row['score']:8.2f}  {changes}  {row['source']}{warnings}"
 
 
 def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:

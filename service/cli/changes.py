@@ -16,12 +16,14 @@ from service.cli.deconvolve import CONTEXT
 from service.cli.options import (
     METHOD,
     NOISE,
+    OTHER_CHANNEL,
     OUTPUT_FOLDER,
     SATURATION,
     STEPS,
     fits_files,
     limits,
     progress_bar,
+    say_warnings,
     user_errors,
     write_json,
 )
@@ -41,6 +43,7 @@ FOR_ALL = (401, 403)
 @click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help=f"Folder for {TABLE} and {SHEET}")
 @PSF
+@OTHER_CHANNEL
 @CONTEXT
 @METHOD
 @STEPS
@@ -55,6 +58,7 @@ def changes(
     images: tuple[Path, ...],
     output: Path,
     psf: str | None,
+    other_channel: bool,
     context: str | None,
     method: str,
     steps: int | None,
@@ -75,6 +79,7 @@ def changes(
     with user_errors(), connection(server, local) as service, progress_bar() as report:
         parameters = {
             "psf_id": named_psf(service, psf),
+            "other_channel": other_channel,
             "context": context,
             "method": method,
             "steps": steps,
@@ -120,6 +125,7 @@ def _one_by_one(
                 if error.code is None or error.status in FOR_ALL:
                     raise
                 raise DataError(error.code, str(error)) from error
+            say_warnings(product)
             version = product["details"]["software_version"]
             products[name] = {
                 "id": product["id"],

@@ -11,12 +11,14 @@ from service.cli.options import (
     FILE,
     METHOD,
     NOISE,
+    OTHER_CHANNEL,
     OUTPUT,
     SATURATION,
     STEPS,
     check_writable,
     percent,
     progress_bar,
+    say_warnings,
     user_errors,
 )
 
@@ -27,6 +29,7 @@ CONTEXT = click.option("--context", help="Choose the PSF from this context: its 
 @click.argument("image", type=FILE)
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the deconvolved image (FITS)")
 @PSF
+@OTHER_CHANNEL
 @CONTEXT
 @METHOD
 @STEPS
@@ -54,6 +57,7 @@ def deconvolve(
     image: Path,
     output: Path,
     psf: str | None,
+    other_channel: bool,
     context: str | None,
     method: str,
     steps: int | None,
@@ -74,6 +78,7 @@ def deconvolve(
             image,
             output,
             psf_id=named_psf(service, psf),
+            other_channel=other_channel,
             context=context,
             method=method,
             preview=plot,
@@ -86,6 +91,7 @@ def deconvolve(
             stop=stop,
             edges=edges,
         )
+    say_warnings(product)
     details = product["details"]
     click.echo(f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}")
     click.echo(f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}")

@@ -114,6 +114,7 @@ def arms(
     plot: Path | None,
 ) -> None:
     """Measure the diffraction arms around a flare in IMAGE (FITS): their angles, and the spacing of their peaks."""
+    from psfcore.drawing.units import unit_label
     from psfcore.fits.images import read_image
     from psfcore.flare.arms import measure_arms
     from psfcore.flare.arms_plot import arms_png
@@ -130,7 +131,7 @@ def arms(
             n_arms=n_arms,
         )
         if plot is not None:
-            arms_png(flare.pixels, found, plot)
+            arms_png(flare.pixels, found, plot, unit=unit_label(flare))
     for angle, sigma in zip(found.angles_deg, found.angles_sigma_deg, strict=True):
         click.echo(f"arm at {angle:8.3f} +- {sigma:.3f} degrees from +x towards +y")
     click.echo(f"spacing  {found.spacing_px:8.4f} +- {found.spacing_sigma_px:.4f} px")

@@ -19,7 +19,7 @@ import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
-from service.client.errors import ServiceError
+from service.client.errors import ServiceError, error_lines
 from workers.contract.methods import Method
 
 if TYPE_CHECKING:
@@ -52,7 +52,12 @@ SATURATION = click.option(
     "saturation_dn",
     type=float,
     metavar="DN",
-    help="Pixels at or above this level are saturated and are ignored",
+    help="Pixels at or above this level are saturated and are ignored [default: the level of the header or the instrument file]",
+)
+OTHER_CHANNEL = click.option(
+    "--other-channel",
+    is_flag=True,
+    help="Use the PSF even if it is of another telescope, channel or filter than the image",
 )
 SEED = click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Seed of random numbers"
@@ -66,13 +71,21 @@ Report = Callable[[str, int, int], None]
 
 @contextmanager
 def user_errors() -> Iterator[None]:
-    """Turn an error of the user's data, files or service into one line and an exit status, without a traceback."""
+    """Turn an error of the user's data, files or service into text and an exit status, without a traceback."""
     try:
         yield
     except DataError as error:
-        raise click.ClickException(error.message) from error
-    except (ServiceError, OSError) as error:
+        raise click.ClickException("\n".join(error_lines(error.message, error.fields))) from error
+    except ServiceError as error:
+        raise click.ClickException("\n".join(error_lines(str(error), error.fields))) from error
+    except OSError as error:
         raise click.ClickException(str(error)) from error
+
+
+def say_warnings(product: dict[str, Any]) -> None:
+    """Print the warnings of a product to standard error."""
+    for warning in product["details"].get("warnings", ()):
+        click.echo(f"warning: {warning['message']}", err=True)
 
 
 def check_writable(*paths: Path | None) -> None:

@@ -67,7 +67,7 @@ class BulkClient(ABC):
         images: ids of uploaded images. files: patterns of paths on the machine of the service, or {"glob": pattern,
         "where": conditions on the header}. Give either psf_id or context (id or name). output: folder on that machine for the
         products. only: write the products only to this folder. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
-        ``error_draws``.
+        ``error_draws``, ``other_channel``.
         """
         return self._json(
             "POST",

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 
 class ServiceError(Exception):
     """A request was refused, a job failed, or no service answered. The message says why.
 
     status: HTTP status; None if there was no answer. code: the reason as a word, such as "no-such-psf".
-    retry_after_s: time after which the service asks to try again, s.
+    retry_after_s: time after which the service asks to try again, s. fields: further fields of the problem document, such as
+    ``psfs`` of "no-psf-for-instrument".
     """
 
     def __init__(
@@ -17,6 +21,38 @@ class ServiceError(Exception):
         status: int | None = None,
         code: str | None = None,
         retry_after_s: float | None = None,
+        fields: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(message)
         self.status, self.code, self.retry_after_s = status, code, retry_after_s
+        self.fields = dict(fields or {})
+
+
+def error_lines(message: str, fields: Mapping[str, Any]) -> list[str]:
+    """An error as lines to print: the message, then the PSFs that could fit an image and the ways on, if it has them."""
+    lines = [message]
+    if fields.get("instruments"):
+        lines.append("Instruments whose PSF can be built:")
+        lines += [
+            f"  {one['name']:<12} {one['wavelength_angstrom']:g} angstrom, {one['plate_scale_arcsec']:g} arcsec/px{_same(one)}"
+            for one in fields["instruments"]
+        ]
+    if "psfs" in fields:
+        lines.append(
+            "PSFs of the catalogue that could fit:"
+            if fields["psfs"]
+            else "No PSF of the catalogue could fit."
+        )
+        lines += [
+            f"  {one['id']}  {one['name']} {one['version']} ({one['status']}){_same(one)}"
+            for one in fields["psfs"]
+        ]
+    if fields.get("ways"):
+        lines.append("Ways on:")
+        lines += [f"  {number}. {one['text']}" for number, one in enumerate(fields["ways"], 1)]
+    return lines
+
+
+def _same(one: Mapping[str, Any]) -> str:
+    same = ", ".join(str(what).replace("_", " ") for what in one["same"])
+    return f"; same {same} as the image" if same else ""

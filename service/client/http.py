@@ -21,6 +21,7 @@ from service.client.operations import DEFAULT_SERVER, Operations
 from service.client.versions import Progress, VersionedPsfs
 
 PATIENCE_S = 30.0
+_STANDARD_FIELDS = ("type", "title", "status", "detail", "instance")  # of a problem document, RFC 9457
 
 
 class Client(VersionedPsfs, BulkClient, Operations):
@@ -257,5 +258,6 @@ def _refused(response: httpx.Response) -> ServiceError:
             status=response.status_code,
             code=code,
             retry_after_s=float(after) if after.isdecimal() else None,
+            fields={name: value for name, value in problem.items() if name not in _STANDARD_FIELDS},
         )
     return ServiceError(f"the service answered {response.status_code}", status=response.status_code)

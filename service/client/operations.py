@@ -84,6 +84,7 @@ class Operations(ABC):
         error_draws: int = 0,
         changes: str | Path | None = None,
         context: str | None = None,
+        other_channel: bool = False,
         **method_parameters: Any,
     ) -> dict[str, Any]:
         """Upload an image, deconvolve it and download the product to ``output``; returns the description of the product.
@@ -91,7 +92,8 @@ class Operations(ABC):
         psf_id: default: the certified PSF for the image in ``context`` (id or name; default: the default context), else
         the PSF that is built for the instrument. noise: photon gain (DN per photon) and read noise (DN rms). error_draws: number of noise
         realisations for an ERROR plane, 0 or at least 2. preview, changes: where to write the picture of the image
-        before and after, and the picture of difference, ratio and histograms (PNG). method_parameters: for example ``steps=20``,
+        before and after, and the picture of difference, ratio and histograms (PNG). other_channel: whether the PSF may be of
+        another telescope, channel or filter than the image. ``details["warnings"]`` of the product says what may be wrong with it. method_parameters: for example ``steps=20``,
         ``stop="discrepancy"``, ``edges="zero"``.
         """
         wanted = {
@@ -101,6 +103,7 @@ class Operations(ABC):
             "error_draws": error_draws,
             "changes_picture": changes is not None,
             **({} if context is None else {"context": context}),
+            **({"other_channel": True} if other_channel else {}),
         }
         image_id = self.upload_image(image)["id"]
         job = self.submit("deconvolve", image_id=image_id, **wanted, **_noise(noise))

@@ -32,6 +32,7 @@ STATUS_OF = {
     "no-such-psf": 404,
     "no-such-transit": 404,
     "changed-meanwhile": 409,
+    "channel-mismatch": 409,
     "cutout-not-plain": 409,
     "line-known": 409,
     "name-taken": 409,
@@ -89,8 +90,8 @@ class Problem(Exception):
 
 
 def problem(error: DataError, **more: Any) -> Problem:
-    """The problem for an error of the request or its data; ``more``: further fields of the document."""
-    return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **more)
+    """The problem for an error of the request or its data, with the error's fields; ``more``: further fields."""
+    return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **{**error.fields, **more})
 
 
 def answer(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import heliopsf
 from heliopsf.psfs import LIMITS
@@ -69,8 +70,9 @@ def test_every_name_is_there_with_a_docstring_and_no_other() -> None:
 
 
 def test_an_image_is_deconvolved_as_the_core_does(tmp_path: Path) -> None:
-    write_image(tmp_path / "image.fits")
+    write_image(tmp_path / "image.fits", WAVELNTH=171)
     write_psf(tmp_path / "psf.fits")
+    fits.setval(tmp_path / "psf.fits", "WAVELNTH", value=171)
     steps: list[tuple[int, int]] = []
     found = heliopsf.deconvolve(
         tmp_path / "image.fits",
@@ -85,6 +87,20 @@ def test_an_image_is_deconvolved_as_the_core_does(tmp_path: Path) -> None:
     core = method_named("richardson-lucy")(image, psf, Conditions(), steps=3)
     np.testing.assert_array_equal(found.pixels, core.pixels)
     assert steps[-1] == (3, 3) and found.steps_done == 3
+
+
+def test_another_channel_is_refused_and_what_is_not_sure_is_a_warning(tmp_path: Path) -> None:
+    write_image(tmp_path / "image.fits", WAVELNTH=193)
+    write_psf(tmp_path / "psf.fits")
+    paths = (tmp_path / "image.fits", tmp_path / "psf.fits")
+    with pytest.warns(UserWarning, match="were not compared"):
+        heliopsf.deconvolve(*paths, steps=1)
+    fits.setval(tmp_path / "psf.fits", "WAVELNTH", value=171)
+    with pytest.raises(heliopsf.DataError) as caught:
+        heliopsf.deconvolve(*paths, steps=1)
+    assert caught.value.code == "channel-mismatch"
+    with pytest.warns(UserWarning, match="193 angstrom"):
+        heliopsf.deconvolve(*paths, steps=1, other_channel=True)
 
 
 def test_errors_have_a_code(tmp_path: Path) -> None:

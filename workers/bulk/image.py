@@ -185,7 +185,7 @@ def _done_now(
     psf_row = requested_psf(context, wanted)
     # The path is taken only now, because the store's local copy may have been removed during a wait or a PSF build.
     image_file = source.copy or context.store.path(source.sha256)
-    image = deconvolve_task.load(context, wanted, image_file, source.summary)
+    image = deconvolve_task.load(context, wanted, image_file)
     started = time.perf_counter()
     made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
     kernel = {"kernel_seconds": round(time.perf_counter() - started, 3)}
@@ -247,6 +247,7 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
         "negative_pixels": details["negative_pixels"],
         "steps_done": details["steps_done"],
         "stopped_because": details["stopped_because"],
+        "warnings": [one["code"] for one in details["warnings"]],
     }
 
 

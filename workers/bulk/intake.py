@@ -78,4 +78,8 @@ def _check_places(request: BulkRequest, settings: Settings) -> None:
 
 def _key(asked: Mapping[str, Any], images: Sequence[str]) -> str:
     """The key of the request: requests that differ only in their names have the same key."""
-    return canonical_hash({**asked, "name": None, "images": list(images)})
+    # Runs that were started before other_channel existed keep their keys.
+    parameters = {
+        name: value for name, value in asked["parameters"].items() if name != "other_channel" or value
+    }
+    return canonical_hash({**asked, "name": None, "parameters": parameters, "images": list(images)})

@@ -54,16 +54,28 @@ def psf_identity(build: PsfBuild) -> str:
     )
 
 
+# Version of the content of product files. 1: planes are tables. 2: planes are images, QUALITY is 0 for good pixels, and
+# saturated pixels are also found in the pixels themselves.
+PRODUCT_FORMAT = 2
+
+
 def product_identity(request: ResolvedDeconvolve) -> str:
-    """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, version of the algorithm."""
+    """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, versions of algorithm and file."""
     # The id of the PSF determines the PSF. The recipe only says how to build the PSF, and the context where it was found.
     excluded = {"psf_recipe", "context_id"} | ({"picked_for"} if request.picked_for is None else set())
+    if not request.other_channel:
+        excluded.add("other_channel")
     hashed = request.model_dump(mode="json", exclude=excluded)
     # This parameter was called effects_picture when the first products were made. Hashing it under that name keeps
     # the ids of existing products valid.
     hashed["effects_picture"] = hashed.pop("changes_picture")
     return canonical_hash(
-        {"kind": "deconvolve", "request": hashed, "algorithm_version": request.method.algorithm_version}
+        {
+            "kind": "deconvolve",
+            "request": hashed,
+            "algorithm_version": request.method.algorithm_version,
+            "product_format": PRODUCT_FORMAT,
+        }
     )
 
 

@@ -34,6 +34,12 @@ Saturation = Annotated[
     ),
 ]
 Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
+OtherChannel = Annotated[
+    bool,
+    Field(
+        description="whether the PSF may be of another telescope, channel or filter than the image; false: such an image is refused"
+    ),
+]
 ShapeName = Literal[
     "softened-power-law",
     "stretched-along-x",
@@ -91,6 +97,7 @@ class Treatment(Parameters):
         le=64,
         description="number of noise realisations for an ERROR plane: 0, or 2 or more; each realisation takes as long as one deconvolution",
     )
+    other_channel: OtherChannel = False
 
     @model_validator(mode="after")
     def _a_spread(self) -> Treatment:

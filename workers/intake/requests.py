@@ -18,6 +18,7 @@ from workers.contract.kinds import KINDS, JobRequest, Kind, load
 from workers.contract.methods import Parameters
 from workers.contract.requests import Deconvolve, PsfBuild
 from workers.contract.resolved import ResolvedDeconvolve
+from workers.intake.no_psf import no_psf
 from workers.intake.psf_choice import picked_for_image
 from workers.lineage import made_by
 
@@ -193,17 +194,8 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
             "picked_for": header["instrument"],
             "context_id": None if found.context is None else found.context.id,
         }
-    recipe = _default_psf(header)
-    return {"psf_id": psf_identity(recipe), "psf_recipe": recipe}
-
-
-def _default_psf(header: dict[str, Any]) -> PsfBuild:
-    """The recipe of the PSF of the instrument that made the image: the shipped instrument file at full size."""
     if header["instrument"] is None:
-        named = " ".join(str(header[k]) for k in ("telescop", "instrume", "detector") if header[k])
-        raise DataError(
-            "no-psf-for-instrument",
-            f"expected an image of an instrument with a shipped instrument file; got an image of "
-            f"'{named or 'an unnamed instrument'}': upload a PSF and name it as psf_id",
-        )
-    return PsfBuild(instrument=header["instrument"])
+        raise no_psf(catalogue, header, owner)
+    # The shipped instrument file at full size.
+    recipe = PsfBuild(instrument=header["instrument"])
+    return {"psf_id": psf_identity(recipe), "psf_recipe": recipe}

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
-
-from astropy.io.fits import Header
 
 from psfcore.deconvolve.assess.changes import measure_changes
 from psfcore.deconvolve.assess.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
@@ -18,8 +16,9 @@ from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.errors import DataError
-from psfcore.fits.gain import noise_for, saturation_for
-from psfcore.fits.images import read_image
+from psfcore.fits.channel import check_channel
+from psfcore.fits.gain import noise_for
+from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image
 from psfcore.instruments.model import load_instrument
@@ -32,7 +31,7 @@ from workers.contract.identities import product_identity
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.tasks.context import Context
 from workers.tasks.data.prepared_psfs import PreparedPsfs
-from workers.tasks.data.product import Inputs, Made, details_of, keep, save_preview, write
+from workers.tasks.data.product import Inputs, Made, Warned, details_of, keep, save_preview, write
 from workers.tasks.psf_build import requested_psf
 
 # Fields of a request's method that go into Conditions; all other fields are arguments of the method itself.
@@ -42,8 +41,8 @@ _CONDITIONS = {"name", "edges", "margin_px"}
 def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
     """Deconvolve an uploaded image and add the product to the catalogue; returns the product's id.
 
-    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "no-noise-figures", and the errors of reading
-    the image and of the method.
+    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "channel-mismatch", "no-noise-figures", and the
+    errors of reading the image and of the method.
     """
     request = ResolvedDeconvolve.model_validate(parameters)
     identity = product_identity(request)
@@ -67,21 +66,13 @@ def _load_upload(context: Context, request: ResolvedDeconvolve) -> Image:
             f"expected the id of an uploaded image; got {request.image_id}, which is not in the catalogue: upload the "
             "image first",
         )
-    return load(context, request, context.store.path(request.image_id), upload.summary)
+    return load(context, request, context.store.path(request.image_id))
 
 
-def load(context: Context, request: ResolvedDeconvolve, path: Path, summary: Mapping[str, Any]) -> Image:
-    """Read an image file; ``summary`` is the summary of its header, from which the saturation level follows."""
+def load(context: Context, request: ResolvedDeconvolve, path: Path) -> Image:
+    """Read an image file and mask its saturated pixels."""
     context.report("reading", 0, request.method.steps)
-    level = request.saturation_dn or _known_saturation_dn(summary)
-    return read_image(path, context.limits, saturation_dn=level)
-
-
-def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
-    """The saturation level of the instrument's gain mode in the header; None if either is unknown."""
-    if summary["instrument"] is None or summary["gain_mode"] is None:
-        return None
-    return saturation_for(load_instrument(summary["instrument"]), Header({"GAINCOMB": summary["gain_mode"]}))
+    return read_observation(path, context.limits, saturation_dn=request.saturation_dn)
 
 
 @lru_cache(maxsize=1)
@@ -114,6 +105,21 @@ class _Work:
     def prepared(self) -> PreparedPsfs:
         """The PSFs that this process has prepared."""
         return _prepared(self.context.settings.psf_cache_mib * 2**20)
+
+    def warnings(self) -> list[Warned]:
+        """What the user must know about the inputs. Raises DataError "channel-mismatch"."""
+        psf, row = self.psf, self.inputs.psf_row
+        # The request of an upload may give an instrument and a channel that the file does not.
+        if psf.instrument is None:
+            psf = replace(psf, instrument=row.instrument)
+        if psf.wavelength_angstrom is None and row.channel is not None and row.channel.isdecimal():
+            psf = replace(psf, wavelength_angstrom=float(row.channel))
+        found: dict[str, str | None] = {
+            "channel": check_channel(psf, self.inputs.image.header, other_channel=self.request.other_channel)
+        }
+        if self.inputs.image.saturation is not None:
+            found["saturation"] = self.inputs.image.saturation.warning
+        return [Warned(code, message) for code, message in found.items() if message is not None]
 
     @cached_property
     def noise(self) -> Noise | None:
@@ -194,6 +200,7 @@ def make(
     """Deconvolve an image and measure what changed in it. ``preview``: also draw the preview picture."""
     inputs = Inputs(context, request, psf_row, image)
     work = _Work(inputs)
+    warnings = work.warnings()
     context.times.begin("deconvolving")
     result = work.run(image, "deconvolving")
     errors = work.errors(result)
@@ -211,6 +218,6 @@ def make(
             suspected=found.artefacts.suspected,
             error=None if errors is None else errors.error,
         )
-        details = details_of(inputs, result, errors, found)
+        details = details_of(inputs, result, errors, found, warnings)
         preview_sha256 = picture() if preview else None
-    return Made(inputs, result, errors, found, quality, details, preview_sha256)
+    return Made(inputs, result, errors, found, quality, warnings, details, preview_sha256)

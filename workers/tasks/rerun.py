@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from psfcore.comparison import Comparison, compare
 from psfcore.errors import DataError
-from psfcore.fits.images import read_plane, read_planes
+from psfcore.fits.images import read_plane
+from psfcore.fits.planes import read_planes
 from psfcore.fits.psfs import read_psf
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
@@ -77,15 +78,17 @@ def _first(context: Context, request: ResolvedRerun) -> Thing:
 def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing:
     """The product or PSF as this version makes it. Its file is in the store; its row is not in the catalogue."""
     named = first.details.get("parents") or {}
-    rerun_catalogue = _RerunCatalogue(
-        context.catalogue, frozenset({first.id, *([named["report"]] if "report" in named else [])})
-    )
+    hidden = {first.id, *([named["report"]] if "report" in named else [])}
     parameters = dict(request.parameters)
+    kind = KINDS[request.kind]
+    if request.kind == "deconvolve":
+        # This version may give the product another id than the first one has, and may have made it already.
+        assert kind.resolved is not None and kind.identity is not None
+        hidden.add(kind.identity(kind.resolved.model_validate(parameters)))
+    rerun_catalogue = _RerunCatalogue(context.catalogue, frozenset(hidden))
     if request.kind == "psf-build":
         parameters |= {"instrument": None, "instrument_file": _instrument_text(context, first)}
-    KINDS[request.kind].load_task()(
-        dataclasses.replace(context, catalogue=rerun_catalogue, anew=True), parameters
-    )
+    kind.load_task()(dataclasses.replace(context, catalogue=rerun_catalogue, anew=True), parameters)
     # The last row is the requested thing. Rows before it are things that it needed and that had been deleted.
     made = [row for row in rerun_catalogue.made if isinstance(row, type(first))]
     if not made:

@@ -18,7 +18,8 @@ from psfcore.deconvolve.assess.contact_sheet import THUMBNAIL_PX, Treated
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing.plots import binned
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_image, read_planes
+from psfcore.fits.images import read_image
+from psfcore.fits.planes import read_planes
 
 DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
 

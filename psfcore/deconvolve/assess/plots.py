@@ -32,7 +32,7 @@ Plane = NDArray[np.float64]
 
 
 def changes_png(
-    before: Plane, after: Plane, found: Changes, path: str | Path, *, title: str, unit: str = "DN/s"
+    before: Plane, after: Plane, found: Changes, path: str | Path, *, title: str, unit: str
 ) -> None:
     """Draw before, after, change in percent, difference, ratio and histogram into a PNG file.
 

@@ -16,15 +16,29 @@ Plane = NDArray[np.float64]
 
 
 class QualityBit(IntFlag):
-    """Bits of the quality plane. The first two are the bits of the mask plane."""
+    """Bits of the quality plane; a pixel without a bit is good. The first two are the bits of `psfcore.image.MaskBit`.
 
-    NONFINITE = 1  # the input has no finite value, so the result has no finite value
-    SATURATED = 2  # the input is saturated; the result is an estimate from the surrounding pixels
-    NEAR_MASKED = 4  # the pixel is within 3 px of a nonfinite or saturated pixel
-    EDGE = 8  # the pixel is in the band at the edges where the result depends on light from beyond the field
-    NEGATIVE = 16  # the result is below zero
-    ARTEFACT = 32  # the pixel shows a sign of an artefact
-    NO_ERROR = 64  # there is no estimate of the noise
+    A negative pixel has no bit. Noise makes some dark pixels negative, and a mean over the other pixels only would be
+    too large. Products of earlier versions mark negative pixels with the value 16, which has no meaning now.
+    """
+
+    NONFINITE = 1
+    SATURATED = 2
+    NEAR_MASKED = 4
+    EDGE = 8
+    ARTEFACT = 32
+    NO_ERROR = 64
+
+
+# What the bits mean, for the header of the plane. A comment of a FITS card has room for about 36 characters here.
+MEANINGS: dict[IntFlag, str] = {
+    QualityBit.NONFINITE: "input not finite, no result",
+    QualityBit.SATURATED: "input saturated, result estimated",
+    QualityBit.NEAR_MASKED: f"within {NEAR_MASKED_PX:g} px of value 1 or 2",
+    QualityBit.EDGE: "depends on light beyond the edges",
+    QualityBit.ARTEFACT: "sign of an artefact",
+    QualityBit.NO_ERROR: "no value in the plane ERROR",
+}
 
 
 def quality_plane(
@@ -38,7 +52,7 @@ def quality_plane(
     """Make the quality plane, bits of QualityBit [y, x], for `result`, the deconvolution of `image`.
 
     edge_px: width of the band at the edges (`Deconvolved.edge_band_px`). suspected: pixels with a sign of an
-    artefact. error: noise plane; if it is None, every pixel has NO_ERROR.
+    artefact. error: noise plane; None: no noise plane was computed, and no pixel has NO_ERROR.
     """
     plane = np.zeros(result.shape, dtype=np.uint8)
     for mask_bit, bit in (
@@ -51,10 +65,10 @@ def quality_plane(
             QualityBit.NEAR_MASKED
         )
     plane[_edge_band(result.shape, edge_px)] |= np.uint8(QualityBit.EDGE)
-    plane[result < 0] |= np.uint8(QualityBit.NEGATIVE)  # False for NaN
     if suspected is not None:
         plane[suspected] |= np.uint8(QualityBit.ARTEFACT)
-    plane[slice(None) if error is None else ~np.isfinite(error)] |= np.uint8(QualityBit.NO_ERROR)
+    if error is not None:
+        plane[~np.isfinite(error)] |= np.uint8(QualityBit.NO_ERROR)
     return plane
 
 

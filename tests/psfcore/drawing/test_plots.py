@@ -24,7 +24,7 @@ def test_the_change_panel_is_red_for_more_light_and_blue_for_less(tmp_path: Path
     after = before.copy()
     after[:, :64] = 180.0
     after[:, 64:] = 20.0
-    preview_png(before, after, tmp_path / "p.png", title="halves")
+    preview_png(before, after, tmp_path / "p.png", title="halves", unit="DN")
     gained, lost = (colour_at(tmp_path / "p.png", x, 0.5) for x in (0.72, 0.90))
     assert gained[0] > 0.6 > gained[2]
     assert lost[2] > lost[0]
@@ -32,7 +32,7 @@ def test_the_change_panel_is_red_for_more_light_and_blue_for_less(tmp_path: Path
 
 def test_before_and_after_use_the_same_stretch(tmp_path: Path) -> None:
     plane = np.random.default_rng(0).random((64, 64)) + 1
-    preview_png(plane, plane, tmp_path / "p.png", title="same")
+    preview_png(plane, plane, tmp_path / "p.png", title="same", unit="DN")
     left, right = (colour_at(tmp_path / "p.png", x, 0.5) for x in (0.1, 0.1 + 0.318))
     np.testing.assert_allclose(left, right, atol=0.02)
 
@@ -47,7 +47,7 @@ def test_any_shape_and_missing_pixels_are_drawn(tmp_path: Path, shape: tuple[int
 
 def test_a_full_image_is_drawn(tmp_path: Path) -> None:
     plane = np.random.default_rng(0).random((2048, 2048)) * 1000
-    preview_png(plane, plane * 1.1, tmp_path / "p.png", title="full")
+    preview_png(plane, plane * 1.1, tmp_path / "p.png", title="full", unit="DN")
     assert matplotlib.image.imread(tmp_path / "p.png").shape[1] == 1560
 
 

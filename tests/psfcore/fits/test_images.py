@@ -15,10 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_image, read_mask, read_planes, write_image
+from psfcore.fits.images import read_image, write_image
 from psfcore.image import Image, MaskBit
 from psfcore.simulate.observe import demo_image
 from tests.psfcore.conftest import gaussian, make_psf
@@ -185,7 +184,7 @@ def test_mutated_files_raise_nothing_but_data_errors(
 
 
 @pytest.mark.parametrize("name", [FSI, HRI, AIA, GZ])
-def test_a_product_keeps_header_and_wcs_and_opens_as_one_map(
+def test_a_product_without_planes_keeps_header_and_wcs_and_opens_as_one_map(
     tmp_path: Path, limits: FitsLimits, real: Find, name: str
 ) -> None:
     source = real(name)
@@ -194,7 +193,6 @@ def test_a_product_keeps_header_and_wcs_and_opens_as_one_map(
     write_image(product, image, cards=CARDS, history=["Richardson-Lucy, 20 steps"])
     again = read_image(product, limits)
     np.testing.assert_array_equal(again.pixels, image.pixels.astype(np.float32))
-    np.testing.assert_array_equal(read_mask(product), image.mask)
     before, after = sunpy.map.Map(source), sunpy.map.Map(product)
     assert isinstance(after, type(before))
     assert after.wcs.wcs.compare(before.wcs.wcs, tolerance=1e-12)
@@ -272,20 +270,15 @@ def test_odd_cards_survive(tmp_path: Path, limits: FitsLimits) -> None:
     assert "a comment" in map(str, header["COMMENT"])
 
 
-def test_a_product_with_nan_and_another_mask(tmp_path: Path) -> None:
+def test_statistics_in_the_header_are_those_of_the_finite_pixels(tmp_path: Path) -> None:
     pixels = ramp()
     pixels[2, 3] = np.nan
     mask = np.where(np.isfinite(pixels), 0, 1).astype(np.uint8)
     image = Image(pixels, mask, fits.Header({"DATAMAX": 9e9, "DATAP50": 4.0}), "DN", 1.0)
-    write_image(tmp_path / "p.fits", image, cards={}, history=[], mask=mask + np.uint8(2))
-    np.testing.assert_array_equal(read_mask(tmp_path / "p.fits"), mask + 2)
+    write_image(tmp_path / "p.fits", image, cards={}, history=[])
     header = fits.getheader(tmp_path / "p.fits")
     assert (header["DATAMIN"], header["DATAMAX"]) == (1.0, np.nanmax(pixels))
     assert "DATAP50" not in header
-
-
-def test_a_file_without_a_mask_has_none(tmp_path: Path) -> None:
-    assert read_mask(save(tmp_path / "m.fits", ramp())) is None
 
 
 def test_the_demo_opens_in_sunpy_and_says_it_is_simulated(tmp_path: Path, limits: FitsLimits) -> None:
@@ -313,68 +306,3 @@ def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path) -> None:
     image = read_image(path, FitsLimits(max_pixels=2**20))
     assert image.mask[3, 4] == MaskBit.NONFINITE and np.isnan(image.pixels[3, 4])
     assert image.pixels[0, 5] == 32773 and np.count_nonzero(image.mask) == 1
-
-
-# --- planes of a product ---
-
-
-def test_planes_are_read_back_and_the_product_opens_as_one_map(
-    tmp_path: Path, limits: FitsLimits, real: Find
-) -> None:
-    image = read_image(real(AIA), limits)
-    shape = image.pixels.shape
-    rng = np.random.default_rng(1)
-    error = rng.random(shape)
-    error[3, 4] = np.nan
-    planes: dict[str, NDArray[np.generic]] = {
-        "ERROR": error,
-        "PSF_ERROR": rng.random(shape).astype(np.float32),
-        "QUALITY": rng.integers(0, 128, shape).astype(np.uint8),
-        "WIDE": rng.integers(0, 2**16, shape).astype(np.uint16),
-    }
-    for name in ("one.fits", "two.fits"):
-        write_image(tmp_path / name, image, cards=CARDS, planes=planes, plane_bits={"QUALITY": QualityBit})
-    product = tmp_path / "one.fits"
-    assert product.read_bytes() == (tmp_path / "two.fits").read_bytes()
-    back = read_planes(product)
-    assert list(back) == ["ERROR", "PSF_ERROR", "QUALITY", "WIDE"]
-    for name, plane in planes.items():
-        stored = np.float32 if plane.dtype.kind == "f" else plane.dtype
-        assert back[name].dtype == stored
-        np.testing.assert_array_equal(back[name], plane.astype(stored))
-    np.testing.assert_array_equal(read_mask(product), image.mask)
-    np.testing.assert_array_equal(read_image(product, limits).pixels, image.pixels.astype(np.float32))
-    assert isinstance(sunpy.map.Map(product), sunpy.map.GenericMap)
-    with fits.open(product, checksum=True) as hdus:
-        assert all((hdu.verify_checksum(), hdu.verify_datasum()) == (1, 1) for hdu in hdus)
-        assert hdus["QUALITY"].header["QBIT3"] == "EDGE"
-        assert hdus["ERROR"].columns[0].unit == image.unit
-        assert hdus["MASK"].header["MBIT1"] == "SATURATED"
-    pixel_bytes = 4 + 1 + 4 + 4 + 1 + 2
-    assert product.stat().st_size < pixel_bytes * image.pixels.size + 60_000
-
-
-def test_a_product_without_planes_has_none(tmp_path: Path, limits: FitsLimits) -> None:
-    image = read_image(save(tmp_path / "in.fits", ramp()), limits)
-    write_image(tmp_path / "out.fits", image, cards=CARDS)
-    assert read_planes(tmp_path / "out.fits") == {}
-
-
-@pytest.mark.parametrize(
-    ("name", "plane"),
-    [
-        ("ERROR", np.zeros((3, 3))),
-        ("MASK", np.zeros((20, 24))),
-        ("lower", np.zeros((20, 24))),
-        ("ERROR", np.zeros((20, 24), np.int32)),
-        ("QUALITY", np.zeros((20, 24), np.uint32)),
-    ],
-)
-def test_a_wrong_plane_is_refused(
-    tmp_path: Path, limits: FitsLimits, name: str, plane: NDArray[np.generic]
-) -> None:
-    image = read_image(save(tmp_path / "in.fits", ramp()), limits)
-    with pytest.raises(DataError) as caught:
-        write_image(tmp_path / "out.fits", image, cards=CARDS, planes={name: plane})
-    assert caught.value.code == "bad-plane"
-    assert not (tmp_path / "out.fits").exists()

@@ -104,6 +104,34 @@ def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_pat
     }
 
 
+def test_an_image_without_a_known_psf_gets_a_problem_with_the_ways_on(
+    api: TestClient, image_file: Path
+) -> None:
+    body = {"kind": "deconvolve", "parameters": {"image_id": upload(api, image_file)}}
+    answer = api.post("/v1/jobs", json=body)
+    problem = answer.json()
+    assert answer.status_code == 409 and problem["type"] == "urn:heliopsf:no-psf-for-instrument"
+    assert {one["name"] for one in problem["instruments"]} == {"aia_171", "hri_euv"}
+    assert problem["psfs"] == [] and [way["way"] for way in problem["ways"]] == ["name", "upload", "fit"]
+
+
+def test_a_psf_of_another_channel_is_refused_unless_the_request_says_so(
+    api: TestClient, run_jobs: Callable[[], None], psf_file: Path, tmp_path: Path
+) -> None:
+    write_image(tmp_path / "193.fits", TELESCOP="SDO/AIA", WAVELNTH=193)
+    fits.setval(psf_file, "WAVELNTH", value=171)
+    parameters = {"image_id": upload(api, tmp_path / "193.fits"), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    found = []
+    for more in ({}, {"other_channel": True}):
+        job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters | more}).json()
+        run_jobs()
+        found.append(api.get(f"/v1/jobs/{job['id']}").json())
+    assert (found[0]["phase"], found[0]["error"]["code"]) == ("ERROR", "channel-mismatch")
+    assert found[1]["phase"] == "COMPLETED"
+    warnings = api.get(found[1]["result"]).json()["details"]["warnings"]
+    assert [warning["code"] for warning in warnings] == ["channel"]
+
+
 def test_cancel_before_the_start(
     api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_file: Path
 ) -> None:

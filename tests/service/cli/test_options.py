@@ -15,6 +15,7 @@ from psfcore.errors import DataError
 from service.cli import options as cli_options
 from service.cli.main import main
 from service.client.http import ServiceError
+from tests.conftest import write_image, write_psf
 
 
 @pytest.fixture
@@ -115,3 +116,40 @@ def test_progress_says_stage_and_steps_on_a_terminal_alone(
     told = capsys.readouterr().err
     assert f"[{'#' * 10}{'-' * 10}] 1/2" in told
     assert "0/0" in told
+
+
+def test_an_image_without_a_known_psf_prints_the_ways_on(tmp_path: Path, image_file: Path) -> None:
+    """Through --local and through a service, whose error has the same fields."""
+    arguments = ["deconvolve", str(image_file), "-o", str(tmp_path / "o.fits"), "--local"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 1 and not (tmp_path / "o.fits").exists()
+    lines = result.output.splitlines()
+    for start in ("Instruments whose PSF can be built:", "  aia_171", "No PSF of the catalogue", "Ways on:"):
+        assert any(line.startswith(start) for line in lines), result.output
+    assert [line[:5] for line in lines[-3:]] == ["  1. ", "  2. ", "  3. "]
+    fields = {
+        "psfs": [{"id": "a" * 64, "name": "p", "version": "1", "status": "draft", "same": ["plate_scale"]}]
+    }
+    with pytest.raises(click.ClickException) as caught, cli_options.user_errors():
+        raise ServiceError("no PSF", code="no-psf-for-instrument", fields=fields)
+    assert caught.value.message.splitlines()[-1].endswith("p 1 (draft); same plate scale as the image")
+
+
+def test_warnings_of_a_product_are_printed(tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", WAVELNTH=193)
+    write_psf(tmp_path / "p.fits")
+    fits.setval(tmp_path / "p.fits", "WAVELNTH", value=171)
+    arguments = [
+        "deconvolve",
+        str(tmp_path / "i.fits"),
+        "-o",
+        str(tmp_path / "o.fits"),
+        "--steps",
+        "2",
+        "--local",
+    ]
+    arguments += ["--psf", str(tmp_path / "p.fits")]
+    refused = CliRunner().invoke(main, arguments)
+    assert refused.exit_code == 1 and "--other-channel" in refused.output
+    taken = CliRunner().invoke(main, [*arguments, "--other-channel"])
+    assert taken.exit_code == 0 and "warning: PSF" in taken.stderr and "193 angstrom" in taken.stderr

@@ -66,6 +66,20 @@ def test_a_product_made_again_is_the_same_bit_for_bit_and_changes_nothing(
     assert len(local._catalogue.page(ProductRow, owner=OWNER, limit=10)) == 1
 
 
+def test_a_product_of_an_earlier_version_is_made_again_although_the_new_one_exists(
+    local: LocalService, made: dict[str, Any], tmp_path: Path
+) -> None:
+    """The earlier version gave the product another id. Deconvolving the image again makes the new product."""
+    old_id = "f" * 64
+    with local._catalogue._database.writing.begin() as session:
+        row = session.get(ProductRow, (OWNER, made["id"]))
+        assert row is not None
+        columns = {column.name: getattr(row, column.name) for column in ProductRow.__table__.columns}
+        session.add(ProductRow(**(columns | {"id": old_id})))
+    _, report = again(local, "product", old_id, tmp_path / "r.json")
+    assert report["same"] and (report["id"], report["again"]["id"]) == (old_id, made["id"])
+
+
 def test_every_rerun_is_a_job_of_its_own(local: LocalService, made: dict[str, Any], tmp_path: Path) -> None:
     first, _ = again(local, "product", made["id"], tmp_path / "1.json")
     second, _ = again(local, "product", made["id"], tmp_path / "2.json")

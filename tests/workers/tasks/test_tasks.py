@@ -11,8 +11,7 @@ import pytest
 from astropy.io import fits
 
 from psfcore.deconvolve.methods.registry import method_names
-from psfcore.fits.images import read_planes
-from psfcore.instruments.model import parse_instrument
+from psfcore.fits.planes import read_planes
 from service.cli.options import METHODS
 from service.client.http import ServiceError
 from service.local import LocalService
@@ -200,7 +199,8 @@ def test_every_method_of_the_contract_runs_and_says_what_it_did(
     assert abs(details["flux_change_pct"]) < 5
     with fits.open(tmp_path / "o.fits") as hdus:
         assert hdus[0].header["DCNVMETH"] == method and hdus[0].header["DCNVEDGE"] == details["edges"]
-        assert "QUALITY" in hdus
+        assert [hdu.name for hdu in hdus] == ["PRIMARY", "QUALITY"]
+        assert hdus["QUALITY"].data.shape == hdus[0].data.shape
 
 
 def test_the_contract_holds_the_methods_that_psfcore_has() -> None:
@@ -219,13 +219,3 @@ def test_error_planes_need_known_noise(
     error = read_planes(tmp_path / "o.fits")["ERROR"]
     assert error.shape == (96, 128) and (error > 0).all()
     assert product["details"]["noise_amplification"] > 1
-
-
-def test_the_saturation_level_is_that_of_the_gain_mode_in_the_header(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = SMALL_INSTRUMENT + '[detector.gain_modes.combined]\nsaturation_dn = 4000.0\nbasis = "assumed"\n'
-    monkeypatch.setattr(deconvolve_task, "load_instrument", lambda name: parse_instrument(text, name))
-    level = deconvolve_task._known_saturation_dn
-    assert level({"instrument": "small", "gain_mode": "combined"}) == 4000.0
-    assert level({"instrument": "small", "gain_mode": "low-only"}) is None
-    assert level({"instrument": "small", "gain_mode": None}) is None
-    assert level({"instrument": None, "gain_mode": "combined"}) is None

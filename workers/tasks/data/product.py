@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from psfcore.deconvolve.assess.changes import Changes
 from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 from psfcore.deconvolve.assess.plots import changes_png
-from psfcore.deconvolve.assess.quality import QualityBit
+from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
+from psfcore.drawing.units import unit_label
 from psfcore.fits.images import write_image
 from psfcore.image import Image, MaskBit
 from workers.catalogue.tables import ProductRow, PsfRow
@@ -37,6 +39,14 @@ class Inputs:
 
 
 @dataclass(frozen=True)
+class Warned:
+    """Something that a user of the product must know: a short code and a sentence."""
+
+    code: str
+    message: str
+
+
+@dataclass(frozen=True)
 class Made:
     """A finished deconvolution whose file is not yet written. preview_sha256: None if no preview was drawn."""
 
@@ -45,6 +55,7 @@ class Made:
     errors: ErrorPlanes | None
     found: Changes
     quality: NDArray[np.uint8]
+    warnings: Sequence[Warned]
     details: dict[str, Any]
     preview_sha256: str | None
 
@@ -66,10 +77,9 @@ def write(made: Made, path: Path) -> None:
         path,
         dataclasses.replace(inputs.image, pixels=result.pixels),
         cards=_cards(inputs, made.identity, result, errors),
-        history=_history(inputs, result),
-        mask=inputs.image.mask,
+        history=_history(inputs, result, made.warnings),
         planes=planes,
-        plane_bits={"QUALITY": QualityBit},
+        plane_bits={"QUALITY": MEANINGS},
     )
 
 
@@ -99,14 +109,22 @@ def keep(made: Made, path: Path) -> ProductRow:
 def save_preview(inputs: Inputs, result: Deconvolved) -> str:
     """Draw the preview (before, after, change) into the store; returns its SHA-256."""
     with inputs.context.store.temporary() as picture:
-        plots.preview_png(inputs.image.pixels, result.pixels, picture, title=_title(inputs))
+        image = inputs.image
+        plots.preview_png(image.pixels, result.pixels, picture, title=_title(inputs), unit=unit_label(image))
         return inputs.context.store.keep(picture)
 
 
 def _save_changes_picture(made: Made) -> str:
     inputs = made.inputs
     with inputs.context.store.temporary() as picture:
-        changes_png(inputs.image.pixels, made.result.pixels, made.found, picture, title=_title(inputs))
+        changes_png(
+            inputs.image.pixels,
+            made.result.pixels,
+            made.found,
+            picture,
+            title=_title(inputs),
+            unit=unit_label(inputs.image),
+        )
         return inputs.context.store.keep(picture)
 
 
@@ -129,16 +147,21 @@ def _cards(
         "SWHELIO": (software_version(), "heliopsf version"),
         "INPSHA": (inputs.request.image_id, ""),
     }
+    saturation = inputs.image.saturation
+    if saturation is not None and saturation.found is not None and saturation.level is not None:
+        cards["DCNVSATL"] = (saturation.level, "saturation level, in the unit of the image")
+        cards["DCNVSATF"] = (saturation.found, "where the saturation level was found")
     if errors is not None and errors.amplification is not None:
         cards["DCNVAMPL"] = (errors.amplification, "noise of result / noise of input")
     return cards
 
 
-def _history(inputs: Inputs, result: Deconvolved) -> list[str]:
+def _history(inputs: Inputs, result: Deconvolved, warnings: Sequence[Warned]) -> list[str]:
     psf = inputs.psf_row
     return [
         f"heliopsf {software_version()}: {inputs.request.method.name}, {result.steps_done} steps, "
-        f"edges {result.edges}, PSF {psf.name} {psf.version} ({psf.status})"
+        f"edges {result.edges}, PSF {psf.name} {psf.version} ({psf.status})",
+        *(f"WARNING ({one.code}): {one.message}" for one in warnings),
     ]
 
 
@@ -150,9 +173,13 @@ def _title(inputs: Inputs) -> str:
 
 
 def details_of(
-    inputs: Inputs, result: Deconvolved, errors: ErrorPlanes | None, found: Changes
+    inputs: Inputs,
+    result: Deconvolved,
+    errors: ErrorPlanes | None,
+    found: Changes,
+    warnings: Sequence[Warned],
 ) -> dict[str, Any]:
-    """The details of the product's row: how it was made, and what changed in the image.
+    """The details of the product's row: how it was made, what changed in the image, and the warnings.
 
     Bright pixels are those at or above the 99th percentile of the input; dark pixels are those at or below the first.
     """
@@ -181,9 +208,17 @@ def details_of(
         "masked_pixels": {
             str(bit.name).lower(): int(np.count_nonzero(image.mask & bit.value)) for bit in MaskBit
         },
+        "saturation": _saturation(image),
+        "warnings": [dataclasses.asdict(one) for one in warnings],
         "changes": found.as_json(),
     }
     return details
+
+
+def _saturation(image: Image) -> dict[str, Any] | None:
+    """The saturation level in the unit of the image, and where it was found; null where it is not known."""
+    found = image.saturation
+    return None if found is None else {"level": found.level, "unit": image.unit, "found": found.found}
 
 
 def _change_pct(before: NDArray[np.float64], after: NDArray[np.float64]) -> float | None:

@@ -190,7 +190,7 @@ def test_the_page_is_drawn(seen: Image, psf: Psf, tmp_path: Path) -> None:
     result[5, 5] = np.nan
     report = measure_changes(seen, result, psf, edge_px=EDGE_PX)
     for name in ("a.png", "b.png"):
-        changes_png(seen.pixels, result, report, tmp_path / name, title="Simulated")
+        changes_png(seen.pixels, result, report, tmp_path / name, title="Simulated", unit="DN/s")
     content = (tmp_path / "a.png").read_bytes()
     assert content.startswith(b"\x89PNG") and len(content) > 100_000
     assert content == (tmp_path / "b.png").read_bytes()
@@ -200,7 +200,7 @@ def test_a_page_of_an_image_without_light_is_drawn(tmp_path: Path) -> None:
     pixels = np.full((64, 64), -1.0)
     pixels[3, 3] = 200.0
     report = measure_changes(make_image(pixels + 1), pixels + 1, make_psf(delta(16)))
-    changes_png(pixels, pixels, report, tmp_path / "p.png", title="Dark")
+    changes_png(pixels, pixels, report, tmp_path / "p.png", title="Dark", unit="DN/s")
 
 
 @pytest.mark.slow

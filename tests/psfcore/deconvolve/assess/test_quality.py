@@ -103,11 +103,11 @@ def test_each_reason_has_its_bit() -> None:
     assert plane[40, 40] == QualityBit.SATURATED | QualityBit.NO_ERROR
     assert plane[20, 23] == plane[42, 42] == QualityBit.NEAR_MASKED
     assert plane[20, 24] == plane[43, 41] == 0  # at 4 and sqrt(10) px
-    assert plane[30, 30] == QualityBit.NEGATIVE
+    assert plane[30, 30] == 0, "noise makes dark pixels negative; a mean without them would be too large"
     assert plane[31, 31] == QualityBit.ARTEFACT
     assert plane[4, 30] == plane[30, 59] == QualityBit.EDGE and plane[5, 30] == plane[30, 58] == 0
     without = quality_plane(make_image(pixels, mask), result, edge_px=0)
-    assert (without & QualityBit.NO_ERROR).all() and not (without & QualityBit.EDGE).any()
+    assert not (without & (QualityBit.NO_ERROR | QualityBit.EDGE)).any()
 
 
 def test_the_first_bits_are_those_of_the_mask() -> None:

@@ -125,7 +125,7 @@ def test_unknown_noise_an_inexact_centre_and_masked_pixels_are_tolerated(
 def test_the_fit_is_plotted(expected: NDArray[np.float64], tmp_path: Path) -> None:
     image, saturated = observed(expected, 8)
     found = measure_arms(image, noise=(1.0, READ_NOISE), saturated=saturated)
-    arms_png(image, found, tmp_path / "arms.png")
+    arms_png(image, found, tmp_path / "arms.png", unit="DN")
     assert matplotlib.image.imread(tmp_path / "arms.png").std() > 0.05
 
 

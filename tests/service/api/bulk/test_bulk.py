@@ -582,3 +582,23 @@ def test_a_turn_lets_others_go_first_after_each_image(
     catalogue.jobs.cancel(waiting.id)
     runner.run(turn.id)
     assert seen(api, bulk)["images"]["done"] == 5 and len(again) == 2
+
+
+def test_images_of_another_channel_fail_alone_unless_the_request_says_so(
+    api: TestClient, work: Callable[[], None], archive: Path, tmp_path: Path
+) -> None:
+    """One image at 174 angstrom and one at 304."""
+    write_psf(tmp_path / "174.fits")
+    fits.setval(tmp_path / "174.fits", "WAVELNTH", value=174)
+    request = {
+        "files": [{"glob": f"{archive}/202[23]/*.fits"}],
+        "psf_id": upload(api, tmp_path / "174.fits", "/v1/psfs"),
+    }
+    strict = asked(api, **request)
+    work()
+    assert [row["warnings"] for row in results(api, strict)] == [[]]
+    failures = api.get(f"/v1/bulk/{strict['id']}/failures").json()["items"]
+    assert [failure["error"]["code"] for failure in failures] == ["channel-mismatch"]
+    told = asked(api, **request, parameters={**FEW, "other_channel": True})
+    work()
+    assert [row["warnings"] for row in results(api, told)] == [[], ["channel"]]

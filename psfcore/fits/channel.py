@@ -1,0 +1,100 @@
+"""Compare the telescope, the channel and the filter of an image with those of a PSF.
+
+Compared are the instrument that the instrument files know, the wavelength, and the cards TELESCOP, INSTRUME, DETECTOR
+and FILTER, each where both the image and the PSF give it. The words of a card are compared without regard to their
+order; one text may have more words than the other, as SDO and SDO/AIA. Wavelengths are equal if they differ by at most 1 %:
+the channels of AIA, EUI and similar telescopes differ by more, and headers round the wavelength.
+"""
+
+from __future__ import annotations
+
+import re
+
+from astropy.io.fits import Header
+
+from psfcore.errors import DataError
+from psfcore.fits.header import optional_text, wavelength_angstrom
+from psfcore.instruments.files import instrument_names, match_instrument, match_table
+from psfcore.instruments.model import load_instrument
+from psfcore.psf import Psf
+
+WAVELENGTH_TOLERANCE = 0.01  # largest deviation from 1 of the ratio of two wavelengths
+_TO_ALLOW = "set other_channel (--other-channel)"
+
+
+def check_channel(psf: Psf, header: Header, *, other_channel: bool = False) -> str | None:
+    """Compare a PSF with an image of this header. Returns a warning, or None if they are of one channel.
+
+    other_channel: whether the PSF may be of another telescope, channel or filter than the image. Raises DataError
+    "channel-mismatch" if it is and may not.
+    """
+    differences = channel_differences(psf, header)
+    if differences and not other_channel:
+        raise DataError(
+            "channel-mismatch",
+            f"expected an image of the telescope, channel and filter of PSF {psf.name}; {'; '.join(differences)}: name "
+            f"a PSF of the image's channel, or {_TO_ALLOW} to use this PSF",
+        )
+    if differences:
+        return f"PSF {psf.name} is of another channel than the image: {'; '.join(differences)}"
+    silent = [
+        name
+        for name, found in (("PSF", _psf_wavelength(psf)), ("image", _image_wavelength(header)))
+        if not found
+    ]
+    if silent:
+        return (
+            f"the channels of image and PSF {psf.name} were not compared: {' and '.join(silent)} without wavelength "
+            "(WAVELNTH)"
+        )
+    return None
+
+
+def channel_differences(psf: Psf, header: Header) -> list[str]:
+    """In what the PSF and an image of this header differ, one text for each difference."""
+    differences = []
+    instrument = _other_instrument(psf, header)
+    if instrument is not None:
+        differences.append(f"the image is of {instrument}, the PSF of {psf.instrument}")
+    image_angstrom, psf_angstrom = _image_wavelength(header), _psf_wavelength(psf)
+    if image_angstrom and psf_angstrom and abs(image_angstrom / psf_angstrom - 1) > WAVELENGTH_TOLERANCE:
+        differences.append(
+            f"the image is of {image_angstrom:g} angstrom, the PSF of {psf_angstrom:g} angstrom"
+        )
+    for key, wanted in psf.cards.items():
+        found = optional_text(header, key)
+        if found is not None and not _same_words(found, wanted):
+            differences.append(f"the image has {key} {found!r}, the PSF {wanted!r}")
+    return differences
+
+
+def _other_instrument(psf: Psf, header: Header) -> str | None:
+    """The image's instrument, if it is known not to be that of the PSF; otherwise None."""
+    if psf.instrument not in instrument_names():
+        return None
+    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
+    known = match_instrument(cards)
+    if known is not None:
+        return None if known == psf.instrument else known
+    # An instrument file without [match] cannot say which images are of its instrument.
+    named = " ".join(text for text in cards.values() if text)
+    return named or None if match_table(psf.instrument) else None
+
+
+def _image_wavelength(header: Header) -> float | None:
+    """Wavelength in angstrom from the header, else from the file of the known instrument; None if there is neither."""
+    found = wavelength_angstrom(header)
+    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
+    known = match_instrument(cards)
+    return load_instrument(known).wavelength_angstrom if found is None and known is not None else found
+
+
+def _psf_wavelength(psf: Psf) -> float | None:
+    if psf.wavelength_angstrom is None and psf.instrument in instrument_names():
+        return load_instrument(psf.instrument).wavelength_angstrom
+    return psf.wavelength_angstrom
+
+
+def _same_words(one: str, other: str) -> bool:
+    first, second = (set(re.findall(r"[a-z0-9.]+", text.lower())) for text in (one, other))
+    return first <= second or second <= first

@@ -1,0 +1,143 @@
+"""The level from which pixels are saturated: from the request, the header, the instrument file, or the pixels.
+
+Cards that give a level: SATURATE and DATASAT, in the unit of the image. AIA has no card with the level, but NSATPIX counts
+the saturated pixels of an image. In 26 level 1 images of a flare of 2012-07-19, NSATPIX is the number of pixels above
+15000 DN (in 25 images exactly, in one it is larger by 1), so an AIA image with NSATPIX has this level. A pixel of exactly
+15000 DN counts as saturated here too.
+
+If no level is known, a saturated image still shows it: many pixels have exactly the largest value, because the
+converter or the software that wrote the image cannot give more. In an image that is not saturated, the number of pixels
+per value falls towards the largest value. So the number n of pixels with the largest value should not exceed the mean
+number of pixels per occupied value, m, among the brightest pixels below it:
+
+    P(n) = probability of at least n events of a Poisson distribution with mean m        Eq. (1)
+
+If P is below MASKED_BELOW, the pixels with the largest value are saturated. If it is below DOUBTED_BELOW, they may be,
+and the image gets a warning. The test does not depend on the unit: a division by the exposure time keeps equal values
+equal. It cannot find saturated pixels that a flat field or an interpolation made different from each other.
+
+| symbol | name | unit |
+|---|---|---|
+| n | pixels with the largest value | - |
+| m | mean number of pixels per value among the COMPARED brightest pixels below it | - |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+from scipy.special import pdtrc
+
+from psfcore.fits.header import optional_number, optional_text
+from psfcore.image import Image, MaskBit, Saturation
+
+COMPARED = 100
+MASKED_BELOW = 1e-6
+DOUBTED_BELOW = 1e-3
+AIA_LEVEL_DN = 15000.0
+REQUEST, INSTRUMENT, PIXELS = "request", "instrument file", "pixels"
+_LEVEL_CARDS = ("SATURATE", "DATASAT")
+_SETTING = "set the level with saturation_dn (--saturation)"
+
+
+def per_second(unit: str | None) -> bool:
+    """Whether a unit is DN/s, possibly with spaces, in upper or lower case, or per pixel."""
+    return (unit or "").replace(" ", "").lower() in ("dn/s", "dn/s/pixel", "dn/s/pix")
+
+
+def card_levels(header: Header) -> dict[str, float]:
+    """Levels in the unit of the image, by the cards that give them."""
+    levels = {key: optional_number(header, key) for key in _LEVEL_CARDS}
+    return {key: level for key, level in levels.items() if level is not None and level > 0}
+
+
+def with_saturation(
+    image: Image, *, requested_dn: float | None = None, instrument_dn: float | None = None
+) -> Image:
+    """The image with its saturated pixels masked, and with the record of how they were found.
+
+    requested_dn, instrument_dn: the level in DN of one exposure that the request and the instrument file give. As in
+    `psfcore.fits.images.read_image`, the level of the request replaces that of the instrument file, and the lowest
+    level of all is used. Unless the request gives a level, the pixels are tested too, see Eq. (1).
+    """
+    known = _levels(image, requested_dn, instrument_dn)
+    found = min(known, key=lambda key: known[key], default=None)
+    level = None if found is None else known[found]
+    warning = None
+    mask = image.mask if level is None else _masked(image, level)
+    if found == "NSATPIX" and mask is not image.mask:
+        warning = _missing_from(image, mask)
+    if requested_dn is None:
+        top, count, chance = largest_value(image.pixels[mask == 0])
+        if chance < MASKED_BELOW:
+            if found is not None:
+                warning = (
+                    f"{count} pixels have the value {top:g}, the largest below the saturation level {level:g} "
+                    f"({found}); they are masked as saturated: if they are not, {_SETTING}"
+                )
+            found, level = PIXELS, top
+            mask = _masked(image, top)
+        elif chance < DOUBTED_BELOW:
+            warning = (
+                f"{count} pixels have the largest value, {top:g}; they may be saturated, but are not masked: "
+                f"if they are saturated, {_SETTING}"
+            )
+    return replace(image, mask=mask, saturation=Saturation(level, found, warning))
+
+
+def largest_value(values: NDArray[np.float64]) -> tuple[float, int, float]:
+    """The largest value, the number n of pixels that have it, and the probability P(n) of Eq. (1).
+
+    values: the valid pixels, one axis. P is 1 if no pixel is below the largest value.
+    """
+    if values.size == 0:
+        return np.nan, 0, 1.0
+    top = float(values.max())
+    below = values[values < top]
+    count = values.size - below.size
+    if below.size == 0:
+        return top, count, 1.0
+    compared = min(COMPARED, below.size)
+    brightest = np.partition(below, below.size - compared)[-compared:]
+    mean_per_value = compared / np.unique(brightest).size
+    return top, count, float(pdtrc(count - 1, mean_per_value))  # Eq. (1)
+
+
+def _levels(image: Image, requested_dn: float | None, instrument_dn: float | None) -> Mapping[str, float]:
+    """All known levels in the unit of the image, by their sources."""
+    levels = card_levels(image.header)
+    in_dn = {REQUEST: requested_dn}
+    if requested_dn is None:
+        in_dn = {INSTRUMENT: instrument_dn, "NSATPIX": _aia_level_dn(image.header)}
+    rate = per_second(image.unit)
+    for source, level_dn in in_dn.items():
+        if level_dn is not None and not (rate and image.exposure_s is None):
+            levels[source] = level_dn / image.exposure_s if rate and image.exposure_s else level_dn
+    return levels
+
+
+def _aia_level_dn(header: Header) -> float | None:
+    """The saturation level of an AIA image with NSATPIX; None for other images."""
+    is_aia = (optional_text(header, "TELESCOP") or "").upper() == "SDO/AIA"
+    return AIA_LEVEL_DN if is_aia and optional_number(header, "NSATPIX") is not None else None
+
+
+def _masked(image: Image, level: float) -> NDArray[np.uint8]:
+    mask = image.mask.copy()
+    mask[image.pixels >= level] |= int(MaskBit.SATURATED)  # False for NaN
+    return mask
+
+
+def _missing_from(image: Image, mask: NDArray[np.uint8]) -> str | None:
+    """A warning if NSATPIX counts saturated pixels, but the image has none; otherwise None."""
+    counted = optional_number(image.header, "NSATPIX") or 0
+    if counted == 0 or np.any(mask & MaskBit.SATURATED):
+        return None
+    return (
+        f"NSATPIX counts {counted:g} saturated pixels, but no pixel is at {AIA_LEVEL_DN:g} DN or above: the image "
+        f"was cut or its values were changed; saturated pixels that are left are not masked: {_SETTING}"
+    )

@@ -1,0 +1,171 @@
+"""The saturation level: from request, header and instrument file, and from the pixels, without false alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+from scipy.stats import poisson
+
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_image
+from psfcore.fits.saturation import largest_value, with_saturation
+from psfcore.image import Image, MaskBit
+from psfcore.simulate.observe import demo_image
+from tests.psfcore.conftest import gaussian, make_psf
+
+Find = Callable[[str], Path]
+FLARE = "aia/limbflare_20120719/aia.lev1_euv_12s.2012-07-19T073037Z.171.image.fits"
+# Unsaturated real images of AIA, FSI, SWAP, TRACE and XRT: integers, floats in DN, and floats in DN/s.
+UNSATURATED = (
+    "aia/aia_171_cutout_20130310.fits",
+    "aia/aia.lev1_euv_12s.2022-04-02T132423Z.304.image.fits",
+    "aia/AIA20110319_105400_0171.fits.gz",
+    "aia/derived_aia193_coronalhole_20161123_map.fits.gz",
+    "eui/solo_L2_eui-fsi174-image_20240109T200055237_V01.fits",
+    "occultation/AIA1600_venus_20120606_040731_UTC.0041.fits",
+    "occultation/L1_XRT20120605_215839.9.fits",
+    "other/swap_lv1_20110607_063329.fits.gz",
+    "other/trace_19980519_222143_171.fits.gz",
+)
+
+
+def image_of(
+    pixels: NDArray[np.float64], unit: str | None = "DN", exposure_s: float | None = 2.0, **cards: object
+) -> Image:
+    return Image(pixels, np.zeros(pixels.shape, np.uint8), fits.Header(cards), unit, exposure_s)
+
+
+def saturated(image: Image) -> NDArray[np.bool_]:
+    return (image.mask & MaskBit.SATURATED) != 0
+
+
+def exposure(seed: int, *, clip_dn: float | None = None, gain: float = 1.0) -> NDArray[np.float64]:
+    """An image in whole DN with bright structure on a faint background, with photon noise, clipped at clip_dn."""
+    rng = np.random.default_rng(seed)
+    y, x = np.indices((128, 128))
+    scene = 30 + 6000 * np.exp(-((x - 70) ** 2 + (y - 50) ** 2) / 60.0)
+    seen = np.round(gain * rng.poisson(scene / gain) + rng.normal(0, 2, scene.shape))
+    return seen if clip_dn is None else np.minimum(seen, clip_dn)
+
+
+def test_aia_marks_what_its_header_counts(limits: FitsLimits, real: Find) -> None:
+    image = with_saturation(read_image(real(FLARE), limits))
+    assert int(image.header["NSATPIX"]) == np.count_nonzero(saturated(image)) == 351
+    assert image.saturation is not None
+    assert (image.saturation.level, image.saturation.found, image.saturation.warning) == (
+        15000.0,
+        "NSATPIX",
+        None,
+    )
+
+
+def test_without_the_card_the_flare_shows_its_saturation_in_the_pixels(
+    limits: FitsLimits, real: Find
+) -> None:
+    image = read_image(real(FLARE), limits)
+    del image.header["NSATPIX"]
+    for unit, exposure_s, scale in (("DN", 2.0, 1.0), ("DN/s", 2.000096, 2.000096)):
+        seen = with_saturation(Image(image.pixels / scale, image.mask, image.header, unit, exposure_s))
+        assert seen.saturation is not None and seen.saturation.found == "pixels"
+        assert seen.saturation.level == pytest.approx(16383 / scale, rel=1e-12)
+        np.testing.assert_array_equal(saturated(seen), image.pixels == 16383)
+        assert seen.saturation.warning is None
+
+
+@pytest.mark.parametrize("name", UNSATURATED)
+def test_no_false_alarm_on_unsaturated_real_images(limits: FitsLimits, real: Find, name: str) -> None:
+    image = with_saturation(read_image(real(name), limits))
+    assert image.saturation is not None and image.saturation.warning is None
+    assert not saturated(image).any() and image.saturation.found in (None, "NSATPIX")
+
+
+@pytest.mark.parametrize("gain", [1.0, 17.0, 250.0])
+def test_no_false_alarm_on_simulated_images(gain: float) -> None:
+    """Coarse gains give many pixels of equal values, also near the largest one."""
+    for seed in range(30):
+        image = with_saturation(image_of(exposure(seed, gain=gain)))
+        assert image.saturation is not None and image.saturation.found is None and not saturated(image).any()
+
+
+def test_a_clipped_simulated_image_is_found_in_any_unit() -> None:
+    for clip_dn in (5500.0, 4095.0, 1000.0):
+        pixels = exposure(1, clip_dn=clip_dn)
+        for scale in (1.0, 1.4, 0.3333):
+            image = with_saturation(image_of(pixels / scale))
+            assert image.saturation is not None and image.saturation.found == "pixels"
+            np.testing.assert_array_equal(saturated(image), pixels == clip_dn)
+
+
+def test_few_equal_pixels_give_a_warning_and_no_mask() -> None:
+    pixels = np.arange(128 * 128, dtype=float).reshape(128, 128)
+    pixels[10, 10:16] = pixels.max()
+    image = with_saturation(image_of(pixels))
+    assert not saturated(image).any() and image.saturation is not None and image.saturation.found is None
+    assert image.saturation.warning is not None and "7 pixels" in image.saturation.warning
+    assert "--saturation" in image.saturation.warning
+
+
+def test_the_chance_is_the_poisson_probability() -> None:
+    values = np.concatenate([np.repeat(np.arange(1.0, 51.0), 2), np.full(9, 60.0)])
+    top, count, chance = largest_value(values)
+    assert (top, count) == (60.0, 9)
+    assert chance == pytest.approx(sum(poisson.pmf(n, 2.0) for n in range(9, 60)), rel=1e-9)
+    assert largest_value(np.full(20, 3.0)) == (3.0, 20, 1.0), "a flat image shows nothing"
+
+
+@pytest.mark.parametrize(
+    ("cards", "unit", "given", "level", "found"),
+    [
+        ({"SATURATE": 4000.0}, "DN", {}, 4000.0, "SATURATE"),
+        ({"DATASAT": 3000.0, "SATURATE": 4000.0}, "DN", {}, 3000.0, "DATASAT"),
+        ({"DATASAT": 3000.0}, "DN/s", {}, 3000.0, "DATASAT"),
+        ({}, "DN/s", {"instrument_dn": 4000.0}, 2000.0, "instrument file"),
+        ({}, "DN / s", {"requested_dn": 4000.0, "instrument_dn": 100.0}, 2000.0, "request"),
+        ({"TELESCOP": "SDO/AIA", "NSATPIX": 0}, None, {}, 15000.0, "NSATPIX"),
+        ({"TELESCOP": "OTHER", "NSATPIX": 0}, None, {}, None, None),
+        ({}, "DN", {}, None, None),
+    ],
+)
+def test_the_level_and_its_source(
+    cards: dict[str, object],
+    unit: str | None,
+    given: dict[str, float],
+    level: float | None,
+    found: str | None,
+) -> None:
+    pixels = exposure(2)
+    image = with_saturation(image_of(pixels, unit, **cards), **given)
+    assert image.saturation is not None
+    assert (image.saturation.level, image.saturation.found) == (level, found)
+    np.testing.assert_array_equal(saturated(image), pixels >= (np.inf if level is None else level))
+
+
+def test_the_request_has_the_last_word() -> None:
+    image = with_saturation(image_of(exposure(3, clip_dn=1000.0)), requested_dn=1e6)
+    assert not saturated(image).any()
+    assert image.saturation is not None and image.saturation.warning is None
+
+
+def test_clipping_below_the_known_level_is_marked_and_told() -> None:
+    pixels = exposure(3, clip_dn=1000.0)
+    image = with_saturation(image_of(pixels, SATURATE=4000.0))
+    np.testing.assert_array_equal(saturated(image), pixels == 1000.0)
+    assert image.saturation is not None and image.saturation.found == "pixels"
+    assert image.saturation.warning is not None and "SATURATE" in image.saturation.warning
+
+
+def test_saturated_pixels_that_the_header_counts_and_the_image_lacks_are_told() -> None:
+    image = with_saturation(image_of(exposure(4), TELESCOP="SDO/AIA", NSATPIX=12))
+    assert image.saturation is not None and image.saturation.warning is not None
+    assert "NSATPIX counts 12 saturated pixels" in image.saturation.warning
+
+
+def test_the_demo_is_not_saturated(tmp_path: Path, limits: FitsLimits) -> None:
+    demo_image(tmp_path / "a.fits", make_psf(gaussian(32, 1.0), plate_scale_arcsec=0.492), size=128, seed=3)
+    image = with_saturation(read_image(tmp_path / "a.fits", limits))
+    assert image.saturation is not None and image.saturation == type(image.saturation)(None, None, None)

@@ -1,0 +1,143 @@
+"""What a deconvolution says about its inputs: saturation, the PSF's channel, the unit; and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from psfcore.deconvolve.assess.quality import QualityBit
+from service.client.errors import ServiceError
+from service.local import LocalService
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from workers.tasks.data import product as product_task
+
+AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171}
+FEW = {"steps": 2}
+
+
+def psf_of(local: LocalService, path: Path, **cards: object) -> str:
+    write_psf(path)
+    fits.writeto(path, fits.getdata(path), fits.Header(cards), overwrite=True)
+    return str(local.upload_psf(path)["id"])
+
+
+def codes(product: dict[str, Any]) -> list[str]:
+    return [warning["code"] for warning in product["details"]["warnings"]]
+
+
+def clipped(path: Path, level: float, **cards: object) -> None:
+    write_image(path, **cards)
+    pixels, header = fits.getdata(path), fits.getheader(path)
+    fits.writeto(path, np.minimum(pixels, level).astype("f4"), header, overwrite=True)
+
+
+def test_a_good_pixel_has_quality_0(
+    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
+) -> None:
+    product = local.deconvolve(
+        image_file, tmp_path / "o.fits", psf_id=local.upload_psf(psf_file)["id"], **FEW
+    )
+    with fits.open(tmp_path / "o.fits") as hdus:
+        assert [hdu.name for hdu in hdus] == ["PRIMARY", "QUALITY"]
+        quality = hdus["QUALITY"].data
+    band = product["details"]["edge_band_px"]
+    inner = quality[band:-band, band:-band] if band else quality
+    assert quality.shape == fits.getdata(image_file).shape
+    assert np.count_nonzero(inner == 0) > 0.9 * inner.size
+
+
+def test_saturation_seen_in_the_pixels_is_in_quality_header_and_details(
+    local: LocalService, psf_file: Path, tmp_path: Path
+) -> None:
+    clipped(tmp_path / "i.fits", 120.0)
+    product = local.deconvolve(
+        tmp_path / "i.fits", tmp_path / "o.fits", psf_id=local.upload_psf(psf_file)["id"], **FEW
+    )
+    full = fits.getdata(tmp_path / "i.fits") == 120.0
+    with fits.open(tmp_path / "o.fits") as hdus:
+        header = hdus[0].header
+        np.testing.assert_array_equal((hdus["QUALITY"].data & QualityBit.SATURATED) > 0, full)
+    assert (header["DCNVSATL"], header["DCNVSATF"]) == (120.0, "pixels")
+    assert product["details"]["saturation"] == {"level": 120.0, "unit": "DN/s", "found": "pixels"}
+    assert product["details"]["masked_pixels"]["saturated"] == np.count_nonzero(full) > 10
+
+
+def test_an_unsure_saturation_is_a_warning_in_header_and_details(
+    local: LocalService, psf_file: Path, tmp_path: Path
+) -> None:
+    write_image(tmp_path / "i.fits", **AIA, NSATPIX=7)
+    product = local.deconvolve(
+        tmp_path / "i.fits", tmp_path / "o.fits", psf_id=local.upload_psf(psf_file)["id"], **FEW
+    )
+    assert "saturation" in codes(product)
+    history = "".join(str(line) for line in fits.getheader(tmp_path / "o.fits")["HISTORY"])
+    assert "WARNING (saturation): NSATPIX counts 7 saturated pixels" in history
+
+
+def test_a_psf_of_another_channel_is_refused_unless_told(local: LocalService, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
+    psf_id = psf_of(local, tmp_path / "p.fits", **AIA)
+    with pytest.raises(ServiceError) as caught:
+        local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, **FEW)
+    assert caught.value.code == "channel-mismatch"
+    product = local.deconvolve(
+        tmp_path / "i.fits", tmp_path / "o.fits", psf_id=psf_id, other_channel=True, **FEW
+    )
+    assert codes(product) == ["channel"]
+    history = "".join(str(line) for line in fits.getheader(tmp_path / "o.fits")["HISTORY"])
+    assert "WARNING (channel)" in history and "193 angstrom" in history
+
+
+def test_the_channel_that_an_upload_was_given_counts(local: LocalService, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
+    write_psf(tmp_path / "p.fits")
+    psf_id = local.upload_psf(tmp_path / "p.fits", instrument="aia_171", channel="171", kind="total")["id"]
+    with pytest.raises(ServiceError) as caught:
+        local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, **FEW)
+    assert caught.value.code == "channel-mismatch"
+
+
+def test_a_psf_that_does_not_say_its_channel_is_taken_with_a_warning(
+    local: LocalService, psf_file: Path, tmp_path: Path
+) -> None:
+    write_image(tmp_path / "i.fits", **AIA)
+    product = local.deconvolve(tmp_path / "i.fits", psf_id=local.upload_psf(psf_file)["id"], **FEW)
+    assert codes(product) == ["channel"]
+
+
+def test_a_built_psf_of_the_images_channel_gives_no_warning(local: LocalService, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
+    psf_id = local.build_psf(tmp_path / "small.toml", size=64)["id"]
+    write_image(tmp_path / "i.fits", WAVELNTH=171)
+    assert codes(local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, **FEW)) == []
+
+
+@pytest.mark.parametrize(("unit", "label"), [("DN", "DN in 2 s"), ("DN/s", "DN/s"), (None, "unit unknown")])
+def test_pictures_name_the_unit_of_the_image(
+    local: LocalService,
+    psf_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    unit: str | None,
+    label: str,
+) -> None:
+    said = []
+    for module, name in ((product_task.plots, "preview_png"), (product_task, "changes_png")):
+        real = getattr(module, name)
+
+        def noted(*arguments: Any, real: Any = real, **named: Any) -> None:
+            said.append(named["unit"])
+            real(*arguments, **named)
+
+        monkeypatch.setattr(module, name, noted)
+    write_image(tmp_path / "i.fits")
+    pixels, header = fits.getdata(tmp_path / "i.fits"), fits.getheader(tmp_path / "i.fits")
+    header.remove("BUNIT") if unit is None else header.set("BUNIT", unit)
+    fits.writeto(tmp_path / "i.fits", pixels, header, overwrite=True)
+    psf_id = local.upload_psf(psf_file)["id"]
+    local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, changes=tmp_path / "c.png", **FEW)
+    assert said == [label, label]
