@@ -11,6 +11,7 @@ from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.result import Deconvolved
+from psfcore.fits.header import check_not_deconvolved, content_of
 from psfcore.fits.images import read_image
 from psfcore.image import Image
 from psfcore.noise import Noise
@@ -26,6 +27,7 @@ def deconvolve(
     noise: tuple[float, float] | None = None,
     saturation_dn: float | None = None,
     edges: Edges | None = None,
+    again: bool = False,
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
     **parameters: Any,
@@ -37,13 +39,17 @@ def deconvolve(
     noise: photon gain (DN per photon) and read noise (DN rms).
     saturation_dn: pixels at or above this level (DN) are ignored. The level is used only if ``image`` is a file.
     edges: "zero", "symmetric" or "extended"; default: the assumption that suits the method best.
+    again: deconvolve the image even if its header says that it is a product or a PSF.
     progress(step, steps) is called after each step.
     parameters: parameters of the method, such as ``steps=20``.
 
-    Raises ``DataError``; its ``code`` is the reason, such as "not-fits", "plate-scale-mismatch" or "unknown-method".
+    Raises ``DataError``; its ``code`` is the reason, such as "not-fits", "already-deconvolved", "plate-scale-mismatch" or
+    "unknown-method".
     """
     if not isinstance(image, Image):
         image = read_image(image, LIMITS, saturation_dn=saturation_dn)
+    if not again:
+        check_not_deconvolved(content_of(image.header))
     if not isinstance(psf, Psf):
         psf = read_psf(psf)
     conditions = Conditions(

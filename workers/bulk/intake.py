@@ -32,6 +32,9 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
         )
     _check_places(request, settings)
     asked = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
+    if not request.parameters.again:
+        # Without this, the keys of runs that were started before this parameter existed would change.
+        del asked["parameters"]["again"]
     now = time.time()
     row = BulkRow(
         id=new_id(),

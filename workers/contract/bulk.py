@@ -110,6 +110,10 @@ class Treatment(_Strict):
     error_draws: int = Field(
         0, ge=0, le=64, description="number of noise realisations for an ERROR plane: 0, or 2 or more"
     )
+    again: bool = Field(
+        False,
+        description="also deconvolve files whose header says that they are products or PSFs; otherwise these images fail",
+    )
 
 
 class BulkWork(_Strict):

@@ -56,7 +56,10 @@ def psf_identity(build: PsfBuild) -> str:
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, version of the algorithm."""
     # The id of the PSF determines the PSF. The recipe only says how to build the PSF, and the context where it was found.
-    excluded = {"psf_recipe", "context_id"} | ({"picked_for"} if request.picked_for is None else set())
+    # `again` only allows the deconvolution; the header of the image determines whether it is a second one.
+    excluded = {"psf_recipe", "context_id", "again"} | (
+        {"picked_for"} if request.picked_for is None else set()
+    )
     hashed = request.model_dump(mode="json", exclude=excluded)
     # This parameter was called effects_picture when the first products were made. Hashing it under that name keeps
     # the ids of existing products valid.

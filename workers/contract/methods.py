@@ -39,7 +39,7 @@ class _Method(Parameters):
 class RichardsonLucy(_Method):
     """Richardson-Lucy. The paper recommends 20 steps and edges `zero`."""
 
-    algorithm_version: ClassVar[int] = 2
+    algorithm_version: ClassVar[int] = 3
     name: Literal["richardson-lucy"] = "richardson-lucy"
     steps: int = Field(20, ge=1, le=200, description="iterations; the paper uses 20")
 
@@ -47,7 +47,7 @@ class RichardsonLucy(_Method):
 class RichardsonLucyAccelerated(_Method):
     """Richardson-Lucy with the extrapolation of Biggs and Andrews, which reaches the same result in fewer steps."""
 
-    algorithm_version: ClassVar[int] = 1
+    algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy-accelerated"]
     steps: int = Field(10, ge=1, le=200)
     order: Literal[1, 2] = Field(1, description="order of the extrapolation")
@@ -56,7 +56,7 @@ class RichardsonLucyAccelerated(_Method):
 class RichardsonLucyExtended(_Method):
     """Richardson-Lucy that also estimates the scene beyond the edges (Bertero and Boccacci)."""
 
-    algorithm_version: ClassVar[int] = 1
+    algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy-extended"]
     steps: int = Field(20, ge=1, le=200)
 
@@ -64,7 +64,7 @@ class RichardsonLucyExtended(_Method):
 class RichardsonLucyTotalVariation(_Method):
     """Richardson-Lucy with total-variation regularisation: less noise; meant for pictures rather than photometry."""
 
-    algorithm_version: ClassVar[int] = 1
+    algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy-total-variation"]
     steps: int = Field(20, ge=1, le=200)
     smoothing: float = Field(
@@ -75,7 +75,7 @@ class RichardsonLucyTotalVariation(_Method):
 class BasicIterative(_Method):
     """Basic iterative deconvolution, which the paper recommends for a bright source near an edge."""
 
-    algorithm_version: ClassVar[int] = 1
+    algorithm_version: ClassVar[int] = 2
     name: Literal["basic-iterative"]
     steps: int = Field(20, ge=1, le=200)
 
@@ -83,7 +83,7 @@ class BasicIterative(_Method):
 class Linear(_Method):
     """Linear reconstruction: no positivity constraint, no bias of faint pixels, converged after about five steps."""
 
-    algorithm_version: ClassVar[int] = 1
+    algorithm_version: ClassVar[int] = 2
     name: Literal["linear"]
     steps: int = Field(5, ge=1, le=200)
 

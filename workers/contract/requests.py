@@ -105,6 +105,10 @@ class Deconvolve(Parameters):
         False, description="also draw the difference, the ratio and the histogram of the changes"
     )
 
+    again: bool = Field(
+        False, description="also deconvolve a file whose header says that it is a product or a PSF"
+    )
+
     @model_validator(mode="after")
     def _a_spread(self) -> Deconvolve:
         if self.error_draws == 1:

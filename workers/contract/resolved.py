@@ -25,6 +25,7 @@ class ResolvedDeconvolve(Parameters):
     saturation_dn: float | None = None
     error_draws: int = 0
     changes_picture: bool = False
+    again: bool = False
 
 
 class ResolvedPsfFit(PsfFit):

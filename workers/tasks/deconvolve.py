@@ -19,6 +19,7 @@ from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.errors import DataError
 from psfcore.fits.gain import noise_for, saturation_for
+from psfcore.fits.header import check_not_deconvolved, content_of
 from psfcore.fits.images import read_image
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image
@@ -42,8 +43,8 @@ _CONDITIONS = {"name", "edges", "margin_px"}
 def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
     """Deconvolve an uploaded image and add the product to the catalogue; returns the product's id.
 
-    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "no-noise-figures", and the errors of reading
-    the image and of the method.
+    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "no-noise-figures", "already-deconvolved",
+    "psf-as-image", and the errors of reading the image and of the method.
     """
     request = ResolvedDeconvolve.model_validate(parameters)
     identity = product_identity(request)
@@ -74,7 +75,11 @@ def load(context: Context, request: ResolvedDeconvolve, path: Path, summary: Map
     """Read an image file; ``summary`` is the summary of its header, from which the saturation level follows."""
     context.report("reading", 0, request.method.steps)
     level = request.saturation_dn or _known_saturation_dn(summary)
-    return read_image(path, context.limits, saturation_dn=level)
+    image = read_image(path, context.limits, saturation_dn=level)
+    # A rerun repeats what was allowed once, also by versions that did not check this.
+    if not (request.again or context.anew):
+        check_not_deconvolved(content_of(image.header))
+    return image
 
 
 def _known_saturation_dn(summary: Mapping[str, Any]) -> float | None:
