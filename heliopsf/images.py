@@ -13,6 +13,7 @@ from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.fits.channel import check_channel
+from psfcore.fits.header import check_not_deconvolved, content_of
 from psfcore.fits.observation import read_observation
 from psfcore.image import Image
 from psfcore.noise import Noise
@@ -29,6 +30,7 @@ def deconvolve(
     saturation_dn: float | None = None,
     edges: Edges | None = None,
     other_channel: bool = False,
+    again: bool = False,
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
     **parameters: Any,
@@ -42,14 +44,18 @@ def deconvolve(
     file gives, or that the pixels show. The level is used only if ``image`` is a file.
     edges: "zero", "symmetric" or "extended"; default: the assumption that suits the method best.
     other_channel: whether the PSF may be of another telescope, channel or filter than the image.
+    again: deconvolve the image even if its header says that it is a product or a PSF.
     progress(step, steps) is called after each step.
     parameters: parameters of the method, such as ``steps=20``.
 
-    Raises ``DataError``; its ``code`` is the reason, such as "not-fits", "plate-scale-mismatch", "channel-mismatch" or
-    "unknown-method". Gives a ``UserWarning`` if saturated pixels may be missed, or if the channels cannot be compared.
+    Raises ``DataError``; its ``code`` is the reason, such as "not-fits", "already-deconvolved", "plate-scale-mismatch",
+    "channel-mismatch" or "unknown-method". Gives a ``UserWarning`` if saturated pixels may be missed, or if the channels
+    cannot be compared.
     """
     if not isinstance(image, Image):
         image = read_observation(image, LIMITS, saturation_dn=saturation_dn)
+    if not again:
+        check_not_deconvolved(content_of(image.header))
     if not isinstance(psf, Psf):
         psf = read_psf(psf)
     said = [check_channel(psf, image.header, other_channel=other_channel)]

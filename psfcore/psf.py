@@ -20,11 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from psfcore.errors import DataError
 from psfcore.plate_scale import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
-
-REACH_GRID_PX = 2048
-LARGEST_SUM = 1 + 1e-3
-SMALLEST_SUM = 0.05
-CENTRE_TOLERANCE = 1e-3  # share of the largest weight: pixels that share the peak may differ by rounding
+from psfcore.weight_rules import CENTRE_TOLERANCE as CENTRE_TOLERANCE
+from psfcore.weight_rules import REACH_GRID_PX as REACH_GRID_PX
+from psfcore.weight_rules import check_weights, is_peak
 
 Kernel = NDArray[np.float64]
 
@@ -94,13 +92,7 @@ def _check_weights(kernel: Kernel) -> None:
     largest, smallest = float(kernel.max()), float(kernel.min())
     # The sum is defined over the full reach; a larger array may sum to more than 1.
     total = float(crop_centred(kernel, _within_reach(kernel.shape)).sum())
-    if smallest < -1e-12 * max(largest, 0.0):
-        raise DataError("psf-negative", f"expected weights >= 0; the smallest is {smallest:.3g}")
-    if not SMALLEST_SUM < total <= LARGEST_SUM:
-        wanted = f"weights that sum to 1 over the full reach, or to less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
-        raise DataError(
-            "psf-sum", f"expected {wanted}; got {total:.6g}. Divide the weights by their sum first"
-        )
+    check_weights(smallest, largest, total)
 
 
 def _within_reach(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -110,7 +102,7 @@ def _within_reach(shape: tuple[int, ...]) -> tuple[int, int]:
 def _check_centre(kernel: Kernel) -> None:
     """Check that the centre holds the largest weight. Otherwise every deconvolved image would be shifted."""
     centre = (kernel.shape[0] // 2, kernel.shape[1] // 2)
-    if kernel[centre] < kernel.max() * (1 - CENTRE_TOLERANCE):
+    if not is_peak(float(kernel[centre]), float(kernel.max())):
         peak = np.unravel_index(int(kernel.argmax()), kernel.shape)
         found = tuple(int(p) for p in peak)
         hint = " (the corner origin of a Fourier transform: shift the PSF first)" if found == (0, 0) else ""

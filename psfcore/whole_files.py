@@ -11,6 +11,23 @@ from pathlib import Path
 from typing import BinaryIO
 
 PARTIAL = ".part"
+PROBE_BYTES = 4096  # a block of most file systems, so that a full disk refuses the probe
+
+
+@contextmanager
+def whole_path(target: Path) -> Iterator[Path]:
+    """A path beside `target` for code that opens its file itself. The file replaces `target` when it is on the disk.
+
+    A killed process leaves its temporary file behind; `partials` finds it. Raises OSError.
+    """
+    partial = _partial(target)
+    try:
+        yield partial
+        with partial.open("rb") as written:
+            os.fsync(written.fileno())
+        partial.replace(target)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -19,13 +36,18 @@ def whole_file(target: Path) -> Iterator[BinaryIO]:
 
     A killed process leaves its temporary file behind; `partials` finds it. Raises OSError.
     """
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
+    with whole_path(target) as partial, partial.open("wb") as unfinished:
+        yield unfinished
+
+
+def probe(target: Path) -> None:
+    """Write and remove a temporary file beside `target`. Raises OSError if `whole_file` could not write there now."""
+    partial = _partial(target)
     try:
-        with partial.open("wb") as unfinished:
-            yield unfinished
-            unfinished.flush()
-            os.fsync(unfinished.fileno())
-        partial.replace(target)
+        with partial.open("wb") as file:
+            file.write(bytes(PROBE_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
     finally:
         partial.unlink(missing_ok=True)
 
@@ -34,6 +56,10 @@ def write_whole(target: Path, text: str) -> None:
     """Write a text file completely or not at all. Raises OSError."""
     with whole_file(target) as file:
         file.write(text.encode())
+
+
+def _partial(target: Path) -> Path:
+    return target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
 
 
 def partials(target: Path) -> Iterator[Path]:

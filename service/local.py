@@ -18,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from psfcore.errors import DataError
 from psfcore.fits.cutout import cutout
 from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.weights import check_is_psf
 from psfcore.tables import lookup
 from psfcore.transit.archive import ArchiveLimits, list_archive
 from psfcore.transit.in_place import FolderTransit, transit_in
@@ -28,6 +29,7 @@ from service.api.reports import ReportView
 from service.api.transits import TransitDetails
 from service.client.errors import ServiceError
 from service.client.operations import Operations
+from service.client.outputs import written
 from service.client.versions import Progress
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
@@ -79,6 +81,15 @@ class LocalStore(Store):
             return super().path(digest)
         _check(seen)
         return next(iter(seen))
+
+    def keep(self, temporary: Path, digest: str | None = None) -> str:
+        """Store a file. If the user has a file with this content, that file is used and stays as it is."""
+        digest = digest or sha256_of(temporary)
+        return digest if digest in self._files else super().keep(temporary, digest)
+
+    def discard(self, digest: str) -> None:
+        """Delete the store's own copy of a file. A file of the user with the same content stays."""
+        super().path(digest).unlink(missing_ok=True)
 
     @contextmanager
     def unpacked(self, digest: str, limits: ArchiveLimits) -> Iterator[Path]:
@@ -156,7 +167,9 @@ class LocalService(Operations):
     ) -> dict[str, Any]:
         """Add a PSF."""
         source = Path(path)
-        summary = read_summary(source, FitsLimits(max_pixels=self._settings.max_pixels))
+        limits = FitsLimits(max_pixels=self._settings.max_pixels)
+        summary = read_summary(source, limits)
+        check_is_psf(source, summary, limits)
         sha256 = self._store.add_file(source)
         row = uploaded_psf_row(
             DEFAULT_OWNER,
@@ -172,8 +185,31 @@ class LocalService(Operations):
         )
         return PsfView.of(self._catalogue.add(row)[0]).model_dump(mode="json")
 
+    def image_id(self, path: str | Path, sha256: str) -> str:
+        """The id of an image, which is added."""
+        identity: str = self.upload_image(path)["id"]
+        return identity
+
+    def result_id(self, kind: str, **parameters: Any) -> str:
+        """The id that the result of such a job has or would have. No job is started."""
+        return self._resolved(kind, parameters)[1]
+
+    def release(self, product: dict[str, Any]) -> None:
+        """Delete a product from the temporary store. Otherwise its files would stay until the service is closed."""
+        row = self._row(f"/v1/products/{product['id']}")
+        self._catalogue.delete_product(row.id, DEFAULT_OWNER)
+        for digest in (row.file_sha256, row.preview_sha256, row.details.get("changes_picture_sha256")):
+            if digest is not None:
+                self._store.discard(digest)
+
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
         """Add a job; ``wait`` runs it."""
+        resolved = self._resolved(kind, parameters)
+        row, _ = self._catalogue.jobs.submit(kind, *resolved, DEFAULT_OWNER)
+        return JobView.of(row).model_dump(mode="json")
+
+    def _resolved(self, kind: str, parameters: dict[str, Any]) -> tuple[dict[str, Any], str]:
+        """The resolved parameters of a job, and the id of its result."""
         body = {"kind": kind, "parameters": parameters}
         try:
             request = TypeAdapter[JobRequest](JobRequest).validate_python(body)
@@ -181,11 +217,7 @@ class LocalService(Operations):
             told = explained(error.errors(), JobRequest)
             faults = (f"{'/'.join(map(str, e['loc'][1:])) or 'kind'}: {said}" for e, said in told)
             raise ServiceError("; ".join(faults)) from error
-        resolved = resolve(
-            request, self._catalogue, DEFAULT_OWNER, added_effects=self._settings.added_effects
-        )
-        row, _ = self._catalogue.jobs.submit(kind, *resolved, DEFAULT_OWNER)
-        return JobView.of(row).model_dump(mode="json")
+        return resolve(request, self._catalogue, DEFAULT_OWNER, added_effects=self._settings.added_effects)
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
         """Run the job; returns its description. Raises ``ServiceError`` if it fails."""
@@ -208,8 +240,8 @@ class LocalService(Operations):
             case _:
                 return PsfView.of(row).model_dump(mode="json")
 
-    def download(self, address: str, path: str | Path) -> None:
-        """Copy a file of the service to ``path``."""
+    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
+        """Copy a file of the service to ``path``. The file appears there only when it is complete."""
         description, _, part = address.rpartition("/")
         row = self._row(description)
         digests = {
@@ -222,7 +254,8 @@ class LocalService(Operations):
         }
         digest = digests[part]
         assert digest is not None
-        shutil.copyfile(self._store.path(digest), path)
+        with written(path, overwrite=overwrite) as partial:
+            shutil.copyfile(self._store.path(digest), partial)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
         """The answer to a query from the tables of the PSF."""
@@ -233,14 +266,16 @@ class LocalService(Operations):
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
 
-    def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
+    def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
         """Write the central part of a PSF."""
         row = self._psf(psf_id)
         limits = FitsLimits(max_pixels=self._settings.max_pixels)
         try:
-            Path(output).write_bytes(cutout(self._store.path(row.file_sha256), size, limits))
+            content = cutout(self._store.path(row.file_sha256), size, limits)
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
+        with written(output, overwrite=overwrite) as partial:
+            partial.write_bytes(content)
 
     def _tables(self, psf_id: str) -> dict[str, Any]:
         digest = self._psf(psf_id).details.get("tables_sha256")

@@ -58,6 +58,9 @@ class SetPlan:
         return range(self.first, self.first + self.cases)
 
 
+LOCK = "lock"  # the file by which a run locks the folder of its set
+
+
 @dataclass(frozen=True)
 class _Attempt:
     """The attempt to make one case. seal: empty if it failed. why_not: the reason of a failure."""
@@ -191,6 +194,12 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
                 f"expected an empty folder, or a set that was made with {about}; {made.folder} contains a set that was made "
                 f"with {before}. Choose another folder",
             )
+    elif made.folder.is_dir() and (others := {path.name for path in made.folder.iterdir()} - {LOCK}):
+        raise DataError(
+            "other-set",
+            f"expected an empty folder, or the folder of a set; {made.folder} contains other files, such as "
+            f"{min(others)}, which a set could replace. Choose another folder",
+        )
     made.folder.mkdir(parents=True, exist_ok=True)
     write_whole(file, json.dumps(about, indent=1) + "\n")
 
@@ -199,7 +208,7 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
 def alone_in(folder: Path) -> Iterator[None]:
     """Lock the set in this folder against other processes. Raises DataError "set-in-use" if another process uses it."""
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("w") as held:
+    with (folder / LOCK).open("w") as held:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

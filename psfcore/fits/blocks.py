@@ -146,6 +146,19 @@ def first_image(source: Source, limits: FitsLimits) -> tuple[Header, int]:
     raise _no_image(kinds)
 
 
+def enter_data(source: Source, hdu: int, limits: FitsLimits) -> Header:
+    """Header of an HDU that `first_image` found. The next byte of ``source``, which is at its start, is then the first
+    byte of the data of this HDU. Raises HeaderError."""
+    for number in range(hdu + 1):
+        raw = _read_header(source, limits.max_header_bytes, limits, first=number == 0)
+        if raw is None:
+            raise HeaderError("truncated-data", f"expected {hdu + 1} HDUs; the file ends after {number}")
+        header = _parse(raw, number)
+        if number < hdu:
+            _pass_data(source, header, number, limits, last=False)
+    return header
+
+
 def walk(source: Source, limits: FitsLimits, *, to_the_end: bool) -> Iterator[tuple[Header, int, str]]:
     """Yield header, number and kind (see `_kind`) of each HDU.
 

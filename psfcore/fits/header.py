@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from psfcore.errors import DataError
 from psfcore.fits.blocks import (
     FitsLimits,
     card_count,
@@ -31,6 +32,8 @@ __all__ = [
     "FitsLimits",
     "HeaderSummary",
     "check_all_headers",
+    "check_not_deconvolved",
+    "content_of",
     "first_image_header",
     "optional_exposure_s",
     "optional_number",
@@ -52,6 +55,8 @@ _ANGSTROM_PER_UNIT = {
     "um": 1e4,
     "m": 1e10,
 }
+# The content of a file, see `content_of`.
+IMAGE, PRODUCT, PSF = "image", "product", "psf"
 _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0}
 
 
@@ -59,7 +64,7 @@ _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600
 class HeaderSummary:
     """The first 2-D image of a file: its HDU, its shape (ny, nx) and values of its header.
 
-    A value is None if its card is missing or unusable.
+    A value is None if its card is missing or unusable. content: IMAGE, PRODUCT or PSF, see `content_of`.
     """
 
     hdu: int
@@ -82,6 +87,7 @@ class HeaderSummary:
     pxend: tuple[int, int] | None
     psf_name: str | None
     psf_version: str | None
+    content: str = IMAGE
 
 
 def read_summary(path: str | os.PathLike[str], limits: FitsLimits) -> HeaderSummary:
@@ -105,6 +111,35 @@ def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
     with open_source(Path(path), limits) as source:
         for _header, _hdu, _kind in walk(source, limits, to_the_end=True):
             pass
+
+
+def content_of(header: Header) -> str:
+    """What heliopsf wrote into a file, by the cards in its header: PRODUCT or PSF; otherwise IMAGE.
+
+    A product has the card PSFID or PRODID, a PSF the card PSFSUM.
+    """
+    if "PSFID" in header or "PRODID" in header:
+        return PRODUCT
+    return PSF if "PSFSUM" in header else IMAGE
+
+
+def check_not_deconvolved(content: str) -> None:
+    """Raise DataError if the content of a file, as `content_of` tells it, is not an image that can be deconvolved.
+
+    Codes: "already-deconvolved" for a product, "psf-as-image" for a PSF.
+    """
+    if content == PRODUCT:
+        raise DataError(
+            "already-deconvolved",
+            "expected an image that was not deconvolved before; the header (PSFID) says that heliopsf made it by deconvolution: "
+            "use the original image, or allow a second deconvolution (--again, in a request again = true)",
+        )
+    if content == PSF:
+        raise DataError(
+            "psf-as-image",
+            "expected an image; the header (PSFSUM) says that the file is a PSF: name it as the PSF, or allow it to be "
+            "deconvolved (--again, in a request again = true)",
+        )
 
 
 def optional_text(header: Header, *keys: str) -> str | None:
@@ -210,4 +245,5 @@ def _summary(header: Header, hdu: int, gzipped: bool) -> HeaderSummary:
         pxend=_pair(header, "PXEND"),
         psf_name=optional_text(header, "PSFNAME"),
         psf_version=optional_text(header, "PSFVERS"),
+        content=content_of(header),
     )

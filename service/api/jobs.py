@@ -86,6 +86,13 @@ class JobView(BaseModel):
         )
 
 
+class Identified(BaseModel):
+    """The identity of the result of a request."""
+
+    result_id: str = Field(description="id that the result has, or would have")
+    parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
+
+
 @router.post(
     "",
     status_code=202,
@@ -118,6 +125,21 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
     response.status_code = 202 if new else 200
     response.headers["Location"] = f"/v1/jobs/{row.id}"
     return JobView.of(row)
+
+
+@router.post("/identity", summary="The id that the result of a job has or would have")
+def get_identity(body: JobRequest, caller: Reading, state: Shared) -> Identified:
+    """Resolve a request without starting a job. Equal requests have equal ids, so a client can skip results that it holds.
+
+    For a kind whose jobs always make a new result (`rerun`), the id is different each time.
+    """
+    try:
+        parameters, identity = resolve(
+            body, state.catalogue, caller.owner, added_effects=state.settings.added_effects
+        )
+    except DataError as error:
+        raise problem(error) from error
+    return Identified(result_id=identity, parameters=parameters)
 
 
 @router.get("", summary="List jobs")

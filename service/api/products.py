@@ -90,9 +90,9 @@ def get_product(product_id: Identity, caller: Reading, state: Shared) -> Product
 def get_product_file(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the product; its hash is the ETag."""
     row = _find(state, caller, product_id)
-    return files.send(
-        request, state.store, row.file_sha256, files.FITS_TYPE, f"heliopsf-{product_id[:12]}.fits"
-    )
+    # Products of earlier versions have no name of their own.
+    name = row.details.get("filename", f"heliopsf-{product_id[:12]}.fits")
+    return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name)
 
 
 @router.get(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import click
 
 from service.cli.connection import SERVER, named_psf, remote
+from service.cli.deconvolve import AGAIN
 from service.cli.options import (
     METHOD,
     NOISE,
@@ -18,16 +20,19 @@ from service.cli.options import (
     OUTPUT,
     SATURATION,
     STEPS,
-    check_writable,
     fits_files,
     percent,
     progress_bar,
     user_errors,
+    writes_files,
 )
+from service.client.outputs import written
 
 _CONDITION = re.compile(r"([A-Z0-9_-]{1,8})\s*(=|!=|<=|>=|<|>)\s*(.+)")
 BULK_ID = click.argument("bulk_id", metavar="ID")
-WAIT = click.option("--wait", is_flag=True, help="Wait until the bulk run ends")
+WAIT = click.option(
+    "--wait", is_flag=True, help="Wait until the bulk run ends; the exit status is 1 if an image failed"
+)
 
 
 class _Condition(click.ParamType):
@@ -72,6 +77,7 @@ def bulk() -> None:
 @STEPS
 @NOISE
 @SATURATION
+@AGAIN
 @click.option("--name", default="", help="Label of the bulk run")
 @WAIT
 @SERVER
@@ -89,6 +95,7 @@ def submit(
     steps: int | None,
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
+    again: bool,
     name: str,
     wait: bool,
     server: str | None,
@@ -115,12 +122,15 @@ def submit(
             noise=figures,
             saturation_dn=saturation_dn,
             other_channel=other_channel or None,
+            again=again or None,
         )
         click.echo(f"bulk {made['id']}")
         if wait:
             with progress_bar() as report:
                 made = service.wait_for_bulk(made["id"], progress=report)
         click.echo("\n".join(_said(made)))
+    if wait:
+        _end_with_status(made)
 
 
 @bulk.command("status", short_help="Show progress, speed and time left.")
@@ -140,7 +150,10 @@ def status(bulk_id: str | None, wait: bool, server: str | None) -> None:
         if wait:
             with progress_bar() as report:
                 service.wait_for_bulk(bulk_id, progress=report)
-        click.echo("\n".join(_said(service.bulk(bulk_id))))
+        found = service.bulk(bulk_id)
+        click.echo("\n".join(_said(found)))
+    if wait:
+        _end_with_status(found)
 
 
 @bulk.command("retry", short_help="Try failed images again.")
@@ -187,9 +200,16 @@ def cancel(bulk_id: str, server: str | None) -> None:
     "--most", default=20, show_default=True, type=click.IntRange(0, 10_000), help="Number of images to show"
 )
 @SERVER
-def report(bulk_id: str, output: Path | None, failures: Path | None, most: int, server: str | None) -> None:
+@writes_files
+def report(
+    bulk_id: str,
+    output: Path | None,
+    failures: Path | None,
+    most: int,
+    server: str | None,
+    overwrite: bool,
+) -> None:
     """Show the results of a bulk run: first the images, sorted by artefact score, then the failures."""
-    check_writable(output, failures)
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.bulk(bulk_id))))
         for row in service.bulk_results(bulk_id, order="worst", limit=most) if most else ():
@@ -201,10 +221,12 @@ def report(bulk_id: str, output: Path | None, failures: Path | None, most: int, 
             click.echo(f"... and {len(failed) - most} more failures")
         if output is not None:
             is_table = output.suffix.lower() == ".csv"
-            service.write_bulk_manifest(bulk_id, output, format="csv" if is_table else "ndjson")
+            kind = "csv" if is_table else "ndjson"
+            service.write_bulk_manifest(bulk_id, output, format=kind, overwrite=overwrite)
             click.echo(str(output))
         if failures is not None:
-            failures.write_text("".join(f"{json.dumps(row)}\n" for row in failed), "utf-8")
+            with written(failures, overwrite=overwrite) as partial:
+                partial.write_text("".join(f"{json.dumps(row)}\n" for row in failed), "utf-8")
             click.echo(str(failures))
 
 
@@ -225,6 +247,12 @@ def _said(found: dict[str, Any]) -> list[str]:
     if found["error"]:
         lines.append(f"stopped: {found['error']['message']}")
     return lines
+
+
+def _end_with_status(found: dict[str, Any]) -> None:
+    """Exit with status 1 unless the run is completed and every image is done."""
+    if found["phase"] != "COMPLETED" or found["images"]["failed"]:
+        sys.exit(1)
 
 
 def _left(seconds: float | None) -> str:

@@ -12,12 +12,13 @@ import click
 
 from psfcore.errors import DataError
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
-from service.cli.deconvolve import CONTEXT
+from service.cli.deconvolve import AGAIN, CONTEXT
 from service.cli.options import (
     METHOD,
     NOISE,
     OTHER_CHANNEL,
     OUTPUT_FOLDER,
+    OVERWRITE,
     SATURATION,
     STEPS,
     fits_files,
@@ -29,6 +30,7 @@ from service.cli.options import (
 )
 from service.client.errors import ServiceError
 from service.client.operations import Operations
+from service.client.outputs import check_output_folder, check_outputs, written
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.assess.contact_sheet import Treated
@@ -52,8 +54,10 @@ FOR_ALL = (401, 403)
 @click.option(
     "--most", default=60, show_default=True, type=click.IntRange(1, 200), help="Images on the contact sheet"
 )
+@AGAIN
 @SERVER
 @LOCAL
+@OVERWRITE
 def changes(
     images: tuple[Path, ...],
     output: Path,
@@ -65,8 +69,10 @@ def changes(
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
     most: int,
+    again: bool,
     server: str | None,
     local: bool,
+    overwrite: bool,
 ) -> None:
     """Deconvolve IMAGES (FITS files, or folders of them); write a table of what changed and a contact sheet.
 
@@ -76,6 +82,14 @@ def changes(
     from psfcore.deconvolve.assess.contact_sheet import contact_sheet_png, table, treat_many
 
     files = [str(path) for path in _named(images)]
+    table_file, sheet_file = output / TABLE, output / SHEET
+    with user_errors():
+        check_output_folder(output)
+        check_outputs(
+            (table_file, sheet_file),
+            inputs=(*files, psf if psf and Path(psf).is_file() else None),
+            overwrite=overwrite,
+        )
     with user_errors(), connection(server, local) as service, progress_bar() as report:
         parameters = {
             "psf_id": named_psf(service, psf),
@@ -85,8 +99,8 @@ def changes(
             "steps": steps,
             "noise": noise or None,
             "saturation_dn": saturation_dn,
+            "again": again,
         }
-        output.mkdir(parents=True, exist_ok=True)
         products: dict[str, dict[str, Any]] = {}
         treated, failures = treat_many(
             files,
@@ -99,10 +113,11 @@ def changes(
             "products": products,
             "inputs_sha256": inputs,
         }
-        write_json(output / TABLE, content)
-        contact_sheet_png(treated, failures, output / SHEET, most=most)
+        write_json(table_file, content, overwrite=overwrite)
+        with written(sheet_file, overwrite=overwrite) as picture:
+            contact_sheet_png(treated, failures, picture, most=most)
     click.echo("\n".join(_lines(content)))
-    click.echo(f"{output / TABLE}, {output / SHEET}")
+    click.echo(f"{table_file}, {sheet_file}")
     if not treated:
         raise click.ClickException("no image could be deconvolved; the reasons are listed above")
 
@@ -132,6 +147,7 @@ def _one_by_one(
                 "psf_id": product["psf_id"],
                 "software_version": version,
             }
+            service.release(product)
             return changes_in_product(name, name, file, product["details"], limits())
 
     return one

@@ -1,33 +1,49 @@
-"""The command ``deconvolve``: deconvolves one image."""
+"""The command ``deconvolve``: deconvolves one image into a file, or many images into a folder."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import Any
 
 import click
 
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
 from service.cli.options import (
-    FILE,
     METHOD,
     NOISE,
     OTHER_CHANNEL,
     OUTPUT,
     SATURATION,
     STEPS,
-    check_writable,
+    Report,
+    fits_files,
     percent,
     progress_bar,
     say_warnings,
     user_errors,
+    writes_files,
 )
+from service.client.many import Outcome, deconvolve_many
+from service.client.operations import Operations
+from service.client.outputs import check_output_folder, check_outputs
 
 CONTEXT = click.option("--context", help="Choose the PSF from this context: its id or name")
+AGAIN = click.option(
+    "--again", is_flag=True, help="Deconvolve files whose header says that they are products or PSFs"
+)
 
 
 @click.command()
-@click.argument("image", type=FILE)
-@click.option("-o", "--output", required=True, type=OUTPUT, help="Write the deconvolved image (FITS)")
+@click.argument("images", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(),
+    metavar="FILE|FOLDER/",
+    help="Write the deconvolved image (FITS) to this file; several images: to this folder",
+)
 @PSF
 @OTHER_CHANNEL
 @CONTEXT
@@ -51,11 +67,13 @@ CONTEXT = click.option("--context", help="Choose the PSF from this context: its 
 )
 @click.option("--plot", type=OUTPUT, help="Write the image before and after (PNG)")
 @click.option("--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG)")
+@AGAIN
 @SERVER
 @LOCAL
+@writes_files
 def deconvolve(
-    image: Path,
-    output: Path,
+    images: tuple[Path, ...],
+    output: str,
     psf: str | None,
     other_channel: bool,
     context: str | None,
@@ -68,34 +86,95 @@ def deconvolve(
     error_draws: int,
     plot: Path | None,
     changes: Path | None,
+    again: bool,
     server: str | None,
     local: bool,
+    overwrite: bool,
 ) -> None:
-    """Deconvolve IMAGE (FITS) with the PSF of its instrument, or with the PSF that you name."""
-    check_writable(output, plot, changes)
-    with user_errors(), connection(server, local) as service, progress_bar() as report:
-        product = service.deconvolve(
-            image,
-            output,
-            psf_id=named_psf(service, psf),
-            other_channel=other_channel,
-            context=context,
-            method=method,
-            preview=plot,
-            progress=report,
-            noise=noise or None,
-            saturation_dn=saturation_dn,
-            error_draws=error_draws,
-            changes=changes,
-            steps=steps,
-            stop=stop,
-            edges=edges,
+    """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with the PSF that you name.
+
+    The output is a folder if there are several images, or if its name ends in /. Images whose product is in the folder
+    are skipped. If an image fails, the others follow; the failures are listed at the end, and the exit status is 1.
+    """
+    files = fits_files(images)
+    if not files:
+        raise click.UsageError("expected FITS files; the folders that you named contain none")
+    parameters: dict[str, Any] = {
+        "context": context,
+        "method": method,
+        "noise": noise or None,
+        "saturation_dn": saturation_dn,
+        "error_draws": error_draws,
+        "steps": steps,
+        "stop": stop,
+        "edges": edges,
+        "other_channel": other_channel,
+        "again": again,
+        "overwrite": overwrite,
+    }
+    into_folder = len(files) > 1 or any(path.is_dir() for path in images) or _is_folder(output)
+    if into_folder and (plot or changes):
+        raise click.UsageError(
+            "--plot and --changes: expected one image and an output file; for several images use `heliopsf changes`"
         )
+    with user_errors():
+        psf_files = [Path(psf)] if psf and Path(psf).is_file() else []
+        if into_folder:
+            check_output_folder(output)
+        else:
+            check_outputs((output, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
+    with user_errors(), connection(server, local) as service, progress_bar() as report:
+        parameters["psf_id"] = named_psf(service, psf)
+        if not into_folder:
+            lines = _one(service, files[0], Path(output), plot, changes, report, parameters)
+            failures: list[Outcome] = []
+        else:
+            lines, failures = _many(service, files, output, report, parameters)
+    click.echo("\n".join(lines))
+    if failures:
+        raise click.ClickException(f"{len(failures)} of {len(files)} images failed; see the list above")
+
+
+def _is_folder(output: str) -> bool:
+    return output.endswith(("/", os.sep)) or Path(output).is_dir()
+
+
+def _one(
+    service: Operations,
+    image: Path,
+    output: Path,
+    plot: Path | None,
+    changes: Path | None,
+    report: Report,
+    parameters: dict[str, Any],
+) -> list[str]:
+    """Deconvolve one image into a file; returns the lines to print."""
+    product = service.deconvolve(image, output, preview=plot, changes=changes, progress=report, **parameters)
     say_warnings(product)
     details = product["details"]
-    click.echo(f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}")
-    click.echo(f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}")
-    click.echo(
+    return [
+        f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}",
+        f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}",
         f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
-        f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}"
+        f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
+    ]
+
+
+def _many(
+    service: Operations, files: list[Path], folder: str, report: Report, parameters: dict[str, Any]
+) -> tuple[list[str], list[Outcome]]:
+    """Deconvolve images into a folder; returns the lines to print, and the failures."""
+    outcomes = list(
+        deconvolve_many(
+            service, files, folder, progress=lambda done, of: report("images", done, of), **parameters
+        )
     )
+    failures = [one for one in outcomes if one.failure is not None]
+    existed = sum(one.existed for one in outcomes)
+    done = len(outcomes) - len(failures) - existed
+    lines = [f"{one.image}: {one.output}" for one in outcomes if one.failure is None and not one.existed]
+    lines += [f"failed: {one.image}: {one.failure}" for one in failures]
+    return [
+        *lines,
+        f"{len(outcomes)} images: {done} deconvolved, {existed} existed already, {len(failures)} failed",
+    ], failures

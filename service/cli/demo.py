@@ -9,9 +9,19 @@ from pathlib import Path
 
 import click
 
-from service.cli.options import FILE, OUTPUT_FOLDER, percent, progress_bar, user_errors
+from service.cli.options import (
+    FILE,
+    OUTPUT_FOLDER,
+    check_fresh_folder,
+    percent,
+    progress_bar,
+    user_errors,
+)
 from service.client.http import Client
+from service.client.outputs import check_outputs
 from service.client.versions import Progress
+
+LOG = "server.log"  # by this file a later demo recognises the folder of an earlier one
 
 
 @click.command()
@@ -25,7 +35,11 @@ from service.client.versions import Progress
     help="Folder for the results",
 )
 def demo(image: Path | None, output: Path) -> None:
-    """Start a service, upload an image, deconvolve it, download the product, and stop the service."""
+    """Start a service, upload an image, deconvolve it, download the product, and stop the service.
+
+    A second demo replaces the files of the first one. The folder must be new, empty, or the folder of an earlier demo.
+    """
+    check_fresh_folder(output, overwrite=(output / LOG).is_file())
     with user_errors(), progress_bar() as report:
         lines = run(image, output, report)
     click.echo("\n".join(lines))
@@ -33,8 +47,10 @@ def demo(image: Path | None, output: Path) -> None:
 
 def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
     """Start a service on a free port, upload and deconvolve an image, download the product, stop the service. Returns lines to print."""
-    output.mkdir(parents=True, exist_ok=True)
-    with (output / "server.log").open("w") as log:
+    if image is not None:
+        product_file, picture = _results_for(image, output)
+        check_outputs((product_file, picture), inputs=(image,), overwrite=True)
+    with (output / LOG).open("w") as log:
         server = subprocess.Popen(
             [
                 sys.executable,
@@ -56,9 +72,10 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
             with Client(_address(server, output)) as service:
                 if image is None:
                     image = _simulated(service, output, progress)
-                product_file = output / f"{image.stem}-deconvolved.fits"
-                picture = output / f"{image.stem}-preview.png"
-                product = service.deconvolve(image, product_file, preview=picture, progress=progress)
+                product_file, picture = _results_for(image, output)
+                product = service.deconvolve(
+                    image, product_file, preview=picture, progress=progress, overwrite=True
+                )
         finally:
             server.terminate()
             server.wait(60)
@@ -73,12 +90,17 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
     ]
 
 
+def _results_for(image: Path, output: Path) -> tuple[Path, Path]:
+    """The product and the picture of an image."""
+    return output / f"{image.stem}-deconvolved.fits", output / f"{image.stem}-preview.png"
+
+
 def _address(server: subprocess.Popen[str], output: Path) -> str:
     """The address of the server, which the server prints when it starts to listen."""
     assert server.stdout is not None
     line = server.stdout.readline()
     if " serves " not in line:
-        raise OSError(f"the server of the demo did not start; read {output / 'server.log'}")
+        raise OSError(f"the server of the demo did not start; read {output / LOG}")
     address = line.split(" serves ")[1].split()[0]
     with Client(address) as service:
         service.wait_until_up()
@@ -93,6 +115,6 @@ def _simulated(service: Client, output: Path, progress: Progress) -> Path:
     from psfcore.simulate.observe import demo_image
 
     psf_file, image = output / "psf.fits", output / "simulated.fits"
-    service.build_psf("hri_euv", psf_file, preview=output / "psf.png", progress=progress)
+    service.build_psf("hri_euv", psf_file, preview=output / "psf.png", progress=progress, overwrite=True)
     demo_image(image, read_psf(psf_file, FitsLimits(max_pixels=2048 * 2048)))
     return image

@@ -15,12 +15,13 @@ from service.cli.options import (
     JSON,
     PLOT,
     SATURATION,
-    check_writable,
     limits,
     progress_bar,
     user_errors,
     write_json,
+    writes_files,
 )
+from service.client.outputs import written
 
 INSTRUMENT = click.option(
     "--instrument",
@@ -51,6 +52,7 @@ INSTRUMENT = click.option(
     type=click.IntRange(1),
     help="Number of terms of the analytic series [default: from the instrument file]",
 )
+@writes_files
 def fresnel(
     instrument: str,
     json_file: Path | None,
@@ -58,13 +60,13 @@ def fresnel(
     distances: str | None,
     phases: int,
     windows: int | None,
+    overwrite: bool,
 ) -> None:
     """Compare the combined diffraction of all meshes with Fresnel propagation through the telescope, in one dimension."""
     from psfcore.diffraction.fresnel_study import DISTANCES_MM, fresnel_study
     from psfcore.diffraction.plots import fresnel_png
     from psfcore.instruments.model import load_instrument
 
-    check_writable(json_file, plot)
     with user_errors(), progress_bar() as report:
         wanted = DISTANCES_MM if distances is None else _numbers("--distances", distances)
         study = fresnel_study(
@@ -75,7 +77,8 @@ def fresnel(
             progress=lambda done, of: report("distances", done, of),
         )
         if plot is not None:
-            fresnel_png(study, plot)
+            with written(plot, overwrite=overwrite) as picture:
+                fresnel_png(study, picture)
     focus = study.focus
     click.echo(
         f"best focus: mirrors {focus.separation_mm:.3f} mm apart, {focus.shift_mm:+.3f} mm from the distance in the drawing "
@@ -86,7 +89,7 @@ def fresnel(
         click.echo(
             f"{at.distance_mm:>13g}   {at.largest_points:>25.2f} points   up to {at.largest_single_points:.2f} points"
         )
-    write_json(json_file, study.as_json())
+    write_json(json_file, study.as_json(), overwrite=overwrite)
 
 
 @click.command()
@@ -104,6 +107,7 @@ def fresnel(
 @SATURATION
 @JSON
 @PLOT
+@writes_files
 def arms(
     image: Path,
     before: Path | None,
@@ -112,6 +116,7 @@ def arms(
     saturation_dn: float | None,
     json_file: Path | None,
     plot: Path | None,
+    overwrite: bool,
 ) -> None:
     """Measure the diffraction arms around a flare in IMAGE (FITS): their angles, and the spacing of their peaks."""
     from psfcore.drawing.units import unit_label
@@ -119,7 +124,6 @@ def arms(
     from psfcore.flare.arms import measure_arms
     from psfcore.flare.arms_plot import arms_png
 
-    check_writable(json_file, plot)
     with user_errors():
         flare = read_image(image, limits(), saturation_dn=saturation_dn)
         reference = None if before is None else read_image(before, limits()).pixels
@@ -131,7 +135,8 @@ def arms(
             n_arms=n_arms,
         )
         if plot is not None:
-            arms_png(flare.pixels, found, plot, unit=unit_label(flare))
+            with written(plot, overwrite=overwrite) as picture:
+                arms_png(flare.pixels, found, picture, unit=unit_label(flare))
     for angle, sigma in zip(found.angles_deg, found.angles_sigma_deg, strict=True):
         click.echo(f"arm at {angle:8.3f} +- {sigma:.3f} degrees from +x towards +y")
     click.echo(f"spacing  {found.spacing_px:8.4f} +- {found.spacing_sigma_px:.4f} px")
@@ -147,6 +152,7 @@ def arms(
             "peaks": [dataclasses.asdict(peak) for peak in found.peaks],
             "stopped_because": found.stopped_because,
         },
+        overwrite=overwrite,
     )
 
 
@@ -158,26 +164,29 @@ def arms(
 @click.option("--wires", default="20,30,40,60", show_default=True, help="Wire widths to try, um")
 @JSON
 @PLOT
-def design(instrument: str, pitches: str, wires: str, json_file: Path | None, plot: Path | None) -> None:
+@writes_files
+def design(
+    instrument: str, pitches: str, wires: str, json_file: Path | None, plot: Path | None, overwrite: bool
+) -> None:
     """Tabulate the diffracted light for combinations of pitch and wire width of the entrance mesh."""
     from psfcore.diffraction.design_plot import design_png
     from psfcore.diffraction.design_study import design_study
     from psfcore.instruments.model import load_instrument
 
-    check_writable(json_file, plot)
     with user_errors():
         study = design_study(
             load_instrument(instrument), _numbers("--pitches", pitches), _numbers("--wires", wires)
         )
         if plot is not None:
-            design_png(study, plot)
+            with written(plot, overwrite=overwrite) as picture:
+                design_png(study, picture)
     names = [field.name for field in dataclasses.fields(study.rows[0])]
     click.echo("  ".join(names))
     for row in study.rows:
         values = (getattr(row, name) for name in names)
         texts = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in values)
         click.echo("  ".join(f"{text:>{len(name)}}" for text, name in zip(texts, names, strict=True)))
-    write_json(json_file, dataclasses.asdict(study))
+    write_json(json_file, dataclasses.asdict(study), overwrite=overwrite)
 
 
 COMMANDS = (fresnel, arms, design)

@@ -12,11 +12,12 @@ from service.cli.options import (
     NOISE,
     PLOT,
     SATURATION,
-    check_writable,
     limits,
     user_errors,
     write_json,
+    writes_files,
 )
+from service.client.outputs import written
 
 
 @click.command()
@@ -47,6 +48,7 @@ from service.cli.options import (
 @SATURATION
 @JSON
 @PLOT
+@writes_files
 def flare(
     image: Path,
     background: Path,
@@ -58,6 +60,7 @@ def flare(
     saturation_dn: float | None,
     json_file: Path | None,
     plot: Path | None,
+    overwrite: bool,
 ) -> None:
     """Simulate the stray light of the flare in IMAGE with a PSF, and compare it along a diffraction arm."""
     from psfcore.fits.images import read_image
@@ -66,7 +69,6 @@ def flare(
     from psfcore.flare.judge import judge_on_flare, summary_lines
     from psfcore.noise import Noise
 
-    check_writable(json_file, plot)
     with user_errors():
         psf = read_psf(psf_file, limits())
         found = judge_on_flare(
@@ -79,11 +81,12 @@ def flare(
             noise=None if noise is None else Noise(*noise),
         )
         if plot is not None:
-            flare_png(found.difference, found.usable, found.comparison, plot, unit=found.unit)
+            with written(plot, overwrite=overwrite) as picture:
+                flare_png(found.difference, found.usable, found.comparison, picture, unit=found.unit)
     click.echo("\n".join(summary_lines(found.comparison)))
     if json_file is not None:
         inputs = {"image": image.name, "background": background.name, "psf": f"{psf.name} {psf.version}"}
-        write_json(json_file, inputs | found.comparison.as_json())
+        write_json(json_file, inputs | found.comparison.as_json(), overwrite=overwrite)
 
 
 COMMANDS = (flare,)

@@ -45,6 +45,7 @@ RENAMED = {
     "--preview": "--plot",
     "--effects": "--changes",
     "--html": "--output",
+    "--force": "--overwrite",
 }
 
 

@@ -1,4 +1,4 @@
-"""Code that commands share: options, settings, errors in one line, checks of output files, and a progress bar.
+"""Code that commands share: options, settings, errors in one line, output files, and a progress bar.
 
 This file imports no numerical libraries, so that commands start fast.
 """
@@ -12,14 +12,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
 from service.client.errors import ServiceError, error_lines
+from service.client.outputs import check_output_folder, check_outputs, written
 from workers.contract.methods import Method
 
 if TYPE_CHECKING:
@@ -28,8 +30,18 @@ if TYPE_CHECKING:
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
-OUTPUT = click.Path(dir_okay=False, path_type=Path)
-OUTPUT_FOLDER = click.Path(file_okay=False, path_type=Path)
+
+
+class OutputFile(click.Path):
+    """The type of an option that names a file to write. ``writes_files`` checks the files of these options."""
+
+
+class OutputFolder(click.Path):
+    """The type of an option that names a folder to write to."""
+
+
+OUTPUT = OutputFile(dir_okay=False, path_type=Path)
+OUTPUT_FOLDER = OutputFolder(file_okay=False, path_type=Path)
 METHODS = [get_args(kind.model_fields["name"].annotation)[0] for kind in get_args(get_args(Method)[0])]
 
 METHOD = click.option(
@@ -65,8 +77,10 @@ SEED = click.option(
 JSON = click.option("--json", "json_file", type=OUTPUT, help="Write all numbers to this file (JSON)")
 PLOT = click.option("--plot", type=OUTPUT, help="Write a plot to this file (PNG)")
 DATA = click.option("--data", type=OUTPUT_FOLDER, help="Data folder [default: HELIOPSF_DATA_DIR]")
+OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files that exist")
 
 Report = Callable[[str, int, int], None]
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 @contextmanager
@@ -88,27 +102,66 @@ def say_warnings(product: dict[str, Any]) -> None:
         click.echo(f"warning: {warning['message']}", err=True)
 
 
-def check_writable(*paths: Path | None) -> None:
-    """Raise ``ClickException`` before the work starts if the folder of an output file does not exist."""
-    for path in paths:
-        if path is not None and not path.resolve().parent.is_dir():
-            raise click.ClickException(f"cannot write {path}: there is no folder {path.resolve().parent}")
+def writes_files(command: Command) -> Command:
+    """Give a command the option ``--overwrite``, and check its output files before it runs.
+
+    The outputs are the values of the options of type ``OUTPUT``. The inputs are the values of the other options and
+    arguments that name files. The command gets ``overwrite`` and hands it on to the code that writes.
+    """
+
+    @OVERWRITE
+    @wraps(command)
+    def checked(**given: Any) -> Any:
+        outputs, inputs = _files_of(click.get_current_context().command.params, given)
+        with user_errors():
+            check_outputs(outputs, inputs=inputs, overwrite=given["overwrite"])
+        return command(**given)
+
+    return checked  # type: ignore[return-value]
 
 
-def check_fresh_folder(folder: Path, *, force: bool = False) -> None:
-    """Raise ``ClickException`` if an output folder cannot be made, or holds files and ``force`` is false."""
-    if not force and folder.is_dir() and any(folder.iterdir()):
-        raise click.ClickException(f"{folder} is not empty; name another folder, or use --force")
-    check_writable(folder)
+def _files_of(
+    parameters: Sequence[click.Parameter], given: dict[str, Any]
+) -> tuple[list[Path | None], list[Path]]:
+    """The files that a command writes, and the files and folders that it reads."""
+    outputs: list[Path | None] = []
+    inputs: list[Path] = []
+    for parameter in parameters:
+        value = given.get(parameter.name or "")
+        if isinstance(parameter.type, OutputFile):
+            outputs.append(value)
+        elif not isinstance(parameter.type, OutputFolder):
+            values = value if isinstance(value, tuple) else (value,)
+            inputs += [one for one in values if isinstance(one, Path)]
+            if "FILE" in (parameter.metavar or ""):  # such as ID|FILE
+                inputs += [Path(one) for one in values if isinstance(one, str) and Path(one).is_file()]
+    return outputs, inputs
 
 
-def write_json(path: Path | None, content: dict[str, Any]) -> None:
+def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> None:
+    """Make an output folder. Raises ``ClickException`` if it cannot be written, if it holds files and ``overwrite`` is
+    false, or if it holds an input."""
+    if not overwrite and folder.is_dir() and any(folder.iterdir()):
+        raise click.ClickException(f"{folder} is not empty; name another folder, or use --overwrite")
+    for path in inputs:
+        if path.resolve().is_relative_to(folder.resolve()):
+            raise click.ClickException(
+                f"cannot write to {folder}: it holds the input {path}; name another folder"
+            )
+    with user_errors():
+        check_output_folder(folder)
+
+
+def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = False) -> None:
     """Write ``content`` to ``path``, if a path is given. Raises ``ClickException`` if the file cannot be written."""
     if path is None:
         return
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
     try:
-        path.write_text(text, "utf-8")
+        with written(path, overwrite=overwrite) as partial:
+            partial.write_text(text, "utf-8")
+    except ServiceError as error:
+        raise click.ClickException(str(error)) from error
     except OSError as error:
         raise click.ClickException(f"cannot write {path}: {error.strerror or error}") from error
 

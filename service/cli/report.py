@@ -16,9 +16,9 @@ from service.cli.options import (
     PLOT,
     SATURATION,
     SEED,
-    check_writable,
     progress_bar,
     user_errors,
+    writes_files,
 )
 
 
@@ -45,6 +45,7 @@ from service.cli.options import (
 @SATURATION
 @SERVER
 @LOCAL
+@writes_files
 def report(
     transit: Path,
     output: Path | None,
@@ -58,6 +59,7 @@ def report(
     saturation_dn: float | None,
     server: str | None,
     local: bool,
+    overwrite: bool,
 ) -> None:
     """Fit a PSF to TRANSIT, or test a PSF on it: compare simulated and observed light in the occulter's disc.
 
@@ -72,7 +74,6 @@ def report(
         raise click.UsageError(
             "--shapes fits every shape to TRANSIT, so it cannot be used with --psf: remove one of the two"
         )
-    check_writable(output, json_file, plot)
     with (
         user_errors(),
         TemporaryDirectory(prefix="heliopsf-") as folder,
@@ -92,6 +93,7 @@ def report(
             dark_offsets=dark_offsets,
             shapes=shapes or None,
             saturation_dn=saturation_dn,
+            overwrite=overwrite,
         )
         told = json.loads(numbers.read_text("utf-8"))
     from psfcore.evaluation.summary_lines import summary_lines

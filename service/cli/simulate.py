@@ -16,10 +16,10 @@ from service.cli.options import (
     JSON,
     OUTPUT_FOLDER,
     check_fresh_folder,
-    check_writable,
     limits,
     user_errors,
     write_json,
+    writes_files,
 )
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def simulate() -> None:
     type=FILE,
     help="Take the scene from this image (FITS). Give one image, or one for each pointing",
 )
-@click.option("--force", is_flag=True, help="Write even if the folder is not empty")
+@click.option("--overwrite", is_flag=True, help="Write even if the folder is not empty; replace its files")
 def transit(
     output: Path,
     size: int,
@@ -118,7 +118,7 @@ def transit(
     diffraction: Path | None,
     diffraction_size: int | None,
     scene_files: tuple[Path, ...],
-    force: bool,
+    overwrite: bool,
 ) -> None:
     """Write a simulated transit, with its true PSF and scenes, to a folder."""
     from psfcore.instruments.model import load_instrument
@@ -129,7 +129,8 @@ def transit(
     from psfcore.simulate.transit import simulate as simulated
     from psfcore.simulate.transit_files import write
 
-    check_fresh_folder(output, force=force)
+    given = [*scene_files, *(Path(one) for one in (diffraction, instrument) if one and Path(one).is_file())]
+    check_fresh_folder(output, given, overwrite=overwrite)
     with user_errors():
         scatter = ScatterTruth(b_px, c, total, stretch, stretch_angle, dipole)
         plan = default_plan(images, size, beyond=beyond, saturation_dn=saturation, dark_offset_dn=dark_offset)
@@ -155,14 +156,14 @@ def transit(
 @simulate.command(short_help="Compute the smallest possible errors.")
 @click.argument("folder", type=FOLDER)
 @JSON
-def bound(folder: Path, json_file: Path | None) -> None:
+@writes_files
+def bound(folder: Path, json_file: Path | None, overwrite: bool) -> None:
     """Compute the smallest errors that photon and read noise allow for FOLDER, a simulated transit."""
     from psfcore.simulate.bound import bound_of_folder
 
-    check_writable(json_file)
     with user_errors():
         found = bound_of_folder(folder, threads=THREADS)
-    write_json(json_file, found.to_json())
+    write_json(json_file, found.to_json(), overwrite=overwrite)
     click.echo("\n".join(_lines(found)))
 
 

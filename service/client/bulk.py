@@ -35,8 +35,8 @@ class BulkClient(ABC):
         """The description at an address of the service."""
 
     @abstractmethod
-    def download(self, address: str, path: str | Path) -> None:
-        """Write the file at an address of the service to ``path``."""
+    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the file at an address of the service to ``path``; an existing file only if ``overwrite`` is true."""
 
     @abstractmethod
     def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
@@ -120,9 +120,11 @@ class BulkClient(ABC):
             for line in answer.iter_lines():
                 yield json.loads(line)
 
-    def write_bulk_manifest(self, bulk_id: str, path: str | Path, *, format: str = "ndjson") -> None:
+    def write_bulk_manifest(
+        self, bulk_id: str, path: str | Path, *, format: str = "ndjson", overwrite: bool = False
+    ) -> None:
         """Write the manifest of all products, as JSON lines ("ndjson") or as a table ("csv")."""
-        self.download(f"/v1/bulk/{bulk_id}/results?format={format}", path)
+        self.download(f"/v1/bulk/{bulk_id}/results?format={format}", path, overwrite=overwrite)
 
     def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> dict[str, Any]:
         """Wait until a bulk run ends, is paused or has failed; returns its description."""

@@ -18,6 +18,7 @@ from psfcore.transit.archive import pack
 from service.client.bulk import BulkClient
 from service.client.errors import ServiceError
 from service.client.operations import DEFAULT_SERVER, Operations
+from service.client.outputs import written
 from service.client.versions import Progress, VersionedPsfs
 
 PATIENCE_S = 30.0
@@ -107,6 +108,25 @@ class Client(VersionedPsfs, BulkClient, Operations):
         body = {"kind": kind, "queue": queue, "parameters": parameters}
         return self._json("POST", "/v1/jobs", json=body)
 
+    def result_id(self, kind: str, **parameters: Any) -> str:
+        """The id that the result of such a job has or would have. No job is started."""
+        body = {"kind": kind, "parameters": parameters}
+        identity: str = self._json("POST", "/v1/jobs/identity", json=body)["result_id"]
+        return identity
+
+    def image_id(self, path: str | Path, sha256: str) -> str:
+        """The id of an image. It is uploaded unless the service holds it. sha256: hash of the file."""
+        try:
+            identity: str = self.get(f"/v1/images/{sha256}")["id"]
+        except ServiceError as error:
+            if error.code != "no-such-image":
+                raise
+            identity = self.upload_image(path)["id"]
+        return identity
+
+    def release(self, product: dict[str, Any]) -> None:
+        """Do nothing: the service keeps its products."""
+
     def job(self, job_id: str) -> dict[str, Any]:
         """The current description of a job."""
         return self._json("GET", f"/v1/jobs/{job_id}")
@@ -163,17 +183,15 @@ class Client(VersionedPsfs, BulkClient, Operations):
         """All products, newest first."""
         return self._all("/v1/products", filters)
 
-    def download(self, address: str, path: str | Path) -> None:
+    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
         """Download a file of the service. The file appears at ``path`` only when it is complete."""
-        target = Path(path)
-        partial = target.with_name(target.name + ".part")
-        try:
-            with self._streamed(address) as response, partial.open("wb") as file:
-                for chunk in response.iter_bytes():
-                    file.write(chunk)
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
+        with (
+            written(path, overwrite=overwrite) as partial,
+            self._streamed(address) as response,
+            partial.open("wb") as file,
+        ):
+            for chunk in response.iter_bytes():
+                file.write(chunk)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
         """The answer of the service to a query about a PSF."""
@@ -183,9 +201,9 @@ class Client(VersionedPsfs, BulkClient, Operations):
         }
         return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=parameters)
 
-    def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
+    def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
         """Download the central (size, size) px of a PSF."""
-        self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output)
+        self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output, overwrite=overwrite)
 
     def _upload(
         self, address: str, path: Path, query: dict[str, str | None], *, media_type: str = "application/fits"

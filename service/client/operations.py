@@ -1,4 +1,8 @@
-"""The requests to a service. They use a few abstract operations, which HTTP and a service in this process implement differently."""
+"""The requests to a service. They use a few abstract operations, which HTTP and a service in this process implement differently.
+
+A method that writes files checks them before it sends anything (``service.client.outputs.check_outputs``). An existing
+file is replaced only with ``overwrite=True``, and only when the new file is complete.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from service.client.errors import ServiceError
+from service.client.outputs import check_outputs
 from service.client.versions import Progress
 
 DEFAULT_SERVER = "http://127.0.0.1:8765"
@@ -48,6 +53,18 @@ class Operations(ABC):
         """Submit a job; returns its description. If an identical job was done before, the description is of that job, which has already ended."""
 
     @abstractmethod
+    def result_id(self, kind: str, **parameters: Any) -> str:
+        """The id that the result of such a job has or would have. No job is started."""
+
+    @abstractmethod
+    def image_id(self, path: str | Path, sha256: str) -> str:
+        """The id of an image. It is uploaded unless the service holds it. sha256: hash of the file."""
+
+    @abstractmethod
+    def release(self, product: dict[str, Any]) -> None:
+        """Delete the files of a downloaded product if nobody else can ask for them. A service over HTTP keeps them."""
+
+    @abstractmethod
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
         """Wait until a job is completed; returns its description. Raises ``ServiceError`` if the job fails or is cancelled."""
 
@@ -56,8 +73,8 @@ class Operations(ABC):
         """The description at an address of the service, such as ``/v1/products/...``."""
 
     @abstractmethod
-    def download(self, address: str, path: str | Path) -> None:
-        """Write the file at an address of the service to ``path``."""
+    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the file at an address of the service to ``path``; an existing file only if ``overwrite`` is true."""
 
     @abstractmethod
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
@@ -67,7 +84,7 @@ class Operations(ABC):
         """
 
     @abstractmethod
-    def psf_cutout(self, psf_id: str, size: int, output: str | Path) -> None:
+    def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
         """Write the central (size, size) px of a PSF as FITS."""
 
     def deconvolve(
@@ -85,6 +102,8 @@ class Operations(ABC):
         changes: str | Path | None = None,
         context: str | None = None,
         other_channel: bool = False,
+        again: bool = False,
+        overwrite: bool = False,
         **method_parameters: Any,
     ) -> dict[str, Any]:
         """Upload an image, deconvolve it and download the product to ``output``; returns the description of the product.
@@ -93,24 +112,29 @@ class Operations(ABC):
         the PSF that is built for the instrument. noise: photon gain (DN per photon) and read noise (DN rms). error_draws: number of noise
         realisations for an ERROR plane, 0 or at least 2. preview, changes: where to write the picture of the image
         before and after, and the picture of difference, ratio and histograms (PNG). other_channel: whether the PSF may be of
-        another telescope, channel or filter than the image. ``details["warnings"]`` of the product says what may be wrong with it. method_parameters: for example ``steps=20``,
-        ``stop="discrepancy"``, ``edges="zero"``.
+        another telescope, channel or filter than the image. again: deconvolve the file even if its header says that it is a
+        product or a PSF. ``details["warnings"]`` of the product says what may be wrong with it. method_parameters: for example
+        ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
         """
-        wanted = {
-            "psf_id": psf_id,
-            "method": {"name": method, **_given(method_parameters)},
-            "saturation_dn": saturation_dn,
-            "error_draws": error_draws,
-            "changes_picture": changes is not None,
-            **({} if context is None else {"context": context}),
-            **({"other_channel": True} if other_channel else {}),
-        }
-        image_id = self.upload_image(image)["id"]
-        job = self.submit("deconvolve", image_id=image_id, **wanted, **_noise(noise))
+        check_outputs((output, preview, changes), inputs=(image,), overwrite=overwrite)
+        wanted = deconvolution(
+            self.upload_image(image)["id"],
+            psf_id=psf_id,
+            method=method,
+            noise=noise,
+            saturation_dn=saturation_dn,
+            error_draws=error_draws,
+            changes_picture=changes is not None,
+            context=context,
+            other_channel=other_channel,
+            again=again,
+            **method_parameters,
+        )
+        job = self.submit("deconvolve", **wanted)
         product = self.get(self.wait(job, progress=progress)["result"])
-        self._fetch(product, output, preview)
+        self._fetch(product, output, preview, overwrite)
         if changes is not None:
-            self.download(product["changes"], changes)
+            self.download(product["changes"], changes, overwrite=overwrite)
         return product
 
     def build_psf(
@@ -123,6 +147,7 @@ class Operations(ABC):
         mask: str | Path | None = None,
         preview: str | Path | None = None,
         progress: Progress | None = None,
+        overwrite: bool = False,
     ) -> dict[str, Any]:
         """Compute the PSF of an instrument and download it to ``output``; returns its description.
 
@@ -130,8 +155,10 @@ class Operations(ABC):
         component: build only this component, such as "diffraction". mask: the mask image (FITS), if the
         mount in the instrument file names one.
         """
+        is_file = isinstance(instrument, Path) or instrument.endswith(".toml")
+        check_outputs((output, preview), inputs=(instrument if is_file else None, mask), overwrite=overwrite)
         wanted: dict[str, Any] = {"size": size, "component": component}
-        if isinstance(instrument, Path) or instrument.endswith(".toml"):
+        if is_file:
             wanted["instrument_file"] = Path(instrument).read_text("utf-8")
         else:
             wanted["instrument"] = instrument
@@ -139,7 +166,7 @@ class Operations(ABC):
             wanted["mask_id"] = self.upload_image(mask)["id"]
         job = self.submit("psf-build", **wanted)
         psf = self.get(self.wait(job, progress=progress)["result"])
-        self._fetch(psf, output, preview)
+        self._fetch(psf, output, preview, overwrite)
         return psf
 
     def fit_psf(
@@ -151,6 +178,7 @@ class Operations(ABC):
         preview: str | Path | None = None,
         progress: Progress | None = None,
         noise: tuple[float, float] | None = None,
+        overwrite: bool = False,
         **parameters: Any,
     ) -> dict[str, Any]:
         """Upload a transit (folder or archive), fit its scatter kernel and download the PSF; returns its description.
@@ -158,10 +186,11 @@ class Operations(ABC):
         report, preview: where to write the report (JSON) and the plot (PNG). noise: as for ``deconvolve``. parameters: for example
         ``shape="stretched"``, ``as_published=True``.
         """
+        check_outputs((output, report, preview), inputs=(transit,), overwrite=overwrite)
         psf = self._on_transit("psf-fit", transit, progress, noise, parameters)
-        self._fetch(psf, output, preview)
+        self._fetch(psf, output, preview, overwrite)
         if report is not None:
-            self.download(psf["report"], report)
+            self.download(psf["report"], report, overwrite=overwrite)
         return psf
 
     def cross_validate(
@@ -172,14 +201,16 @@ class Operations(ABC):
         preview: str | Path | None = None,
         progress: Progress | None = None,
         noise: tuple[float, float] | None = None,
+        overwrite: bool = False,
         **parameters: Any,
     ) -> dict[str, Any]:
         """Upload a transit, cross-validate its fit and download the report (JSON); returns its description.
 
         parameters: as for ``fit_psf``, and ``scheme="exact"``, ``runs=10``.
         """
+        check_outputs((report, preview), inputs=(transit,), overwrite=overwrite)
         found = self._on_transit("cross-validate", transit, progress, noise, parameters)
-        self._fetch(found, report, preview)
+        self._fetch(found, report, preview, overwrite)
         return found
 
     def report(
@@ -191,6 +222,7 @@ class Operations(ABC):
         preview: str | Path | None = None,
         progress: Progress | None = None,
         noise: tuple[float, float] | None = None,
+        overwrite: bool = False,
         **parameters: Any,
     ) -> dict[str, Any]:
         """Upload a transit, make a report on its PSF and download it; returns its description.
@@ -198,10 +230,11 @@ class Operations(ABC):
         report, page, preview: where to write the report as JSON, as HTML, and its plot (PNG). noise: as for
         ``deconvolve``. parameters: ``psf_id`` of a PSF to test (default: fit a PSF), ``seed``, ``dark_offsets``, ``shapes``.
         """
+        check_outputs((report, page, preview), inputs=(transit,), overwrite=overwrite)
         found = self._on_transit("report", transit, progress, noise, parameters)
-        self._fetch(found, report, preview)
+        self._fetch(found, report, preview, overwrite)
         if page is not None:
-            self.download(found["html"], page)
+            self.download(found["html"], page, overwrite=overwrite)
         return found
 
     def diagnose_gap(
@@ -213,6 +246,7 @@ class Operations(ABC):
         preview: str | Path | None = None,
         progress: Progress | None = None,
         noise: tuple[float, float] | None = None,
+        overwrite: bool = False,
         **parameters: Any,
     ) -> dict[str, Any]:
         """Upload a transit, diagnose the gap between it and the fitted model, and download the report; returns its description.
@@ -220,10 +254,11 @@ class Operations(ABC):
         report, page, preview, noise: as for ``report``. parameters: ``psf_id`` of a fitted PSF to start from, ``seed``,
         ``correct``. If an effect was found, ``details.corrected_psf_id`` is the id of the PSF that includes it.
         """
+        check_outputs((report, page, preview), inputs=(transit,), overwrite=overwrite)
         found = self._on_transit("gap-diagnose", transit, progress, noise, parameters)
-        self._fetch(found, report, preview)
+        self._fetch(found, report, preview, overwrite)
         if page is not None:
-            self.download(found["html"], page)
+            self.download(found["html"], page, overwrite=overwrite)
         return found
 
     def _on_transit(
@@ -270,11 +305,13 @@ class Operations(ABC):
             self.wait(self.submit("psf-tables", psf_id=psf_id))
         return self.ask(psf_ids[0], question, **query)
 
-    def _fetch(self, result: dict[str, Any], output: str | Path | None, preview: str | Path | None) -> None:
+    def _fetch(
+        self, result: dict[str, Any], output: str | Path | None, preview: str | Path | None, overwrite: bool
+    ) -> None:
         if output is not None:
-            self.download(result["file"], output)
+            self.download(result["file"], output, overwrite=overwrite)
         if preview is not None:
-            self.download(result["preview"], preview)
+            self.download(result["preview"], preview, overwrite=overwrite)
 
     @staticmethod
     def _ended(job: dict[str, Any]) -> dict[str, Any]:
@@ -286,6 +323,35 @@ class Operations(ABC):
         if job["phase"] == "ABORTED":
             raise ServiceError(f"job {job['id']} was cancelled", code="cancelled")
         return job
+
+
+def deconvolution(
+    image_id: str,
+    *,
+    psf_id: str | None = None,
+    method: str = "richardson-lucy",
+    noise: tuple[float, float] | None = None,
+    saturation_dn: float | None = None,
+    error_draws: int = 0,
+    changes_picture: bool = False,
+    context: str | None = None,
+    other_channel: bool = False,
+    again: bool = False,
+    **method_parameters: Any,
+) -> dict[str, Any]:
+    """The parameters of a request to deconvolve an uploaded image, from the arguments of ``Operations.deconvolve``."""
+    return {
+        "image_id": image_id,
+        "psf_id": psf_id,
+        "method": {"name": method, **_given(method_parameters)},
+        "saturation_dn": saturation_dn,
+        "error_draws": error_draws,
+        "changes_picture": changes_picture,
+        **({} if context is None else {"context": context}),
+        **({"other_channel": True} if other_channel else {}),
+        **({"again": True} if again else {}),
+        **_noise(noise),
+    }
 
 
 def _given(parameters: dict[str, Any]) -> dict[str, Any]:

@@ -71,6 +71,10 @@ class VersionedPsfs(ABC):
         body = {"status": "deprecated", "successor": successor, "reason": reason}
         return self._json("POST", f"/v1/psfs/{psf_id}/status", json=body)
 
+    def delete_psf(self, psf_id: str) -> dict[str, Any]:
+        """Delete a draft that nothing uses. Returns its last description."""
+        return self._json("DELETE", f"/v1/psfs/{psf_id}")
+
     def best_psf(self, **filters: str | None) -> dict[str, Any]:
         """The one PSF that fits ``instrument``, ``channel``, ``kind``, ``version``, ``valid_at``, ``context``, ...
 

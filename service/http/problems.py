@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
 # HTTP status of a DataError, by its code; 422 for every other code.
 STATUS_OF = {
+    "already-deconvolved": 409,
     "no-psf-fits": 404,
     "no-such-context": 404,
     "no-such-image": 404,
@@ -41,12 +42,15 @@ STATUS_OF = {
     "no-line": 409,
     "no-psf-for-instrument": 409,
     "no-such-successor": 409,
+    "not-a-draft": 409,
     "not-made-here": 409,
     "not-to-supersede": 409,
     "nothing-to-pin": 409,
     "parameters-outdated": 409,
     "parameters-unknown": 409,
     "plate-scale-mismatch": 409,
+    "psf-as-image": 409,
+    "psf-in-use": 409,
     "ranges-overlap": 409,
     "several-psfs-fit": 409,
     "successor-named": 409,

@@ -7,6 +7,8 @@ from service.http.problems import Problem
 from service.http.state import State
 from workers.catalogue.catalogue import Row
 from workers.catalogue.owners import NOT_KEPT, OverQuota, Usage
+from workers.catalogue.tables import PsfRow
+from workers.files.collection import remove_unnamed
 
 
 class Allowed:
@@ -29,6 +31,9 @@ class Allowed:
         try:
             return self._state.catalogue.add(row, self._state.settings.quota_mib)
         except OverQuota as over:
+            # Nothing stays of a refused upload: its file was stored before its row.
+            digest = row.file_sha256 if isinstance(row, PsfRow) else row.id
+            remove_unnamed(self._state.catalogue, self._state.store, [digest])
             raise _file_too_large(over.usage, row.bytes) from over
 
 

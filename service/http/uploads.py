@@ -19,6 +19,7 @@ from starlette.requests import ClientDisconnect
 
 from psfcore.errors import DataError, HeaderError
 from psfcore.fits.header import FitsLimits, HeaderSummary, read_summary
+from psfcore.fits.weights import check_is_psf
 from psfcore.transit.archive import (
     START_BYTES,
     ArchiveContents,
@@ -114,6 +115,18 @@ async def receive(
 
 
 @asynccontextmanager
+async def receive_psf(
+    request: Request, store: Store, limits: FitsLimits, max_bytes: int, take: Take
+) -> AsyncIterator[Upload[HeaderSummary]]:
+    """Stream the request's FITS file to a temporary path and check that it can be a PSF.
+
+    Raises the same ``Problem`` as ``receive``, and 422 if the file is plainly no PSF.
+    """
+    async with _receive(request, store, _PsfFile(limits), max_bytes, take) as upload:
+        yield upload
+
+
+@asynccontextmanager
 async def receive_transit(
     request: Request, store: Store, limits: ArchiveLimits, max_bytes: int, take: Take
 ) -> AsyncIterator[Upload[ArchiveContents]]:
@@ -176,6 +189,16 @@ class _Fits:
             return read_summary(path, self._limits)
         except HeaderError as error:
             raise problem(error) from error
+
+
+class _PsfFile(_Fits):
+    def inspect(self, path: Path) -> HeaderSummary:
+        summary = super().inspect(path)
+        try:
+            check_is_psf(path, summary, self._limits)
+        except DataError as error:
+            raise problem(error) from error
+        return summary
 
 
 class _Archive:

@@ -91,12 +91,14 @@ def test_what_people_import_stands_on_the_core_and_the_client_alone() -> None:
 LIGHT = (
     "psfcore.fits.header",
     "psfcore.fits.cutout",
+    "psfcore.fits.weights",
     "psfcore.tables.lookup",
     "psfcore.errors",
     "psfcore.noise_figures",
     "psfcore.transit.archive",
     "psfcore.transit.in_place",
     "psfcore.transit.manifest",
+    "psfcore.whole_files",
 )
 
 

@@ -62,16 +62,20 @@ def test_a_folder_without_a_transit_is_refused(tmp_path: Path) -> None:
     assert caught.value.code == "no-manifest"
 
 
-def test_a_product_may_replace_the_image_that_it_was_made_from(tmp_path: Path) -> None:
+def test_a_product_does_not_replace_the_image_that_it_was_made_from(tmp_path: Path) -> None:
     write_image(tmp_path / "image.fits")
     write_psf(tmp_path / "psf.fits")
     before = sha256_of(tmp_path / "image.fits")
     with local_service() as service:
         psf = service.upload_psf(tmp_path / "psf.fits")
-        product = service.deconvolve(
-            tmp_path / "image.fits", tmp_path / "image.fits", psf_id=psf["id"], steps=2
-        )
-        assert product["image_id"] == before
-        assert sha256_of(tmp_path / "image.fits") == product["sha256"] != before
-        again = service.upload_image(tmp_path / "image.fits")
-        assert again["id"] == product["sha256"], "the file is another one now"
+        for overwrite in (False, True):
+            with pytest.raises(ServiceError) as caught:
+                service.deconvolve(
+                    tmp_path / "image.fits",
+                    tmp_path / "image.fits",
+                    psf_id=psf["id"],
+                    steps=2,
+                    overwrite=overwrite,
+                )
+            assert caught.value.code == "output-is-input"
+            assert sha256_of(tmp_path / "image.fits") == before

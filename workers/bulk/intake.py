@@ -32,6 +32,10 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
         )
     _check_places(request, settings)
     asked = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
+    for name in ("again", "other_channel"):
+        if not asked["parameters"][name]:
+            # Without this, the keys of runs that were started before these parameters existed would change.
+            del asked["parameters"][name]
     now = time.time()
     row = BulkRow(
         id=new_id(),

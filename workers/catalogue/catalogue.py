@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeVar
 
-from sqlalchemy import Select, select, tuple_
+from sqlalchemy import Select, String, cast, select, tuple_
 from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
 
+from psfcore.errors import DataError
 from workers.catalogue.affected import AffectedProducts
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
@@ -31,12 +33,17 @@ from workers.catalogue.tables import (
     JobRow,
     ProductRow,
     PsfContextRow,
+    PsfPinRow,
     PsfRow,
     ReportRow,
     SolutionRow,
     TransitRow,
 )
 from workers.catalogue.uws_jobs import UwsJobs
+from workers.contract.bulk import OPEN
+from workers.contract.identities import canonical_hash
+from workers.contract.phases import ENDED, Phase
+from workers.versions.status import PsfStatus
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 AnyRow = TypeVar(
@@ -104,6 +111,51 @@ class Catalogue:
         with self._database.reading() as session:
             return session.get(table, (owner, identity))
 
+    def delete_draft(self, psf_id: str, owner: str) -> PsfRow:
+        """Delete a draft PSF that nothing uses; returns the deleted row.
+
+        Its bytes no longer count for the owner, and a later identical request makes it again. Its files stay in the store.
+        Raises ``DataError`` "no-such-psf", "not-a-draft" or "psf-in-use", and then deletes nothing.
+        """
+        with self._database.writing.begin() as session:
+            add_bytes(session, owner, 0)  # locks the owner first, as `hold_to_quota` does: no deadlock
+            row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
+            if row is None:
+                raise DataError(
+                    "no-such-psf",
+                    f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
+                )
+            if row.status != PsfStatus.DRAFT:
+                raise DataError(
+                    "not-a-draft",
+                    f"expected a draft; PSF {psf_id} is {row.status}, and such PSFs are never deleted: deprecate it instead",
+                )
+            user = _user_of(session, row)
+            if user is not None:
+                raise DataError(
+                    "psf-in-use",
+                    f"expected a PSF that nothing uses; {user} uses PSF {psf_id}: it can only be deleted without this",
+                )
+            session.delete(row)
+            add_bytes(session, owner, -row.bytes)
+            _unshare_jobs(session, owner, psf_id)
+            return row
+
+    def delete_product(self, identity: str, owner: str) -> bool:
+        """Remove a product from the catalogue; returns whether it was there.
+
+        Its bytes no longer count for the owner, and a later identical request makes it again. Its files stay in the store.
+        """
+        with self._database.writing.begin() as session:
+            add_bytes(session, owner, 0)  # locks the owner first, as `hold_to_quota` does: no deadlock
+            row = session.get(ProductRow, (owner, identity), with_for_update=True)
+            if row is None:
+                return False
+            session.delete(row)
+            add_bytes(session, owner, -row.bytes)
+            _unshare_jobs(session, owner, identity)
+            return True
+
     def page(
         self,
         table: type[AnyRow],
@@ -126,3 +178,46 @@ class Catalogue:
         query = query.order_by(table.created_at.desc(), table.id.desc()).limit(limit)
         with self._database.reading() as session:
             return session.scalars(query).all()
+
+
+def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
+    """Give the completed jobs with this result other keys, because their result is deleted.
+
+    An identical request then gets a new job, instead of a job whose result is gone.
+    """
+    done = select(JobRow).where(
+        JobRow.owner == owner, JobRow.phase == Phase.COMPLETED, JobRow.result_id == result_id
+    )
+    for job in session.scalars(done):
+        job.request_key = canonical_hash({"request_key": job.request_key, "deleted": job.id})
+
+
+def _user_of(session: Session, psf: PsfRow) -> str | None:
+    """A thing that uses a PSF, as words for a message; None if nothing uses it."""
+    found: str | None
+    owner = psf.owner
+    products = select(ProductRow.id).where(ProductRow.owner == owner, ProductRow.psf_id == psf.id)
+    pins = select(PsfPinRow.context_id).where(PsfPinRow.owner == owner, PsfPinRow.psf_id == psf.id)
+    runs = select(BulkRow.id).where(
+        BulkRow.owner == owner, BulkRow.psf_id == psf.id, BulkRow.phase.in_(sorted(OPEN))
+    )
+    jobs = select(JobRow.id).where(
+        JobRow.owner == owner,
+        JobRow.phase.not_in(sorted(ENDED)),
+        cast(JobRow.parameters, String).contains(psf.id),
+    )
+    # The details of a fitted or corrected PSF name the PSFs from which it was made.
+    psfs = select(PsfRow.id).where(
+        PsfRow.owner == owner, PsfRow.id != psf.id, cast(PsfRow.details, String).contains(psf.id)
+    )
+    for what, query in (
+        ("product", products),
+        ("context", pins),
+        ("bulk run", runs),
+        ("job", jobs),
+        ("PSF", psfs),
+    ):
+        found = session.scalars(query.limit(1)).first()
+        if found is not None:
+            return f"{what} {found}"
+    return None

@@ -10,10 +10,11 @@ import math
 import re
 from collections.abc import Iterator
 
-from sqlalchemy import JSON, String, Table, cast, select
+from sqlalchemy import JSON, String, Table, cast, literal, or_, select
 
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.database import Database
+from workers.catalogue.owners import COUNTED
 from workers.catalogue.tables import Base, SolutionRow
 
 BATCH = 1000
@@ -36,6 +37,23 @@ class NamedFiles:
         for table in Base.metadata.sorted_tables:
             if table.name not in _SKIPPED:
                 yield from self._in(table, solutions_from)
+
+    def among(self, digests: frozenset[str]) -> frozenset[str]:
+        """Those of a few hashes that a row with files names: an upload, a PSF, a product, a report or a solution.
+
+        Jobs and bulk runs are not searched: they name things by their ids, and such a thing has a row while it exists.
+        """
+        named: set[str] = set()
+        with self._database.reading() as session:
+            for table in (row.__table__ for row in COUNTED):
+                texts = [cast(one, String) for one in table.columns if isinstance(one.type, String | JSON)]
+                for digest in digests - named:
+                    contains = or_(*(text.contains(digest) for text in texts))
+                    if session.execute(
+                        select(literal(1)).select_from(table).where(contains).limit(1)
+                    ).first():
+                        named.add(digest)
+        return frozenset(named)
 
     def _in(self, table: Table, solutions_from: float) -> Iterator[str]:
         texts = [cast(one, String) for one in table.columns if isinstance(one.type, String | JSON)]

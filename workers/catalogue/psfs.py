@@ -134,7 +134,7 @@ class Psfs:
             row = _found(session, psf_id, owner)
             series = _series(row, asked)
             self._lock(session, series, owner)
-            session.refresh(row, with_for_update=True)
+            row = _found(session, psf_id, owner, lock=True)  # it may have been deleted meanwhile
             if _series(row, asked) != series:
                 raise DataError(
                     "changed-meanwhile",
@@ -223,8 +223,8 @@ def _released(series: str, owner: str) -> Select[Any]:
     return select(PsfRow.version).where(PsfRow.owner == owner, PsfRow.series == series, released)
 
 
-def _found(session: Session, psf_id: str, owner: str) -> PsfRow:
-    row = session.get(PsfRow, (owner, psf_id))
+def _found(session: Session, psf_id: str, owner: str, *, lock: bool = False) -> PsfRow:
+    row = session.get(PsfRow, (owner, psf_id), populate_existing=lock, with_for_update=lock or None)
     if row is None:
         raise DataError(
             "no-such-psf",

@@ -62,7 +62,10 @@ PRODUCT_FORMAT = 2
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, versions of algorithm and file."""
     # The id of the PSF determines the PSF. The recipe only says how to build the PSF, and the context where it was found.
-    excluded = {"psf_recipe", "context_id"} | ({"picked_for"} if request.picked_for is None else set())
+    # `again` only allows the deconvolution; the header of the image determines whether it is a second one.
+    excluded = {"psf_recipe", "context_id", "again"} | (
+        {"picked_for"} if request.picked_for is None else set()
+    )
     if not request.other_channel:
         excluded.add("other_channel")
     hashed = request.model_dump(mode="json", exclude=excluded)

@@ -98,6 +98,9 @@ class Treatment(Parameters):
         description="number of noise realisations for an ERROR plane: 0, or 2 or more; each realisation takes as long as one deconvolution",
     )
     other_channel: OtherChannel = False
+    again: bool = Field(
+        False, description="also deconvolve a file whose header says that it is a product or a PSF"
+    )
 
     @model_validator(mode="after")
     def _a_spread(self) -> Treatment:

@@ -26,6 +26,7 @@ class ResolvedDeconvolve(Parameters):
     error_draws: int = 0
     changes_picture: bool = False
     other_channel: bool = False
+    again: bool = False
 
 
 class ResolvedPsfFit(PsfFit):

@@ -9,6 +9,7 @@ Kept solutions of transits can be made again. Those that were made before the sa
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from psfcore.errors import DataError
@@ -78,6 +79,15 @@ def collect(
         catalogue.owners.forget_solutions(solutions)
         old = _removed(old, catalogue, store, kept_before, second_look_after_s)
     return Collected(len(there), sum(blob.bytes for blob in there.values()), tuple(old))
+
+
+def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -> None:
+    """Remove these files now, except those that a row with files of any owner names."""
+    wanted = frozenset(digests)
+    before = time.time()
+    for digest in wanted - catalogue.named_files.among(wanted):
+        store.remove(digest, before)
+    store.settle(catalogue.named_files.all())
 
 
 def _removed(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from psfcore.errors import DataError
+from psfcore.fits.header import IMAGE, check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import parse_instrument
@@ -46,8 +47,8 @@ def resolve(
 
     added_effects: modules with effects that the operator adds to the library of a gap diagnosis. Raises
     ``DataError`` "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument",
-    "no-noise-figures", "no-known-psf", "unknown-instrument" or "bad-instrument-file", and the errors of
-    ``workers.intake.psf_choice`` and ``workers.lineage.made_by``.
+    "no-noise-figures", "no-known-psf", "unknown-instrument", "bad-instrument-file", "already-deconvolved" or
+    "psf-as-image", and the errors of ``workers.intake.psf_choice`` and ``workers.lineage.made_by``.
     """
     kind = KINDS[request.kind]
     resolver = load(kind.resolver)
@@ -131,6 +132,9 @@ def resolved_deconvolution(
     wanted: Deconvolve, header: dict[str, Any], catalogue: Catalogue, owner: str
 ) -> ResolvedDeconvolve:
     """The resolved deconvolution of an image with this header, with its PSF. Raises the same ``DataError`` as ``resolve``."""
+    # The summaries of images that were uploaded by earlier versions lack "content"; the worker checks the header itself.
+    if not wanted.again:
+        check_not_deconvolved(header.get("content", IMAGE))
     return ResolvedDeconvolve(
         **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
     )

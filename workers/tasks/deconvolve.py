@@ -18,6 +18,7 @@ from psfcore.deconvolve.result import Deconvolved
 from psfcore.errors import DataError
 from psfcore.fits.channel import check_channel
 from psfcore.fits.gain import noise_for
+from psfcore.fits.header import check_not_deconvolved, content_of
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image
@@ -41,8 +42,8 @@ _CONDITIONS = {"name", "edges", "margin_px"}
 def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
     """Deconvolve an uploaded image and add the product to the catalogue; returns the product's id.
 
-    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "channel-mismatch", "no-noise-figures", and the
-    errors of reading the image and of the method.
+    Raises DataError "no-such-image", "no-such-psf", "instrument-changed", "channel-mismatch", "no-noise-figures",
+    "already-deconvolved", "psf-as-image", and the errors of reading the image and of the method.
     """
     request = ResolvedDeconvolve.model_validate(parameters)
     identity = product_identity(request)
@@ -72,7 +73,11 @@ def _load_upload(context: Context, request: ResolvedDeconvolve) -> Image:
 def load(context: Context, request: ResolvedDeconvolve, path: Path) -> Image:
     """Read an image file and mask its saturated pixels."""
     context.report("reading", 0, request.method.steps)
-    return read_observation(path, context.limits, saturation_dn=request.saturation_dn)
+    image = read_observation(path, context.limits, saturation_dn=request.saturation_dn)
+    # A rerun repeats what was allowed once, also by versions that did not check this.
+    if not (request.again or context.anew):
+        check_not_deconvolved(content_of(image.header))
+    return image
 
 
 @lru_cache(maxsize=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -22,11 +23,13 @@ from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
+from workers.files.collection import remove_unnamed
 from workers.intake.uploads import uploaded_psf_row
 from workers.versions.series import WORD
 from workers.versions.status import PsfStatus
 from workers.versions.validity import iso
 
+log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
 
@@ -117,11 +120,12 @@ async def upload_psf(
 ) -> PsfView:
     """Upload a PSF: one 2-D image with its centre at [n//2, n//2] and a sum of at most 1.
 
-    The header is checked at upload. The pixels are checked by the jobs that use the PSF.
+    Header and weights are checked at upload; compressed weights are checked by the jobs that use the PSF. Nothing is kept of a
+    file that is refused.
     """
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
-    async with uploads.receive(request, state.store, state.limits, limit, take) as upload:
+    async with uploads.receive_psf(request, state.store, state.limits, limit, take) as upload:
         await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
     row = uploaded_psf_row(
         caller.owner,
@@ -164,6 +168,23 @@ def list_psfs(
 def get_psf(psf_id: Identity, caller: Reading, state: Shared) -> PsfView:
     """A PSF's metadata, with links to its files."""
     return PsfView.of(_find(state, caller, psf_id))
+
+
+@router.delete("/{psf_id}", summary="Delete a draft PSF that nothing uses")
+def delete_psf(psf_id: Identity, caller: Submitting, state: Shared) -> PsfView:
+    """Delete a draft with its files, and return its last description.
+
+    The answer is 409 if the PSF is certified or deprecated, or if a product, a job that has not ended, an open bulk run, a context
+    or another PSF uses it.
+    """
+    try:
+        row = state.catalogue.delete_draft(psf_id, caller.owner)
+    except DataError as error:
+        raise problem(error) from error
+    named = (row.file_sha256, row.preview_sha256, row.details.get("tables_sha256"))
+    remove_unnamed(state.catalogue, state.store, [digest for digest in named if digest is not None])
+    log.info("PSF %s: deleted by %s", psf_id, caller.name)
+    return PsfView.of(row)
 
 
 @router.get("/{psf_id}/file", summary="The PSF as FITS", response_class=Response)

@@ -18,9 +18,9 @@ from service.cli.options import (
     PLOT,
     SATURATION,
     SEED,
-    check_writable,
     progress_bar,
     user_errors,
+    writes_files,
 )
 
 SHOWN = 6
@@ -67,6 +67,7 @@ def gap() -> None:
 @SATURATION
 @SERVER
 @LOCAL
+@writes_files
 def diagnose(
     transit: Path,
     output: Path | None,
@@ -80,12 +81,12 @@ def diagnose(
     saturation_dn: float | None,
     server: str | None,
     local: bool,
+    overwrite: bool,
 ) -> None:
     """Diagnose the gap between TRANSIT and the model fitted to it: which effect explains the residuals.
 
     TRANSIT is a folder with a transit.json, or a .zip or .tar file of such a folder.
     """
-    check_writable(output, json_file, plot, corrected_file)
     if effects is not None and not local:
         raise click.UsageError(
             "--effects: expected --local with it; a service tests the effects in HELIOPSF_GAP_EFFECTS"
@@ -109,11 +110,12 @@ def diagnose(
             seed=seed,
             # A service always makes the corrected PSF and keeps it, so that later requests find it.
             correct=corrected_file is not None or not local,
+            overwrite=overwrite,
         )
         report = json.loads(numbers.read_text("utf-8"))
         corrected = found["details"]["corrected_psf_id"]
         if corrected_file is not None and corrected is not None:
-            service.download(f"/v1/psfs/{corrected}/file", corrected_file)
+            service.download(f"/v1/psfs/{corrected}/file", corrected_file, overwrite=overwrite)
     click.echo("\n".join(_lines(report)))
     if corrected_file is not None and corrected is None:
         raise click.ClickException(

@@ -23,6 +23,7 @@ SECTIONS = {
         "upload": Lazy("service.cli.psf.versions", "upload_psf", "Upload a PSF."),
         "certify": Lazy("service.cli.psf.versions", "certify", "Certify a PSF for a range of times."),
         "deprecate": Lazy("service.cli.psf.versions", "deprecate", "Withdraw a certified PSF."),
+        "delete": Lazy("service.cli.psf.versions", "delete_psf", "Delete a draft that nothing uses."),
         "best": Lazy("service.cli.psf.versions", "best", "Find the PSF for an image."),
         "lineage": Lazy("service.cli.psf.versions", "lineage", "Show what a PSF or product was made from."),
         "rerun": Lazy("service.cli.psf.versions", "rerun", "Make a PSF or product again and compare."),

@@ -18,11 +18,12 @@ from service.cli.options import (
     OUTPUT,
     PLOT,
     SATURATION,
-    check_writable,
     limits,
     progress_bar,
     user_errors,
+    writes_files,
 )
+from service.client.outputs import written
 from workers.contract.requests import Component, ShapeName
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 11.5, 20, 50, 100, 200, 500, 1000)
@@ -48,6 +49,7 @@ SHAPE = click.option(
 @PLOT
 @SERVER
 @LOCAL
+@writes_files
 def build(
     instrument: str,
     size: int,
@@ -56,9 +58,9 @@ def build(
     plot: Path | None,
     server: str | None,
     local: bool,
+    overwrite: bool,
 ) -> None:
     """Compute the PSF of an instrument."""
-    check_writable(output, plot)
     with (
         user_errors(),
         _mask_of(instrument) as mask,
@@ -66,7 +68,14 @@ def build(
         progress_bar() as report,
     ):
         built = service.build_psf(
-            instrument, output, size=size, component=component, mask=mask, preview=plot, progress=report
+            instrument,
+            output,
+            size=size,
+            component=component,
+            mask=mask,
+            preview=plot,
+            progress=report,
+            overwrite=overwrite,
         )
     click.echo(f"{output}: {built['name']} {built['version']} ({built['status']})")
     for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
@@ -86,6 +95,7 @@ def build(
 @SATURATION
 @SERVER
 @LOCAL
+@writes_files
 def fit(
     transit: Path,
     output: Path,
@@ -97,9 +107,9 @@ def fit(
     saturation_dn: float | None,
     server: str | None,
     local: bool,
+    overwrite: bool,
 ) -> None:
     """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of such a folder."""
-    check_writable(output, json_file, plot)
     with user_errors(), connection(server, local) as service, progress_bar() as say:
         fitted = service.fit_psf(
             transit,
@@ -111,6 +121,7 @@ def fit(
             shape=shape,
             as_published=as_published,
             saturation_dn=saturation_dn,
+            overwrite=overwrite,
         )
     found = fitted["details"]["fit"]
     click.echo(f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']})")
@@ -144,6 +155,7 @@ def fit(
 @NOISE
 @SERVER
 @LOCAL
+@writes_files
 def crossval(
     transit: Path,
     json_file: Path,
@@ -154,9 +166,9 @@ def crossval(
     noise: tuple[float, float] | None,
     server: str | None,
     local: bool,
+    overwrite: bool,
 ) -> None:
     """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many runs."""
-    check_writable(json_file, plot)
     with user_errors(), connection(server, local) as service, progress_bar() as report:
         found = service.cross_validate(
             transit,
@@ -167,6 +179,7 @@ def crossval(
             scheme=scheme,
             runs=runs,
             shape=shape,
+            overwrite=overwrite,
         )
     click.echo(f"{json_file}: {found['details']['sentence']}")
 
@@ -174,20 +187,21 @@ def crossval(
 @click.command("show")
 @click.argument("file", type=FILE)
 @PLOT
-def show(file: Path, plot: Path | None) -> None:
+@writes_files
+def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     """Show what the PSF in FILE (FITS) contains: its size, its sum, and the light beyond some radii."""
     import numpy as np
 
     from psfcore.fits.psfs import read_psf
     from psfcore.psf import cumulative_curve
 
-    check_writable(plot)
     with user_errors():
         psf = read_psf(file, limits())
         if plot is not None:
             from psfcore.drawing.plots import psf_png
 
-            psf_png(psf, plot)
+            with written(plot, overwrite=overwrite) as picture:
+                psf_png(psf, picture)
     radii = np.array([r for r in SHOWN_RADII_PX if r < psf.reach_px])
     kernels = {"TOTAL": psf.kernel, **psf.components}
     curves = {name: cumulative_curve(kernel, radii) for name, kernel in kernels.items()}

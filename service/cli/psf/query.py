@@ -15,7 +15,8 @@ import click
 
 from psfcore.tables import lookup
 from service.cli.connection import remote, server_option
-from service.cli.options import JSON, OUTPUT, check_writable, is_psf_id, limits, user_errors, write_json
+from service.cli.options import JSON, OUTPUT, is_psf_id, limits, user_errors, write_json, writes_files
+from service.client.outputs import written
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
@@ -38,6 +39,7 @@ SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 )
 @JSON
 @SERVER
+@writes_files
 def query(
     psf: str,
     radii: tuple[float, ...],
@@ -46,9 +48,9 @@ def query(
     compare: str | None,
     json_file: Path | None,
     server: str | None,
+    overwrite: bool,
 ) -> None:
     """Show the light of a PSF beyond radii or in an annulus, and the difference from another PSF."""
-    check_writable(json_file)
     answers: dict[str, Any] = {}
     with user_errors(), _asking(server, psf, compare) as ask:
         if radii or not (annulus or profile or compare):
@@ -64,7 +66,7 @@ def query(
     for name, lines in _LINES.items():
         if name in answers:
             click.echo("\n".join(lines(answers[name])))
-    write_json(json_file, answers)
+    write_json(json_file, answers, overwrite=overwrite)
 
 
 @click.command("cutout")
@@ -74,17 +76,17 @@ def query(
 )
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the part (FITS)")
 @SERVER
-def cutout(psf: str, size: int, output: Path, server: str | None) -> None:
+@writes_files
+def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: bool) -> None:
     """Write the central part of a PSF, not renormalised. If the PSF is a file, the components are written too."""
     from psfcore.central_part import central_part
 
-    check_writable(output)
     with user_errors():
         if _is_id(psf):
             with remote(server) as service:
-                service.psf_cutout(psf, size, output)
+                service.psf_cutout(psf, size, output, overwrite=overwrite)
         else:
-            _write(output, central_part(_read(psf), size))
+            _write(output, central_part(_read(psf), size), overwrite)
     click.echo(f"{output}: central {size} x {size} px")
 
 
@@ -93,11 +95,11 @@ def cutout(psf: str, size: int, output: Path, server: str | None) -> None:
 @click.option("--factor", required=True, type=click.IntRange(2), help="Pixels per binned pixel, on each axis")
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the binned PSF (FITS)")
 @SERVER
-def rebin(psf: str, factor: int, output: Path, server: str | None) -> None:
+@writes_files
+def rebin(psf: str, factor: int, output: Path, server: str | None, overwrite: bool) -> None:
     """Write the PSF for images that are binned by FACTOR x FACTOR pixels."""
     from psfcore.psf_sampling import rebinned
 
-    check_writable(output)
     with user_errors(), TemporaryDirectory(prefix="heliopsf-") as folder:
         file = psf
         if _is_id(psf):
@@ -105,7 +107,7 @@ def rebin(psf: str, factor: int, output: Path, server: str | None) -> None:
             with remote(server) as service:
                 service.download(f"/v1/psfs/{psf}/file", file)
         binned = rebinned(_read(file), factor)
-        _write(output, binned)
+        _write(output, binned, overwrite)
     ny, nx = binned.kernel.shape
     click.echo(f"{output}: {binned.name} {binned.version}, {nx} x {ny} px of {factor} x {factor}")
 
@@ -159,11 +161,12 @@ def _read(file: str) -> Psf:
     return read_psf(file, limits())
 
 
-def _write(output: Path, psf: Psf) -> None:
+def _write(output: Path, psf: Psf, overwrite: bool) -> None:
     from psfcore.fits.psfs import write_psf
 
     text = psf.provenance.get("instrument_toml")
-    write_psf(output, psf, instrument_file=None if text is None else text.encode())
+    with written(output, overwrite=overwrite) as partial:
+        write_psf(partial, psf, instrument_file=None if text is None else text.encode())
 
 
 def _curve_lines(answer: dict[str, Any]) -> list[str]:

@@ -1,17 +1,20 @@
-"""Commands about PSF versions: ``psf list``, ``upload``, ``certify``, ``deprecate``, ``best``, ``lineage``, ``rerun``."""
+"""Commands about PSF versions: ``psf list``, ``upload``, ``certify``, ``deprecate``, ``delete``, ``best``, ``lineage``, ``rerun``."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from service.cli.connection import SERVER, remote
-from service.cli.options import FILE, JSON, check_writable, progress_bar, user_errors, write_json
+from service.cli.options import FILE, JSON, is_psf_id, progress_bar, user_errors, write_json, writes_files
 from workers.versions.status import PsfStatus
+
+if TYPE_CHECKING:
+    from service.client.http import Client
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 REASON = click.option("--reason", default="", help="Reason, kept in the history")
@@ -129,14 +132,29 @@ def deprecate(psf_id: str, successor: str | None, reason: str, server: str | Non
     click.echo(f"products made with it: {count}")
 
 
+@click.command("delete")
+@click.argument("psf_id", metavar="PSF_ID")
+@SERVER
+def delete_psf(psf_id: str, server: str | None) -> None:
+    """Delete a draft with its files. The id may be shortened to its first digits, if no other PSF begins with them.
+
+    A PSF that a product, a job that has not ended, an open bulk run, a context or another PSF uses is not deleted.
+    """
+    with user_errors(), remote(server) as service:
+        row = service.delete_psf(_whole_id(service, psf_id))
+    click.echo(f"deleted {row['id']}  {row['name']}  {row['version']}")
+
+
 @click.command("best")
 @click.option("--image", type=FILE, help="Image (FITS) that the PSF is for")
 @_filter_options
 @JSON
 @SERVER
-def best(image: Path | None, json_file: Path | None, server: str | None, **filters: str | None) -> None:
+@writes_files
+def best(
+    image: Path | None, json_file: Path | None, server: str | None, overwrite: bool, **filters: str | None
+) -> None:
     """Find the PSF that fits an image, or the PSF that has the given properties."""
-    check_writable(json_file)
     given = _given(filters)
     if image is not None and set(given) - {"context", "kind"}:
         raise click.UsageError(
@@ -149,7 +167,7 @@ def best(image: Path | None, json_file: Path | None, server: str | None, **filte
             found = service.psf_for_image(service.upload_image(image)["id"], **given)
     psf = found["psf"]
     click.echo(f"{psf['id']}  {psf['name']}  {psf['version']}  {psf['status']}{_validity(psf)}")
-    write_json(json_file, found)
+    write_json(json_file, found, overwrite=overwrite)
 
 
 @click.command("lineage")
@@ -157,14 +175,16 @@ def best(image: Path | None, json_file: Path | None, server: str | None, **filte
 @PRODUCT
 @JSON
 @SERVER
-def lineage(identity: str, product: bool, json_file: Path | None, server: str | None) -> None:
+@writes_files
+def lineage(
+    identity: str, product: bool, json_file: Path | None, server: str | None, overwrite: bool
+) -> None:
     """Show the things from which a PSF or a product was made, back to the uploads."""
-    check_writable(json_file)
     with user_errors(), remote(server) as service:
         told = service.lineage("product" if product else "psf", identity)
     for line in _tree(told, 0):
         click.echo(line)
-    write_json(json_file, told)
+    write_json(json_file, told, overwrite=overwrite)
 
 
 @click.command("rerun")
@@ -172,18 +192,31 @@ def lineage(identity: str, product: bool, json_file: Path | None, server: str | 
 @PRODUCT
 @JSON
 @SERVER
-def rerun(identity: str, product: bool, json_file: Path | None, server: str | None) -> None:
+@writes_files
+def rerun(identity: str, product: bool, json_file: Path | None, server: str | None, overwrite: bool) -> None:
     """Make a PSF or a product again and compare both results. If they differ, the exit status is 1."""
-    check_writable(json_file)
     with user_errors(), remote(server) as service, progress_bar() as report:
         found = service.rerun("product" if product else "psf", identity, progress=report)
         if json_file is not None:
-            service.download(found["file"], json_file)
+            service.download(found["file"], json_file, overwrite=overwrite)
     click.echo(found["details"]["sentence"])
     sys.exit(0 if found["details"]["same"] else 1)
 
 
-COMMANDS = (list_psfs, upload_psf, certify, deprecate, best, lineage, rerun)
+COMMANDS = (list_psfs, upload_psf, certify, deprecate, delete_psf, best, lineage, rerun)
+
+
+def _whole_id(service: Client, psf_id: str) -> str:
+    """The id of the one PSF whose id begins with these digits. Raises ``ClickException``."""
+    if is_psf_id(psf_id):
+        return psf_id
+    ids = [row["id"] for row in service.psfs() if psf_id and row["id"].startswith(psf_id)]
+    if len(ids) == 1:
+        return str(ids[0])
+    found = ", ".join(ids) or "none"
+    raise click.ClickException(
+        f"expected the id of a PSF, or the first digits of one id; PSFs whose id begins with {psf_id!r}: {found}"
+    )
 
 
 def _given(filters: dict[str, str | None]) -> dict[str, str]:

@@ -121,7 +121,7 @@ def test_it_agrees_with_deconvolve_on_a_certified_psf_and_in_a_context(
     client.create_context("first")
     client.certify_psf(ids[1], "1.1.0", supersedes=[ids[0]])
     for n, (chosen, context) in enumerate(((ids[1], ()), (ids[0], ("--context", "first")))):
-        one = run("deconvolve", image, "-o", tmp_path / "d.fits", "--steps", 4, *context)
+        one = run("deconvolve", image, "-o", tmp_path / "d.fits", "--steps", 4, "--overwrite", *context)
         many = run("changes", image, "-o", tmp_path / f"out{n}", "--steps", 4, *context)
         assert one.exit_code == many.exit_code == 0, one.output + many.output
         product = client.product(fits.getheader(tmp_path / "d.fits")["PRODID"])

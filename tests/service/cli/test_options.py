@@ -69,7 +69,7 @@ def test_a_folder_to_fill_is_taken_where_it_is_empty_or_forced(tmp_path: Path) -
     (tmp_path / "full" / "file").touch()
     with pytest.raises(click.ClickException, match="not empty"):
         cli_options.check_fresh_folder(tmp_path / "full")
-    cli_options.check_fresh_folder(tmp_path / "full", force=True)
+    cli_options.check_fresh_folder(tmp_path / "full", overwrite=True)
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_a_folder_in_use_is_left_alone(made: Path, diffraction: Path, tmp_path: 
     refused = run(*again)
     assert refused.exit_code == 1 and "not empty" in refused.output
     assert (used / "truth.json").read_bytes() == before
-    forced = run(*again, "--force")
+    forced = run(*again, "--overwrite")
     assert forced.exit_code == 0, forced.output
     assert (used / "truth.json").read_bytes() != before
 

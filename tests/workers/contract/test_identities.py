@@ -46,6 +46,7 @@ def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: py
     assert base == identity(method={"name": "richardson-lucy", "steps": 20})
     recipe = {"instrument": "hri_euv"}
     assert base == identity(psf_recipe=recipe), "how a PSF would be made is in its id"
+    assert base == identity(again=True), "this only allows the deconvolution"
     others = {
         identity(image_id=B),
         identity(psf_id=A),
@@ -87,8 +88,8 @@ def _gap(**parameters: Any) -> str:
 
 
 # Computed by commit c86f564, whose catalogues must stay valid: the id of a result that exists must not change. The ids of
-# gap diagnoses are newer: they contain the hash of the library of effects. Those of
-# products changed with product format 2, because the content of the files changed.
+# gap diagnoses are newer: they contain the hash of the library of effects. Those of products changed with product format 2,
+# because the content of the files changed.
 FROZEN: list[tuple[Callable[[], str], str]] = [
     (lambda: _product(), "17e6708fd0c2995c30a4e6de81cd687afb784b7708d2f01654d665d314696cc1"),
     (

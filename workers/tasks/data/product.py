@@ -19,11 +19,14 @@ from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
 from psfcore.drawing.units import unit_label
+from psfcore.fits.header import optional_text
 from psfcore.fits.images import write_image
+from psfcore.fits.product_cards import described
 from psfcore.image import Image, MaskBit
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.identities import product_identity
 from workers.contract.resolved import ResolvedDeconvolve
+from workers.files.archive import safe_name
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
 
@@ -73,14 +76,26 @@ def write(made: Made, path: Path) -> None:
         planes["ERROR"] = errors.error
         if errors.psf_error is not None:
             planes["PSF_ERROR"] = errors.psf_error
+    own = described(
+        inputs.image.header,
+        filename=filename_of(inputs),
+        creator=f"heliopsf {software_version()}",
+        sha256=inputs.request.image_id,
+    )
     write_image(
         path,
-        dataclasses.replace(inputs.image, pixels=result.pixels),
-        cards=_cards(inputs, made.identity, result, errors),
-        history=_history(inputs, result, made.warnings),
+        dataclasses.replace(inputs.image, pixels=result.pixels, header=own.header),
+        cards=own.cards | _cards(inputs, made.identity, result, errors),
+        history=_history(inputs, result, made.warnings) + own.history,
         planes=planes,
         plane_bits={"QUALITY": MEANINGS},
     )
+
+
+def filename_of(inputs: Inputs) -> str:
+    """The name in the product's header: it depends only on the content of the input and on the request."""
+    name = optional_text(inputs.image.header, "FILENAME") or "heliopsf"
+    return safe_name(name, product_identity(inputs.request))
 
 
 def keep(made: Made, path: Path) -> ProductRow:
@@ -188,6 +203,7 @@ def details_of(
     low, high = np.percentile(before, [1, 99])
     dark, bright = before <= low, before >= high
     details = {
+        "filename": filename_of(inputs),
         "method": inputs.request.method.model_dump(mode="json"),
         "algorithm_version": inputs.request.method.algorithm_version,
         "software_version": software_version(),

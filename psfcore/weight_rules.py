@@ -1,0 +1,37 @@
+"""What the weights of a PSF must fulfil, as conditions on a few numbers. No numerical library is needed.
+
+The sum is that of the central 2048 x 2048 px (the reach), or of the whole array if it is smaller.
+"""
+
+from __future__ import annotations
+
+import math
+
+from psfcore.errors import DataError
+
+REACH_GRID_PX = 2048
+LARGEST_SUM = 1 + 1e-3
+SMALLEST_SUM = 0.05
+CENTRE_TOLERANCE = 1e-3  # share of the largest weight: pixels that share the peak may differ by rounding
+
+
+def check_weights(smallest: float, largest: float, total: float) -> None:
+    """Raise DataError "psf-negative" or "psf-sum" unless the weights are at least 0 and their sum is in the allowed range."""
+    if smallest < -1e-12 * max(largest, 0.0):
+        raise DataError("psf-negative", f"expected weights >= 0; the smallest is {smallest:.3g}")
+    if not SMALLEST_SUM < total <= LARGEST_SUM:
+        wanted = f"weights that sum to 1 over the full reach, or to less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
+        raise DataError(
+            "psf-sum", f"expected {wanted}; got {total:.6g}. Divide the weights by their sum first"
+        )
+
+
+def check_finite(total: float) -> None:
+    """Raise DataError "psf-nonfinite" if a sum of weights is not finite."""
+    if not math.isfinite(total):
+        raise DataError("psf-nonfinite", "expected finite weights; got weights that are NaN or infinite")
+
+
+def is_peak(centre: float, largest: float) -> bool:
+    """Whether the weight of the central pixel is the largest weight. Otherwise every deconvolved image would be shifted."""
+    return centre >= largest * (1 - CENTRE_TOLERANCE)

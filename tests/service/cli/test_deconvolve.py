@@ -1,0 +1,115 @@
+"""``heliopsf deconvolve`` with many images, and the exit status of commands that wait for many images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner, Result
+
+from service.cli import bulk as cli_bulk
+from service.cli.main import main
+from tests.conftest import write_image, write_psf
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "in").mkdir()
+    for seed in range(2):
+        write_image(tmp_path / "in" / f"{seed}.fits", seed=seed)
+    write_psf(tmp_path / "psf.dat")
+    return tmp_path
+
+
+def options(folder: Path) -> tuple[object, ...]:
+    return "--psf", folder / "psf.dat", "--steps", 1, "--local"
+
+
+@pytest.mark.parametrize("given", ["files", "folder", "one"])
+def test_images_go_into_a_folder(folder: Path, given: str) -> None:
+    images = {
+        "files": [folder / "in" / "0.fits", folder / "in" / "1.fits"],
+        "folder": [folder / "in"],
+        "one": [folder / "in" / "0.fits"],
+    }[given]
+    done = run("deconvolve", *images, "-o", f"{folder}/out/", *options(folder))
+    assert done.exit_code == 0, done.output
+    count = 1 if given == "one" else 2
+    assert f"{count} images: {count} deconvolved, 0 existed already, 0 failed" in done.output
+    made = sorted((folder / "out").iterdir())
+    assert [path.name.split("-")[0] for path in made] == ["0", "1"][:count]
+    again = run("deconvolve", *images, "-o", folder / "out", *options(folder))
+    assert again.exit_code == 0 and f"0 deconvolved, {count} existed already" in again.output
+
+
+def test_one_image_goes_into_a_file(folder: Path) -> None:
+    done = run("deconvolve", folder / "in" / "0.fits", "-o", folder / "new.fits", *options(folder))
+    assert done.exit_code == 0 and "new.fits: PSF" in done.output, done.output
+    assert fits.getheader(folder / "new.fits")["DCNVITER"] == 1
+
+
+def test_a_failure_is_named_and_ends_with_status_1(folder: Path) -> None:
+    (folder / "in" / "a.fits").write_text("Dear archive,\n" * 300)
+    done = run("deconvolve", folder / "in", "-o", folder / "out", *options(folder))
+    assert done.exit_code == 1, done.output
+    assert f"failed: {folder}/in/a.fits: expected a FITS file" in done.output
+    assert "3 images: 2 deconvolved, 0 existed already, 1 failed" in done.output
+    assert "1 of 3 images failed" in done.output
+    assert len(list((folder / "out").iterdir())) == 2
+
+
+def test_what_does_not_fit_together_is_refused(folder: Path) -> None:
+    images = (folder / "in" / "0.fits", folder / "in" / "1.fits")
+    plot = run("deconvolve", *images, "-o", folder / "out", "--plot", folder / "p.png", *options(folder))
+    assert plot.exit_code == 2 and "heliopsf changes" in plot.output
+    into_file = run("deconvolve", *images, "-o", folder / "psf.dat", *options(folder))
+    assert into_file.exit_code == 1 and "expected a folder; this is a file" in into_file.output
+    (folder / "empty").mkdir()
+    none = run("deconvolve", folder / "empty", "-o", folder / "out", *options(folder))
+    assert none.exit_code == 2 and "contain none" in none.output
+    gone = run("deconvolve", *images, folder / "gone.fits", "-o", folder / "out", *options(folder))
+    assert gone.exit_code == 2 and not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("phase", "failed", "status"), [("COMPLETED", 0, 0), ("COMPLETED", 1, 1), ("ERROR", 0, 1)]
+)
+def test_a_bulk_run_with_failures_ends_with_status_1(
+    monkeypatch: pytest.MonkeyPatch, phase: str, failed: int, status: int
+) -> None:
+    counts = {"total": 3, "done": 3 - failed, "failed": failed, "reused": 0, "at_work": 0, "waiting": 0}
+    bulk = {
+        "id": "b" * 32,
+        "phase": phase,
+        "images": counts | {"to_look_at": 0},
+        "images_an_hour": None,
+        "time_left_s": None,
+        "error": None,
+    }
+
+    class Ended:
+        def __enter__(self) -> Ended:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def bulk(self, bulk_id: str) -> dict[str, Any]:
+            return bulk
+
+        def submit_bulk(self, **_: Any) -> dict[str, Any]:
+            return bulk
+
+        def wait_for_bulk(self, bulk_id: str, **_: Any) -> dict[str, Any]:
+            return bulk
+
+    monkeypatch.setattr(cli_bulk, "remote", lambda server: Ended())
+    assert run("bulk", "status", "b" * 32, "--wait").exit_code == status
+    assert run("bulk", "submit", "/x/*.fits", "--psf", "a" * 64, "--wait").exit_code == status
+    assert run("bulk", "status", "b" * 32).exit_code == 0

@@ -1,0 +1,202 @@
+"""Every command that writes files: it refuses to replace an input, and replaces other files only if told."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner, Result
+
+from service import local
+from service.cli import options
+from service.cli.main import main
+from tests.conftest import write_image, write_psf
+from tests.service.cli.test_main import ALL
+from tests.transit_files import write_transit
+
+# These commands go on in the folder of an earlier run, which they recognise by its files.
+RESUMES = {("demo",), ("gap", "blind")}
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No command may start to work."""
+
+    def begun(**_given: Any) -> Any:
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr(local, "local_service", begun)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    write_image(tmp_path / "image.fits")
+    write_psf(tmp_path / "psf.fits")
+    write_transit(tmp_path / "transit")
+    (tmp_path / "soft.fits").symlink_to(tmp_path / "image.fits")
+    os.link(tmp_path / "image.fits", tmp_path / "hard.fits")
+    return tmp_path
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+DECONVOLVE = ("deconvolve", "image.fits", "--psf", "psf.fits", "--local")
+REPLACING = [
+    (*DECONVOLVE, "-o", "image.fits"),
+    (*DECONVOLVE, "-o", "soft.fits"),
+    (*DECONVOLVE, "-o", "hard.fits"),
+    (*DECONVOLVE, "-o", "psf.fits"),
+    (*DECONVOLVE, "-o", "new.fits", "--plot", "image.fits"),
+    (*DECONVOLVE, "-o", "new.fits", "--changes", "hard.fits"),
+    ("psf", "fit", "transit", "--local", "-o", "transit/transit.json"),
+    ("psf", "crossval", "transit", "--json", "transit/transit.json"),
+    ("report", "transit", "--local", "--json", "transit/transit.json"),
+    ("gap", "diagnose", "transit", "--local", "-o", "transit/transit.json"),
+    ("psf", "show", "psf.fits", "--plot", "psf.fits"),
+    ("psf", "query", "psf.fits", "--json", "psf.fits"),
+    ("psf", "cutout", "psf.fits", "--size", "9", "-o", "psf.fits"),
+    ("psf", "rebin", "psf.fits", "--factor", "2", "-o", "psf.fits"),
+    ("psf", "best", "--image", "image.fits", "--json", "soft.fits"),
+    ("arms", "image.fits", "--plot", "hard.fits"),
+    ("flare", "image.fits", "--background", "soft.fits", "--psf", "psf.fits", "--json", "psf.fits"),
+    ("changes", "changes/changes.json", "--psf", "psf.fits", "-o", "changes", "--local"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", REPLACING, ids=lambda command: "-".join(command[:2]))
+@pytest.mark.parametrize("overwrite", [(), ("--overwrite",)], ids=["", "overwrite"])
+@pytest.mark.usefixtures("idle")
+def test_an_input_is_never_replaced(
+    files: Path, command: tuple[str, ...], overwrite: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(files)
+    (files / "changes").mkdir()
+    shutil.copy(files / "image.fits", files / "changes" / "changes.json")
+    before = contents(files)
+    refused = run(*command, *overwrite)
+    assert refused.exit_code == 1 and "is the same file as the input" in refused.output, refused.output
+    assert contents(files) == before
+
+
+@pytest.mark.usefixtures("idle")
+def test_two_outputs_of_one_name_are_refused(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(files)
+    refused = run(*DECONVOLVE, "-o", "new.fits", "--plot", "./new.fits")
+    assert refused.exit_code == 1 and "the same file as the output" in refused.output
+
+
+WRITES = [
+    ("psf", "query", "psf.fits", "--json"),
+    ("psf", "cutout", "psf.fits", "--size", "9", "-o"),
+    ("psf", "rebin", "psf.fits", "--factor", "2", "-o"),
+    ("psf", "show", "psf.fits", "--plot"),
+    (*DECONVOLVE, "--steps", "1", "-o"),
+]
+
+
+@pytest.mark.parametrize("command", WRITES, ids=lambda command: "-".join(command[:2]))
+def test_an_existing_output_is_replaced_only_if_told(
+    files: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(files)
+    Path("old").write_text("old")
+    refused = run(*command, "old")
+    assert refused.exit_code == 1 and "old: the file exists" in refused.output, refused.output
+    assert Path("old").read_text() == "old"
+    replaced = run(*command, "old", "--overwrite")
+    assert replaced.exit_code == 0, replaced.output
+    assert not Path("old").read_bytes().startswith(b"old")
+    assert not [path for path in files.iterdir() if path.name.endswith(".part")]
+
+
+def test_work_that_fails_while_it_writes_leaves_the_old_file(
+    files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(files)
+    Path("old").write_text("old")
+
+    def half(_source: Path, target: Path) -> None:
+        Path(target).write_text("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfile", half)
+    failed = run(*DECONVOLVE, "--steps", "1", "-o", "old", "--overwrite")
+    assert failed.exit_code == 1 and "No space left" in failed.output
+    assert Path("old").read_text() == "old"
+    assert not [path for path in files.iterdir() if path.name.endswith(".part")]
+
+
+@pytest.mark.parametrize(
+    "output", ["nowhere/new.fits", "image.fits/new.fits", "/proc/new.fits"], ids=["none", "file", "refuses"]
+)
+@pytest.mark.usefixtures("idle")
+def test_an_output_that_cannot_be_written_is_noticed_before_the_work(
+    files: Path, output: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(files)
+    for option in (("-o", output), ("-o", "new.fits", "--plot", output)):
+        refused = run(*DECONVOLVE, *option)
+        assert refused.exit_code == 1, refused.output
+        assert f"cannot write {output}" in refused.output
+    assert not Path("new.fits").exists()
+
+
+def outputs(command: click.Command) -> Iterator[str]:
+    for parameter in command.params:
+        if isinstance(parameter.type, options.OutputFile):
+            yield str(parameter.name)
+        elif isinstance(parameter.type, options.OutputFolder) and parameter.name == "output":
+            yield "output"
+
+
+def test_every_command_that_writes_files_has_the_option() -> None:
+    writing = {path: list(outputs(command)) for path, command in ALL}
+    writing = {path: names for path, names in writing.items() if names and path not in RESUMES}
+    assert len(writing) > 15
+    for path, command in ALL:
+        has = any(parameter.name == "overwrite" for parameter in command.params)
+        assert has == (path in writing), path
+
+
+def test_a_demo_replaces_only_the_files_of_a_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.cli.demo.run", lambda image, output, report: ["done"])
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "psf.fits").write_text("mine")
+    refused = run("demo", "-o", own)
+    assert refused.exit_code == 1 and "not empty" in refused.output
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / "server.log").write_text("of an earlier demo")
+    for folder in (tmp_path / "demo", tmp_path / "new"):
+        assert run("demo", "-o", folder).exit_code == 0
+
+
+def test_a_blind_set_takes_no_folder_with_other_files(tmp_path: Path) -> None:
+    case = tmp_path / "cases" / "0001"
+    case.mkdir(parents=True)
+    (case / "thesis.txt").write_text("mine")
+    refused = run("gap", "blind", "--cases", "1", "--make-only", "--synthetic", "-o", tmp_path)
+    assert refused.exit_code == 1 and "contains other files" in refused.output, refused.output
+    assert (case / "thesis.txt").read_text() == "mine"
+
+
+def test_a_simulation_is_not_written_over_its_scene(tmp_path: Path) -> None:
+    write_image(tmp_path / "000.fits", shape=(128, 128))
+    before = fits.getdata(tmp_path / "000.fits")
+    refused = run(
+        "simulate", "transit", "-o", tmp_path, "--scene", tmp_path / "000.fits", "--size", "64", "--overwrite"
+    )
+    assert refused.exit_code == 1 and "it holds the input" in refused.output, refused.output
+    assert (fits.getdata(tmp_path / "000.fits") == before).all()

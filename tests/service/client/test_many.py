@@ -1,0 +1,203 @@
+"""Many images into a folder: what is done is skipped, what fails is told, and the run goes on."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from astropy.io import fits
+from fastapi.testclient import TestClient
+
+from service.client import many
+from service.client.errors import ServiceError
+from service.client.http import Client
+from service.client.many import Outcome, deconvolve_many
+from service.client.operations import Operations
+from service.local import local_service
+from tests.conftest import write_image, write_psf
+
+Run = Callable[..., list[Outcome]]
+
+
+class AtOnce(Client):
+    """A client of the application in this process. Its jobs run at once; it counts them and the uploads."""
+
+    def __init__(self, api: TestClient, run_jobs: Callable[[], None]) -> None:
+        super().__init__("http://testserver", transport=api._transport)
+        self.run_jobs, self.submitted, self.uploaded = run_jobs, 0, 0
+
+    def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
+        self.submitted += 1
+        job = super().submit(kind, queue=queue, **parameters)
+        self.run_jobs()
+        return job
+
+    def upload_image(self, path: str | Path) -> dict[str, Any]:
+        self.uploaded += 1
+        return super().upload_image(path)
+
+
+@pytest.fixture(params=["http", "local"])
+def service(request: pytest.FixtureRequest) -> Iterator[Operations]:
+    if request.param == "local":
+        with local_service() as here:
+            yield here
+        return
+    yield AtOnce(request.getfixturevalue("api"), request.getfixturevalue("run_jobs"))
+
+
+@pytest.fixture
+def run(service: Operations, tmp_path: Path) -> Run:
+    write_psf(tmp_path / "psf.fits")
+    psf_id = service.upload_psf(tmp_path / "psf.fits")["id"]
+
+    def run(*images: Path, **more: Any) -> list[Outcome]:
+        return list(
+            deconvolve_many(service, images, tmp_path / "out", **{"psf_id": psf_id, "steps": 1} | more)
+        )
+
+    return run
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> list[Path]:
+    """Two images of one name, and a copy of the first under another name."""
+    paths = [tmp_path / name for name in ("a/image.fits", "b/image.fits", "copy.fits")]
+    for seed, path in enumerate(paths[:2]):
+        path.parent.mkdir()
+        write_image(path, seed=seed)
+    shutil.copy(paths[0], paths[2])
+    return paths
+
+
+def test_each_image_has_one_product_and_none_is_made_twice(
+    run: Run, service: Operations, images: list[Path], tmp_path: Path
+) -> None:
+    first = run(*images)
+    assert [(one.existed, one.failure) for one in first] == [(False, None), (False, None), (True, None)]
+    assert first[0].output == first[2].output, "the bytes of both are the same"
+    outputs = sorted((tmp_path / "out").iterdir())
+    assert len(outputs) == 2 and {one.output for one in first} == set(outputs)
+    for one in first:
+        assert one.output is not None and one.output.name.startswith("image-")
+        assert fits.getheader(one.output)["INPSHA"] in (service.upload_image(one.image)["id"],)
+    before = {path: path.stat().st_mtime_ns for path in outputs}
+    again = run(*images)
+    assert all(one.existed for one in again) and [one.output for one in again] == [
+        one.output for one in first
+    ]
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == before
+
+
+def test_a_product_is_known_by_its_header_and_not_by_its_name(
+    run: Run, images: list[Path], tmp_path: Path
+) -> None:
+    (made,) = run(images[0])
+    assert made.output is not None
+    renamed = made.output.rename(tmp_path / "out" / "renamed.fits")
+    (known,) = run(images[0])
+    assert known.existed and known.output == renamed
+    shutil.copy(images[1], made.output)  # an image under the name of the product
+    renamed.unlink()
+    (refused,) = run(images[0])
+    assert refused.failure is not None and "the file exists" in refused.failure
+    assert made.output.read_bytes() == images[1].read_bytes()
+    (replaced,) = run(images[0], overwrite=True)
+    assert replaced.failure is None and fits.getheader(made.output)["PRODID"]
+
+
+def test_other_parameters_and_cut_files_are_made_anew(run: Run, images: list[Path], tmp_path: Path) -> None:
+    (first,) = run(images[0])
+    (other,) = run(images[0], steps=2)
+    assert not other.existed and other.output != first.output
+    assert first.output is not None
+    first.output.write_bytes(first.output.read_bytes()[:-2880])
+    (refused,) = run(images[0])
+    assert refused.failure is not None and not refused.existed
+    assert run(images[0], overwrite=True)[0].failure is None
+    assert run(images[0])[0].existed
+
+
+def test_failures_are_told_and_the_run_goes_on(
+    run: Run, service: Operations, images: list[Path], tmp_path: Path
+) -> None:
+    (tmp_path / "letter.fits").write_text("Dear archive,\n" * 300)
+    (product,) = run(images[0])
+    assert product.output is not None
+    product_file = shutil.copy(product.output, tmp_path / "product.fits")
+    seen: list[tuple[int, int]] = []
+    outcomes = run(
+        tmp_path / "letter.fits",
+        tmp_path / "gone.fits",
+        product_file,
+        images[1],
+        progress=lambda done, of: seen.append((done, of)),
+    )
+    failures = [one.failure or "" for one in outcomes]
+    assert "expected a FITS file" in failures[0] and "No such file" in failures[1]
+    assert "not deconvolved before" in failures[2] and failures[3] == ""
+    assert seen == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]
+    assert run(product_file, again=True)[0].failure is None
+
+
+def test_nothing_is_sent_or_kept_twice(
+    api: TestClient, run_jobs: Callable[[], None], images: list[Path], tmp_path: Path
+) -> None:
+    client = AtOnce(api, run_jobs)
+    write_psf(tmp_path / "psf.fits")
+    wanted = {"psf_id": client.upload_psf(tmp_path / "psf.fits")["id"], "steps": 1}
+    list(deconvolve_many(client, images, tmp_path / "out", **wanted))
+    assert (client.uploaded, client.submitted) == (2, 2)
+    list(deconvolve_many(client, images, tmp_path / "out", **wanted))
+    assert (client.uploaded, client.submitted) == (2, 2)
+    with local_service() as here:
+        wanted["psf_id"] = here.upload_psf(tmp_path / "psf.fits")["id"]
+        outcomes = list(deconvolve_many(here, images, tmp_path / "other", **wanted))
+        assert [one.failure for one in outcomes] == [None, None, None]
+        assert not [blob for blob in here._store.blobs() if blob.bytes > 50_000], (
+            "products stay in the folder only"
+        )
+
+
+def test_a_product_that_the_user_keeps_as_an_input_stays(images: list[Path], tmp_path: Path) -> None:
+    """In this process, the file of the product is then found at the user's path."""
+    write_psf(tmp_path / "psf.fits")
+    with local_service() as here:
+        wanted = {"psf_id": here.upload_psf(tmp_path / "psf.fits")["id"], "steps": 1}
+        (made,) = deconvolve_many(here, images[:1], tmp_path / "out", **wanted)
+        assert made.output is not None
+        here.upload_image(made.output)
+        (again,) = deconvolve_many(here, images[:1], tmp_path / "other", **wanted)
+        assert again.output is not None and again.output.read_bytes() == made.output.read_bytes()
+
+
+def test_an_error_that_concerns_every_image_ends_the_run(tmp_path: Path, images: list[Path]) -> None:
+    with pytest.raises(ServiceError, match="no answer"), Client("http://127.0.0.1:9") as nobody:
+        list(deconvolve_many(nobody, images, tmp_path / "out"))
+    (tmp_path / "file").touch()
+    with local_service() as here, pytest.raises(ServiceError, match="expected a folder"):
+        list(deconvolve_many(here, images, tmp_path / "file"))
+
+
+def test_a_busy_service_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited: list[float] = []
+    monkeypatch.setattr(many.time, "sleep", waited.append)
+    answers: list[Any] = [
+        ServiceError("later", status=429, retry_after_s=7.0),
+        ServiceError("later", status=503),
+        "done",
+    ]
+
+    def ask() -> str:
+        answer = answers.pop(0)
+        if isinstance(answer, ServiceError):
+            raise answer
+        return str(answer)
+
+    assert many._patiently(ask) == "done" and waited == [7.0, 1.0]
+    with pytest.raises(ServiceError):
+        answers.append(ServiceError("no", status=404))
+        many._patiently(ask)
