@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from service.cli.options import FILE, OUTPUT_FOLDER, percent, progress_bar, user_errors
+from service.client.errors import WaitInterrupted
 from service.client.http import Client
 from service.client.versions import Progress
 
@@ -59,6 +60,8 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
                 product_file = output / f"{image.stem}-deconvolved.fits"
                 picture = output / f"{image.stem}-preview.png"
                 product = service.deconvolve(image, product_file, preview=picture, progress=progress)
+        except WaitInterrupted as stop:
+            raise KeyboardInterrupt from stop  # the job does not go on, because the demo stops its service
         finally:
             server.terminate()
             server.wait(60)

@@ -1,4 +1,4 @@
-"""The error that a client raises."""
+"""The errors that a client raises."""
 
 from __future__ import annotations
 
@@ -20,3 +20,14 @@ class ServiceError(Exception):
     ) -> None:
         super().__init__(message)
         self.status, self.code, self.retry_after_s = status, code, retry_after_s
+
+
+class WaitInterrupted(KeyboardInterrupt):
+    """Control-C during a wait for a job or a bulk run, which goes on without the client.
+
+    what: "job" or "bulk". identity: its id. server: address of the service.
+    """
+
+    def __init__(self, what: str, identity: str, server: str) -> None:
+        super().__init__(f"the wait was interrupted; {what} {identity} goes on at {server}")
+        self.what, self.identity, self.server = what, identity, server

@@ -10,8 +10,6 @@ from typing import Any
 from service.client.errors import ServiceError
 from service.client.versions import Progress
 
-DEFAULT_SERVER = "http://127.0.0.1:8765"
-
 
 class Operations(ABC):
     """The requests to a service, over HTTP or in this process. Every method raises ``ServiceError``."""

@@ -100,18 +100,3 @@ def test_json_is_written_where_a_path_is_given_and_holds_no_nan(tmp_path: Path) 
     assert not (tmp_path / "y.json").exists()
     with pytest.raises(click.ClickException, match="cannot write"):
         cli_options.write_json(tmp_path, {"x": 1})
-
-
-def test_progress_says_stage_and_steps_on_a_terminal_alone(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with cli_options.progress_bar() as report:
-        report("reading", 1, 2)
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    with cli_options.progress_bar() as report:
-        report("reading", 1, 2)
-        report("nothing to do", 0, 0)
-    told = capsys.readouterr().err
-    assert f"[{'#' * 10}{'-' * 10}] 1/2" in told
-    assert "0/0" in told
