@@ -47,6 +47,7 @@ STATUS_OF = {
     "parameters-unknown": 409,
     "plate-scale-mismatch": 409,
     "ranges-overlap": 409,
+    "several-ids-fit": 409,
     "several-psfs-fit": 409,
     "successor-named": 409,
     "version-taken": 409,

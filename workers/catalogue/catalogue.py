@@ -17,7 +17,7 @@ from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
 from workers.catalogue.census import Census
 from workers.catalogue.contexts import Contexts
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, begins_with
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.keys import Keys
 from workers.catalogue.named_files import NamedFiles
@@ -37,11 +37,15 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 from workers.catalogue.uws_jobs import UwsJobs
+from workers.contract.identities import canonical_hash
+from workers.contract.phases import Phase
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 AnyRow = TypeVar(
     "AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow, PsfContextRow, BulkRow
 )
+ListedRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | JobRow | PsfContextRow | BulkRow
+MOST_CANDIDATES = 6
 
 
 class Catalogue:
@@ -103,6 +107,33 @@ class Catalogue:
         """The row with this identity, or None."""
         with self._database.reading() as session:
             return session.get(table, (owner, identity))
+
+    def ids_from(self, table: type[ListedRow], digits: str, owner: str) -> Sequence[str]:
+        """The ids of an owner's rows that begin with these digits, at most MOST_CANDIDATES."""
+        query = select(table.id).where(table.owner == owner, begins_with(table.id, digits))
+        with self._database.reading() as session:
+            return session.scalars(query.order_by(table.id).limit(MOST_CANDIDATES)).all()
+
+    def delete_product(self, identity: str, owner: str) -> bool:
+        """Remove a product from the catalogue; returns whether it was there.
+
+        Its bytes no longer count for the owner. Its files stay until ``workers.files.collection`` removes them, because
+        other rows may refer to the same files. The job that made the product keeps its row, but gets another key: an
+        identical request then makes the product again, instead of sharing a job whose result is gone.
+        """
+        with self._database.writing.begin() as session:
+            add_bytes(session, owner, 0)  # locks the owner first, as `hold_to_quota` does: no deadlock
+            row = session.get(ProductRow, (owner, identity), with_for_update=True)
+            if row is None:
+                return False
+            session.delete(row)
+            add_bytes(session, owner, -row.bytes)
+            made_it = select(JobRow).where(
+                JobRow.owner == owner, JobRow.phase == Phase.COMPLETED, JobRow.result_id == identity
+            )
+            for job in session.scalars(made_it):
+                job.request_key = canonical_hash({"request_key": job.request_key, "deleted": job.id})
+            return True
 
     def page(
         self,
