@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
+from service.cli.connection import CONTEXT, LOCAL, PSF, SERVER, connection, named_psf, short
 from service.cli.options import (
     FILE,
     METHOD,
@@ -19,8 +19,6 @@ from service.cli.options import (
     progress_bar,
     user_errors,
 )
-
-CONTEXT = click.option("--context", help="Choose the PSF from this context: its id or name")
 
 
 @click.command()
@@ -87,7 +85,7 @@ def deconvolve(
             edges=edges,
         )
     details = product["details"]
-    click.echo(f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}")
+    click.echo(f"{output}: PSF {product['psf_version']}, product {short(product['id'])}")
     click.echo(f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}")
     click.echo(
         f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
