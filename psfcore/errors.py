@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+MOST_TOLD = 20  # errors of which the text is given, if one request has many
 
 
 class DataError(ValueError):
@@ -25,3 +27,14 @@ class DataError(ValueError):
 
 class HeaderError(DataError):
     """The headers of a file show that the file cannot be used. No pixel was read."""
+
+
+def together(errors: Sequence[DataError]) -> DataError:
+    """One error for several files: their messages in one message, with the type and code of the first error."""
+    first = errors[0]
+    if len(errors) == 1:
+        return first
+    told = [error.message for error in errors[:MOST_TOLD]]
+    if len(errors) > MOST_TOLD:
+        told.append(f"and {len(errors) - MOST_TOLD} more")
+    return type(first)(first.code, f"{len(errors)} files cannot be used: " + "; ".join(told))

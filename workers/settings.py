@@ -16,6 +16,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from psfcore.transit.archive import ArchiveLimits
 from workers.contract.queues import Queue, queues_named
+from workers.data_folder import default_data_dir
 
 EMBEDDED_BROKER = "filesystem://"
 
@@ -26,7 +27,9 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="HELIOPSF_", frozen=True)
 
     data_dir: Path = Field(
-        Path("heliopsf-data"), description="folder of stored files and, by default, of the SQLite database"
+        default_factory=default_data_dir,
+        description="folder of stored files and, by default, of the SQLite database; default: the user's data folder, on Linux "
+        "`~/.local/share/heliopsf`, unless `heliopsf-data` in the working folder holds data of an earlier version",
     )
     store_url: str | None = Field(
         None,

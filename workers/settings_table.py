@@ -18,7 +18,7 @@ _BOUNDS = {Ge: ("≥", "ge"), Gt: (">", "gt"), Le: ("≤", "le"), Lt: ("<", "lt"
 _INTRODUCTION = """# Settings
 
 Each setting is an environment variable. All settings are optional: without them, `heliopsf serve` keeps all data in
-one folder and needs no other server. Set the same variables for servers, workers and operator commands.
+one folder of the user and needs no other server. Set the same variables for servers, workers and operator commands.
 Scientific choices are never settings; they are parameters of a job.
 
 This page is generated from the class `workers.settings.Settings` by `make settings`; a test compares the two.
@@ -43,7 +43,7 @@ def settings_table() -> str:
 
 
 def _row(name: str, field: FieldInfo) -> str:
-    cells = (f"`{PREFIX}{name.upper()}`", _type(field), _default(field.default), field.description or "")
+    cells = (f"`{PREFIX}{name.upper()}`", _type(field), _default(field), field.description or "")
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
@@ -70,8 +70,10 @@ def _name(annotation: Any) -> str:
     return {"str": "text", "int": "integer", "float": "number", "Path": "path"}[annotation.__name__]
 
 
-def _default(value: Any) -> str:
-    return "not set" if value is None or value == "" else f"`{value}`"
+def _default(field: FieldInfo) -> str:
+    if field.default_factory is not None:
+        return "see the meaning"  # the value depends on the user
+    return "not set" if field.default is None or field.default == "" else f"`{field.default}`"
 
 
 def main(arguments: Sequence[str]) -> None:

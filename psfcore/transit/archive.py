@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import io
 import tarfile
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from psfcore.errors import DataError
+from psfcore.errors import DataError, together
 from psfcore.transit.admission import ArchiveLimits
 from psfcore.transit.manifest import (
     MANIFEST_NAME,
@@ -46,7 +47,7 @@ def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
     A .zip has a table of contents, and in a .tar the data can be skipped. A .tar.gz must be decompressed from start to
     end, within the limits.
     Raises the DataErrors of ``unpack``; also "no-manifest", "bad-manifest", "missing-file" if transit.json names a file
-    that the archive does not contain, and "not-fits" if a named file cannot be FITS.
+    that the archive does not contain, and "not-fits" if a named file cannot be FITS. The message names all such files.
     """
     files: dict[str, int] = {}
     starts: dict[str, bytes] = {}
@@ -62,15 +63,7 @@ def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
     if content is None:
         raise DataError("no-manifest", f"expected a file {MANIFEST_NAME} in the archive; add it")
     manifest = parse_manifest(content)
-    for name in manifest.files:
-        if name not in files:
-            message = (
-                f"expected the archive to contain every file that {MANIFEST_NAME} names; missing: {name}"
-            )
-            raise DataError("missing-file", message)
-        if not starts[name].startswith(_FITS_STARTS):
-            message = f"{name}: expected a FITS file, which begins with 'SIMPLE  ='; got {starts[name]!r}"
-            raise DataError("not-fits", message)
+    _check_files(manifest, starts, "the archive")
     return ArchiveContents(kind, manifest, files)
 
 
@@ -107,21 +100,55 @@ def pack(folder: str | Path, path: str | Path) -> TransitManifest:
 
     Equal files give equal bytes, so the hash of the archive is the identity of the transit.
 
-    Raises DataError "no-manifest", "bad-manifest", "missing-file".
+    Raises the DataErrors of ``checked_folder``, before anything is written.
     """
-    manifest = read_manifest(Path(folder))
+    manifest, _ = checked_folder(Path(folder))
     with Path(path).open("wb") as file:
         pack_into(Path(folder), manifest, file)
     return manifest
+
+
+def checked_folder(folder: Path) -> tuple[TransitManifest, dict[str, int]]:
+    """The manifest of the transit in a folder, and the size in bytes of each of its files.
+
+    Raises DataError "no-manifest", "bad-manifest", "missing-file", and "not-fits" if a named file cannot be FITS. The message
+    names all such files.
+    """
+    manifest = read_manifest(folder)
+    starts: dict[str, bytes] = {}
+    for name in manifest.files:
+        if (folder / name).is_file():
+            with (folder / name).open("rb") as file:
+                starts[name] = file.read(len(_FITS_STARTS[0]))
+    _check_files(manifest, starts, str(folder))
+    return manifest, {name: (folder / name).stat().st_size for name in (MANIFEST_NAME, *manifest.files)}
+
+
+def _check_files(manifest: TransitManifest, starts: Mapping[str, bytes], where: str) -> None:
+    """Raise DataError if files that the manifest names are missing, or cannot be FITS by their first bytes."""
+    missing = [
+        DataError(
+            "missing-file", f"{name}: expected in {where}, because {MANIFEST_NAME} names it; it is missing"
+        )
+        for name in manifest.files
+        if name not in starts
+    ]
+    no_fits = [
+        DataError(
+            "not-fits",
+            f"{name}: expected a FITS file, which begins with 'SIMPLE  ='; got {start!r}",
+        )
+        for name, start in starts.items()
+        if name in manifest.files and not start.startswith(_FITS_STARTS)
+    ]
+    if missing or no_fits:
+        raise together([*missing, *no_fits])
 
 
 def pack_into(folder: Path, manifest: TransitManifest, target: IO[bytes]) -> None:
     """Write the same .tar as ``pack``, but into an open file. Only ``write`` and ``tell`` of this file are called."""
     with tarfile.open(fileobj=target, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for name in (MANIFEST_NAME, *manifest.files):
-            if not (folder / name).is_file():
-                message = f"expected every file that {MANIFEST_NAME} names; missing: {name}"
-                raise DataError("missing-file", message)
             with (folder / name).open("rb") as file:
                 entry = tarfile.TarInfo(name)  # owner, mode and time keep their defaults, which are constants
                 entry.size = file.seek(0, io.SEEK_END)
@@ -134,6 +161,7 @@ __all__ = [
     "ArchiveContents",
     "ArchiveLimits",
     "archive_kind",
+    "checked_folder",
     "could_be_archive",
     "list_archive",
     "pack",

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io.fits import Header
 
-from psfcore.errors import DataError
+from psfcore.errors import DataError, together
 from psfcore.fits.gain import saturation_for
 from psfcore.fits.header import FitsLimits, HeaderSummary, plate_scale_arcsec, read_summary
 from psfcore.fits.images import read_image, read_plane
@@ -76,13 +76,14 @@ def read_prepared(
 
     Raises DataError: "no-manifest", "bad-manifest", "missing-file", "transit-shapes", "occulter-outside",
     "occulter-too-large", "no-noise-figures", "no-known-psf", "known-psf-..." (see ``checked_kernel``), the errors of
-    ``read_image`` with the name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header.
+    ``read_image`` with the name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header. If
+    several images have faults, one error names all of them.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
     noise = noise or _noise(manifest)
     _check_present(folder, manifest)
-    headers = [_summary(folder / image.file, limits) for image in manifest.images]
+    headers = _summaries(folder, manifest, limits)
     _check_frames(manifest.images, headers)
     instrument = manifest.instrument or next((h.instrument for h in headers if h.instrument), None)
     known = _known_psf(folder, manifest, limits, diffraction, instrument, headers[0].shape)
@@ -93,12 +94,19 @@ def read_prepared(
     looks.sort(key=lambda look: look.time_s)  # stable: equal times stay in the order of transit.json
     exposures: list[Exposure] = []
     scales: list[float | None] = []
+    faults: list[DataError] = []
     for done, look in enumerate(looks, start=1):
-        exposure, scale = _read(folder, look, limits)
-        exposures.append(exposure)
-        scales.append(scale)
+        try:
+            exposure, scale = _read(folder, look, limits)
+        except DataError as fault:
+            faults.append(fault)
+        else:
+            exposures.append(exposure)
+            scales.append(scale)
         if progress is not None:
             progress(done, len(looks))
+    if faults:
+        raise together(faults)
     frames, prepared = prepare(exposures)
     transit = Transit(
         frames=frames,
@@ -149,9 +157,19 @@ def _naming(file: str) -> Iterator[None]:
         raise type(error)(error.code, f"{file}: {error.message}") from None
 
 
-def _summary(path: Path, limits: FitsLimits) -> HeaderSummary:
-    with _naming(path.name):
-        return read_summary(path, limits)
+def _summaries(folder: Path, manifest: TransitManifest, limits: FitsLimits) -> list[HeaderSummary]:
+    """The headers of all images. Raises one DataError that names all files whose header cannot be used."""
+    found: list[HeaderSummary] = []
+    faults: list[DataError] = []
+    for image in manifest.images:
+        try:
+            with _naming(image.file):
+                found.append(read_summary(folder / image.file, limits))
+        except DataError as fault:
+            faults.append(fault)
+    if faults:
+        raise together(faults)
+    return found
 
 
 def _check_present(folder: Path, manifest: TransitManifest) -> None:
@@ -164,18 +182,29 @@ def _check_present(folder: Path, manifest: TransitManifest) -> None:
 
 
 def _check_frames(images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]) -> None:
-    first = headers[0].shape
+    """Raise one DataError that names all images whose shape or occulter is wrong."""
+    faults: list[DataError] = []
     for index, (image, header) in enumerate(zip(images, headers, strict=True)):
-        label = f"images[{index}] ({image.file})"
-        ny, nx = header.shape
-        if header.shape != first:
-            size = f"{first[1]} x {first[0]} px, as {images[0].file} has"
-            raise DataError("transit-shapes", f"{label}: expected {size}; got {nx} x {ny}")
-        largest = LARGEST_RADIUS_SHARE * min(ny, nx)
-        if image.r > largest:
-            message = f"expected a radius r of at most {largest:g} px in images of {nx} x {ny} px"
-            raise DataError("occulter-too-large", f"{label}: {message}; got {image.r:g}")
-        check_reaches_in(Place(image.x, image.y, image.r), header.shape, label)
+        try:
+            _check_frame(f"images[{index}] ({image.file})", image, header, images[0].file, headers[0].shape)
+        except DataError as fault:
+            faults.append(fault)
+    if faults:
+        raise together(faults)
+
+
+def _check_frame(
+    label: str, image: ImageEntry, header: HeaderSummary, first_file: str, first: tuple[int, int]
+) -> None:
+    ny, nx = header.shape
+    if header.shape != first:
+        size = f"{first[1]} x {first[0]} px, as {first_file} has"
+        raise DataError("transit-shapes", f"{label}: expected {size}; got {nx} x {ny}")
+    largest = LARGEST_RADIUS_SHARE * min(ny, nx)
+    if image.r > largest:
+        message = f"expected a radius r of at most {largest:g} px in images of {nx} x {ny} px"
+        raise DataError("occulter-too-large", f"{label}: {message}; got {image.r:g}")
+    check_reaches_in(Place(image.x, image.y, image.r), header.shape, label)
 
 
 def _times_s(headers: Sequence[HeaderSummary]) -> list[float]:

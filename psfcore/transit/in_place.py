@@ -10,11 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, cast
 
-from psfcore.errors import DataError
-from psfcore.transit.archive import ArchiveContents, pack_into
-from psfcore.transit.manifest import MANIFEST_NAME, read_manifest
-
-_FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")
+from psfcore.transit.archive import ArchiveContents, checked_folder, pack_into
 
 
 @dataclass(frozen=True)
@@ -48,23 +44,10 @@ class _Digest:
 def transit_in(folder: str | Path) -> FolderTransit:
     """Check and identify the transit in a folder.
 
-    Raises DataError "no-manifest", "bad-manifest", "missing-file", and "not-fits" if a named file cannot be FITS.
+    Raises the DataErrors of ``checked_folder``.
     """
     folder = Path(folder).resolve()
-    manifest = read_manifest(folder)
-    sizes: dict[str, int] = {}
-    for name in (MANIFEST_NAME, *manifest.files):
-        path = folder / name
-        if not path.is_file():
-            message = f"expected every file that {MANIFEST_NAME} names in {folder}; missing: {name}"
-            raise DataError("missing-file", message)
-        sizes[name] = path.stat().st_size
-        if name != MANIFEST_NAME:
-            with path.open("rb") as file:
-                start = file.read(len(_FITS_STARTS[0]))
-            if not start.startswith(_FITS_STARTS):
-                message = f"{name}: expected a FITS file, which starts with 'SIMPLE  ='; got {start!r}"
-                raise DataError("not-fits", message)
+    manifest, sizes = checked_folder(folder)
     digest = _Digest()
     pack_into(folder, manifest, cast(IO[bytes], digest))
     return FolderTransit(

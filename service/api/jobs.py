@@ -33,7 +33,9 @@ class Progress(BaseModel):
     stage: str
     step: int
     steps: int
-    time_left_s: float | None = Field(description="estimated from the time used so far; null if unknown")
+    time_left_s: float | None = Field(
+        description="time left until the last of `steps`, s, from the pace of the present count of steps alone; null if unknown"
+    )
 
 
 class Estimate(BaseModel):
@@ -172,16 +174,17 @@ def cancel_job(job_id: JobId, caller: Submitting, state: Shared) -> JobView:
     return JobView.of(find(state, caller, job_id))
 
 
-def time_left_s(row: JobRow) -> float | None:
-    """Estimated time left of a running job at its present speed; None if unknown."""
-    if (
-        not KINDS[row.kind].counted_whole
-        or row.phase != Phase.EXECUTING
-        or not row.step
-        or not row.started_at
-    ):
+def time_left_s(row: JobRow, now: float | None = None) -> float | None:
+    """Estimated time left of a running job at the pace of its present count of steps; None if unknown.
+
+    now: seconds since 1970; default: this machine's clock. The time of earlier counts, such as that of reading the images,
+    does not enter.
+    """
+    now = time.time() if now is None else now
+    done = row.step - row.count_step
+    if not KINDS[row.kind].counted_whole or row.phase != Phase.EXECUTING or done <= 0 or row.count_at is None:
         return None
-    return max(0.0, (time.time() - row.started_at) * (row.steps - row.step) / row.step)
+    return max(0.0, (now - row.count_at) * (row.steps - row.step) / done)
 
 
 def find(state: Shared, caller: Caller, job_id: str) -> JobRow:

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, Field
 
 from service.http import downloads as files
-from service.http.callers import Caller, Reading
+from service.http.callers import Caller, Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem
 from service.http.state import Shared
@@ -118,6 +118,14 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
             "expected a product whose job had changes_picture true; this job had it false: submit the job again with true",
         )
     return files.send(request, state.store, digest, "image/png", None)
+
+
+@router.delete("/{product_id}", status_code=204, summary="Delete a product", response_class=Response)
+def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> Response:
+    """Remove the product from the catalogue and from your quota. The same request makes it again."""
+    _find(state, caller, product_id)
+    state.catalogue.delete_product(product_id, caller.owner)
+    return Response(status_code=204)
 
 
 def _find(state: Shared, caller: Caller, product_id: str) -> ProductRow:

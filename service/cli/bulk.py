@@ -7,11 +7,21 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from service.cli.connection import SERVER, named_psf, remote
+from service.cli.connection import (
+    CONTEXT,
+    ID,
+    SERVER,
+    id_argument,
+    named_psf,
+    psf_option,
+    remote,
+    short,
+    whole_ids,
+)
 from service.cli.deconvolve import AGAIN
 from service.cli.options import (
     METHOD,
@@ -26,10 +36,17 @@ from service.cli.options import (
     user_errors,
     writes_files,
 )
+from service.cli.progress import duration
+from service.client.errors import ServiceError
 from service.client.outputs import written
 
+if TYPE_CHECKING:
+    from service.client.http import Client
+
 _CONDITION = re.compile(r"([A-Z0-9_-]{1,8})\s*(=|!=|<=|>=|<|>)\s*(.+)")
-BULK_ID = click.argument("bulk_id", metavar="ID")
+# Statuses of refusals that concern one file; after any other refusal the next file would be refused too.
+OF_ONE_FILE, OF_ALL_FILES = (400, 413, 415, 422), ("quota-exceeded",)
+BULK_ID = id_argument("bulk_id")
 WAIT = click.option(
     "--wait", is_flag=True, help="Wait until the bulk run ends; the exit status is 1 if an image failed"
 )
@@ -55,8 +72,8 @@ def bulk() -> None:
 
 @bulk.command("submit", short_help="Start a bulk run.")
 @click.argument("patterns", nargs=-1)
-@click.option("--psf", metavar="ID|FILE", help="PSF for all images: an id or a file")
-@click.option("--context", help="Choose the PSF of each image from this context: its id or name")
+@psf_option("PSF for all images: an id or a file")
+@CONTEXT
 @OTHER_CHANNEL
 @click.option("--upload", "uploads", multiple=True, type=click.Path(exists=True, path_type=Path),
               help="FITS file, or folder of FITS files, to upload and deconvolve; can be repeated")  # fmt: skip
@@ -64,6 +81,7 @@ def bulk() -> None:
     "--image",
     "images",
     multiple=True,
+    type=ID,
     metavar="ID",
     help="Id of an uploaded image; can be repeated",
 )
@@ -103,15 +121,18 @@ def submit(
     """Start a bulk run: deconvolve the files on the machine of the service that match PATTERNS.
 
     A pattern is an absolute path in a folder that the operator allows. * ? and [ab] match parts of a name, ** matches any
-    number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context.
+    number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context. Files of --upload
+    that are refused are named; the run starts with the others, and the exit status is 1.
     """
     if (psf is None) == (context is None):
         raise click.UsageError("expected either --psf or --context")
     figures = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]} if noise else None
     with user_errors(), remote(server) as service:
-        sent = [service.upload_image(path)["id"] for path in fits_files(uploads)]
+        sent, refused = _uploaded(service, fits_files(uploads))
+        if refused and not (sent or images or patterns):
+            raise click.ClickException("no file could be uploaded, so no bulk run was started")
         made = service.submit_bulk(
-            images=[*images, *sent],
+            images=[*whole_ids(service, "images", images), *sent],
             files=[{"glob": pattern, "where": _where(conditions)} for pattern in patterns],
             psf_id=named_psf(service, psf),
             context=context,
@@ -124,17 +145,19 @@ def submit(
             other_channel=other_channel or None,
             again=again or None,
         )
-        click.echo(f"bulk {made['id']}")
+        click.echo(f"bulk {short(made['id'])}")
         if wait:
             with progress_bar() as report:
                 made = service.wait_for_bulk(made["id"], progress=report)
         click.echo("\n".join(_said(made)))
+    if refused:
+        raise click.ClickException(f"{refused} files were not uploaded; the reasons are listed above")
     if wait:
         _end_with_status(made)
 
 
 @bulk.command("status", short_help="Show progress, speed and time left.")
-@click.argument("bulk_id", metavar="[ID]", required=False)
+@click.argument("bulk_id", type=ID, metavar="[ID]", required=False)
 @WAIT
 @SERVER
 def status(bulk_id: str | None, wait: bool, server: str | None) -> None:
@@ -143,7 +166,7 @@ def status(bulk_id: str | None, wait: bool, server: str | None) -> None:
         if bulk_id is None:
             for row in service.bulks():
                 click.echo(
-                    f"{row['id']}  {row['phase']:<9}  {row['done']} of {row['total']} done, {row['failed']} failed  "
+                    f"{short(row['id'])}  {row['phase']:<9}  {row['done']} of {row['total']} done, {row['failed']} failed  "
                     f"{row['name']}".rstrip()
                 )
             return
@@ -233,6 +256,23 @@ def report(
 COMMANDS = (bulk,)
 
 
+def _uploaded(service: Client, files: Sequence[Path]) -> tuple[list[str], int]:
+    """Upload files; returns the ids of the images, and how many files were refused. Each refused file is named on standard error."""
+    sent: list[str] = []
+    refused = 0
+    for file in files:
+        try:
+            sent.append(service.upload_image(file)["id"])
+        except (ServiceError, OSError) as error:
+            if isinstance(error, ServiceError) and (
+                error.status not in OF_ONE_FILE or error.code in OF_ALL_FILES
+            ):
+                raise
+            refused += 1
+            click.echo(f"not uploaded: {file}: {error}", err=True)
+    return sent, refused
+
+
 def _said(found: dict[str, Any]) -> list[str]:
     images = found["images"]
     lines = [
@@ -241,7 +281,7 @@ def _said(found: dict[str, Any]) -> list[str]:
         + f", {images['failed']} failed, {images['at_work']} in progress, {images['waiting']} waiting"
     ]
     if images["to_look_at"]:
-        lines.append(f"{images['to_look_at']} to look at: `heliopsf bulk report {found['id']}`")
+        lines.append(f"{images['to_look_at']} to look at: `heliopsf bulk report {short(found['id'])}`")
     if found["images_an_hour"]:
         lines.append(f"{found['images_an_hour']:.0f} images per hour{_left(found['time_left_s'])}")
     if found["error"]:
@@ -256,12 +296,7 @@ def _end_with_status(found: dict[str, Any]) -> None:
 
 
 def _left(seconds: float | None) -> str:
-    if seconds is None:
-        return ""
-    for unit, length in (("days", 86_400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * length:
-            return f", {seconds / length:.0f} {unit} left"
-    return f", {seconds:.0f} s left"
+    return "" if seconds is None else f", {duration(seconds)} left"
 
 
 def _line(row: dict[str, Any]) -> str:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from psfcore.errors import DataError
-from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
-from service.cli.deconvolve import AGAIN, CONTEXT
+from service.cli.connection import CONTEXT, LOCAL, PSF, SERVER, connection, named_psf
+from service.cli.deconvolve import AGAIN
 from service.cli.options import (
     METHOD,
     NOISE,

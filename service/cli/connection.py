@@ -1,22 +1,82 @@
-"""Where a command sends its request: to a service over HTTP, or to a service inside this process."""
+"""Where a command sends its request, and the options and ids that commands share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
-from service.cli.options import is_psf_id
-from service.client.operations import DEFAULT_SERVER, Operations
+from service.cli.progress import say
+from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
+from service.client.operations import Operations
+from workers.contract.short_ids import FEWEST_DIGITS
 
 if TYPE_CHECKING:
     from service.client.http import Client
 
 _KEY = "heliopsf.key"
+DIGITS = 64  # of a whole id, other than those of jobs and bulk runs
+_ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class _Id(click.ParamType):
+    """An id, or its first digits."""
+
+    name = "id"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The digits in lower case. Only such texts become part of an address of the service."""
+        digits = str(value).lower()
+        if not _ID.fullmatch(digits):
+            self.fail(
+                f"expected an id, or its first {FEWEST_DIGITS} or more hexadecimal digits; got {value!r}",
+                param,
+                ctx,
+            )
+        return digits
+
+
+class _IdOrFile(click.ParamType):
+    """The id of a PSF, or the name of a file."""
+
+    name = "id or file"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The text, if it is the name of a file or can be an id."""
+        text = str(value)
+        if not (Path(text).is_file() or _ID.fullmatch(text)):
+            self.fail(
+                f"expected a PSF id ({FEWEST_DIGITS} or more hexadecimal digits) or a file; got {text!r}",
+                param,
+                ctx,
+            )
+        return text
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Let the shell complete the name of a file."""
+        return [CompletionItem(incomplete, type="file")]
+
+
+class _Server(click.Option):
+    """``--server``, whose help says whether the command needs a service."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """The names and the help text of the option."""
+        record = super().get_help_record(ctx)
+        if record is None:
+            return None
+        names, text = record
+        local = any(param.name == "local" for param in ctx.command.params)
+        return names, f"{text}; --local needs none" if local else text
 
 
 def _remember(context: click.Context, _parameter: click.Parameter, key: str | None) -> None:
@@ -24,7 +84,7 @@ def _remember(context: click.Context, _parameter: click.Parameter, key: str | No
 
 
 def server_option(what: str) -> Callable[[Command], Command]:
-    """The options ``--server`` and ``--key`` of a command that needs a service."""
+    """The options ``--server`` and ``--key`` of a command that can send a request to a service."""
     key = click.option(
         "--key",
         envvar="HELIOPSF_KEY",
@@ -32,24 +92,50 @@ def server_option(what: str) -> Callable[[Command], Command]:
         callback=_remember,
         help="Access key. Other users can read command lines, so set HELIOPSF_KEY instead",
     )
-    server = click.option("--server", envvar="HELIOPSF_SERVER", help=f"{what} [default: {DEFAULT_SERVER}]")
+    server = click.option(
+        "--server",
+        cls=_Server,
+        metavar="ADDRESS",
+        envvar="HELIOPSF_SERVER",
+        help=f"{what} [default: {DEFAULT_SERVER}]",
+    )
     return lambda command: server(key(command))
 
 
-SERVER = server_option("Address of the service")
+def psf_option(what: str, *, required: bool = False) -> Callable[[Command], Command]:
+    """The option ``--psf``. what: what the command does with the PSF, and its default."""
+    return click.option("--psf", type=ID_OR_FILE, metavar="ID|FILE", required=required, help=what)
+
+
+ID, ID_OR_FILE = _Id(), _IdOrFile()
+SERVER = server_option("Address of the service, which this command needs")
 LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
-PSF = click.option(
-    "--psf",
-    metavar="ID|FILE",
-    help="PSF: an id or a file [default: the certified PSF for the image, else the PSF built for its instrument]",
+SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")
+PSF = psf_option(
+    "PSF: an id or a file [default: the certified PSF for the image, else the PSF built for its instrument]"
 )
+CONTEXT = click.option(
+    "--context", help="Take PSFs from this context: its id or name; now: the PSFs that are certified now"
+)
+
+
+def id_argument(name: str = "identity", *, several: bool = False) -> Callable[[Command], Command]:
+    """The argument that names a thing of the service by its id, or by the first digits of its id."""
+    return click.argument(
+        name, type=ID, metavar="ID..." if several else "ID", nargs=-1 if several else 1, required=True
+    )
+
+
+def short(identity: str) -> str:
+    """An id as lists show it. Every command accepts ids that are cut like this."""
+    return identity[:SHOWN_DIGITS]
 
 
 def remote(server: str | None) -> Client:
     """A client of the service at ``server``, with the key that the command was given."""
     from service.client.http import Client
 
-    return Client(server, key=click.get_current_context().meta.get(_KEY))
+    return Client(server, key=click.get_current_context().meta.get(_KEY), say=say)
 
 
 @contextmanager
@@ -66,11 +152,41 @@ def connection(server: str | None, local: bool, *, gap_effects: str = "") -> Ite
         yield here
 
 
+def is_psf_id(psf: str) -> bool:
+    """Whether a text that ``ID_OR_FILE`` accepted is an id. Otherwise it is the name of a file."""
+    return not Path(psf).is_file()
+
+
+def whole_id(service: Operations, things: str, identity: str) -> str:
+    """The whole id of a thing from its first digits. things: the part of its address, such as "psfs"."""
+    if len(identity) == DIGITS:
+        return identity
+    found: str = service.get(f"/v1/{things}/{identity}")["id"]
+    return found
+
+
+def whole_ids(service: Operations, things: str, identities: Sequence[str]) -> list[str]:
+    """The whole ids of several things."""
+    return [whole_id(service, things, identity) for identity in identities]
+
+
+@contextmanager
+def psf_file(server: str | None, psf: str) -> Iterator[Path]:
+    """The file of the PSF that the user named. If the user named an id, the file is downloaded to a temporary folder."""
+    if not is_psf_id(psf):
+        yield Path(psf)
+        return
+    with TemporaryDirectory(prefix="heliopsf-") as folder, remote(server) as service:
+        file = Path(folder) / "psf.fits"
+        service.download(f"/v1/psfs/{psf}/file", file)
+        yield file
+
+
 def named_psf(service: Operations, psf: str | None) -> str | None:
-    """The id of the PSF that the user named; a file is uploaded first. Raises ``ClickException``."""
-    if psf is None or is_psf_id(psf):
-        return psf
-    if not Path(psf).is_file():
-        raise click.ClickException(f"--psf: expected a PSF id (64 hexadecimal digits) or a file; got {psf!r}")
+    """The id of the PSF that the user named with ``--psf``; a file is uploaded first."""
+    if psf is None:
+        return None
+    if is_psf_id(psf):
+        return whole_id(service, "psfs", psf)
     uploaded: str = service.upload_psf(psf)["id"]
     return uploaded

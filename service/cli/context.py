@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from service.cli.connection import SERVER, remote
+from service.cli.connection import ID, SERVER, remote, short, whole_ids
 from service.cli.options import user_errors
 
 
@@ -19,6 +19,7 @@ def context() -> None:
     "--psf",
     "psf_ids",
     multiple=True,
+    type=ID,
     metavar="ID",
     help="Id of a PSF to pin; can be repeated [default: all certified PSFs]",
 )
@@ -26,10 +27,10 @@ def context() -> None:
 @SERVER
 def create(name: str, psf_ids: tuple[str, ...], reason: str, server: str | None) -> None:
     """Create a context NAME that pins all PSFs that are certified now, or the PSFs that you name."""
-    pins = [{"psf_id": psf_id} for psf_id in psf_ids] or None
     with user_errors(), remote(server) as service:
+        pins = [{"psf_id": psf_id} for psf_id in whole_ids(service, "psfs", psf_ids)] or None
         made = service.create_context(name, pins, reason=reason)
-    click.echo(f"{made['id']}  {made['name']}  {made['size']} pinned")
+    click.echo(f"{short(made['id'])}  {made['name']}  {made['size']} pinned")
 
 
 @context.command("list", short_help="List contexts.")
@@ -43,7 +44,9 @@ def list_contexts(server: str | None) -> None:
         click.echo("no context yet; `heliopsf context create NAME` pins the certified PSFs")
     for row in rows:
         sign = "*" if default is not None and default["id"] == row["id"] else " "
-        click.echo(f"{sign} {row['id']}  {row['name']}  {row['size']} pinned  {row['reason']}".rstrip())
+        click.echo(
+            f"{sign} {short(row['id'])}  {row['name']}  {row['size']} pinned  {row['reason']}".rstrip()
+        )
 
 
 @context.command("show", short_help="List the PSFs of a context.")
@@ -53,10 +56,10 @@ def show(name: str, server: str | None) -> None:
     """List the PSFs that the context NAME (or id) pins."""
     with user_errors(), remote(server) as service:
         found = service.context(name)
-    click.echo(f"{found['id']}  {found['name']}")
+    click.echo(f"{short(found['id'])}  {found['name']}")
     for pin in found["pins"]:
         times = f"[{pin['valid_from'] or 'always'}, {pin['valid_to'] or 'open'})"
-        click.echo(f"  {pin['series']}  {times}  {pin['version']}  {pin['psf_id']}")
+        click.echo(f"  {pin['series']}  {times}  {pin['version']}  {short(pin['psf_id'])}")
 
 
 @context.command("use", short_help="Set the default context.")
@@ -78,7 +81,7 @@ def use(name: str | None, no_context: bool, reason: str, server: str | None) -> 
     click.echo(
         "no default context: the certified PSFs are used"
         if now is None
-        else f"default: {now['name']}  {now['id']}"
+        else f"default: {now['name']}  {short(now['id'])}"
     )
 
 

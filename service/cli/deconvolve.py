@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
+from service.cli.connection import CONTEXT, LOCAL, PSF, SERVER, connection, named_psf, short
 from service.cli.options import (
     METHOD,
     NOISE,
@@ -16,7 +16,6 @@ from service.cli.options import (
     OUTPUT,
     SATURATION,
     STEPS,
-    Report,
     fits_files,
     percent,
     progress_bar,
@@ -24,11 +23,11 @@ from service.cli.options import (
     user_errors,
     writes_files,
 )
+from service.cli.progress import Report
 from service.client.many import Outcome, deconvolve_many
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs
 
-CONTEXT = click.option("--context", help="Choose the PSF from this context: its id or name")
 AGAIN = click.option(
     "--again", is_flag=True, help="Deconvolve files whose header says that they are products or PSFs"
 )
@@ -153,7 +152,7 @@ def _one(
     say_warnings(product)
     details = product["details"]
     return [
-        f"{output}: PSF {product['psf_version']}, product {product['id'][:12]}",
+        f"{output}: PSF {product['psf_version']}, product {short(product['id'])}",
         f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}",
         f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
         f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",

@@ -17,6 +17,7 @@ from service.cli.options import (
     progress_bar,
     user_errors,
 )
+from service.client.errors import WaitInterrupted
 from service.client.http import Client
 from service.client.outputs import check_outputs
 from service.client.versions import Progress
@@ -76,6 +77,8 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
                 product = service.deconvolve(
                     image, product_file, preview=picture, progress=progress, overwrite=True
                 )
+        except WaitInterrupted as stop:
+            raise KeyboardInterrupt from stop  # the job does not go on, because the demo stops its service
         finally:
             server.terminate()
             server.wait(60)

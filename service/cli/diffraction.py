@@ -11,6 +11,8 @@ from pathlib import Path
 import click
 
 from service.cli.options import (
+    BACKGROUND,
+    CENTRE,
     FILE,
     JSON,
     PLOT,
@@ -94,8 +96,8 @@ def fresnel(
 
 @click.command()
 @click.argument("image", type=FILE)
-@click.option("--before", type=FILE, help="Image of the same frame before the flare, to subtract (FITS)")
-@click.option("--centre", metavar="X,Y", help="Position of the flare, px [default: found]")
+@click.option("--background", type=FILE, help=f"{BACKGROUND}, to subtract")
+@CENTRE
 @click.option(
     "--arms",
     "n_arms",
@@ -110,8 +112,8 @@ def fresnel(
 @writes_files
 def arms(
     image: Path,
-    before: Path | None,
-    centre: str | None,
+    background: Path | None,
+    centre: tuple[float, float] | None,
     n_arms: int,
     saturation_dn: float | None,
     json_file: Path | None,
@@ -126,10 +128,10 @@ def arms(
 
     with user_errors():
         flare = read_image(image, limits(), saturation_dn=saturation_dn)
-        reference = None if before is None else read_image(before, limits()).pixels
+        reference = None if background is None else read_image(background, limits()).pixels
         found = measure_arms(
             flare.pixels,
-            None if centre is None else _pair("--centre", centre),
+            centre,
             reference=reference,
             saturated=~flare.valid,
             n_arms=n_arms,
@@ -199,10 +201,3 @@ def _numbers(option: str, text: str) -> tuple[float, ...]:
         raise click.BadParameter(
             f"expected numbers separated by commas; got {text!r}", param_hint=option
         ) from error
-
-
-def _pair(option: str, text: str) -> tuple[float, float]:
-    numbers = _numbers(option, text)
-    if len(numbers) != 2:
-        raise click.BadParameter(f"expected two numbers, x,y; got {text!r}", param_hint=option)
-    return numbers[0], numbers[1]

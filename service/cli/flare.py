@@ -6,7 +6,10 @@ from pathlib import Path
 
 import click
 
+from service.cli.connection import SERVER_FOR_IDS, psf_file, psf_option
 from service.cli.options import (
+    BACKGROUND,
+    CENTRE,
     FILE,
     JSON,
     NOISE,
@@ -22,11 +25,9 @@ from service.client.outputs import written
 
 @click.command()
 @click.argument("image", type=FILE)
-@click.option(
-    "--background", required=True, type=FILE, help="Image of the same frame before the flare (FITS)"
-)
-@click.option("--psf", "psf_file", required=True, type=FILE, help="PSF to test (FITS)")
-@click.option("--centre", nargs=2, type=int, metavar="X Y", help="Position of the flare, px [default: found]")
+@click.option("--background", required=True, type=FILE, help=BACKGROUND)
+@psf_option("PSF to test: an id or a file", required=True)
+@CENTRE
 @click.option(
     "--arm",
     "arm_deg",
@@ -48,18 +49,20 @@ from service.client.outputs import written
 @SATURATION
 @JSON
 @PLOT
+@SERVER_FOR_IDS
 @writes_files
 def flare(
     image: Path,
     background: Path,
-    psf_file: Path,
-    centre: tuple[int, int] | None,
+    psf: str,
+    centre: tuple[float, float] | None,
     arm_deg: float | None,
     distances_px: tuple[float, float],
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
     json_file: Path | None,
     plot: Path | None,
+    server: str | None,
     overwrite: bool,
 ) -> None:
     """Simulate the stray light of the flare in IMAGE with a PSF, and compare it along a diffraction arm."""
@@ -70,12 +73,13 @@ def flare(
     from psfcore.noise import Noise
 
     with user_errors():
-        psf = read_psf(psf_file, limits())
+        with psf_file(server, psf) as file:
+            tested = read_psf(file, limits())
         found = judge_on_flare(
             read_image(image, limits(), saturation_dn=saturation_dn),
             read_image(background, limits(), saturation_dn=saturation_dn),
-            psf,
-            centre_xy=centre,
+            tested,
+            centre_xy=None if centre is None else (round(centre[0]), round(centre[1])),
             arm_deg=arm_deg,
             distances_px=distances_px,
             noise=None if noise is None else Noise(*noise),
@@ -85,7 +89,11 @@ def flare(
                 flare_png(found.difference, found.usable, found.comparison, picture, unit=found.unit)
     click.echo("\n".join(summary_lines(found.comparison)))
     if json_file is not None:
-        inputs = {"image": image.name, "background": background.name, "psf": f"{psf.name} {psf.version}"}
+        inputs = {
+            "image": image.name,
+            "background": background.name,
+            "psf": f"{tested.name} {tested.version}",
+        }
         write_json(json_file, inputs | found.comparison.as_json(), overwrite=overwrite)
 
 

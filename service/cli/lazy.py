@@ -8,6 +8,13 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import click
+from click.shell_completion import CompletionItem
+
+from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
+from service.client.errors import WaitInterrupted
+
+INTERRUPTED = 130  # exit status of a command that was ended by Control-C: 128 + the number of SIGINT
+REJOIN = {"job": "heliopsf job wait {id}", "bulk": "heliopsf bulk status {id} --wait"}
 
 
 class Lazy(NamedTuple):
@@ -49,6 +56,16 @@ class LazyGroup(click.Group):
         command: click.Command = getattr(import_module(row.module), row.name)
         return command
 
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """The commands for tab completion. click's own version would import all of them."""
+        if incomplete.startswith("-"):
+            return super().shell_complete(ctx, incomplete)
+        return [
+            CompletionItem(name, help=row.summary)
+            for name, row in self.rows.items()
+            if name.startswith(incomplete)
+        ]
+
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
@@ -61,9 +78,15 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command. If the user gives the former name of an option, the error names the new option."""
+        """Run a command. If the user gives the former name of an option, the error names the new option.
+
+        Control-C ends the command with status 130, and says how to return to the job that goes on.
+        """
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            click.echo(_interrupted(stop), err=True)
+            ctx.exit(INTERRUPTED)
         except click.NoSuchOption as error:
             if error.option_name not in self._renamed:
                 raise
@@ -77,3 +100,17 @@ class LazyGroup(click.Group):
         for heading, rows in self.sections.items():
             with formatter.section(heading):
                 formatter.write_dl([(f"{name:<{width}}", row.summary) for name, row in rows.items()])
+
+
+def _interrupted(stop: KeyboardInterrupt) -> str:
+    """What to tell a user who interrupted a command."""
+    if not isinstance(stop, WaitInterrupted):
+        return "interrupted"
+    there = "" if stop.server == DEFAULT_SERVER else f" --server {stop.server}"
+    short = stop.identity[:SHOWN_DIGITS]
+    rejoin = REJOIN[stop.what].format(id=short)
+    return (
+        f"interrupted; {stop.what} {short} goes on\n"
+        f"  wait for it again: {rejoin}{there}\n"
+        f"  cancel it:         heliopsf {stop.what} cancel {short}{there}"
+    )

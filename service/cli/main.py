@@ -10,6 +10,7 @@ SECTIONS = {
     "Images": {
         "deconvolve": Lazy("service.cli.deconvolve", "deconvolve", "Deconvolve one image."),
         "changes": Lazy("service.cli.changes", "changes", "Deconvolve images and show what changed."),
+        "product": Lazy("service.cli.results.product", "product", "List, download and delete products."),
     },
     "PSFs": {
         "psf": Lazy("service.cli.psf.group", "psf", "Build, fit, inspect, certify and list PSFs."),
@@ -22,6 +23,9 @@ SECTIONS = {
     },
     "Archives": {
         "bulk": Lazy("service.cli.bulk", "bulk", "Deconvolve many images on a service."),
+    },
+    "Jobs": {
+        "job": Lazy("service.cli.results.job", "job", "List, show, wait for and cancel jobs."),
     },
     "Service and operation": {
         "serve": Lazy("service.cli.serve", "serve", "Start a service."),
@@ -46,6 +50,7 @@ RENAMED = {
     "--effects": "--changes",
     "--html": "--output",
     "--force": "--overwrite",
+    "--before": "--background",
 }
 
 
@@ -55,10 +60,11 @@ RENAMED = {
     renamed=RENAMED,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-@click.version_option(package_name="heliopsf", prog_name="heliopsf")
+@click.version_option(None, "-V", "--version", package_name="heliopsf", prog_name="heliopsf")
 def main() -> None:
     """Determine the point-spread functions (PSFs) of solar EUV telescopes, and deconvolve images.
 
     Most commands send a request to a service (option --server). `heliopsf serve` starts a service.
-    With --local these commands run in this process and need no service. For help on a command: heliopsf COMMAND -h
+    With --local these commands run in this process and need no service. The help of a command says whether it needs a
+    service: heliopsf COMMAND -h
     """

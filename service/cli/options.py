@@ -6,10 +6,6 @@ This file imports no numerical libraries, so that commands start fast.
 from __future__ import annotations
 
 import json
-import re
-import sys
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -20,6 +16,7 @@ import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
+from service.cli.progress import progress_bar as progress_bar
 from service.client.errors import ServiceError, error_lines
 from service.client.outputs import check_output_folder, check_outputs, written
 from workers.contract.methods import Method
@@ -71,15 +68,22 @@ OTHER_CHANNEL = click.option(
     is_flag=True,
     help="Use the PSF even if it is of another telescope, channel or filter than the image",
 )
+CENTRE = click.option(
+    "--centre", nargs=2, type=float, metavar="X Y", help="Position of the flare, px [default: found]"
+)
+BACKGROUND = "Image of the same frame before the flare (FITS)"
 SEED = click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Seed of random numbers"
 )
 JSON = click.option("--json", "json_file", type=OUTPUT, help="Write all numbers to this file (JSON)")
 PLOT = click.option("--plot", type=OUTPUT, help="Write a plot to this file (PNG)")
-DATA = click.option("--data", type=OUTPUT_FOLDER, help="Data folder [default: HELIOPSF_DATA_DIR]")
+DATA = click.option(
+    "--data",
+    type=OUTPUT_FOLDER,
+    help="Data folder [default: HELIOPSF_DATA_DIR, else the data folder of the user]",
+)
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files that exist")
 
-Report = Callable[[str, int, int], None]
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
@@ -178,11 +182,6 @@ def _is_fits(path: Path) -> bool:
     return path.name.lower().endswith((".fits", ".fits.gz", ".fts", ".fit"))
 
 
-def is_psf_id(psf: str) -> bool:
-    """Whether a text is the id of a PSF. Otherwise it is the name of a file."""
-    return re.fullmatch(r"[0-9a-f]{64}", psf) is not None
-
-
 def percent(value: float | None, digits: int = 1) -> str:
     """A relative change as text; None: the reference has no light."""
     return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
@@ -201,32 +200,19 @@ def read_settings(data: Path | None = None) -> Settings:
         raise click.ClickException("; ".join(faults)) from error
 
 
+def data_settings(data: Path | None) -> Settings:
+    """The settings of a command that opens the data folder. It tells the user if this is the folder of an earlier version."""
+    from workers.data_folder import told
+
+    settings = read_settings(data)
+    note = None if "data_dir" in settings.model_fields_set else told()
+    if note is not None:
+        click.echo(note, err=True)
+    return settings
+
+
 def limits() -> FitsLimits:
     """The limits on FITS files that a command reads, from HELIOPSF_MAX_PIXELS."""
     from psfcore.fits.header import FitsLimits
 
     return FitsLimits(max_pixels=read_settings().max_pixels)
-
-
-@contextmanager
-def progress_bar() -> Iterator[Report]:
-    """A progress bar with the estimated time left. It shows nothing if standard error is not a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda stage, step, steps: None
-        return
-    lock = threading.Lock()
-    started = time.monotonic()
-
-    def report(stage: str, step: int, steps: int) -> None:
-        filled = round(20 * step / max(steps, 1))
-        bar = "#" * filled + "-" * (20 - filled)
-        elapsed = time.monotonic() - started
-        left = f", {elapsed * (steps - step) / step:.0f} s left" if step else ""
-        with lock:
-            sys.stderr.write(f"\r{stage:<32.32} [{bar}] {step}/{steps}  {elapsed:5.1f} s{left:<14}")
-            sys.stderr.flush()
-
-    try:
-        yield report
-    finally:
-        sys.stderr.write("\n")

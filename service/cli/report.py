@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 import click
 
-from service.cli.connection import LOCAL, SERVER, connection, named_psf
+from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
 from service.cli.options import (
     JSON,
     NOISE,
@@ -27,9 +27,7 @@ from service.cli.options import (
 @click.option("-o", "--output", type=OUTPUT, help="Write a page to read and print (HTML)")
 @JSON
 @PLOT
-@click.option(
-    "--psf", metavar="ID|FILE", help="Test this PSF: an id or a file [default: fit a PSF to TRANSIT]"
-)
+@psf_option("PSF to test: an id or a file [default: fit a PSF to TRANSIT]")
 @click.option(
     "--dark-offsets/--no-dark-offsets",
     default=True,

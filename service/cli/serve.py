@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from service.cli.options import DATA, read_settings
+from service.cli.options import DATA, data_settings
 from workers.contract.queues import Queue, queues_named
 
 
@@ -30,7 +30,7 @@ def serve(host: str, port: int, data: Path | None) -> None:
     from workers import checks
     from workers.catalogue.schema import SchemaError
 
-    settings = read_settings(data)
+    settings = data_settings(data)
     where = settings.data_dir.resolve()
     try:
         where.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,10 @@ def worker(
             queues_named(queues)
         except ValueError as error:
             raise click.BadParameter(str(error), param_hint="--queues") from error
-    os.environ |= environment(read_settings(data).model_copy(update=given))
+    settings = data_settings(data)
+    if stop_with_parent is None:  # the server has told it of its own worker
+        click.echo(f"heliopsf worker (data in {settings.data_dir.resolve()})", err=True)
+    os.environ |= environment(settings.model_copy(update=given))
     from workers.run.worker import main as run
 
     run(stop_with_parent)

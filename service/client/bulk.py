@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.client.errors import ServiceError
+from service.client.errors import ServiceError, WaitInterrupted
 from service.client.versions import Progress
 
 if TYPE_CHECKING:
     import httpx
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0
-PATIENCE_S = 600.0
+PATIENCE_S = 600.0  # longest time without an answer after which a client still waits for a job or a bulk run
 PASSING = (None, 429, 502, 503)  # statuses after which a request is tried again; None: no answer
 QUIET_S = (
     60.0  # longest silence before the stream counts as broken; a stream sends a line at least every 15 s
@@ -28,7 +28,12 @@ class BulkClient(ABC):
     """The requests about bulk runs and events.
 
     Every method raises ``ServiceError``; its ``code`` is the reason ("path-not-allowed", "no-such-bulk", ...).
+    server: address of the service. say: is called with a sentence if the service does not answer during a wait, and when
+    it answers again.
     """
+
+    server: str
+    say: Callable[[str], None]
 
     @abstractmethod
     def get(self, address: str) -> dict[str, Any]:
@@ -127,13 +132,19 @@ class BulkClient(ABC):
         self.download(f"/v1/bulk/{bulk_id}/results?format={format}", path, overwrite=overwrite)
 
     def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> dict[str, Any]:
-        """Wait until a bulk run ends, is paused or has failed; returns its description."""
-        for bulk in self.follow(f"/v1/bulk/{bulk_id}"):
-            images = bulk["images"]
-            if progress is not None and images["total"]:
-                progress("images", images["done"] + images["failed"], images["total"])
-            if bulk["phase"] not in ("LISTING", "RUNNING"):
-                break
+        """Wait until a bulk run ends, is paused or has failed; returns its description.
+
+        Raises ``WaitInterrupted`` on Control-C; the bulk run goes on.
+        """
+        try:
+            for bulk in self.follow(f"/v1/bulk/{bulk_id}"):
+                images = bulk["images"]
+                if progress is not None and images["total"]:
+                    progress("images", images["done"] + images["failed"], images["total"])
+                if bulk["phase"] not in ("LISTING", "RUNNING"):
+                    break
+        except KeyboardInterrupt as stop:
+            raise WaitInterrupted("bulk", bulk_id, self.server) from stop
         return bulk
 
     def follow(self, address: str) -> Iterator[dict[str, Any]]:
@@ -143,13 +154,15 @@ class BulkClient(ABC):
         restart, the client tries again.
         """
         last_id: str | None = None
-        wait_s, heard_at = FIRST_WAIT_S, time.monotonic()
+        wait_s, heard_at, lost = FIRST_WAIT_S, time.monotonic(), False
         while True:
             headers = {} if last_id is None else {"Last-Event-ID": last_id}
             try:
                 with self._streamed(f"{address}/events", headers=headers, timeout=QUIET_S) as answer:
                     for event in _events(answer.iter_lines()):
-                        last_id = event.get("id", last_id)
+                        if lost:
+                            self.say("the service answers again")
+                        last_id, lost = event.get("id", last_id), False
                         wait_s, heard_at = FIRST_WAIT_S, time.monotonic()
                         if event["event"] == "gone":
                             return
@@ -161,8 +174,18 @@ class BulkClient(ABC):
             except ServiceError as error:
                 if error.status not in PASSING or time.monotonic() - heard_at > PATIENCE_S:
                     raise
-                wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+                if not lost:
+                    self.say(still_waiting(error))
+                wait_s, lost = min(2 * wait_s, LONGEST_WAIT_S), True
             time.sleep(wait_s)
+
+
+def still_waiting(error: ServiceError) -> str:
+    """What to tell a user whose service stopped answering during a wait."""
+    return (
+        f"{error}. Jobs that were submitted are kept and go on as soon as the service does; trying again for "
+        f"{PATIENCE_S / 60:.0f} min"
+    )
 
 
 def _events(lines: Iterator[str]) -> Iterator[dict[str, str]]:

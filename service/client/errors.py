@@ -1,4 +1,4 @@
-"""The error that a client raises."""
+"""The errors that a client raises."""
 
 from __future__ import annotations
 
@@ -56,3 +56,14 @@ def error_lines(message: str, fields: Mapping[str, Any]) -> list[str]:
 def _same(one: Mapping[str, Any]) -> str:
     same = ", ".join(str(what).replace("_", " ") for what in one["same"])
     return f"; same {same} as the image" if same else ""
+
+
+class WaitInterrupted(KeyboardInterrupt):
+    """Control-C during a wait for a job or a bulk run, which goes on without the client.
+
+    what: "job" or "bulk". identity: its id. server: address of the service.
+    """
+
+    def __init__(self, what: str, identity: str, server: str) -> None:
+        super().__init__(f"the wait was interrupted; {what} {identity} goes on at {server}")
+        self.what, self.identity, self.server = what, identity, server

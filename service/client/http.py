@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,14 +15,19 @@ import httpx
 
 from psfcore.errors import DataError
 from psfcore.transit.archive import pack
-from service.client.bulk import BulkClient
-from service.client.errors import ServiceError
-from service.client.operations import DEFAULT_SERVER, Operations
+from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS, service_address
+from service.client.bulk import FIRST_WAIT_S, LONGEST_WAIT_S, PASSING, PATIENCE_S, BulkClient, still_waiting
+from service.client.errors import ServiceError, WaitInterrupted
+from service.client.operations import Operations
 from service.client.outputs import written
 from service.client.versions import Progress, VersionedPsfs
 
-PATIENCE_S = 30.0
 _STANDARD_FIELDS = ("type", "title", "status", "detail", "instance")  # of a problem document, RFC 9457
+QUEUED_S = 10.0  # time in the queue after which a client that waits for a job says so
+
+
+def _silent(_line: str) -> None:
+    """Say nothing."""
 
 
 class Client(VersionedPsfs, BulkClient, Operations):
@@ -34,12 +39,15 @@ class Client(VersionedPsfs, BulkClient, Operations):
         *,
         key: str | None = None,
         transport: httpx.BaseTransport | None = None,
+        say: Callable[[str], None] = _silent,
     ) -> None:
-        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY.
+        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY. say: is called with
+        a sentence during a wait, if the job stays in the queue or the service does not answer.
 
-        Raises ``ServiceError`` "bad-key" if the key cannot be sent.
+        A service of this machine needs no scheme: ``localhost:8765``. Raises ``ServiceError`` "bad-address", and "bad-key" if
+        the key cannot be sent.
         """
-        self.server = server or os.environ.get("HELIOPSF_SERVER", DEFAULT_SERVER)
+        self.server = service_address(server or os.environ.get("HELIOPSF_SERVER") or DEFAULT_SERVER)
         key = (key or os.environ.get("HELIOPSF_KEY", "")).strip()
         if not (key.isascii() and key.isprintable()) or " " in key:
             # The key is checked here. Otherwise the HTTP library would print the key in its error about a bad header.
@@ -47,6 +55,7 @@ class Client(VersionedPsfs, BulkClient, Operations):
                 "expected a key of the form hpsf_ID_SECRET; got something else", code="bad-key"
             )
         headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self.say = say
         self._http = httpx.Client(base_url=self.server, timeout=60, transport=transport, headers=headers)
 
     def __enter__(self) -> Client:
@@ -131,6 +140,10 @@ class Client(VersionedPsfs, BulkClient, Operations):
         """The current description of a job."""
         return self._json("GET", f"/v1/jobs/{job_id}")
 
+    def jobs(self, **filters: str) -> Iterator[dict[str, Any]]:
+        """Your jobs, newest first; ``phase`` selects the jobs in one phase."""
+        return self._all("/v1/jobs", filters)
+
     def cancel(self, job_id: str) -> dict[str, Any]:
         """Cancel a job."""
         return self._json("DELETE", f"/v1/jobs/{job_id}")
@@ -140,28 +153,52 @@ class Client(VersionedPsfs, BulkClient, Operations):
     ) -> dict[str, Any]:
         """Wait until a job is completed; returns its description.
 
-        Raises ``ServiceError`` if the job failed or was cancelled, and ``TimeoutError`` after ``timeout_s``.
+        If the service does not answer, for example while it is restarted, the client tries again for ten minutes. Raises
+        ``ServiceError`` if the job failed or was cancelled, ``TimeoutError`` after ``timeout_s``, and ``WaitInterrupted`` on
+        Control-C; the job goes on.
         """
-        started = time.monotonic()
+        try:
+            return self._ended(self._followed(job, progress, timeout_s))
+        except KeyboardInterrupt as stop:
+            raise WaitInterrupted("job", job["id"], self.server) from stop
+
+    def _followed(
+        self, job: dict[str, Any], progress: Progress | None, timeout_s: float | None
+    ) -> dict[str, Any]:
+        """The description of a job when it has ended."""
+        started, told = time.monotonic(), False
         while job["phase"] in ("QUEUED", "EXECUTING"):
-            if timeout_s is not None and time.monotonic() - started > timeout_s:
+            waited_s = time.monotonic() - started
+            if timeout_s is not None and waited_s > timeout_s:
                 raise TimeoutError(f"job {job['id']} is {job['phase']} after {timeout_s:g} s")
+            if job["phase"] == "QUEUED" and waited_s > QUEUED_S and not told:
+                self.say(f"job {job['id'][:SHOWN_DIGITS]} waits in the queue {job['queue']}")
+                told = True
             time.sleep(0.1)
             job = self._job_patiently(job["id"])
             if progress is not None and job["progress"]["steps"]:
                 progress(job["progress"]["stage"], job["progress"]["step"], job["progress"]["steps"])
-        return self._ended(job)
+        return job
 
     def _job_patiently(self, job_id: str) -> dict[str, Any]:
-        """The description of a job. If the service does not answer for a short time, as during a restart, the request is repeated."""
-        deadline = time.monotonic() + PATIENCE_S
+        """The description of a job. While the service does not answer, the request is repeated at growing intervals."""
+        deadline, wait_s = time.monotonic() + PATIENCE_S, FIRST_WAIT_S
+        lost = False
         while True:
             try:
-                return self.job(job_id)
+                job = self.job(job_id)
             except ServiceError as error:
-                if error.status not in (None, 429, 502, 503) or time.monotonic() > deadline:
+                if error.status not in PASSING or time.monotonic() > deadline:
                     raise
-                time.sleep(min(error.retry_after_s or 0.5, PATIENCE_S))
+                if not lost and error.status != 429:
+                    self.say(still_waiting(error))
+                    lost = True
+                time.sleep(min(error.retry_after_s or wait_s, LONGEST_WAIT_S))
+                wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+            else:
+                if lost:
+                    self.say("the service answers again")
+                return job
 
     def get(self, address: str) -> dict[str, Any]:
         """The description at an address of the service."""
@@ -182,6 +219,10 @@ class Client(VersionedPsfs, BulkClient, Operations):
     def products(self, **filters: str) -> Iterator[dict[str, Any]]:
         """All products, newest first."""
         return self._all("/v1/products", filters)
+
+    def delete_product(self, product_id: str) -> None:
+        """Delete a product. The same request makes it again."""
+        self._answer("DELETE", f"/v1/products/{product_id}")
 
     def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
         """Download a file of the service. The file appears at ``path`` only when it is complete."""
@@ -238,14 +279,17 @@ class Client(VersionedPsfs, BulkClient, Operations):
             raise self._unreachable(error) from error
 
     def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
+        body: dict[str, Any] = self._answer(method, address, **options).json()
+        return body
+
+    def _answer(self, method: str, address: str, **options: Any) -> httpx.Response:
         try:
             response = self._http.request(method, address, **options)
         except httpx.TransportError as error:
             raise self._unreachable(error) from error
         if response.is_error:
             raise _refused(response)
-        body: dict[str, Any] = response.json()
-        return body
+        return response
 
     def _unreachable(self, error: httpx.TransportError) -> ServiceError:
         return ServiceError(f"no answer from {self.server} ({error}); `heliopsf serve` starts a service")

@@ -15,8 +15,6 @@ from service.client.errors import ServiceError
 from service.client.outputs import check_outputs
 from service.client.versions import Progress
 
-DEFAULT_SERVER = "http://127.0.0.1:8765"
-
 
 class Operations(ABC):
     """The requests to a service, over HTTP or in this process. Every method raises ``ServiceError``."""

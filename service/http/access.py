@@ -5,10 +5,10 @@ By default a service bound to a loopback address is open, and any other service 
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 from dataclasses import dataclass
 
+from service.client.address import is_loopback
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
@@ -35,14 +35,6 @@ class Access:
         if "*" in named or not (named or (not keys and is_loopback(bound_to))):
             return cls(keys, None)
         return cls(keys, named | LOOPBACK_NAMES | {bound_to.lower()})
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address can be reached only from its own machine."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:  # the host is a name, which may stand for another address on another machine
-        return False
 
 
 def check_can_serve(settings: Settings, host: str, catalogue: Catalogue) -> None:

@@ -17,6 +17,7 @@ from fastapi.openapi.models import HTTPBase, HTTPBearer
 from fastapi.security import SecurityScopes
 from fastapi.security.base import SecurityBase
 
+from service.http import short_ids
 from service.http.problems import Problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State
@@ -70,6 +71,8 @@ def _caller(
         reading = scope in (Scope.READ, Scope.ADMIN)
         bucket = Bucket.READS if reading else Bucket.SUBMISSIONS
         request.state.allowance = state.rates.take(bucket, caller.name)
+    # Parameters of the path are read after this dependency, so every route gets whole ids.
+    short_ids.complete(request, state, caller.owner)
     return caller
 
 

@@ -11,7 +11,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http import problems
 from service.http.access import Access
-from service.http.uploads import LARGE
+from service.http.uploads import has_own_limit
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 
@@ -39,7 +39,7 @@ class _Guard:
         try:
             self._check_host(headers)
             _check_origin(scope["method"], headers)
-            if scope["path"] not in LARGE:
+            if not has_own_limit(scope["path"]):
                 receive = _bounded(headers, receive, self._max_body_bytes)
         except problems.Problem as problem:
             refusal = problems.answer(problem.status, problem.code, problem.detail)

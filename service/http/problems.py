@@ -52,6 +52,7 @@ STATUS_OF = {
     "psf-as-image": 409,
     "psf-in-use": 409,
     "ranges-overlap": 409,
+    "several-ids-fit": 409,
     "several-psfs-fit": 409,
     "successor-named": 409,
     "version-taken": 409,

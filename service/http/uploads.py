@@ -229,6 +229,35 @@ def _refuse_by_length(request: Request, max_bytes: int) -> int:
     return declared
 
 
+def check_size(size_bytes: int, max_bytes: int) -> None:
+    """Raise ``Problem`` 413 if a received file is too large, and 400 if it is empty."""
+    if size_bytes > max_bytes:
+        raise _too_large(max_bytes)
+    if size_bytes == 0:
+        raise Problem(400, "empty-upload", "expected a file, got 0 bytes: check the file")
+
+
+def fits_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
+    """The summary of a received FITS file. Raises ``Problem`` 415 or 422 if it cannot be used."""
+    return _inspected(path, _Fits(limits))
+
+
+def archive_contents(path: Path, limits: ArchiveLimits) -> ArchiveContents:
+    """The contents of a received archive of a transit. Raises ``Problem`` 413, 415 or 422 if it cannot be used."""
+    return _inspected(path, _Archive(limits))
+
+
+def _inspected(path: Path, expected: _Format[Found]) -> Found:
+    with path.open("rb") as file:
+        expected.recognise(file.read(expected.start_bytes), whole=True)
+    return expected.inspect(path)
+
+
+def has_own_limit(address: str) -> bool:
+    """Whether the route at an address limits the size of its bodies itself, because they may contain files."""
+    return address in LARGE or re.fullmatch(r"/uws/jobs(/[^/]+/parameters)?", address) is not None
+
+
 def _too_large(max_bytes: int) -> Problem:
     return Problem(
         413,
@@ -254,7 +283,7 @@ class _Body:
                 async for chunk in self._form(options):
                     yield chunk
             else:
-                self.filename = _label(self._request.query_params.get("filename"))
+                self.filename = label(self._request.query_params.get("filename"))
                 async for chunk in self._request.stream():
                     if chunk:
                         yield chunk
@@ -311,7 +340,7 @@ class _Body:
             _, options = parse_options_header(self._value)
             if options.get(b"name") == b"file" and not self._seen_file:
                 self._in_file = self._seen_file = True
-                self.filename = _label(options.get(b"filename", b"").decode("utf-8", "replace"))
+                self.filename = label(options.get(b"filename", b"").decode("utf-8", "replace"))
         self._name, self._value = b"", b""
 
     def _part_data(self, data: bytes, start: int, end: int) -> None:
@@ -322,7 +351,7 @@ class _Body:
         self._whole = True
 
 
-def _label(filename: str | None) -> str | None:
+def label(filename: str | None) -> str | None:
     """A short printable label from a client's file name. It is never used as a path."""
     if not filename:
         return None

@@ -52,7 +52,7 @@ async def read_form(request: Request) -> dict[str, str]:
             )
         except ValueError as error:
             raise bad(f"expected a form of at most {MAX_FIELDS} fields in UTF-8: {error}") from error
-    return _single([*request.query_params.multi_items(), *sent])
+    return single([*request.query_params.multi_items(), *sent])
 
 
 Form = Annotated[dict[str, str], Depends(read_form)]
@@ -183,7 +183,8 @@ def _shown(value: object) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
-def _single(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
+def single(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """The fields of a form by their names in lower case, without empty ones. Raises ``Problem`` if a name occurs twice."""
     found: dict[str, str] = {}
     for name, value in pairs:
         name = name.lower()

@@ -44,11 +44,14 @@ def query(**described: str) -> dict[str, Any]:
     }
 
 
-def form(**described: str) -> dict[str, Any]:
-    """OpenAPI description of the fields of a form."""
+def form(*, files: bool = False, **described: str) -> dict[str, Any]:
+    """OpenAPI description of the fields of a form. files: whether a multipart form may contain files."""
     fields = {name: {"type": "string", "description": text} for name, text in described.items()}
     schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
-    return {"requestBody": {"content": {"application/x-www-form-urlencoded": {"schema": schema}}}}
+    content = {"application/x-www-form-urlencoded": {"schema": schema}}
+    if files:
+        content["multipart/form-data"] = {"schema": schema}
+    return {"requestBody": {"content": content}}
 
 
 TEXT: dict[str, Any] = {"response_class": PlainTextResponse}

@@ -23,12 +23,15 @@ from service.http.state import Shared, State
 from service.uws import documents
 from service.uws import plain_errors as routing
 from service.uws.parameters import Form, bad, check, integer, kind_of, moment, phase, query_of, resolved
+from service.uws.uploads import SentForm, ids_of, keep
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.contract.phases import JobError, Phase
 
 MAX_RUN_ID = 256
 MOST = 2**31 - 1
 MOST_LISTED = 10_000  # largest number of jobs in one document, because the document is built in memory
+UPLOADS = "NAME,param:PART: the file in the part PART of a multipart form is the image, mask, transit or psf (NAME) of the job"
+PENDING_ONLY = "parameters can be set only while a job is PENDING"
 FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a waiting request checks its job at growing intervals
 
 
@@ -75,15 +78,18 @@ def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
     summary="UWS: create a job",
     **routing.TO_JOB,
     openapi_extra=routing.form(
+        files=True,
         KIND="kind of job, for example deconvolve",
         PHASE="RUN: start the job at once",
         RUNID="your own name for the job",
         EXECUTIONDURATION="seconds that the job may execute",
         DESTRUCTION="time at which the job is destroyed",
+        UPLOAD=UPLOADS,
     ),
 )
-def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
+def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: Shared) -> Response:
     """Create a job. All other fields are parameters of the job; write objects as JSON."""
+    form = dict(sent.fields)
     run_id, start = form.pop("runid", None), form.pop("phase", None)
     duration, destruction = form.pop("executionduration", None), form.pop("destruction", None)
     kind = kind_of(form)
@@ -91,7 +97,9 @@ def create_uws_job(caller: Submitting, form: Form, request: Request, state: Shar
         raise bad(f"expected RUNID of at most {MAX_RUN_ID} characters that XML can hold; got {run_id[:40]!a}")
     if start not in (None, "RUN"):
         raise bad(f"expected PHASE=RUN or no PHASE; got {start[:40]!a}")
+    form |= ids_of(sent, kind)
     check(kind, form)
+    keep(state, caller, sent, kind)
     ready = resolved(state, caller.owner, kind, form) if start else None
     row = state.catalogue.uws.draft(
         kind,
@@ -247,25 +255,30 @@ def get_uws_parameters(job_id: str, caller: Reading, state: Shared) -> Response:
     "/{job_id}/parameters",
     summary="UWS: change a pending job's parameters",
     **routing.TO_JOB,
-    openapi_extra=routing.form(),
+    openapi_extra=routing.form(files=True, UPLOAD=UPLOADS),
 )
 def post_uws_parameters(
-    job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
+    job_id: str, caller: Submitting, sent: SentForm, request: Request, state: Shared
 ) -> Response:
     """Set parameters of a PENDING job. Parameters that are not sent do not change."""
-    row = _find(state, caller, job_id)
+    row, form = _find(state, caller, job_id), dict(sent.fields)
+    if row.phase != Phase.PENDING:
+        raise _not_now(row, PENDING_ONLY)
     if kind_of({"kind": row.kind} | form) != row.kind:
         raise bad(
             f"expected KIND={row.kind}; got {form['kind']}: the kind of a job cannot change, so create another job"
         )
     form.pop("kind", None)
+    form |= ids_of(sent, row.kind)
+    check(row.kind, row.parameters | form)
+    keep(state, caller, sent, row.kind)
 
     def change(given: dict[str, Any]) -> dict[str, Any]:
         check(row.kind, given | form)
         return given | form
 
     if not state.catalogue.uws.amend(job_id, change):
-        raise _not_now(_find(state, caller, job_id), "parameters can be set only while a job is PENDING")
+        raise _not_now(_find(state, caller, job_id), PENDING_ONLY)
     return _see(request, job_id)
 
 

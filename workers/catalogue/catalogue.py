@@ -19,7 +19,7 @@ from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
 from workers.catalogue.census import Census
 from workers.catalogue.contexts import Contexts
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, begins_with
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.keys import Keys
 from workers.catalogue.named_files import NamedFiles
@@ -49,6 +49,8 @@ Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, Soluti
 AnyRow = TypeVar(
     "AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow, PsfContextRow, BulkRow
 )
+ListedRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | JobRow | PsfContextRow | BulkRow
+MOST_CANDIDATES = 6
 
 
 class Catalogue:
@@ -141,10 +143,17 @@ class Catalogue:
             _unshare_jobs(session, owner, psf_id)
             return row
 
+    def ids_from(self, table: type[ListedRow], digits: str, owner: str) -> Sequence[str]:
+        """The ids of an owner's rows that begin with these digits, at most MOST_CANDIDATES."""
+        query = select(table.id).where(table.owner == owner, begins_with(table.id, digits))
+        with self._database.reading() as session:
+            return session.scalars(query.order_by(table.id).limit(MOST_CANDIDATES)).all()
+
     def delete_product(self, identity: str, owner: str) -> bool:
         """Remove a product from the catalogue; returns whether it was there.
 
-        Its bytes no longer count for the owner, and a later identical request makes it again. Its files stay in the store.
+        Its bytes no longer count for the owner, and a later identical request makes it again. Its files stay until
+        ``workers.files.collection`` removes them, because other rows may refer to the same files.
         """
         with self._database.writing.begin() as session:
             add_bytes(session, owner, 0)  # locks the owner first, as `hold_to_quota` does: no deadlock

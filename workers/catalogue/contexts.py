@@ -14,9 +14,10 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, begins_with, several_ids_fit
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
 from workers.contract.identities import canonical_hash
+from workers.contract.short_ids import SHORT_ID
 from workers.versions.status import PsfStatus
 from workers.versions.validity import Validity, iso
 
@@ -24,6 +25,7 @@ NOW = "now"  # used instead of a context's name: the PSFs that are certified now
 RESERVED = (NOW, "default")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$"  # shorter than an id, so a name is never read as an id
 _ID = re.compile(r"[0-9a-f]{64}")
+_SHORT_ID = re.compile(SHORT_ID)
 
 
 @dataclass(frozen=True)
@@ -74,17 +76,24 @@ class Contexts:
             return existing, False
 
     def find(self, id_or_name: str, owner: str) -> PsfContextRow | None:
-        """The context with this id or name, or None."""
+        """The context with this id or name, or the only one whose id begins with these digits; else None.
+
+        Raises ``DataError`` "several-ids-fit".
+        """
+        of_owner = select(PsfContextRow).where(PsfContextRow.owner == owner)
         with self._database.reading() as session:
             if _ID.fullmatch(id_or_name):
                 return session.get(PsfContextRow, (owner, id_or_name))
-            named = select(PsfContextRow).where(
-                PsfContextRow.owner == owner, PsfContextRow.name == id_or_name
-            )
-            return session.scalars(named).first()
+            found = session.scalars(of_owner.where(PsfContextRow.name == id_or_name)).first()
+            if found is not None or not _SHORT_ID.fullmatch(id_or_name):
+                return found
+            rows = session.scalars(of_owner.where(begins_with(PsfContextRow.id, id_or_name)).limit(6)).all()
+        if len(rows) > 1:
+            raise several_ids_fit(id_or_name, [row.id for row in rows])
+        return rows[0] if rows else None
 
     def named(self, id_or_name: str, owner: str) -> PsfContextRow:
-        """The context with this id or name. Raises ``DataError`` "no-such-context"."""
+        """The context with this id or name. Raises ``DataError`` "no-such-context" or "several-ids-fit"."""
         found = self.find(id_or_name, owner)
         if found is None:
             raise DataError(

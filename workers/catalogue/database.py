@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import (
@@ -14,12 +15,15 @@ from sqlalchemy import (
     Engine,
     MetaData,
     Update,
+    and_,
     create_engine,
     event,
     literal_column,
 )
 from sqlalchemy.engine import CursorResult
-from sqlalchemy.orm import Session, sessionmaker
+from sqlalchemy.orm import InstrumentedAttribute, Session, sessionmaker
+
+from psfcore.errors import DataError
 
 PATIENCE_S = 30.0  # longest time to wait for other writers of SQLite
 
@@ -59,6 +63,20 @@ class Database:
             result = session.execute(statement)
             assert isinstance(result, CursorResult)
             return result.rowcount
+
+
+def begins_with(column: InstrumentedAttribute[str], digits: str) -> ColumnElement[bool]:
+    """The condition that an id begins with these hexadecimal digits. It is written so that an index can be used."""
+    return and_(column >= digits, column < digits + "g")
+
+
+def several_ids_fit(digits: str, candidates: Sequence[str]) -> DataError:
+    """The error about the first digits of an id with which several ids begin."""
+    return DataError(
+        "several-ids-fit",
+        f"expected the first digits of one id; got {digits}, with which these ids begin: {', '.join(candidates)}: "
+        "write more digits",
+    )
 
 
 def open_engine(url: str) -> Engine:

@@ -153,6 +153,8 @@ class Jobs:
                 step=0,
                 steps=0,
                 stage="",
+                count_at=None,
+                count_step=0,
             )
         except IntegrityError:  # because of the index one_at_work_a_result
             self.forget_submission(job_id)
@@ -164,9 +166,16 @@ class Jobs:
         return self._set([*_held(lease), JobRow.cancel_requested.is_(False)], heartbeat_at=self._database.now)
 
     def progress(self, lease: Lease, stage: str, step: int, steps: int) -> bool:
-        """Store the job's progress and a heartbeat; False if the lease is lost or the job was cancelled."""
+        """Store the job's progress and a heartbeat; False if the lease is lost or the job was cancelled.
+
+        A job counts its steps several times. A count is new if its number of steps differs, or if its step is smaller than the
+        step before. The row keeps the beginning of the present count, so that its pace can be computed.
+        """
+        new_count = or_(JobRow.count_at.is_(None), JobRow.steps != steps, JobRow.step > step)
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(False)],
+            count_at=case((new_count, self._database.now), else_=JobRow.count_at),
+            count_step=case((new_count, step), else_=JobRow.count_step),
             stage=stage,
             step=step,
             steps=steps,

@@ -247,6 +247,9 @@ class JobRow(Base):
     step: Mapped[int] = mapped_column(default=0)
     steps: Mapped[int] = mapped_column(default=0)
     stage: Mapped[str] = mapped_column(default="")
+    # The time and the step at which the job began its present count of steps.
+    count_at: Mapped[float | None]
+    count_step: Mapped[int] = mapped_column(default=0, server_default="0")
     result_id: Mapped[str | None] = mapped_column(String(64))
     error: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     # The estimate was made when the job was submitted.

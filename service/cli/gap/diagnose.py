@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from service.cli.connection import LOCAL, SERVER, connection, named_psf
+from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
 from service.cli.gap.blind import blind
 from service.cli.options import (
     JSON,
@@ -50,7 +50,9 @@ def gap() -> None:
 @click.option("-o", "--output", type=OUTPUT, help="Write a page to read and print (HTML)")
 @JSON
 @PLOT
-@click.option("--psf", metavar="ID|FILE", help="Fit the shape of this PSF, starting from its parameters")
+@psf_option(
+    "PSF whose shape is fitted, starting from its parameters: an id or a file [default: fit the default shape]"
+)
 @click.option(
     "--corrected",
     "corrected_file",

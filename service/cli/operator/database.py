@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
-from service.cli.options import DATA, read_settings
+from service.cli.options import DATA, data_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.schema import SchemaError, SchemaStatus
@@ -64,7 +64,7 @@ def sentence(found: SchemaStatus) -> str:
 @contextmanager
 def opened_catalogue(data: Path | None) -> Iterator[Catalogue]:
     """The catalogue of a data folder. Its database is not upgraded; an error of the database becomes a ``ClickException``."""
-    settings = read_settings(data)
+    settings = data_settings(data)
     if settings.database_url is None:
         settings.data_dir.mkdir(parents=True, exist_ok=True)
     try:

@@ -11,6 +11,7 @@ SECTIONS = {
         "build": Lazy("service.cli.psf.make", "build", "Compute the PSF of an instrument."),
         "fit": Lazy("service.cli.psf.make", "fit", "Fit the scattered light of a transit."),
         "crossval": Lazy("service.cli.psf.make", "crossval", "Estimate the uncertainty of a fit."),
+        "instruments": Lazy("service.cli.psf.files", "instruments", "List instruments that can be built."),
     },
     "Read": {
         "show": Lazy("service.cli.psf.make", "show", "Show what a PSF file contains."),
@@ -20,6 +21,7 @@ SECTIONS = {
     },
     "Versions on a service": {
         "list": Lazy("service.cli.psf.versions", "list_psfs", "List PSFs."),
+        "download": Lazy("service.cli.psf.files", "download", "Download a PSF."),
         "upload": Lazy("service.cli.psf.versions", "upload_psf", "Upload a PSF."),
         "certify": Lazy("service.cli.psf.versions", "certify", "Certify a PSF for a range of times."),
         "deprecate": Lazy("service.cli.psf.versions", "deprecate", "Withdraw a certified PSF."),

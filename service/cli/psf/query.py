@@ -8,25 +8,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from psfcore.tables import lookup
-from service.cli.connection import remote, server_option
-from service.cli.options import JSON, OUTPUT, is_psf_id, limits, user_errors, write_json, writes_files
+from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, whole_id
+from service.cli.options import JSON, OUTPUT, limits, user_errors, write_json, writes_files
 from service.client.outputs import written
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
 
-SERVER = server_option("Address of the service, if PSF is an id")
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @click.command("query")
-@click.argument("psf", metavar="PSF_ID|FILE")
+@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
 @click.option("--radius", "radii", multiple=True, type=float, help="Radius, px; can be repeated")
 @click.option(
     "--annulus", nargs=2, type=float, metavar="INNER OUTER", help="Show the light between two radii, px"
@@ -34,11 +32,12 @@ SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 @click.option("--profile", is_flag=True, help="Also show the mean weight by radius")
 @click.option(
     "--compare",
-    metavar="PSF_ID|FILE",
+    type=ID_OR_FILE,
+    metavar="ID|FILE",
     help="Compare with this PSF; shows this PSF minus the first",
 )
 @JSON
-@SERVER
+@SERVER_FOR_IDS
 @writes_files
 def query(
     psf: str,
@@ -70,19 +69,19 @@ def query(
 
 
 @click.command("cutout")
-@click.argument("psf", metavar="PSF_ID|FILE")
+@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
 @click.option(
     "--size", required=True, type=click.IntRange(1), help="Width and height of the part to write, px"
 )
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the part (FITS)")
-@SERVER
+@SERVER_FOR_IDS
 @writes_files
 def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: bool) -> None:
     """Write the central part of a PSF, not renormalised. If the PSF is a file, the components are written too."""
     from psfcore.central_part import central_part
 
     with user_errors():
-        if _is_id(psf):
+        if is_psf_id(psf):
             with remote(server) as service:
                 service.psf_cutout(psf, size, output, overwrite=overwrite)
         else:
@@ -91,22 +90,17 @@ def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: boo
 
 
 @click.command("rebin")
-@click.argument("psf", metavar="PSF_ID|FILE")
+@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
 @click.option("--factor", required=True, type=click.IntRange(2), help="Pixels per binned pixel, on each axis")
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the binned PSF (FITS)")
-@SERVER
+@SERVER_FOR_IDS
 @writes_files
 def rebin(psf: str, factor: int, output: Path, server: str | None, overwrite: bool) -> None:
     """Write the PSF for images that are binned by FACTOR x FACTOR pixels."""
     from psfcore.psf_sampling import rebinned
 
-    with user_errors(), TemporaryDirectory(prefix="heliopsf-") as folder:
-        file = psf
-        if _is_id(psf):
-            file = str(Path(folder) / "psf.fits")
-            with remote(server) as service:
-                service.download(f"/v1/psfs/{psf}/file", file)
-        binned = rebinned(_read(file), factor)
+    with user_errors(), psf_file(server, psf) as file:
+        binned = rebinned(_read(str(file)), factor)
         _write(output, binned, overwrite)
     ny, nx = binned.kernel.shape
     click.echo(f"{output}: {binned.name} {binned.version}, {nx} x {ny} px of {factor} x {factor}")
@@ -118,8 +112,8 @@ COMMANDS = (query, cutout, rebin)
 @contextmanager
 def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
     """A function that answers queries about the named PSFs: the service answers for ids; for files the tables are computed here."""
-    ids = [psf for psf in psfs if psf is not None and _is_id(psf)]
-    files = [psf for psf in psfs if psf is not None and not _is_id(psf)]
+    ids = [psf for psf in psfs if psf is not None and is_psf_id(psf)]
+    files = [psf for psf in psfs if psf is not None and not is_psf_id(psf)]
     if ids and files:
         raise click.UsageError(
             "expected two PSF ids or two files; got an id and a file. Upload the file first: heliopsf psf upload FILE"
@@ -136,17 +130,15 @@ def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dic
         yield ask_files
         return
     with remote(server) as service:
-        yield lambda psf, question, **wanted: service.answer(
-            ids if "/" in question else [psf], question, wanted
-        )
+        whole = {psf: whole_id(service, "psfs", psf) for psf in ids}
 
+        def ask_service(psf: str, question: str, **wanted: Any) -> dict[str, Any]:
+            name, _, other = question.partition("/")
+            if other:
+                return service.compare_psfs(whole[psf], whole[other])
+            return service.answer([whole[psf]], name, wanted)
 
-def _is_id(psf: str) -> bool:
-    if is_psf_id(psf):
-        return True
-    if not Path(psf).is_file():
-        raise click.UsageError(f"expected a PSF id (64 hexadecimal digits) or a file; got {psf!r}")
-    return False
+        yield ask_service
 
 
 def _tables(file: str) -> dict[str, Any]:

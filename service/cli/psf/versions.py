@@ -5,16 +5,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
-from service.cli.connection import SERVER, remote
-from service.cli.options import FILE, JSON, is_psf_id, progress_bar, user_errors, write_json, writes_files
+from service.cli.connection import CONTEXT, ID, SERVER, id_argument, remote, short, whole_id, whole_ids
+from service.cli.options import FILE, JSON, progress_bar, user_errors, write_json, writes_files
 from workers.versions.status import PsfStatus
 
 if TYPE_CHECKING:
-    from service.client.http import Client
+    pass
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 REASON = click.option("--reason", default="", help="Reason, kept in the history")
@@ -22,7 +22,6 @@ FROM = click.option(
     "--from", "valid_from", metavar="TIME", help="Start of its time range (included) [default: no start]"
 )
 TO = click.option("--to", "valid_to", metavar="TIME", help="End of its time range (excluded) [default: open]")
-CONTEXT = click.option("--context", help="Context: its id or name; now: the PSFs that are certified now")
 PRODUCT = click.option("--product", is_flag=True, help="The ID is of a product, not of a PSF")
 
 
@@ -58,7 +57,7 @@ def list_psfs(server: str | None, **filters: str | None) -> None:
         click.echo("no PSF with " + ", ".join(f"{name} {value}" for name, value in _given(filters).items()))
     for row in rows:
         size = "x".join(map(str, row["details"]["shape"]))
-        line = f"{row['id']}  {row['name']}  {row['version']}  {row['status']}  {size}"
+        line = f"{short(row['id'])}  {row['name']}  {row['version']}  {row['status']}  {size}"
         click.echo(line + _validity(row))
 
 
@@ -73,11 +72,11 @@ def upload_psf(file: Path, server: str | None, **said: str | None) -> None:
     with user_errors(), remote(server) as service:
         row = service.upload_psf(file, **said)
     line = f"{row['instrument'] or 'unknown instrument'} {row['channel'] or '-'} {row['kind']}"
-    click.echo(f"{row['id']}  {row['name']}  {row['version']}  {row['status']}  {line}")
+    click.echo(f"{short(row['id'])}  {row['name']}  {row['version']}  {row['status']}  {line}")
 
 
 @click.command("certify")
-@click.argument("psf_id", metavar="PSF_ID")
+@id_argument("psf_id")
 @click.option(
     "--version",
     help="Version of a draft, such as 1.2.0, which the series does not have yet; a certified PSF keeps its version",
@@ -87,7 +86,8 @@ def upload_psf(file: Path, server: str | None, **said: str | None) -> None:
 @click.option(
     "--supersedes",
     multiple=True,
-    metavar="PSF_ID",
+    type=ID,
+    metavar="ID",
     help="Also deprecate this certified PSF; can be repeated",
 )
 @REASON
@@ -110,7 +110,7 @@ def certify(
             version,
             valid_from=valid_from,
             valid_to=valid_to,
-            supersedes=supersedes,
+            supersedes=whole_ids(service, "psfs", supersedes),
             reason=reason,
             **line,
         )
@@ -118,31 +118,32 @@ def certify(
 
 
 @click.command("deprecate")
-@click.argument("psf_id", metavar="PSF_ID")
-@click.option("--successor", metavar="PSF_ID", help="Certified PSF to use instead")
+@id_argument("psf_id")
+@click.option("--successor", type=ID, metavar="ID", help="Certified PSF to use instead")
 @REASON
 @SERVER
 def deprecate(psf_id: str, successor: str | None, reason: str, server: str | None) -> None:
     """Withdraw a certified PSF from use, or name the successor of a deprecated PSF."""
     with user_errors(), remote(server) as service:
-        said = service.deprecate_psf(psf_id, successor, reason=reason)
+        instead_id = None if successor is None else whole_id(service, "psfs", successor)
+        said = service.deprecate_psf(psf_id, instead_id, reason=reason)
         count = sum(1 for _ in service.affected(psf_id))
-    instead = f", use {said['successor']}" if said["successor"] else ""
+    instead = f", use {short(said['successor'])}" if said["successor"] else ""
     click.echo(f"{said['series']} {said['version']}: {said['status']}{instead}")
     click.echo(f"products made with it: {count}")
 
 
 @click.command("delete")
-@click.argument("psf_id", metavar="PSF_ID")
+@id_argument("psf_id")
 @SERVER
 def delete_psf(psf_id: str, server: str | None) -> None:
-    """Delete a draft with its files. The id may be shortened to its first digits, if no other PSF begins with them.
+    """Delete a draft with its files.
 
     A PSF that a product, a job that has not ended, an open bulk run, a context or another PSF uses is not deleted.
     """
     with user_errors(), remote(server) as service:
-        row = service.delete_psf(_whole_id(service, psf_id))
-    click.echo(f"deleted {row['id']}  {row['name']}  {row['version']}")
+        row = service.delete_psf(psf_id)
+    click.echo(f"deleted {short(row['id'])}  {row['name']}  {row['version']}")
 
 
 @click.command("best")
@@ -166,12 +167,12 @@ def best(
         else:
             found = service.psf_for_image(service.upload_image(image)["id"], **given)
     psf = found["psf"]
-    click.echo(f"{psf['id']}  {psf['name']}  {psf['version']}  {psf['status']}{_validity(psf)}")
+    click.echo(f"{short(psf['id'])}  {psf['name']}  {psf['version']}  {psf['status']}{_validity(psf)}")
     write_json(json_file, found, overwrite=overwrite)
 
 
 @click.command("lineage")
-@click.argument("identity", metavar="ID")
+@id_argument()
 @PRODUCT
 @JSON
 @SERVER
@@ -188,7 +189,7 @@ def lineage(
 
 
 @click.command("rerun")
-@click.argument("identity", metavar="ID")
+@id_argument()
 @PRODUCT
 @JSON
 @SERVER
@@ -196,7 +197,8 @@ def lineage(
 def rerun(identity: str, product: bool, json_file: Path | None, server: str | None, overwrite: bool) -> None:
     """Make a PSF or a product again and compare both results. If they differ, the exit status is 1."""
     with user_errors(), remote(server) as service, progress_bar() as report:
-        found = service.rerun("product" if product else "psf", identity, progress=report)
+        of: Literal["product", "psf"] = "product" if product else "psf"
+        found = service.rerun(of, whole_id(service, f"{of}s", identity), progress=report)
         if json_file is not None:
             service.download(found["file"], json_file, overwrite=overwrite)
     click.echo(found["details"]["sentence"])
@@ -204,19 +206,6 @@ def rerun(identity: str, product: bool, json_file: Path | None, server: str | No
 
 
 COMMANDS = (list_psfs, upload_psf, certify, deprecate, delete_psf, best, lineage, rerun)
-
-
-def _whole_id(service: Client, psf_id: str) -> str:
-    """The id of the one PSF whose id begins with these digits. Raises ``ClickException``."""
-    if is_psf_id(psf_id):
-        return psf_id
-    ids = [row["id"] for row in service.psfs() if psf_id and row["id"].startswith(psf_id)]
-    if len(ids) == 1:
-        return str(ids[0])
-    found = ", ".join(ids) or "none"
-    raise click.ClickException(
-        f"expected the id of a PSF, or the first digits of one id; PSFs whose id begins with {psf_id!r}: {found}"
-    )
 
 
 def _given(filters: dict[str, str | None]) -> dict[str, str]:
@@ -235,10 +224,10 @@ def _tree(told: dict[str, Any], depth: int) -> Iterator[str]:
     made = told["made"] or {}
     named = " ".join(str(made[key]) for key in ("name", "version", "status") if made.get(key))
     by = [f"heliopsf {made['software_version']}"] if made.get("software_version") else []
-    by += [f"job {made['job_id']}"] if made.get("job_id") else []
+    by += [f"job {short(made['job_id'])}"] if made.get("job_id") else []
     gone = "" if told["there"] or told["type"] == "instrument-file" else "deleted since"
     cut = "shown above" if told["cut"] else ""
     said = "; ".join(part for part in (named, ", ".join(by), gone, cut) if part)
-    yield "  " * depth + f"{told['type']} {told['id']}" + (f"  ({said})" if said else "")
+    yield "  " * depth + f"{told['type']} {short(told['id'])}" + (f"  ({said})" if said else "")
     for parent in told["parents"]:
         yield from _tree(parent, depth + 1)

@@ -252,6 +252,28 @@ def test_an_occulter_too_large_for_the_frame_is_refused(folder: Path) -> None:
     read_transit(folder, LIMITS)
 
 
+def test_all_images_with_faults_are_named_in_one_error(folder: Path) -> None:
+    for index in (1, 4):
+        header = fits.getheader(folder / f"00{index}.fits")
+        fits.PrimaryHDU(np.ones((64, 64), "i4"), header).writeto(folder / f"00{index}.fits", overwrite=True)
+    change_image(folder, 2, x=1e5)
+    message = refusal(folder, "transit-shapes")
+    assert all(name in message for name in ("3 files cannot be used", "001.fits", "002.fits", "004.fits"))
+    for index in (1, 4):
+        (folder / f"00{index}.fits").write_bytes(b"SIMPLE  = letter" + bytes(3000))
+    with pytest.raises(HeaderError) as headers:
+        read_transit(folder, LIMITS)
+    assert "001.fits: " in headers.value.message and "004.fits: " in headers.value.message
+    write_transit(folder)
+    for index in (0, 5):
+        header = fits.getheader(folder / f"00{index}.fits")
+        fits.PrimaryHDU(np.full(SHAPE, np.nan, "f4"), header).writeto(
+            folder / f"00{index}.fits", overwrite=True
+        )
+    message = refusal(folder, "all-nan")
+    assert "000.fits: " in message and "005.fits: " in message
+
+
 @pytest.mark.parametrize(
     ("cards", "code"),
     [

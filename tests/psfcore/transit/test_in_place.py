@@ -43,3 +43,17 @@ def test_it_is_refused_as_its_archive_would_be(folder: Path, tmp_path: Path) -> 
     with pytest.raises(DataError, match=image.name) as missing:
         transit_in(folder)
     assert missing.value.code == "missing-file"
+
+
+def test_all_bad_files_are_named_in_one_error_and_nothing_is_written(folder: Path, tmp_path: Path) -> None:
+    (folder / "001.fits").unlink()
+    (folder / "003.fits").write_text("a letter")
+    (folder / "diffraction.fits").unlink()
+    for check in (transit_in, lambda folder: pack(folder, tmp_path / "t.tar")):
+        with pytest.raises(DataError) as refused:
+            check(folder)
+        assert refused.value.code == "missing-file"
+        for name in ("3 files cannot be used", "001.fits", "003.fits", "diffraction.fits"):
+            assert name in refused.value.message
+        assert "000.fits" not in refused.value.message
+    assert not (tmp_path / "t.tar").exists()

@@ -61,7 +61,7 @@ def test_the_help_is_grouped() -> None:
     assert len(lines) < MOST_LINES
     headings = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
     assert headings[1:] == [
-        "Images:", "PSFs:", "Transits:", "Archives:", "Service and operation:", "Studies:",
+        "Images:", "PSFs:", "Transits:", "Archives:", "Jobs:", "Service and operation:", "Studies:",
     ]  # fmt: skip
 
 
@@ -74,6 +74,50 @@ def test_options_have_the_same_name_everywhere() -> None:
             assert "--output" in names, path
         if "--local" in names:
             assert "--server" in names, path
+
+
+def options_of(name: str) -> dict[str, click.Option]:
+    """The option of this name, by the command that has it."""
+    return {
+        " ".join(path): option
+        for path, command in ALL
+        for option in command.params
+        if isinstance(option, click.Option) and name in option.opts
+    }
+
+
+@pytest.mark.parametrize(
+    "name", ["--local", "--context", "--centre", "--key", "--noise", "--saturation", "--method"]
+)
+def test_an_option_is_explained_in_the_same_words_everywhere(name: str) -> None:
+    found = options_of(name)
+    found.pop("simulate transit", None)  # its --saturation is the level of the simulated camera
+    assert len(found) > 1
+    assert len({(option.help, option.nargs, option.metavar) for option in found.values()}) == 1, found.keys()
+
+
+def test_a_psf_is_an_id_or_a_file_everywhere() -> None:
+    shown = {name: (option.metavar, option.help) for name, option in options_of("--psf").items()}
+    only_ids = {"context create", "product list"}
+    assert {shown.pop(name)[0] for name in only_ids} == {"ID"}
+    assert {metavar for metavar, _ in shown.values()} == {"ID|FILE"}
+    assert all("an id or a file" in (text or "") for _, text in shown.values())
+
+
+def test_the_help_says_whether_a_command_needs_a_service() -> None:
+    for path, command in ALL:
+        names = {name for option in command.params for name in option.opts}
+        if "--server" not in names:
+            continue
+        helped = " ".join(CliRunner().invoke(main, [*path, "-h"]).output.split())
+        needs, for_ids = "which this command needs" in helped, "only if a PSF is given by its id" in helped
+        assert needs != for_ids, path
+        assert ("--local needs none" in helped) == ("--local" in names), path
+
+
+@pytest.mark.parametrize("option", ["-V", "--version"])
+def test_the_version_is_told(option: str) -> None:
+    assert CliRunner().invoke(main, [option]).output.startswith("heliopsf, version ")
 
 
 def test_a_row_of_the_table_is_the_command_of_that_name() -> None:
@@ -106,7 +150,7 @@ def test_an_unknown_name_is_refused() -> None:
     assert "Did you mean" not in refused.output
 
 
-@pytest.mark.parametrize("option", ["--version", "--help"])
+@pytest.mark.parametrize("option", ["-V", "--help"])
 def test_version_and_help_load_nothing_heavy(option: str) -> None:
     script = (
         "import sys, json, atexit\n"

@@ -103,21 +103,6 @@ def test_json_is_written_where_a_path_is_given_and_holds_no_nan(tmp_path: Path) 
         cli_options.write_json(tmp_path, {"x": 1})
 
 
-def test_progress_says_stage_and_steps_on_a_terminal_alone(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with cli_options.progress_bar() as report:
-        report("reading", 1, 2)
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    with cli_options.progress_bar() as report:
-        report("reading", 1, 2)
-        report("nothing to do", 0, 0)
-    told = capsys.readouterr().err
-    assert f"[{'#' * 10}{'-' * 10}] 1/2" in told
-    assert "0/0" in told
-
-
 def test_an_image_without_a_known_psf_prints_the_ways_on(tmp_path: Path, image_file: Path) -> None:
     """Through --local and through a service, whose error has the same fields."""
     arguments = ["deconvolve", str(image_file), "-o", str(tmp_path / "o.fits"), "--local"]

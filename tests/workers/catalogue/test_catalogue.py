@@ -7,8 +7,9 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from sqlalchemy import update
+from sqlalchemy import Double, literal_column, update
 
+from service.api.jobs import time_left_s
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow
@@ -273,3 +274,33 @@ def test_a_job_that_is_queued_again_has_not_ended(catalogue: Catalogue) -> None:
     assert catalogue.jobs.requeue(lease)
     row = catalogue.jobs.get(job.id)
     assert row is not None and (row.phase, row.ended_at, row.lease) == (Phase.QUEUED, None, None)
+
+
+def test_the_beginning_of_each_count_of_steps_is_kept(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading 5 images takes 250 s; then each of 11 steps takes 1 s."""
+    now = [1000.0]
+    monkeypatch.setattr(
+        type(catalogue.jobs._database), "now", property(lambda _: literal_column(f"{now[0]!r}", Double))
+    )
+    _job, lease = claimed(catalogue)
+
+    def left_s(stage: str, step: int, steps: int, at_s: float) -> float | None:
+        now[0] = 1000.0 + at_s
+        assert catalogue.jobs.progress(lease, stage, step, steps)
+        row = catalogue.jobs.get(lease.job_id)
+        assert row is not None
+        return time_left_s(row, now[0])
+
+    assert left_s("reading", 0, 5, 0.0) is None
+    assert left_s("reading", 4, 5, 240.0) == pytest.approx(60.0)
+    assert left_s("reading", 5, 5, 250.0) == 0.0
+    assert left_s("fitting", 1, 11, 251.0) is None, "one report of a count has no pace"
+    assert left_s("fitting", 2, 11, 252.0) == pytest.approx(9.0)
+    assert left_s("errors", 5, 11, 255.0) == pytest.approx(6.0), "the same count goes on"
+    assert left_s("errors", 1, 11, 256.0) is None, "a new count of as many steps"
+    assert catalogue.jobs.hand_back(lease)
+    assert catalogue.jobs.claim(lease.job_id, "other") is not None
+    row = catalogue.jobs.get(lease.job_id)
+    assert row is not None and row.count_at is None and time_left_s(row, now[0]) is None

@@ -165,7 +165,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     [
         (["--json", "no/such/folder/g.json", "--local"], "there is no folder"),
         (["--corrected", "no/such/folder/p.fits", "--local"], "there is no folder"),
-        (["--psf", "missing.fits", "--local"], "expected a PSF id (64 hexadecimal digits) or a file"),
+        (["--psf", "missing.fits", "--local"], "expected a PSF id (8 or more hexadecimal digits) or a file"),
         (["--psf", "0" * 64, "--local"], "expected the id of a PSF in the catalogue"),
         (["--effects", "mine.py"], "--effects: expected --local with it"),
         (["--effects", "mine.py", "--local"], "effects of mine.py: expected a readable Python file"),

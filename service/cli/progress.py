@@ -1,0 +1,111 @@
+"""Tells on standard error how far a command is: a bar on a terminal, otherwise a line now and then."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+LINE_EVERY_S = 10.0
+UNITS = (("days", 86_400), ("h", 3600), ("min", 60))
+
+Report = Callable[[str, int, int], None]
+
+
+@dataclass
+class Pace:
+    """The time left until the last step of the present count, from the pace of this count alone.
+
+    A job counts its steps several times, for example images that it reads, then rounds of a fit. A count is new if its
+    number of steps differs, or if its step is smaller than the step before. Earlier counts say nothing about the pace of
+    the present one.
+    """
+
+    steps: int = -1
+    first: tuple[int, float] = (0, 0.0)  # step and time of the first report of the count
+    last: tuple[int, float] = (0, 0.0)  # step and time of the first report of the last step
+
+    def left_s(self, step: int, steps: int, now_s: float) -> float | None:
+        """Take a report; returns the time left, or None before the second step of a count."""
+        if steps != self.steps or step < self.last[0]:
+            self.steps, self.first, self.last = steps, (step, now_s), (step, now_s)
+        elif step > self.last[0]:
+            self.last = (step, now_s)
+        done = self.last[0] - self.first[0]
+        if not done:
+            return None
+        step_s = (self.last[1] - self.first[1]) / done
+        return max(0.0, step_s * (steps - step) - (now_s - self.last[1]))
+
+
+def duration(seconds: float) -> str:
+    """A duration in the largest unit of which it has two or more."""
+    for unit, length_s in UNITS:
+        if seconds >= 2 * length_s:
+            return f"{seconds / length_s:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+class _Teller:
+    """Writes the progress of one command."""
+
+    def __init__(self, *, bar: bool) -> None:
+        self.bar = bar
+        self.started_s = self.told_s = time.monotonic()
+        self.pace, self.lock = Pace(), threading.Lock()
+        self.open_line = False  # whether the cursor is behind a bar, so that other text needs a new line
+
+    def report(self, stage: str, step: int, steps: int) -> None:
+        """Tell that this step of a stage is done."""
+        now_s = time.monotonic()
+        with self.lock:
+            left_s = self.pace.left_s(step, steps, now_s)
+            left = "" if left_s is None else f", {duration(left_s)} left"
+            if self.bar:
+                filled = round(20 * step / max(steps, 1))
+                drawn = "#" * filled + "-" * (20 - filled)
+                elapsed_s = now_s - self.started_s
+                sys.stderr.write(f"\r{stage:<32.32} [{drawn}] {step}/{steps}  {elapsed_s:5.1f} s{left:<14}")
+                sys.stderr.flush()
+                self.open_line = True
+            elif now_s - self.told_s >= LINE_EVERY_S:
+                self.told_s = now_s
+                elapsed = duration(now_s - self.started_s)
+                sys.stderr.write(f"{stage}: step {step} of {steps} after {elapsed}{left}\n")
+                sys.stderr.flush()
+
+    def line(self, text: str) -> None:
+        """Write a line of its own."""
+        with self.lock:
+            self.end()
+            sys.stderr.write(f"{text}\n")
+            sys.stderr.flush()
+
+    def end(self) -> None:
+        """End the line of the bar."""
+        if self.open_line:
+            sys.stderr.write("\n")
+            self.open_line = False
+
+
+_tellers: list[_Teller] = []  # of the commands that tell their progress now, the innermost last
+
+
+@contextmanager
+def progress_bar() -> Iterator[Report]:
+    """Tell the progress of the block, with the time left in its present stage: a bar on a terminal, else a line every 10 s."""
+    teller = _Teller(bar=sys.stderr.isatty())
+    _tellers.append(teller)
+    try:
+        yield teller.report
+    finally:
+        _tellers.remove(teller)
+        teller.end()
+
+
+def say(text: str) -> None:
+    """Write a line to standard error, on a line of its own if a bar is shown."""
+    (_tellers[-1] if _tellers else _Teller(bar=False)).line(text)

@@ -1,0 +1,61 @@
+"""The address of a service, as users write it: a URL, or host and port of this machine without a scheme."""
+
+from __future__ import annotations
+
+import ipaddress
+from urllib.parse import SplitResult, urlsplit
+
+from service.client.errors import ServiceError
+
+DEFAULT_SERVER = "http://127.0.0.1:8765"
+EXAMPLE = f"{DEFAULT_SERVER} or localhost:8765"
+SHOWN_DIGITS = 12  # digits of an id in lists; commands and addresses accept ids that are cut like this
+
+
+def service_address(text: str) -> str:
+    """The URL of a service. ``localhost:8791`` becomes ``http://localhost:8791``.
+
+    A host of another machine needs a scheme, because the client cannot know whether this machine uses TLS, and an access
+    key must not be sent without TLS by mistake. Raises ``ServiceError`` "bad-address".
+    """
+    text = text.strip()
+    if "://" in text:
+        parts = _split(text, text)
+        if parts.scheme not in ("http", "https"):
+            raise _bad(text)
+        return text
+    parts = _split(f"http://{text}", text)
+    assert parts.hostname is not None
+    if not is_loopback(parts.hostname):
+        raise ServiceError(
+            f"expected http:// or https:// before the name of another machine; got {text!r}: "
+            f"write https://{text} if the service uses TLS, else http://{text}",
+            code="bad-address",
+        )
+    return parts.geturl()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address can be reached only from its own machine."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:  # the host is a name, which may stand for another address on another machine
+        return False
+
+
+def _split(url: str, said: str) -> SplitResult:
+    """The parts of a URL. Raises ``ServiceError`` if it has no host or no valid port."""
+    try:
+        parts = urlsplit(url)
+        valid = bool(parts.hostname) and (parts.port is None or parts.port > 0)
+    except ValueError as error:  # a port that is no number, or an IPv6 address without its brackets
+        raise _bad(said) from error
+    if not valid or any(sign.isspace() or not sign.isprintable() for sign in said):
+        raise _bad(said)
+    return parts
+
+
+def _bad(said: str) -> ServiceError:
+    return ServiceError(
+        f"expected the address of a service, such as {EXAMPLE}; got {said!r}", code="bad-address"
+    )

@@ -1,0 +1,99 @@
+"""``heliopsf job`` and ``heliopsf product``: short ids in and out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from astropy.io import fits
+from fastapi.testclient import TestClient
+
+from service.cli.connection import short
+from tests.conftest import write_psf
+from tests.service.conftest import upload
+
+Command = Callable[..., str]
+
+
+@pytest.fixture
+def psf(api: TestClient, psf_file: Path) -> str:
+    return upload(api, psf_file, "/v1/psfs")
+
+
+def submitted(api: TestClient, image: str, psf: str, **more: object) -> str:
+    parameters = {"image_id": image, "psf_id": psf, "method": {"name": "linear", "steps": 1}, **more}
+    identity: str = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()["id"]
+    return identity
+
+
+def test_a_job_is_found_waited_for_and_its_product_fetched_by_short_ids(
+    command: Command, api: TestClient, image_file: Path, psf: str, tmp_path: Path
+) -> None:
+    assert command("job", "list") == "no job yet\n"
+    assert "no product yet" in command("product", "list")
+    job = submitted(api, upload(api, image_file), psf)
+    [line] = command("job", "list").splitlines()
+    assert line.startswith(f"{short(job)}  QUEUED     deconvolve")
+    assert command("job", "list", "--phase", "ERROR") == "no job in phase ERROR\n"
+
+    waited = command("job", "wait", short(job))
+    product = api.get(f"/v1/jobs/{job}").json()["result"].rpartition("/")[2]
+    said = f"product {short(product)}: heliopsf product get {short(product)} -o FILE"
+    assert waited == f"job {short(job)}: {said}\n"
+    assert said in command("job", "list")
+    shown = command("job", "show", job[:8].upper(), "--json", tmp_path / "j.json")
+    assert f"job {job}: deconvolve, COMPLETED" in shown and f"psf_id {short(psf)}" in shown
+    assert json.loads((tmp_path / "j.json").read_text())["id"] == job
+
+    [listed] = command("product", "list", "--psf", short(psf), "--most", 5).splitlines()
+    assert listed.startswith(short(product)) and listed.endswith("linear") and short(psf) in listed
+    assert command("product", "list", "--image", psf[:9], code=1).startswith(
+        "Error: expected the id of an image"
+    )
+    got = command("product", "get", short(product), "-o", tmp_path / "p.fits", "--plot", tmp_path / "p.png")
+    assert short(product) in got and fits.getval(tmp_path / "p.fits", "PSFID") == psf
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    assert "changes_picture" in command("product", "get", short(product), "--changes", tmp_path / "c", code=1)
+    assert "expected an output" in command("product", "get", short(product), code=2)
+    assert command("product", "delete", short(product)) == f"product {short(product)} is deleted\n"
+    assert "no product yet" in command("product", "list")
+    assert "product" in command("product", "delete", short(product), code=1)
+
+
+def test_jobs_are_cancelled_and_a_wait_for_several_ends_with_1_if_one_failed(
+    command: Command, api: TestClient, image_file: Path, psf: str
+) -> None:
+    image = upload(api, image_file)
+    stopped, fine = submitted(api, image, psf), submitted(api, image, psf, changes_picture=True)
+    assert command("job", "cancel", short(stopped)) == f"job {short(stopped)}: ABORTED\n"
+    told = command("job", "wait", short(stopped), short(fine), code=1)
+    assert f"job {short(stopped)}: ABORTED" in told
+    assert f"job {short(fine)}: product" in told
+    assert "no id of yours begins" in command("job", "wait", "01234567", code=1)
+
+
+@pytest.mark.parametrize("identity", ["0123456", "../../metrics", "x" * 12])
+def test_a_text_that_cannot_be_an_id_is_refused_before_a_request(command: Command, identity: str) -> None:
+    assert "expected an id, or its first 8 or more" in command("job", "show", identity, code=2)
+
+
+def test_psfs_are_downloaded_and_named_by_short_ids(
+    command: Command, api: TestClient, image_file: Path, psf: str, psf_file: Path, tmp_path: Path
+) -> None:
+    got = command("psf", "download", short(psf), "-o", tmp_path / "p.fits")
+    assert short(psf) in got and (tmp_path / "p.fits").read_bytes() == psf_file.read_bytes()
+    done = command("deconvolve", image_file, "-o", tmp_path / "o.fits", "--psf", short(psf), "--steps", 2)
+    assert "product " in done and fits.getval(tmp_path / "o.fits", "PSFID") == psf
+    assert "sum 1.000000 on 64 x 64 px" in command("psf", "query", short(psf), "--radius", 5)
+    write_psf(tmp_path / "other.fits", size=48)
+    other = upload(api, tmp_path / "other.fits", "/v1/psfs")
+    assert " minus " in command("psf", "query", short(psf), "--compare", short(other))
+    assert "central 9 x 9 px" in command("psf", "cutout", short(psf), "--size", 9, "-o", tmp_path / "c.fits")
+    assert "px of 2 x 2" in command("psf", "rebin", short(psf), "--factor", 2, "-o", tmp_path / "r.fits")
+    assert command("psf", "lineage", short(psf)).startswith(f"psf {short(psf)}")
+
+
+def test_the_instruments_that_can_be_built_are_listed(command: Command) -> None:
+    assert "heliopsf psf build --instrument hri_euv -o FILE" in command("psf", "instruments")

@@ -1,0 +1,49 @@
+"""Addresses of services, as users write them."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.client.address import service_address
+from service.client.errors import ServiceError
+from service.client.http import Client
+
+
+@pytest.mark.parametrize(
+    ("said", "url"),
+    [
+        ("localhost:8791", "http://localhost:8791"),
+        (" 127.0.0.1:8791 ", "http://127.0.0.1:8791"),
+        ("[::1]:8791", "http://[::1]:8791"),
+        ("localhost", "http://localhost"),
+        ("http://sun.example:80", "http://sun.example:80"),
+        ("https://sun.example/heliopsf", "https://sun.example/heliopsf"),
+    ],
+)
+def test_a_service_of_this_machine_needs_no_scheme(said: str, url: str) -> None:
+    assert service_address(said) == url
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("sun.example:8765", "write https://sun.example:8765"),
+        ("10.0.0.7:8765", "https://10.0.0.7:8765"),
+        ("ftp://localhost", "expected the address of a service"),
+        ("localhost:port", "expected the address of a service"),
+        ("http://", "expected the address of a service"),
+        ("local host:1", "expected the address of a service"),
+        ("http://localhost:99999", "expected the address of a service"),
+        ("[::1:8791", "expected the address of a service"),
+    ],
+)
+def test_other_addresses_are_refused_with_an_example(said: str, told: str) -> None:
+    with pytest.raises(ServiceError) as refused:
+        service_address(said)
+    assert refused.value.code == "bad-address" and told in str(refused.value)
+
+
+def test_the_client_takes_the_address_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HELIOPSF_SERVER", "localhost:8791")
+    with Client() as client:
+        assert client.server == "http://localhost:8791"

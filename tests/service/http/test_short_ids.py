@@ -1,0 +1,145 @@
+"""Ids that are cut to their first digits, in the addresses of requests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from tests.conftest import write_psf
+from tests.service.conftest import upload
+from tests.service.keyed import Keyed, keyed
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow
+from workers.contract.phases import Phase
+from workers.settings import Settings
+
+SAME = "0123456789"  # the first digits of several ids
+
+
+def product(identity: str, owner: str = DEFAULT_OWNER) -> ProductRow:
+    return ProductRow(
+        owner=owner, id=identity, created_at=1.0, kind="deconvolved", image_id="1" * 64, psf_id="2" * 64,
+        psf_version="1", file_sha256="3" * 64, bytes=1, preview_sha256="4" * 64, details={},
+    )  # fmt: skip
+
+
+@pytest.fixture
+def catalogue(api: TestClient) -> Catalogue:
+    found: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    return found
+
+
+def test_the_first_digits_of_an_id_stand_for_it(
+    api: TestClient, image_file: Path, psf_file: Path, tmp_path: Path
+) -> None:
+    image, psf = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    assert api.get(f"/v1/images/{image[:8]}").json()["id"] == image
+    for digits in (8, 12, 63, 64):
+        assert api.get(f"/v1/psfs/{psf[:digits]}").json()["id"] == psf
+    assert api.get(f"/v1/psfs/{psf[:9]}/file").content == psf_file.read_bytes()
+    assert api.get(f"/v1/psfs/{psf[:9]}/lineage").json()["id"] == psf
+    assert api.get(f"/v1/images/{image[:9]}/psf").status_code == 409, "found; it has no known instrument"
+    write_psf(tmp_path / "other.fits", size=48)
+    other = upload(api, tmp_path / "other.fits", "/v1/psfs")
+    refused = api.get(f"/v1/psfs/{psf[:8]}/compare/{other[:8]}").json()
+    assert refused["type"] == "urn:heliopsf:no-tables", "both were found"
+    job = api.post(
+        "/v1/jobs",
+        json={"kind": "deconvolve", "parameters": {"image_id": image, "psf_id": psf}},
+    ).json()["id"]
+    assert api.get(f"/v1/jobs/{job[:8]}").json()["id"] == job
+    assert f"{job}</" in api.get(f"/uws/jobs/{job[:10]}").text
+    assert api.get(f"/uws/jobs/{job[:10]}/phase").text == "QUEUED"
+    assert api.delete(f"/v1/jobs/{job[:31]}").json()["phase"] == "ABORTED"
+
+
+def test_digits_of_several_ids_are_refused_with_the_candidates(api: TestClient, catalogue: Catalogue) -> None:
+    ids = [SAME + digit * 54 for digit in "0af"]
+    for identity in ids:
+        catalogue.add(product(identity))
+    refused = api.get(f"/v1/products/{SAME}")
+    assert refused.status_code == 409 and refused.json()["type"] == "urn:heliopsf:several-ids-fit"
+    assert refused.json()["candidates"] == ids
+    assert all(identity in refused.json()["detail"] for identity in ids)
+    assert api.get(f"/v1/products/{SAME}a").json()["id"] == ids[1]
+    many = api.delete(f"/v1/products/{SAME}")
+    assert many.status_code == 409 and len(api.get("/v1/products").json()["items"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("address", "code"),
+    [
+        ("/v1/products/01234567", "no-such-product"),
+        ("/v1/psfs/01234567/file", "no-such-psf"),
+        ("/v1/jobs/01234567", "no-such-job"),
+        ("/v1/bulk/01234567", "no-such-bulk"),
+        ("/v1/images/01234567", "no-such-image"),
+        ("/v1/reports/01234567", "no-such-report"),
+        ("/v1/transits/01234567", "no-such-transit"),
+        ("/v1/products/0123456", "invalid-request"),
+        ("/v1/products/0123456_", "invalid-request"),
+        ("/v1/products/%2e%2e%2f01234567", "http-404"),
+    ],
+)
+def test_digits_of_no_id_are_refused(api: TestClient, address: str, code: str) -> None:
+    refused = api.get(address)
+    assert refused.status_code in (404, 422)
+    assert refused.json()["type"] == f"urn:heliopsf:{code}"
+    if code.startswith("no-such"):
+        assert "its first 8 or more digits" in refused.json()["detail"]
+
+
+def test_uws_answers_in_plain_text(api: TestClient) -> None:
+    refused = api.get("/uws/jobs/01234567/phase")
+    assert refused.status_code == 404 and refused.headers["content-type"].startswith("text/plain")
+
+
+@pytest.fixture
+def service(settings: Settings) -> Keyed:
+    with keyed(settings) as found:
+        yield found
+
+
+def test_ids_of_other_owners_are_not_found_and_do_not_make_digits_ambiguous(service: Keyed) -> None:
+    ann, bob = service.client("ann"), service.client("bob")
+    service.catalogue.add(product(SAME + "a" * 54, "ann"))
+    service.catalogue.add(product(SAME + "b" * 54, "bob"))
+    assert ann.get(f"/v1/products/{SAME}").json()["id"] == SAME + "a" * 54
+    assert bob.get(f"/v1/products/{SAME}").json()["id"] == SAME + "b" * 54
+    assert bob.get(f"/v1/products/{SAME}a").status_code == 404
+    assert service.api.get(f"/v1/products/{SAME}a").status_code == 401
+
+
+def test_a_product_is_deleted_and_the_same_request_makes_it_again(
+    api: TestClient,
+    catalogue: Catalogue,
+    run_jobs: Callable[[], None],
+    image_file: Path,
+    psf_file: Path,
+) -> None:
+    image, psf = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    asked = {
+        "kind": "deconvolve",
+        "parameters": {"image_id": image, "psf_id": psf, "method": {"name": "linear", "steps": 1}},
+    }
+    first = api.post("/v1/jobs", json=asked).json()["id"]
+    run_jobs()
+    made = api.get(api.get(f"/v1/jobs/{first}").json()["result"]).json()
+    used = catalogue.owners.usage(DEFAULT_OWNER, 0).used_bytes
+    assert api.delete(f"/v1/products/{made['id'][:8]}").status_code == 204
+    assert api.get(f"/v1/products/{made['id']}").status_code == 404
+    assert api.delete(f"/v1/products/{made['id']}").status_code == 404
+    assert catalogue.owners.usage(DEFAULT_OWNER, 0).used_bytes == used - made["bytes"]
+    assert list(catalogue.owners.recount()) == []
+    row = catalogue.jobs.get(first)
+    assert row is not None and row.phase == Phase.COMPLETED, "the job stays"
+    again = api.post("/v1/jobs", json=asked).json()
+    assert again["id"] != first and again["phase"] == "QUEUED"
+    run_jobs()
+    remade = api.get(f"/v1/products/{made['id']}").json()
+    assert remade["sha256"] == made["sha256"]
+    assert api.post("/v1/jobs", json=asked).json()["id"] == again["id"], "shared as before"
+    assert len(catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=9)) == 2

@@ -1,0 +1,203 @@
+"""Files in the forms of UWS clients: UPLOAD=name,param:part (DALI 1.1)."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi.testclient import TestClient
+
+from psfcore.transit.archive import pack
+from tests.service.conftest import upload
+from tests.service.keyed import keyed
+from tests.service.uws.test_uws import JOBS, document, parameters
+from tests.transit_files import write_transit
+from workers.catalogue.keys import Scope
+from workers.files.store import sha256_of
+from workers.settings import Settings
+
+Files = dict[str, tuple[str, bytes]]
+TABLES = ("images", "transits", "psfs")
+NOTHING: dict[str, list[str]] = {table: [] for table in TABLES}
+
+
+def post(api: TestClient, address: str, fields: dict[str, str | list[str]], files: Files) -> httpx.Response:
+    return api.post(address, data=fields, files=files, follow_redirects=False)
+
+
+def kept(api: TestClient) -> dict[str, list[str]]:
+    """The ids of everything that was uploaded."""
+    return {table: [row["id"] for row in api.get(f"/v1/{table}").json()["items"]] for table in TABLES}
+
+
+def temporary(settings: Settings) -> list[Path]:
+    return list((settings.data_dir / "tmp").iterdir())
+
+
+def test_an_image_and_its_psf_arrive_with_the_job(
+    api: TestClient, settings: Settings, run_jobs: Callable[[], None], image_file: Path, psf_file: Path
+) -> None:
+    fields: dict[str, str | list[str]] = {
+        "KIND": "deconvolve",
+        "PHASE": "RUN",
+        "method": '{"name": "linear", "steps": 1}',
+        "UPLOAD": ["image,param:first", "psf,param:second"],
+    }
+    files = {"first": ("../sun.fits", image_file.read_bytes()), "second": ("psf.fits", psf_file.read_bytes())}
+    made = post(api, JOBS, fields, files)
+    assert made.status_code == 303, made.text
+    job = made.headers["location"]
+    image, psf = sha256_of(image_file), sha256_of(psf_file)
+    sent = parameters(document(api.get(f"{job}/parameters")))
+    assert (sent["image_id"], sent["psf_id"]) == (image, psf)
+    assert kept(api) == {"images": [image], "transits": [], "psfs": [psf]}
+    assert api.get(f"/v1/images/{image}").json()["filename"] == "sun.fits"
+    assert temporary(settings) == []
+    run_jobs()
+    assert api.get(f"{job}/phase").text == "COMPLETED"
+    assert api.get(f"{job}/results/result").content.startswith(b"SIMPLE  =")
+
+
+def test_a_file_may_follow_while_the_job_is_pending(
+    api: TestClient, image_file: Path, psf_file: Path
+) -> None:
+    psf = upload(api, psf_file, "/v1/psfs")
+    job = post(api, JOBS, {"KIND": "deconvolve", "psf_id": psf}, {}).headers["location"]
+    files = {"f": ("sun.fits", image_file.read_bytes())}
+    changed = post(api, f"{job}/parameters", {"UPLOAD": "image,param:f"}, files)
+    assert changed.status_code == 303, changed.text
+    assert parameters(document(api.get(job)))["image_id"] == sha256_of(image_file)
+    assert api.post(f"{job}/phase", data={"PHASE": "RUN"}, follow_redirects=False).status_code == 303
+    other = {"f": ("x.fits", psf_file.read_bytes())}
+    late = post(api, f"{job}/parameters", {"UPLOAD": "image,param:f"}, other)
+    assert late.status_code == 403 and "only while a job is PENDING" in late.text
+    assert kept(api)["images"] == [sha256_of(image_file)], "nothing was kept of the file that came too late"
+
+
+def test_a_transit_arrives_with_the_job(api: TestClient, tmp_path: Path) -> None:
+    folder = write_transit(tmp_path / "mercury")
+    pack(folder, tmp_path / "t.tar")
+    files = {"t": ("t.tar", (tmp_path / "t.tar").read_bytes())}
+    made = post(api, f"{JOBS}?UPLOAD=transit,param:t", {"KIND": "psf-fit"}, files)
+    assert made.status_code == 303, made.text
+    assert kept(api)["transits"] == [sha256_of(tmp_path / "t.tar")]
+
+
+def tar_without_images() -> bytes:
+    target = io.BytesIO()
+    with tarfile.open(fileobj=target, mode="w") as archive:
+        archive.addfile(tarfile.TarInfo("001.fits"))
+    return target.getvalue()
+
+
+IMAGE = {"KIND": "deconvolve", "UPLOAD": "image,param:f"}
+REFUSED = [
+    ("an address", {**IMAGE, "UPLOAD": "image,http://127.0.0.1:8765/metrics"}, 400, "are not fetched"),
+    ("no name", {**IMAGE, "UPLOAD": "param:f"}, 400, "expected UPLOAD=NAME,param:PART"),
+    ("no such part", {**IMAGE, "UPLOAD": "image,param:g"}, 400, "expected a part 'g' with a file"),
+    ("no UPLOAD", {"KIND": "deconvolve"}, 400, "expected UPLOAD=NAME,param:f"),
+    ("unknown name", {**IMAGE, "UPLOAD": "sun,param:f"}, 400, "(image, psf); got 'sun'"),
+    ("another kind", {**IMAGE, "KIND": "psf-fit"}, 400, "(transit); got 'image'"),
+    ("twice", {**IMAGE, "UPLOAD": "image,param:f;image,param:f"}, 400, "expected one image; got several"),
+    ("id and file", {**IMAGE, "image_id": "0" * 64}, 400, "expected one image; got several"),
+    ("bad parameter", {**IMAGE, "error_draws": "many"}, 400, "error_draws: "),
+    ("no KIND", {"UPLOAD": "image,param:f"}, 400, "expected KIND"),
+    ("field twice", {**IMAGE, "KIND": ["deconvolve", "deconvolve"]}, 400, "expected 'kind' once"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fields", "status", "told"), [r[1:] for r in REFUSED], ids=[r[0] for r in REFUSED])
+def test_nothing_stays_of_a_refused_form(
+    api: TestClient,
+    settings: Settings,
+    image_file: Path,
+    fields: dict[str, str | list[str]],
+    status: int,
+    told: str,
+) -> None:
+    answer = post(api, JOBS, fields, {"f": ("sun.fits", image_file.read_bytes())})
+    assert answer.status_code == status and told in answer.text, answer.text
+    assert answer.headers["content-type"].startswith("text/plain")
+    assert kept(api) == NOTHING and len(document(api.get(JOBS))) == 0
+    assert temporary(settings) == [] and list((settings.data_dir / "blobs").rglob("*/*")) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "content", "status", "told"),
+    [
+        ("deconvolve", "image", b"hello, I am an image", 415, "expected a FITS file"),
+        ("deconvolve", "image", b"", 400, "got 0 bytes"),
+        ("deconvolve", "image", b"SIMPLE  = " + bytes(3000), 422, ""),
+        ("deconvolve", "image", b"SIMPLE  =" + bytes(2 * 2**20), 413, "at most 2097152 bytes"),
+        ("psf-fit", "transit", b"hello, I am a transit", 415, "expected a .zip, .tar or .tar.gz"),
+        ("psf-fit", "transit", tar_without_images(), 422, "expected a file transit.json"),
+    ],
+)
+def test_a_file_is_checked_as_an_upload_is(
+    api: TestClient, image_file: Path, kind: str, name: str, content: bytes, status: int, told: str
+) -> None:
+    answer = post(api, JOBS, {"KIND": kind, "UPLOAD": f"{name},param:f"}, {"f": ("x", content)})
+    assert answer.status_code == status and told in answer.text, answer.text
+    assert kept(api) == NOTHING and len(document(api.get(JOBS))) == 0
+
+
+def test_if_one_of_two_files_is_bad_neither_is_kept(api: TestClient, image_file: Path) -> None:
+    fields: dict[str, str | list[str]] = {**IMAGE, "UPLOAD": "image,param:f;psf,param:g"}
+    files = {"f": ("sun.fits", image_file.read_bytes()), "g": ("psf.fits", b"a letter")}
+    assert post(api, JOBS, fields, files).status_code == 415
+    assert kept(api) == NOTHING
+
+
+BOUNDARY = "multipart/form-data; boundary=x"
+PART = b'--x\r\nContent-Disposition: form-data; name="f"; filename="a"\r\n\r\nSIMPLE  =\r\n'
+
+
+@pytest.mark.parametrize(
+    ("media_type", "body", "told"),
+    [
+        ("multipart/form-data", PART, "expected a boundary"),
+        (BOUNDARY, PART, "it ended before its last boundary"),
+        (BOUNDARY, b"no boundary", "expected multipart/form-data"),
+        (BOUNDARY, PART * 2 + b"--x--", "in parts of different names"),
+        (BOUNDARY, PART.replace(b'name="f"; ', b"") + b"--x--", "expected a name for every part"),
+        (BOUNDARY, PART.replace(b'"a"', b'"\xff"') + b"--x--", "in UTF-8"),
+        (BOUNDARY, b'--x\r\nContent-Disposition: form-data; name="a"\r\n\r\n\xff\r\n--x--', "in UTF-8"),
+    ],
+)  # fmt: skip
+def test_a_broken_form_is_refused(
+    api: TestClient, settings: Settings, media_type: str, body: bytes, told: str
+) -> None:
+    answer = api.post(JOBS, content=body, headers={"Content-Type": media_type})
+    assert answer.status_code == 400 and told in answer.text, answer.text
+    assert temporary(settings) == []
+
+
+def test_forms_without_files_may_be_multipart_and_are_bounded(api: TestClient) -> None:
+    made = api.post(JOBS, files={"KIND": (None, "deconvolve")}, follow_redirects=False)
+    assert made.status_code == 303, made.text
+    long = api.post(JOBS, files={"KIND": (None, "deconvolve"), "a": (None, "b" * (2**20 + 1))})
+    assert long.status_code == 413
+    many = api.post(JOBS, files=[(f"f{n}", (None, "v")) for n in range(65)])
+    assert many.status_code == 400 and "at most 64 fields" in many.text
+
+
+def test_a_file_needs_the_scope_and_counts_for_its_owner(settings: Settings, image_file: Path) -> None:
+    files = {"f": ("sun.fits", image_file.read_bytes())}
+    fields: dict[str, str | list[str]] = dict(IMAGE)
+    with keyed(settings, submissions_per_minute=2) as service:
+        reader = service.client("ann", Scope.READ)
+        assert post(reader, JOBS, fields, files).status_code == 403
+        ann, bob = service.client("ann"), service.client("bob")
+        assert post(ann, JOBS, fields, files).status_code == 303
+        assert post(ann, JOBS, fields, files).status_code == 303, "one request is counted once"
+        assert post(ann, JOBS, fields, files).status_code == 429
+        assert kept(bob) == NOTHING
+        assert service.catalogue.owners.usage("ann", 0).used_bytes == image_file.stat().st_size
+    small = settings.model_copy(update={"upload_mib_per_minute": 1})
+    with keyed(small) as service:
+        large = {"f": ("sun.fits", image_file.read_bytes() + bytes(2**20))}
+        assert post(service.client("ann"), JOBS, fields, large).status_code == 429

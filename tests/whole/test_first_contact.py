@@ -1,0 +1,132 @@
+"""What a new user does with a real service: the curl lines of the README, Control-C, and a service that is restarted."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from astropy.io import fits
+
+from service.client.http import Client
+from tests.conftest import REPOSITORY, write_image, write_psf
+from tests.whole import stack as stacks
+from tests.whole.stack import Stack, wait_for
+
+COMMAND = (sys.executable, "-m", "service.cli")
+
+
+@pytest.fixture(scope="module")
+def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
+    with stacks.embedded(tmp_path_factory.mktemp("first")) as running:
+        yield running
+
+
+def rest_of(terminal: int) -> Iterator[str]:
+    """What is written to a terminal until its other end is closed."""
+    while True:
+        try:
+            yield os.read(terminal, 1000).decode()
+        except OSError:  # Linux's way to tell the end of a terminal
+            os.close(terminal)
+            return
+
+
+def started(stack: Stack, folder: Path) -> str:
+    """A job that takes so long that something can happen meanwhile, at work."""
+    write_image(folder / "large.fits", shape=(1024, 1024), seed=len(list(stack.client.jobs())))
+    write_psf(folder / "large-psf.fits")
+    image = stack.client.upload_image(folder / "large.fits")["id"]
+    psf = stack.client.upload_psf(folder / "large-psf.fits")["id"]
+    method = {"name": "richardson-lucy", "steps": 60}
+    job: str = stack.client.submit("deconvolve", image_id=image, psf_id=psf, method=method)["id"]
+    wait_for(lambda: stack.client.job(job)["progress"]["step"] > 1, "the job is at work")
+    return job
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is missing")
+def test_the_curl_lines_of_the_readme_work(stack: Stack, tmp_path: Path) -> None:
+    [lines] = re.findall(r"```sh\n(.+?)```", (REPOSITORY / "README.md").read_text("utf-8"), flags=re.S)
+    assert lines.count("curl ") == 6 and lines.startswith("S=http://127.0.0.1:8765\n")
+    write_psf(tmp_path / "psf.fits", size=256)
+    psf = stack.client.upload_psf(tmp_path / "psf.fits", instrument="hri_euv", channel="174", kind="total")
+    stack.client.certify_psf(psf["id"], "1.0.0")
+    stack.client.psf_curve(
+        psf["id"]
+    )  # makes the tables, which a PSF that the service builds has from the start
+    write_image(
+        tmp_path / "IMAGE.fits", DETECTOR="HRI_EUV", TELESCOP="SOLO/EUI/HRI_EUV", WAVELNTH=174.0,
+        **{"DATE-BEG": "2020-05-05"},
+    )  # fmt: skip
+    script = lines.replace("http://127.0.0.1:8765", stack.client.server)
+    done = subprocess.run(
+        ["bash", "-eu", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    assert answer["radii_px"] == [1, 10, 100] and answer["shape"] == [256, 256]
+    assert fits.getval(tmp_path / "OUT.fits", "PSFID") == psf["id"]
+    assert "event: end" in (tmp_path / "events.txt").read_text()
+
+
+def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(stack: Stack, tmp_path: Path) -> None:
+    job = started(stack, tmp_path)
+    address = stack.client.server.removeprefix("http://")
+    terminal, other_end = pty.openpty()
+    waiting = subprocess.Popen(
+        [*COMMAND, "job", "wait", job[:12], "--server", address], stderr=other_end, stdout=subprocess.DEVNULL
+    )
+    os.close(other_end)
+    shown = b""
+    while b"deconvolving" not in shown:  # the bar: the command has begun to wait
+        shown += os.read(terminal, 1000)
+    waiting.send_signal(signal.SIGINT)
+    told = "".join(rest_of(terminal)).replace("\r\n", "\n")
+    assert waiting.wait(60) == 130, told
+    assert f"interrupted; job {job[:12]} goes on" in told and "Traceback" not in told
+    assert stack.client.job(job)["phase"] == "EXECUTING"
+    cancel = re.findall(r"cancel it: +heliopsf (.+)", told)[0].split()
+    assert cancel == ["job", "cancel", job[:12], "--server", stack.client.server]
+    assert subprocess.run([*COMMAND, *cancel], timeout=60, check=False).returncode == 0
+    rejoin = re.findall(r"again: +heliopsf (.+)", told)[0].split()
+    ended = subprocess.run([*COMMAND, *rejoin], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1 and f"job {job[:12]}: ABORTED" in ended.stderr
+
+
+@pytest.mark.slow
+def test_a_wait_survives_a_restart_of_the_service(stack: Stack, tmp_path: Path) -> None:
+    job = stack.client.job(started(stack, tmp_path))
+    said: list[str] = []
+    ended: list[str] = []
+
+    def wait() -> None:
+        with Client(stack.client.server, say=said.append) as client:
+            ended.append(client.wait(job, timeout_s=170)["phase"])
+
+    waiter = threading.Thread(target=wait)
+    waiter.start()
+    assert stack.server is not None
+    port = stack.client.server.rpartition(":")[2]
+    stack.server.send_signal(signal.SIGTERM)
+    wait_for(lambda: bool(said), "the client has noticed")
+    stack.server.wait(60)
+    stack.server = subprocess.Popen(
+        [*COMMAND, "serve", "--port", port],
+        env=stack.environment,
+        stdout=subprocess.DEVNULL,
+        stderr=(tmp_path / "server.log").open("a"),
+        start_new_session=True,
+        text=True,
+    )
+    waiter.join(170)
+    assert ended == ["COMPLETED"]
+    assert "no answer" in said[0] and said[-1] == "the service answers again"
