@@ -37,6 +37,7 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 from workers.catalogue.uws_jobs import UwsJobs
+from workers.catalogue.waiting.turns import Turns
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 AnyRow = TypeVar(
@@ -52,6 +53,7 @@ class Catalogue:
         self._engine = self._database.engine
         self.schema = Schema(self._database)
         self.jobs = Jobs(self._database)
+        self.turns = Turns(self._database, self.jobs)
         self.uws = UwsJobs(self._database, self.jobs)
         self.parts = Parts(self._database)
         self.bulks = Bulks(self._database)

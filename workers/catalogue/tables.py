@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Double, Index, String, text
+from sqlalchemy import JSON, BigInteger, Double, Index, String, false, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from workers.contract.phases import LIVE
@@ -239,6 +239,8 @@ class JobRow(Base):
     ended_at: Mapped[float | None]
     submitted_at: Mapped[float | None]
     submissions: Mapped[int] = mapped_column(default=0)
+    # A temporary failure ended the last attempt, and the job has not been submitted again yet.
+    delayed: Mapped[bool] = mapped_column(default=False, server_default=false())
     attempt: Mapped[int] = mapped_column(default=0)
     lease: Mapped[str | None] = mapped_column(String(32))
     heartbeat_at: Mapped[float | None]
@@ -288,6 +290,15 @@ class TermsRow(Base):
     run_id: Mapped[str | None] = mapped_column(default=None)
     execution_duration_s: Mapped[int] = mapped_column(default=0)  # 0: unlimited
     destruction_at: Mapped[float | None] = mapped_column(default=None, index=True)
+
+
+class OwnerTurnRow(Base):
+    """When an owner's jobs of a queue were last claimed. In each queue, the claims are numbered."""
+
+    __tablename__ = "owner_turns"
+    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
+    queue: Mapped[str] = mapped_column(String(16), primary_key=True)
+    number: Mapped[int] = mapped_column(BigInteger)
 
 
 class ReportRow(Base):

@@ -106,7 +106,7 @@ def factor(kind: str, catalogue: Catalogue) -> float:
     value, until = known.get(kind, (1.0, -math.inf))
     if time.monotonic() < until:
         return value
-    times = catalogue.jobs.run_times(kind, MOST_JOBS)
+    times = catalogue.stage_times.run_times(kind, MOST_JOBS)
     ratios = [
         took_s / estimated["start_s"] for estimated, took_s in times if estimated.get("start_s", 0.0) > 0
     ]
