@@ -80,6 +80,10 @@ class LocalStore(Store):
         _check(seen)
         return next(iter(seen))
 
+    def verified(self, digest: str) -> Path:
+        """As ``Store.verified``. A file of the user is checked as in ``path``, which is quicker."""
+        return self.path(digest) if digest in self._files else super().verified(digest)
+
     @contextmanager
     def unpacked(self, digest: str, limits: ArchiveLimits) -> Iterator[Path]:
         """A folder with the files of a transit: the user's own folder, or an archive that is unpacked."""
@@ -222,7 +226,7 @@ class LocalService(Operations):
         }
         digest = digests[part]
         assert digest is not None
-        shutil.copyfile(self._store.path(digest), path)
+        shutil.copyfile(self._store.verified(digest), path)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
         """The answer to a query from the tables of the PSF."""

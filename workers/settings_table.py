@@ -43,7 +43,7 @@ def settings_table() -> str:
 
 
 def _row(name: str, field: FieldInfo) -> str:
-    cells = (f"`{PREFIX}{name.upper()}`", _type(field), _default(field.default), field.description or "")
+    cells = (f"`{PREFIX}{name.upper()}`", _type(field), _default(field), field.description or "")
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
@@ -70,7 +70,10 @@ def _name(annotation: Any) -> str:
     return {"str": "text", "int": "integer", "float": "number", "Path": "path"}[annotation.__name__]
 
 
-def _default(value: Any) -> str:
+def _default(field: FieldInfo) -> str:
+    if field.default_factory is not None:
+        return "of the machine"
+    value = field.default
     return "not set" if value is None or value == "" else f"`{value}`"
 
 

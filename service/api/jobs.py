@@ -20,6 +20,7 @@ from workers.contract.kinds import KINDS, JobRequest
 from workers.contract.phases import JobError, Phase
 from workers.contract.queues import Queue
 from workers.intake import estimates
+from workers.intake.again import reopened
 from workers.intake.requests import resolve
 
 log = logging.getLogger(__name__)
@@ -98,7 +99,8 @@ class JobView(BaseModel):
     },
 )
 def submit_job(body: JobRequest, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """Put a job into its queue. If an identical request was made before, the answer is the existing job."""
+    """Put a job into its queue. If an identical request was made before, the answer is the existing job. If the result of that
+    job was deleted or lost, the job is queued again."""
     check_room(state, caller.owner)
     try:
         parameters, request_key = resolve(
@@ -113,6 +115,11 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
     )
     if new:
         log.info("job %s: %s, submitted", row.id, body.kind, extra={"fields": {"job": row.id}})
+    if not new and reopened(row, state.catalogue, state.store):
+        log.info(
+            "job %s: queued again, because its result was lost", row.id, extra={"fields": {"job": row.id}}
+        )
+        row, new = find(state, caller, row.id), True
     if row.submitted_at is None:  # the job is new, or was moved to a queue of higher priority
         state.reconciler.wake()
     response.status_code = 202 if new else 200

@@ -91,7 +91,12 @@ def get_product_file(product_id: Identity, request: Request, caller: Reading, st
     """Download the product; its hash is the ETag."""
     row = _find(state, caller, product_id)
     return files.send(
-        request, state.store, row.file_sha256, files.FITS_TYPE, f"heliopsf-{product_id[:12]}.fits"
+        request,
+        state.store,
+        row.file_sha256,
+        files.FITS_TYPE,
+        f"heliopsf-{product_id[:12]}.fits",
+        size=row.bytes,
     )
 
 

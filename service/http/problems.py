@@ -31,6 +31,8 @@ STATUS_OF = {
     "no-such-product": 404,
     "no-such-psf": 404,
     "no-such-transit": 404,
+    "file-damaged": 410,
+    "file-lost": 410,
     "changed-meanwhile": 409,
     "cutout-not-plain": 409,
     "line-known": 409,

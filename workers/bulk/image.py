@@ -151,7 +151,7 @@ def _done_before(
 ) -> Outcome | None:
     """The existing product, copied to the output folder if it is not there yet; None if there is no product."""
     if request.keeps_products:
-        row = context.catalogue.get(ProductRow, identity, context.owner)
+        row = context.made(ProductRow, identity)
         return None if row is None else _kept(context, row, target, reused=True)
     earlier = context.catalogue.bulks.progress.done_before(context.owner, identity, str(target))
     if earlier is None or target is None or not target.is_file() or sha256_of(target) != earlier.sha256:
@@ -184,7 +184,7 @@ def _done_now(
     estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
     psf_row = requested_psf(context, wanted)
     # The path is taken only now, because the store's local copy may have been removed during a wait or a PSF build.
-    image_file = source.copy or context.store.path(source.sha256)
+    image_file = source.copy or context.store.verified(source.sha256)
     image = deconvolve_task.load(context, wanted, image_file, source.summary)
     started = time.perf_counter()
     made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
@@ -216,7 +216,7 @@ def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: boo
     if target is not None and not (
         target.is_file() and target.stat().st_size == row.bytes and sha256_of(target) == row.file_sha256
     ):
-        _put(context.store.path(row.file_sha256), target)
+        _put(context.store.verified(row.file_sha256), target)
     return Outcome(
         image_sha256=row.image_id,
         psf_id=row.psf_id,

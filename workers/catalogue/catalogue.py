@@ -37,9 +37,11 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 from workers.catalogue.uws_jobs import UwsJobs
+from workers.catalogue.waiting.again import Again
 from workers.catalogue.waiting.turns import Turns
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
+Made = TypeVar("Made", ProductRow, PsfRow, ReportRow)
 AnyRow = TypeVar(
     "AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow, PsfContextRow, BulkRow
 )
@@ -53,6 +55,7 @@ class Catalogue:
         self._engine = self._database.engine
         self.schema = Schema(self._database)
         self.jobs = Jobs(self._database)
+        self.again = Again(self._database)
         self.turns = Turns(self._database, self.jobs)
         self.uws = UwsJobs(self._database, self.jobs)
         self.parts = Parts(self._database)
@@ -100,6 +103,19 @@ class Catalogue:
             if existing is None:
                 raise
             return existing, False
+
+    def refile(self, row: Made) -> Made:
+        """Let the existing row of this identity refer to the files of ``row``; returns the existing row."""
+        with self._database.writing.begin() as session:
+            there = session.get(type(row), (row.owner, row.id), with_for_update=True)
+            if there is None:  # it was deleted meanwhile
+                session.add(row)
+                add_bytes(session, row.owner, row.bytes)
+                return row
+            add_bytes(session, row.owner, row.bytes - there.bytes)
+            there.file_sha256, there.bytes = row.file_sha256, row.bytes
+            there.preview_sha256, there.details = row.preview_sha256, row.details
+            return there
 
     def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
         """The row with this identity, or None."""

@@ -30,7 +30,8 @@ from service.cli.options import DATA, read_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.files.opened import open_store
-from workers.settings import Settings, cores, software_version
+from workers.machine import cores
+from workers.settings import Settings, software_version
 
 State = Literal["ok", "warning", "broken"]
 SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}

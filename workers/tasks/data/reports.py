@@ -41,7 +41,7 @@ def keep_report(
     """Move the written files of a report into the store, and add a row with these details to the catalogue."""
     file_sha256 = context.store.keep(text)
     of_page = {} if page is None else {"page_sha256": context.store.keep(page)}
-    context.catalogue.add(
+    context.add(
         ReportRow(
             owner=context.owner,
             id=identity,

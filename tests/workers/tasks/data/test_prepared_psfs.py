@@ -23,10 +23,12 @@ SHAPE = (96, 128)
 
 def test_a_psf_is_read_once_and_equals_the_file(psf_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = PreparedPsfs(2**30)
-    first = prepared.on_pixels_of(Header(), psf_file, LIMITS)
+    first = prepared.on_pixels_of(Header(), psf_file, lambda: psf_file, LIMITS)
     monkeypatch.delattr(prepared_psfs, "read_psf")
-    assert prepared.on_pixels_of(Header({"CDELT1": 7.0}), psf_file, LIMITS) is first
-    np.testing.assert_array_equal(first.kernel, read_psf(psf_file, LIMITS, parts=False).kernel)
+    assert prepared.on_pixels_of(Header({"CDELT1": 7.0}), psf_file, lambda: psf_file, LIMITS) is first
+    np.testing.assert_array_equal(
+        first.kernel, read_psf(psf_file, lambda: psf_file, LIMITS, parts=False).kernel
+    )
 
 
 def test_a_binned_image_gets_the_psf_of_its_pixels_once(tmp_path: Path) -> None:
@@ -35,16 +37,19 @@ def test_a_binned_image_gets_the_psf_of_its_pixels_once(tmp_path: Path) -> None:
     write_psf(tmp_path / "psf.fits")
     fits.setval(tmp_path / "psf.fits", "CDELT1", value=0.5)
     prepared, binned = PreparedPsfs(2**30), Header({"CDELT1": 1.0, "CDELT2": 1.0})
-    whole = prepared.on_pixels_of(Header({"CDELT1": 0.5}), tmp_path / "psf.fits", LIMITS)
+    whole = prepared.on_pixels_of(Header({"CDELT1": 0.5}), "psf", lambda: tmp_path / "psf.fits", LIMITS)
     assert whole.plate_scale_arcsec == 0.5
-    found = prepared.on_pixels_of(binned, tmp_path / "psf.fits", LIMITS)
-    assert found is not whole and prepared.on_pixels_of(binned, tmp_path / "psf.fits", LIMITS) is found
+    found = prepared.on_pixels_of(binned, "psf", lambda: tmp_path / "psf.fits", LIMITS)
+    assert (
+        found is not whole
+        and prepared.on_pixels_of(binned, "psf", lambda: tmp_path / "psf.fits", LIMITS) is found
+    )
     np.testing.assert_array_equal(found.kernel, psf_for_image(whole, binned).kernel)
 
 
 def test_an_engine_is_made_once_for_a_psf_and_a_shape(psf_file: Path) -> None:
     prepared = PreparedPsfs(2**30)
-    psf, other = (read_psf(psf_file, LIMITS, parts=False) for _ in range(2))
+    psf, other = (read_psf(psf_file, lambda: psf_file, LIMITS, parts=False) for _ in range(2))
     engine = prepared.engine_for(psf, SHAPE, SHAPE, 1)
     assert prepared.engine_for(psf, SHAPE, SHAPE, 1) is engine
     others = [
@@ -56,7 +61,7 @@ def test_an_engine_is_made_once_for_a_psf_and_a_shape(psf_file: Path) -> None:
 
 
 def test_the_least_recently_used_are_removed_but_never_the_last(psf_file: Path) -> None:
-    psf = read_psf(psf_file, LIMITS, parts=False)
+    psf = read_psf(psf_file, lambda: psf_file, LIMITS, parts=False)
     size = new_engine(psf, SHAPE, SHAPE, 1).nbytes
     assert size > 2 * 4 * SHAPE[0] * SHAPE[1]
     prepared = PreparedPsfs(int(2.5 * size))
