@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import uuid
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ PARTIAL = ".part"
 def whole_file(target: Path) -> Iterator[BinaryIO]:
     """Open a temporary file beside `target`. It replaces `target` when its whole content is on the disk.
 
-    A killed process leaves its temporary file behind; `partials` finds it. Raises OSError.
+    A killed process leaves its temporary file behind; its name ends with `PARTIAL`. Raises OSError.
     """
     partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
     try:
@@ -34,8 +33,3 @@ def write_whole(target: Path, text: str) -> None:
     """Write a text file completely or not at all. Raises OSError."""
     with whole_file(target) as file:
         file.write(text.encode())
-
-
-def partials(target: Path) -> Iterator[Path]:
-    """Temporary files of `target` that killed processes left behind."""
-    return target.parent.glob(f".{glob.escape(target.name)}.*{PARTIAL}")

@@ -152,7 +152,7 @@ def get_job(job_id: JobId, caller: Reading, state: Shared) -> JobView:
 @router.delete("/{job_id}", status_code=202, summary="Cancel a job")
 def cancel_job(job_id: JobId, caller: Submitting, state: Shared) -> JobView:
     """Cancel a job. A queued job ends at once. An executing job ends at its next step. A job that has ended does not change."""
-    find(state, caller, job_id)
+    check_own(find(state, caller, job_id))
     state.catalogue.jobs.cancel(job_id)
     return JobView.of(find(state, caller, job_id))
 
@@ -167,6 +167,19 @@ def time_left_s(row: JobRow) -> float | None:
     ):
         return None
     return max(0.0, (time.time() - row.started_at) * (row.steps - row.step) / row.step)
+
+
+def check_own(row: JobRow) -> JobRow:
+    """The job itself. Raises ``Problem`` 409 if the job is a part of a bulk run, which only requests to the bulk run change."""
+    if KINDS[row.kind].parameters is None:
+        bulk_id = row.parameters["bulk_id"]
+        raise Problem(
+            409,
+            "job-of-bulk",
+            f"expected a job that was submitted; job {row.id} is a part of bulk run {bulk_id}: pause or cancel the bulk run "
+            f"(POST /v1/bulk/{bulk_id}/pause or /cancel)",
+        )
+    return row
 
 
 def find(state: Shared, caller: Caller, job_id: str) -> JobRow:

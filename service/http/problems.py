@@ -12,12 +12,12 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import ErrorDetails
-from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import DatabaseError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
 from psfcore.errors import DataError
-from workers import logs
+from workers import checks, logs
 from workers.contract.suggestions import explained
 from workers.files.store import StoreAway
 
@@ -155,6 +155,17 @@ def install(app: FastAPI) -> None:
             "database-away",
             "the database of the service does not answer; try again in a moment",
             headers={"Retry-After": "5"},
+        )
+
+    @app.exception_handler(DatabaseError)
+    def _damaged(request: Request, error: DatabaseError) -> JSONResponse:
+        if not checks.damaged(error):
+            raise error
+        log.error("database: %s", error)
+        return answer(
+            503,
+            "database-damaged",
+            "the database of the service is damaged; tell the operator, who must restore a copy",
         )
 
     @app.exception_handler(StoreAway)

@@ -82,6 +82,13 @@ class Catalogue:
         with self._database.reading() as session:
             session.execute(select(1))
 
+    def check_pages(self) -> None:
+        """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged.
+
+        This reads the whole file. PostgreSQL checks the pages that it reads itself.
+        """
+        self._database.check_pages()
+
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row with this identity, and whether it is new.
 

@@ -246,7 +246,13 @@ class Jobs:
         """Queue the jobs again whose worker has been silent for longer than ``lease_s``; returns the ids of these jobs.
 
         A cancelled job is aborted instead. A job that was already started ``max_attempts`` times ends in ERROR.
+        If the database's clock was set back, a heartbeat may lie in the future. It then counts as a heartbeat of this
+        moment, so that the lease of a lost worker does not last until the clock has caught up.
         """
+        now = self._database.now
+        ahead = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at > now + lease_s]
+        started_at = case((JobRow.started_at > now, now), else_=JobRow.started_at)
+        self._set(ahead, heartbeat_at=now, started_at=started_at)
         silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
         too_often = and_(JobRow.cancel_requested.is_(False), JobRow.attempt >= max_attempts)
         error = JobError(
@@ -282,7 +288,9 @@ class Jobs:
             *((JobRow.submissions == number, wait) for number, wait in waits.items()),
             else_=resubmit_s * 2**8,
         )
-        due = or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < self._database.now - wait_s)
+        now = self._database.now
+        ahead = JobRow.submitted_at > now + resubmit_s  # the database's clock was set back since
+        due = or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < now - wait_s, ahead)
         query = select(JobRow.id, JobRow.queue).where(JobRow.phase == Phase.QUEUED, due, no_equal_at_work())
         found: list[Waiting] = []
         with self._database.reading() as session:

@@ -349,7 +349,9 @@ class WorkerRow(Base):
     """A running worker process. It renews its heartbeat and deletes the row when it ends."""
 
     __tablename__ = "workers"
-    name: Mapped[str] = mapped_column(String(128), primary_key=True)  # host:process, as in JobRow.worker
+    name: Mapped[str] = mapped_column(
+        String(128), primary_key=True
+    )  # host:process:random, as in JobRow.worker
     started_at: Mapped[float]
     heartbeat_at: Mapped[float]
     version: Mapped[str] = mapped_column(String(64))

@@ -7,7 +7,9 @@ import logging
 import os
 import socket
 import time
+import uuid
 from collections.abc import Callable
+from functools import cache
 
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 
@@ -34,7 +36,13 @@ TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
 
 def worker_name() -> str:
     """The name of this process, as jobs and the list of workers show it."""
-    return f"{socket.gethostname()}:{os.getpid()}"
+    return _name(os.getpid())
+
+
+@cache
+def _name(process: int) -> str:
+    """A name that no other process has: workers in different containers may have the same host name and process id."""
+    return f"{socket.gethostname()}:{process}:{uuid.uuid4().hex[:8]}"
 
 
 class Runner:

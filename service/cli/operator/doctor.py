@@ -337,7 +337,10 @@ def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]
         started = time.perf_counter()
         catalogue.ping()
         took_ms = 1e3 * (time.perf_counter() - started)
+        catalogue.check_pages()
     except SQLAlchemyError as error:
+        if checks.damaged(error):
+            advice = "stop the service, and restore a copy of the database"
         yield None, Finding("database", "broken", f"{where}: {checks.database_said(error)}", advice)
     else:
         yield catalogue, Finding("database", "ok", f"{where} answers in {took_ms:.0f} ms")
