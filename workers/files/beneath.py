@@ -38,9 +38,10 @@ def opened(path: Path, allowed: Sequence[Path]) -> Iterator[BinaryIO]:
     resolved = check_under(path, allowed)
     with _folder(resolved.parent, allowed, make=False) as folder:
         handle = os.open(resolved.name, _FILE, dir_fd=folder)
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise DataError("unreadable-file", "expected a regular file; got a folder, pipe or device")
     with open(handle, "rb") as file:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise DataError("unreadable-file", "expected a regular file; got a folder, pipe or device")
         yield file
 
 

@@ -21,6 +21,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
 from workers.files.store import Store
 from workers.settings import Settings
+from workers.tasks import deconvolve
 
 
 @pytest.fixture
@@ -76,30 +77,22 @@ def test_a_good_file_declares_its_hash(api: TestClient, product: dict[str, Any])
 
 
 @pytest.mark.parametrize(("spoil", "code"), [(halve, "file-damaged"), (Path.unlink, "file-lost")])
-@pytest.mark.parametrize("part", ["file", "preview"])
 def test_a_product_that_is_not_whole_is_not_sent(
     api: TestClient,
     product: dict[str, Any],
     store: Store,
     catalogue: Catalogue,
-    part: str,
     spoil: Callable[[Path], None],
     code: str,
 ) -> None:
     row = catalogue.get(ProductRow, product["id"], DEFAULT_OWNER)
     assert row is not None
-    spoil(store.path(row.file_sha256 if part == "file" else row.preview_sha256))
-    answer = api.get(product[part])
-    assert (answer.status_code, code_of(answer)) == (410, code)
-    assert "submit the same request again" in answer.json()["detail"]
-
-
-def test_a_zeroed_picture_is_not_sent(
-    api: TestClient, product: dict[str, Any], store: Store, catalogue: Catalogue
-) -> None:
-    row = catalogue.get(ProductRow, product["id"], DEFAULT_OWNER)
-    assert row is not None
-    zero(store.path(row.preview_sha256))
+    for part, digest in (("file", row.file_sha256), ("preview", row.preview_sha256)):
+        spoil(store.path(digest))
+        answer = api.get(product[part])
+        assert (answer.status_code, code_of(answer)) == (410, code)
+        assert "submit the same request again" in answer.json()["detail"]
+    store.path(row.preview_sha256).write_bytes(bytes(1000))  # a picture's size is not recorded
     assert code_of(api.get(product["preview"])) == "file-damaged"
 
 
@@ -140,8 +133,14 @@ def test_the_client_refuses_what_has_another_hash(
     assert list(tmp_path.glob("product*")) == []
 
 
-@pytest.mark.parametrize(("spoil", "code"), [(zero, "file-damaged"), (Path.unlink, "file-lost")])
-@pytest.mark.parametrize("which", ["image_id", "psf_id"])
+@pytest.mark.parametrize(
+    ("which", "spoil", "code"),
+    [
+        ("image_id", zero, "file-damaged"),
+        ("image_id", Path.unlink, "file-lost"),
+        ("psf_id", zero, "file-damaged"),
+    ],
+)
 def test_a_changed_upload_is_refused_until_it_is_uploaded_again(
     api: TestClient,
     run_jobs: Callable[[], None],
@@ -153,6 +152,7 @@ def test_a_changed_upload_is_refused_until_it_is_uploaded_again(
     spoil: Callable[[Path], None],
     code: str,
 ) -> None:
+    deconvolve._prepared.cache_clear()  # a worker may still have the PSF in its memory
     digest = request_body["parameters"][which]
     spoil(store.path(digest))
     job = api.post("/v1/jobs", json=request_body).json()
