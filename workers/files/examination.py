@@ -1,4 +1,4 @@
-"""Compare the files of the store with what the catalogue says about them; let jobs make lost results again."""
+"""Compare the files of the store with what the catalogue says about them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.named_files import Kept
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
 from workers.files.intact import files_of
 from workers.files.store import FileState, Store
-from workers.intake.again import make_again
 
 NAMES: dict[type[Any], str] = {
     ImageRow: "image",
@@ -54,25 +52,6 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
                     bad.append((digest, states[digest]))
             if bad:
                 yield Fault(row, tuple(bad))
-
-
-def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
-    """Set damaged files aside, and queue the job that makes a result again; returns what was done or has to be done."""
-    row = fault.row
-    for digest, state in fault.files:
-        if state == "damaged":
-            store.set_aside(digest)
-    match row:
-        case SolutionRow():
-            catalogue.owners.forget_solutions([row])
-            return "removed; the next job on the transit makes it again"
-        case ImageRow() | TransitRow():
-            return f"owner {row.owner} must upload the file again ({row.filename or 'without a name'})"
-        case _:
-            try:
-                return f"job {make_again(row, catalogue, store)} makes it again"
-            except DataError as error:
-                return f"cannot be made again: {error.message}"
 
 
 def _files(row: Kept) -> Iterator[tuple[str, int | None]]:

@@ -8,12 +8,21 @@ from pydantic import ValidationError
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
+from workers.catalogue.tables import (
+    ImageRow,
+    JobRow,
+    ProductRow,
+    PsfRow,
+    ReportRow,
+    SolutionRow,
+    TransitRow,
+)
 from workers.contract.identities import request_identity
 from workers.contract.kinds import KINDS, Result
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 from workers.contract.requests import PsfTables
+from workers.files.examination import Fault
 from workers.files.intact import intact
 from workers.files.store import Store
 from workers.lineage import made_by
@@ -32,6 +41,25 @@ def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
         return False
     row = catalogue.get(table, job.result_id, job.owner)
     return (row is None or not intact(store, row)) and catalogue.again.reopen(job.id)
+
+
+def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
+    """Set damaged files aside, and queue the job that makes a result again; returns what was done or has to be done."""
+    row = fault.row
+    for digest, state in fault.files:
+        if state == "damaged":
+            store.set_aside(digest)
+    match row:
+        case SolutionRow():
+            catalogue.owners.forget_solutions([row])
+            return "removed; the next job on the transit makes it again"
+        case ImageRow() | TransitRow():
+            return f"owner {row.owner} must upload the file again ({row.filename or 'without a name'})"
+        case _:
+            try:
+                return f"job {make_again(row, catalogue, store)} makes it again"
+            except DataError as error:
+                return f"cannot be made again: {error.message}"
 
 
 def make_again(row: ProductRow | PsfRow | ReportRow, catalogue: Catalogue, store: Store) -> str:

@@ -12,8 +12,9 @@ from service.cli.options import DATA, read_settings, user_errors
 from workers.catalogue.keys import OWNER
 from workers.catalogue.owners import MIB, Usage
 from workers.files.collection import collect
-from workers.files.examination import examine, repair
+from workers.files.examination import examine
 from workers.files.opened import open_store
+from workers.intake.again import repair
 
 DAY_S = 86_400
 
