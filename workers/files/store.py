@@ -100,8 +100,8 @@ class Store:
 
     def verified(self, digest: str) -> Path:
         """The path of the file with this SHA-256, after its content was checked. Raises ``BadFile``."""
-        path = self.path(digest)
         try:
+            path = self.path(digest)
             found = sha256_of(path)
         except FileNotFoundError:
             raise lost(digest) from None
