@@ -14,6 +14,7 @@ from psfcore.fits.psfs import read_psf
 from psfcore.psf_sampling import psf_for_image
 from service.local import LocalService
 from tests.conftest import write_image, write_psf
+from workers.tasks import deconvolve
 from workers.tasks.data import prepared_psfs
 from workers.tasks.data.prepared_psfs import PreparedPsfs
 
@@ -26,9 +27,7 @@ def test_a_psf_is_read_once_and_equals_the_file(psf_file: Path, monkeypatch: pyt
     first = prepared.on_pixels_of(Header(), psf_file, lambda: psf_file, LIMITS)
     monkeypatch.delattr(prepared_psfs, "read_psf")
     assert prepared.on_pixels_of(Header({"CDELT1": 7.0}), psf_file, lambda: psf_file, LIMITS) is first
-    np.testing.assert_array_equal(
-        first.kernel, read_psf(psf_file, lambda: psf_file, LIMITS, parts=False).kernel
-    )
+    np.testing.assert_array_equal(first.kernel, read_psf(psf_file, LIMITS, parts=False).kernel)
 
 
 def test_a_binned_image_gets_the_psf_of_its_pixels_once(tmp_path: Path) -> None:
@@ -49,7 +48,7 @@ def test_a_binned_image_gets_the_psf_of_its_pixels_once(tmp_path: Path) -> None:
 
 def test_an_engine_is_made_once_for_a_psf_and_a_shape(psf_file: Path) -> None:
     prepared = PreparedPsfs(2**30)
-    psf, other = (read_psf(psf_file, lambda: psf_file, LIMITS, parts=False) for _ in range(2))
+    psf, other = (read_psf(psf_file, LIMITS, parts=False) for _ in range(2))
     engine = prepared.engine_for(psf, SHAPE, SHAPE, 1)
     assert prepared.engine_for(psf, SHAPE, SHAPE, 1) is engine
     others = [
@@ -61,7 +60,7 @@ def test_an_engine_is_made_once_for_a_psf_and_a_shape(psf_file: Path) -> None:
 
 
 def test_the_least_recently_used_are_removed_but_never_the_last(psf_file: Path) -> None:
-    psf = read_psf(psf_file, lambda: psf_file, LIMITS, parts=False)
+    psf = read_psf(psf_file, LIMITS, parts=False)
     size = new_engine(psf, SHAPE, SHAPE, 1).nbytes
     assert size > 2 * 4 * SHAPE[0] * SHAPE[1]
     prepared = PreparedPsfs(int(2.5 * size))
@@ -79,6 +78,7 @@ def test_jobs_share_prepared_psfs(
     local: LocalService, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[object] = []
+    deconvolve._prepared.cache_clear()  # other tests use the same PSF
     real = prepared_psfs.new_engine
     monkeypatch.setattr(prepared_psfs, "new_engine", lambda *given: made.append(given) or real(*given))
     psf_id = local.upload_psf(psf_file)["id"]
