@@ -1,20 +1,24 @@
 # One image for the service and its workers; docker-compose.yml selects the command.
 FROM python:3.11-slim AS build
 WORKDIR /src
-COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY pyproject.toml README.md LICENSE ./
+COPY pins pins
 COPY heliopsf heliopsf
 COPY psfcore psfcore
 COPY service service
 COPY workers workers
 RUN python -m venv /opt/heliopsf \
- && /opt/heliopsf/bin/pip install --no-cache-dir -c constraints.txt '.[s3]'
+ && /opt/heliopsf/bin/pip install --no-cache-dir --require-hashes -r pins/service.txt \
+ && /opt/heliopsf/bin/pip install --no-cache-dir --no-deps --no-build-isolation .
 
 FROM python:3.11-slim
 COPY --from=build /opt/heliopsf /opt/heliopsf
 RUN useradd --create-home --uid 10001 heliopsf \
  && install -d -o heliopsf -g heliopsf /data
 USER heliopsf
+# Libraries write their caches below HOME and NUMBA_CACHE_DIR; /tmp is the only such folder that a read-only container has.
 ENV PATH=/opt/heliopsf/bin:$PATH \
+    HOME=/tmp \
     PYTHONUNBUFFERED=1 \
     NUMBA_CACHE_DIR=/tmp/numba \
     HELIOPSF_DATA_DIR=/data

@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test test-full bench bench-peers blind chaos lint openapi settings clean
+.PHONY: demo test test-full bench bench-peers blind chaos lint openapi settings pins clean
 .DELETE_ON_ERROR:
 
 $(RUN): pyproject.toml constraints.txt
@@ -65,5 +65,10 @@ settings: $(DEV)
 openapi: $(DEV)
 	$(BIN)/python -m service.openapi openapi/openapi.json
 
+# The hashes of the pinned packages and of the build tool, for the image. The file names no index.
+pins: constraints.txt pyproject.toml pins/build.in
+	test -x .venv-pins/bin/uv || { $(PYTHON) -m venv .venv-pins && .venv-pins/bin/python -m pip install --quiet --disable-pip-version-check uv; }
+	.venv-pins/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c constraints.txt --extra s3 -o pins/service.txt pyproject.toml pins/build.in
+
 clean:
-	rm -rf $(VENV) .venv-peers .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-peers .venv-pins .mypy_cache .ruff_cache .hypothesis

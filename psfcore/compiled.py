@@ -10,13 +10,19 @@ file is a hash of what was compiled, and a function that is defined inside anoth
 numba also does not notice when a kernel calls a function of another file and that file changes. In this module, every
 kernel depends on all source files that define kernels. If a power failure left a kernel file incomplete, the file is
 ignored.
+
+A kernel file contains machine code, and loading it executes it. Therefore a folder is used only if nobody else can write
+to it; otherwise the kernels are kept in a private folder in the user's home.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import os
+import stat
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +33,7 @@ from numba.core.dispatcher import Dispatcher
 
 SEAL_BYTES = 2 * hashlib.sha256().digest_size
 MARK = b"@compiled("
+SOURCE = Path(__file__)
 log = logging.getLogger(__name__)
 
 
@@ -49,11 +56,64 @@ def compiled(
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
             cache = kernel._cache  # type: ignore[attr-defined]
             cache._cache_file = KernelFiles(
-                cache.cache_path, cache._impl.filename_base, cache._impl.locator.get_source_stamp()
+                kernel_folder(Path(cache.cache_path)),
+                cache._impl.filename_base,
+                cache._impl.locator.get_source_stamp(),
             )
         return kernel
 
     return decorate
+
+
+@cache
+def kernel_folder(usual: Path, home: Path | None = None) -> str:
+    """The folder for kernels: the usual one if nobody else can write to it, else a private one below the user's home.
+
+    home: default: the home of the user. If the private folder cannot be made, `KernelFiles` neither writes nor reads there.
+    """
+    with suppress(OSError):  # numba makes it only later; a folder that cannot be made is not trusted
+        usual.mkdir(parents=True, exist_ok=True)
+    if trusted(usual):
+        return str(usual)
+    source = hashlib.sha256(str(SOURCE).encode()).hexdigest()[:12]
+    private = (home or Path.home()) / ".cache" / "heliopsf" / f"kernels-{source}"
+    log.warning(
+        "expected a folder for compiled kernels to which nobody else can write; %s is another one: the kernels are kept in %s",
+        usual,
+        private,
+    )
+    try:
+        private.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        log.warning(
+            "cannot make the folder %s; each process will compile the kernels again: %s", private, error
+        )
+    return str(private)
+
+
+def trusted(path: Path) -> bool:
+    """Whether only this user, the owner of the system and those who can change this source file can change a file or folder.
+
+    The folders above it are checked too: whoever can rename one of them can put another folder in its place.
+    """
+    if not hasattr(os, "geteuid"):  # a system without the owners and modes of POSIX
+        return True
+    source = SOURCE.stat()
+    owners = {0, os.geteuid(), source.st_uid, Path("/").stat().st_uid}
+    shared_group = source.st_gid if source.st_mode & stat.S_IWGRP else None
+    try:
+        path = path.resolve(strict=True)
+        found = [one.stat() for one in (path, *path.parents)]
+    except OSError:  # it does not exist, or this user may not see it
+        return False
+    for place, one in enumerate(found):
+        if one.st_uid not in owners:
+            return False
+        others = one.st_mode & stat.S_IWOTH or (one.st_mode & stat.S_IWGRP and one.st_gid != shared_group)
+        # In a folder with the sticky bit, such as /tmp, nobody can rename the folders of others.
+        if others and not (place > 0 and one.st_mode & stat.S_ISVTX):
+            return False
+    return True
 
 
 class KernelFiles(IndexDataCacheFile):
@@ -64,6 +124,13 @@ class KernelFiles(IndexDataCacheFile):
 
     def save(self, key: Any, data: Any) -> None:
         """Write a kernel to disk in one step. If this fails, log a warning; the kernel can still be used."""
+        if not trusted(Path(self._cache_path)):
+            log.warning(
+                "expected a folder for compiled kernels to which nobody else can write; got %s: each process will compile "
+                "them again",
+                self._cache_path,
+            )
+            return
         payload = self._dump(data)
         try:
             with self._open_for_write(self._data_path(self._name(key))) as file:
@@ -76,7 +143,7 @@ class KernelFiles(IndexDataCacheFile):
     def load(self, key: Any) -> Any:
         """The kernel for this key, compiled from the present sources; None if it is not on disk yet."""
         name = self._name(key)
-        if not self._is_good(name):
+        if not (self._is_good(name) and self._is_ours(name)):
             return None
         data = self._load_data(name)
         # Meanwhile, a process of another version may have replaced the file.
@@ -88,6 +155,10 @@ class KernelFiles(IndexDataCacheFile):
         except FileNotFoundError:
             return False
         return kept[-SEAL_BYTES:] == self._seal(kept[:-SEAL_BYTES])
+
+    def _is_ours(self, name: str) -> bool:
+        """Whether nobody else can change the kernel file or add files to its folder."""
+        return trusted(Path(self._cache_path)) and trusted(Path(self._data_path(name)))
 
     def _seal(self, payload: bytes) -> bytes:
         stamp = repr((self._version, self._source_stamp, sources_sha256()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import uuid
 from collections.abc import Iterator
@@ -34,7 +33,7 @@ def whole_path(target: Path) -> Iterator[Path]:
 def whole_file(target: Path) -> Iterator[BinaryIO]:
     """Open a temporary file beside `target`. It replaces `target` when its whole content is on the disk.
 
-    A killed process leaves its temporary file behind; `partials` finds it. Raises OSError.
+    A killed process leaves its temporary file behind; its name ends with `PARTIAL`. Raises OSError.
     """
     with whole_path(target) as partial, partial.open("wb") as unfinished:
         yield unfinished
@@ -60,8 +59,3 @@ def write_whole(target: Path, text: str) -> None:
 
 def _partial(target: Path) -> Path:
     return target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
-
-
-def partials(target: Path) -> Iterator[Path]:
-    """Temporary files of `target` that killed processes left behind."""
-    return target.parent.glob(f".{glob.escape(target.name)}.*{PARTIAL}")

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import re
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryFile
+from weakref import WeakKeyDictionary
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -22,12 +24,29 @@ class Unusable(Exception):
     """Something that the service needs does not work."""
 
 
+# For each catalogue: the time until which the last check of its pages counts.
+_pages_good_until: WeakKeyDictionary[Catalogue, float] = WeakKeyDictionary()
+PAGES_SHARE = 0.01  # largest share of the time that is spent on checking the pages
+
+
 def database(catalogue: Catalogue) -> None:
-    """Check that the database answers."""
+    """Check that the database answers and that its file is not damaged.
+
+    The check reads the whole file. In a large database it takes long; it is then made less often.
+    """
     try:
         catalogue.ping()
     except SQLAlchemyError as error:
         raise Unusable(f"the database does not answer ({_kind(error)})") from error
+    started = time.monotonic()
+    if started < _pages_good_until.get(catalogue, 0.0):
+        return
+    try:
+        catalogue.check_pages()
+    except SQLAlchemyError as error:
+        raise Unusable(f"the database is damaged ({_kind(error)}); restore a copy of it") from error
+    ended = time.monotonic()
+    _pages_good_until[catalogue] = ended + (ended - started) / PAGES_SHARE
 
 
 def storage(folder: Path) -> None:
@@ -97,6 +116,7 @@ def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, 
     return checks
 
 
+_DAMAGED = r"not a database|malformed"
 _REASONS = {
     r"refused": "the connection is refused",
     r"resolve|name or service|getaddrinfo": "the host name is unknown",
@@ -104,9 +124,14 @@ _REASONS = {
     r'database ".*" does not exist': "there is no database with this name",
     r"timeout|timed out": "no answer within the time limit",
     r"unable to open|readonly": "the file cannot be opened or written to",
-    r"not a database|malformed": "the file is not an SQLite database",
+    _DAMAGED: "the file is damaged, or is not an SQLite database",
     r"locked": "the file is locked by another process",
 }
+
+
+def damaged(error: SQLAlchemyError) -> bool:
+    """Whether this error says that the file of an SQLite database is damaged."""
+    return re.search(_DAMAGED, str(getattr(error, "orig", None) or error).lower()) is not None
 
 
 def database_said(error: SQLAlchemyError) -> str:

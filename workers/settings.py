@@ -6,7 +6,6 @@ Scientific choices are never settings; they are parameters of a job.
 
 from __future__ import annotations
 
-import os
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
@@ -17,8 +16,10 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from psfcore.transit.archive import ArchiveLimits
 from workers.contract.queues import Queue, queues_named
 from workers.data_folder import default_data_dir
+from workers.machine import cores, memory_bytes
 
 EMBEDDED_BROKER = "filesystem://"
+MEMORY_OF_JOBS = 0.8  # share of the memory for jobs; the rest is for the system, the server and the database
 
 
 class Settings(BaseSettings):
@@ -140,7 +141,9 @@ class Settings(BaseSettings):
         3600.0, gt=0, description="longest duration of an event stream, s; then the client must connect again"
     )
     max_job_memory_mib: int = Field(
-        65_536, ge=1, description="largest estimated memory of a job, MiB; a job that needs more is refused"
+        default_factory=lambda checked: _memory_of_a_job_mib(checked.get("worker_processes", 1)),
+        ge=1,
+        description="largest estimated memory of a job, MiB; a job that needs more is refused; default: 80 % of the memory of the machine (or of its container) / worker_processes",
     )
     max_job_s: float = Field(
         172_800.0,
@@ -227,9 +230,9 @@ class Settings(BaseSettings):
         return ArchiveLimits(max_bytes=self.max_transit_unpacked_mib * 2**20)
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _memory_of_a_job_mib(worker_processes: int) -> int:
+    """The memory that one job may need if every process of a worker runs a job of this size on this machine, MiB."""
+    return max(1, int(MEMORY_OF_JOBS * memory_bytes() / worker_processes) // 2**20)
 
 
 def software_version() -> str:

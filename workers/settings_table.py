@@ -72,8 +72,9 @@ def _name(annotation: Any) -> str:
 
 def _default(field: FieldInfo) -> str:
     if field.default_factory is not None:
-        return "see the meaning"  # the value depends on the user
-    return "not set" if field.default is None or field.default == "" else f"`{field.default}`"
+        return "see the meaning"  # the value depends on the user or the machine
+    value = field.default
+    return "not set" if value is None or value == "" else f"`{value}`"
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -20,6 +20,7 @@ from workers.contract.kinds import KINDS, JobRequest
 from workers.contract.phases import JobError, Phase
 from workers.contract.queues import Queue
 from workers.intake import estimates
+from workers.intake.again import reopened
 from workers.intake.requests import resolve
 
 log = logging.getLogger(__name__)
@@ -107,7 +108,8 @@ class Identified(BaseModel):
     },
 )
 def submit_job(body: JobRequest, response: Response, caller: Submitting, state: Shared) -> JobView:
-    """Put a job into its queue. If an identical request was made before, the answer is the existing job."""
+    """Put a job into its queue. If an identical request was made before, the answer is the existing job. If the result of that
+    job was deleted or lost, the job is queued again."""
     check_room(state, caller.owner)
     try:
         parameters, request_key = resolve(
@@ -122,6 +124,11 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
     )
     if new:
         log.info("job %s: %s, submitted", row.id, body.kind, extra={"fields": {"job": row.id}})
+    if not new and reopened(row, state.catalogue, state.store):
+        log.info(
+            "job %s: queued again, because its result was lost", row.id, extra={"fields": {"job": row.id}}
+        )
+        row, new = find(state, caller, row.id), True
     if row.submitted_at is None:  # the job is new, or was moved to a queue of higher priority
         state.reconciler.wake()
     response.status_code = 202 if new else 200
@@ -169,7 +176,7 @@ def get_job(job_id: JobId, caller: Reading, state: Shared) -> JobView:
 @router.delete("/{job_id}", status_code=202, summary="Cancel a job")
 def cancel_job(job_id: JobId, caller: Submitting, state: Shared) -> JobView:
     """Cancel a job. A queued job ends at once. An executing job ends at its next step. A job that has ended does not change."""
-    find(state, caller, job_id)
+    check_own(find(state, caller, job_id))
     state.catalogue.jobs.cancel(job_id)
     return JobView.of(find(state, caller, job_id))
 
@@ -185,6 +192,19 @@ def time_left_s(row: JobRow, now: float | None = None) -> float | None:
     if not KINDS[row.kind].counted_whole or row.phase != Phase.EXECUTING or done <= 0 or row.count_at is None:
         return None
     return max(0.0, (now - row.count_at) * (row.steps - row.step) / done)
+
+
+def check_own(row: JobRow) -> JobRow:
+    """The job itself. Raises ``Problem`` 409 if the job is a part of a bulk run, which only requests to the bulk run change."""
+    if KINDS[row.kind].parameters is None:
+        bulk_id = row.parameters["bulk_id"]
+        raise Problem(
+            409,
+            "job-of-bulk",
+            f"expected a job that was submitted; job {row.id} is a part of bulk run {bulk_id}: pause or cancel the bulk run "
+            f"(POST /v1/bulk/{bulk_id}/pause or /cancel)",
+        )
+    return row
 
 
 def find(state: Shared, caller: Caller, job_id: str) -> JobRow:

@@ -92,7 +92,7 @@ def get_product_file(product_id: Identity, request: Request, caller: Reading, st
     row = _find(state, caller, product_id)
     # Products of earlier versions have no name of their own.
     name = row.details.get("filename", f"heliopsf-{product_id[:12]}.fits")
-    return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name)
+    return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name, size=row.bytes)
 
 
 @router.get(

@@ -95,7 +95,12 @@ def get_report_file(report_id: Identity, request: Request, caller: Reading, stat
     """Download the report; its hash is the ETag."""
     row = _find(state, caller, report_id)
     return files.send(
-        request, state.store, row.file_sha256, "application/json", f"report-{report_id[:12]}.json"
+        request,
+        state.store,
+        row.file_sha256,
+        "application/json",
+        f"report-{report_id[:12]}.json",
+        size=row.bytes,
     )
 
 

@@ -33,7 +33,7 @@ SECTIONS = {
         "demo": Lazy("service.cli.demo", "demo", "Process one image with a temporary service."),
         "doctor": Lazy("service.cli.operator.doctor", "doctor", "Check settings, database, broker and disk."),
         "database": Lazy("service.cli.operator.database", "database", "Show or upgrade the database's tables."),
-        "store": Lazy("service.cli.operator.store", "store", "Clean up stored files; set quotas."),
+        "store": Lazy("service.cli.operator.store", "store", "Check and clean up stored files; set quotas."),
         "key": Lazy("service.cli.operator.key", "key", "Create, list and revoke access keys."),
     },
     "Studies": {

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -225,14 +228,20 @@ class Client(VersionedPsfs, BulkClient, Operations):
         self._answer("DELETE", f"/v1/products/{product_id}")
 
     def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
-        """Download a file of the service. The file appears at ``path`` only when it is complete."""
+        """Download a file of the service. The file appears at ``path`` only when it is complete.
+
+        Raises ``ServiceError`` "download-damaged" if its SHA-256 is not the one that the service recorded.
+        """
         with (
             written(path, overwrite=overwrite) as partial,
             self._streamed(address) as response,
             partial.open("wb") as file,
         ):
+            digest = hashlib.sha256()
             for chunk in response.iter_bytes():
+                digest.update(chunk)
                 file.write(chunk)
+            _check_digest(response, digest.digest())
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
         """The answer of the service to a query about a PSF."""
@@ -308,6 +317,18 @@ def as_archive(path: Path) -> Iterator[Path]:
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
         yield archive
+
+
+def _check_digest(response: httpx.Response, received: bytes) -> None:
+    """Compare the SHA-256 of the received bytes with the header Repr-Digest (RFC 9530), if the answer has one."""
+    declared = response.headers.get("repr-digest", "")
+    found = re.search(r"\bsha-256=:([A-Za-z0-9+/=]+):", declared)
+    if found is not None and found[1] != base64.b64encode(received).decode():
+        raise ServiceError(
+            f"expected a file with the SHA-256 {base64.b64decode(found[1]).hex()}; received one with {received.hex()}: try "
+            "again; if this does not help, the file in the store is damaged: tell the operator",
+            code="download-damaged",
+        )
 
 
 def _refused(response: httpx.Response) -> ServiceError:

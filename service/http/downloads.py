@@ -2,21 +2,64 @@
 
 from __future__ import annotations
 
+import base64
+import logging
+from pathlib import Path
+
 from fastapi import Request
 from fastapi.responses import FileResponse, Response
 
-from workers.files.store import Store
+from service.http.problems import Problem, problem
+from workers.files.store import BadFile, Store, lost
+
+log = logging.getLogger(__name__)
 
 FITS_TYPE = "application/fits"
 KEPT = "private, max-age=31536000, immutable"  # the content at an address never changes
 
 
-def send(request: Request, store: Store, digest: str, media_type: str, filename: str | None) -> Response:
-    """The file, or 304 if the client already has it."""
-    headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT}
+def send(
+    request: Request,
+    store: Store,
+    digest: str,
+    media_type: str,
+    filename: str | None,
+    *,
+    size: int | None = None,
+) -> Response:
+    """The file, or 304 if the client already has it. size: as for ``found``. Raises ``Problem`` 410.
+
+    Clients can compare what they received with the header Repr-Digest (RFC 9530).
+    """
+    content = base64.b64encode(bytes.fromhex(digest)).decode()
+    headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT, "Repr-Digest": f"sha-256=:{content}:"}
     if known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    return FileResponse(store.path(digest), media_type=media_type, filename=filename, headers=headers)
+    path = found(store, digest, size)
+    return FileResponse(path, media_type=media_type, filename=filename, headers=headers)
+
+
+def found(store: Store, digest: str, size: int | None = None) -> Path:
+    """The path of a stored file, after a check. Raises ``Problem`` 410 if the file is lost or damaged.
+
+    size: the recorded size of the file, bytes; the check then reads only the size. None: the check reads the whole file,
+    which must therefore be small.
+    """
+    try:
+        if size is not None:
+            path = store.path(digest)
+            if path.stat().st_size == size:
+                return path
+        return store.verified(digest)
+    except FileNotFoundError as error:
+        raise _told(lost(digest)) from error
+    except BadFile as error:
+        raise _told(error) from error
+
+
+def _told(error: BadFile) -> Problem:
+    log.error("%s", error.message)
+    return problem(error)
 
 
 def known(request: Request, etag: str) -> bool:

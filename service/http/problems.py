@@ -12,12 +12,12 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import ErrorDetails
-from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import DatabaseError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
 from psfcore.errors import DataError
-from workers import logs
+from workers import checks, logs
 from workers.contract.suggestions import explained
 from workers.files.store import StoreAway
 
@@ -32,6 +32,8 @@ STATUS_OF = {
     "no-such-product": 404,
     "no-such-psf": 404,
     "no-such-transit": 404,
+    "file-damaged": 410,
+    "file-lost": 410,
     "changed-meanwhile": 409,
     "channel-mismatch": 409,
     "cutout-not-plain": 409,
@@ -159,6 +161,17 @@ def install(app: FastAPI) -> None:
             "database-away",
             "the database of the service does not answer; try again in a moment",
             headers={"Retry-After": "5"},
+        )
+
+    @app.exception_handler(DatabaseError)
+    def _damaged(request: Request, error: DatabaseError) -> JSONResponse:
+        if not checks.damaged(error):
+            raise error
+        log.error("database: %s", error)
+        return answer(
+            503,
+            "database-damaged",
+            "the database of the service is damaged; tell the operator, who must restore a copy",
         )
 
     @app.exception_handler(StoreAway)

@@ -16,7 +16,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, RedirectResponse
 
-from service.api.jobs import time_left_s
+from service.api.jobs import check_own, time_left_s
 from service.http.callers import Caller, Reading, Submitting
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -146,7 +146,7 @@ async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Sha
 @router.delete("/{job_id}", summary="UWS: abort and destroy a job", **routing.TO_JOB)
 def delete_uws_job(job_id: str, request: Request, caller: Submitting, state: Shared) -> Response:
     """Delete the job in any phase. If a worker runs the job, the worker stops it. Its result stays in the catalogue."""
-    _find(state, caller, job_id)
+    check_own(_find(state, caller, job_id))
     state.catalogue.uws.destroy(job_id)
     return RedirectResponse(_jobs_url(request), 303)
 
@@ -176,7 +176,7 @@ def get_uws_phase(job_id: str, caller: Reading, state: Shared) -> Response:
 )
 def post_uws_phase(job_id: str, caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
     """RUN queues a PENDING job. ABORT stops a job that has not ended. A repeated request changes nothing."""
-    row = _find(state, caller, job_id)
+    row = check_own(_find(state, caller, job_id))
     match form.get("phase"):
         case "RUN":
             _start(state, caller, row)
@@ -203,7 +203,7 @@ def post_uws_duration(
     job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
 ) -> Response:
     """Set the limit. If it exceeds the largest limit that the operator allows, the service sets that limit."""
-    _find(state, caller, job_id)
+    check_own(_find(state, caller, job_id))
     asked = _duration(state, _given(form, "EXECUTIONDURATION"))
     state.catalogue.uws.set_terms(job_id, execution_duration_s=asked)
     return _see(request, job_id)
@@ -226,7 +226,7 @@ def post_uws_destruction(
     job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
 ) -> Response:
     """Set the time. If it is later than the latest time that the operator allows, the service sets that time."""
-    _find(state, caller, job_id)
+    check_own(_find(state, caller, job_id))
     at = _destruction(state, _given(form, "DESTRUCTION"))
     state.catalogue.uws.set_terms(job_id, destruction_at=at)
     return _see(request, job_id)

@@ -6,11 +6,14 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from service.openapi import description
 
@@ -243,12 +246,58 @@ def test_the_compose_file_fits_the_settings_and_the_commands() -> None:
     assert services["api"]["ports"][0].startswith("127.0.0.1:"), "reachable from this machine alone"
 
 
+def test_the_containers_have_no_more_rights_and_memory_than_they_need() -> None:
+    services = yaml.safe_load((HERE / "docker-compose.yml").read_text())["services"]
+    for name, service in services.items():
+        assert service["read_only"] is True, name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert service["mem_limit"] and service["pids_limit"], name
+        assert "privileged" not in service, name
+    # PostgreSQL's start as root has to give its folder to another user; the others need nothing.
+    assert {name for name, service in services.items() if "cap_add" in service} == {"postgres"}
+    password = "${REDIS_PASSWORD:?set REDIS_PASSWORD in .env}"
+    assert services["redis"]["command"].endswith(f"--requirepass {password}")
+    assert services["redis"]["environment"]["REDISCLI_AUTH"] == password
+    for name in ("api", "worker"):
+        assert f"redis://:{password}@redis:" in services[name]["environment"]["HELIOPSF_BROKER_URL"], name
+        assert "/tmp" in services[name]["tmpfs"], name
+        assert "JOB_MEMORY_MIB" in services[name]["environment"]["HELIOPSF_MAX_JOB_MEMORY_MIB"], name
+
+
 def test_the_dockerfile_copies_what_there_is() -> None:
     for line in (HERE / "Dockerfile").read_text().splitlines():
         if line.startswith("COPY ") and "--from" not in line:
             for source in line.split()[1:-1]:
                 assert (HERE / source).exists(), source
                 assert f"!{source}" in (HERE / ".dockerignore").read_text(), source
+
+
+def test_the_image_is_installed_from_pins_with_hashes() -> None:
+    text = (HERE / "pins" / "service.txt").read_text()
+    blocks = re.split(r"\n(?=[A-Za-z0-9])", text.strip())
+    pins = {}
+    for block in blocks:
+        name, version = re.match(r"([A-Za-z0-9._-]+)(?:\[[^\]]*\])?==([^ ;\\]+)", block).groups()  # type: ignore[union-attr]
+        assert re.search(r"--hash=sha256:[0-9a-f]{64}", block), name
+        pins[canonicalize_name(name)] = version
+    tested = dict(
+        line.split(";")[0].strip().split("==")
+        for line in (HERE / "constraints.txt").read_text().splitlines()
+        if "==" in line
+    )
+    tested = {canonicalize_name(name): version for name, version in tested.items()}
+    differ = {name for name, version in pins.items() if tested.get(name, version) != version}
+    assert differ == set(), "`make pins` writes the file anew"
+    project = tomllib.loads((HERE / "pyproject.toml").read_text())
+    build = project["build-system"]["requires"]
+    assert (HERE / "pins" / "build.in").read_text().split() == build
+    needed = [*project["project"]["dependencies"], *project["project"]["optional-dependencies"]["s3"], *build]
+    missing = {canonicalize_name(Requirement(one).name) for one in needed} - set(pins)
+    assert missing == set(), "`make pins` writes the file anew"
+    installs = re.findall(r"pip install (.+)", (HERE / "Dockerfile").read_text())
+    assert len(installs) == 2 and "--require-hashes" in installs[0]
+    assert "--no-deps" in installs[1] and "--no-build-isolation" in installs[1]
 
 
 def test_the_page_of_settings_is_made_from_the_settings_class() -> None:

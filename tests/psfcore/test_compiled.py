@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from psfcore.compiled import MARK, KernelFiles, compiled
+from psfcore.compiled import MARK, KernelFiles, compiled, kernel_folder, trusted
 from psfcore.convolution import fft_kernels
 
 ROOT = Path(__file__).parents[2]
@@ -64,8 +65,68 @@ def test_a_kernel_file_cut_short_by_a_power_failure_is_compiled_again(tmp_path: 
 
 
 def test_a_kernel_that_cannot_be_written_is_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    KernelFiles(str(tmp_path / "gone"), "f.py311", "source").save(("float32",), "code")
+    files = KernelFiles(str(tmp_path), "f.py311", "source")
+
+    def full(path: str) -> Any:
+        raise OSError(28, "No space left on device")
+
+    files._open_for_write = full
+    files.save(("float32",), "code")
     assert "cannot write a compiled kernel" in caplog.text
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o770])
+def test_a_kernel_in_a_folder_that_others_can_write_is_neither_loaded_nor_written(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, mode: int
+) -> None:
+    folder = tmp_path / "kernels"
+    folder.mkdir()
+    files = KernelFiles(str(folder), "f.py311", "source")
+    files.save(("float32",), "code")
+    assert files.load(("float32",)) == "code"
+    folder.chmod(mode)
+    assert files.load(("float32",)) is None
+    files.save(("float64",), "code")
+    assert len(list(folder.iterdir())) == 1 and "nobody else can write" in caplog.text
+
+
+def test_a_kernel_file_that_others_can_write_is_not_loaded(tmp_path: Path) -> None:
+    files = KernelFiles(str(tmp_path), "f.py311", "source")
+    files.save(("float32",), "code")
+    (kept,) = tmp_path.iterdir()
+    kept.chmod(0o666)
+    assert files.load(("float32",)) is None
+
+
+def test_a_kernel_below_a_folder_that_others_can_rename_is_not_loaded(tmp_path: Path) -> None:
+    folder = tmp_path / "open" / "kernels"
+    folder.mkdir(parents=True)
+    files = KernelFiles(str(folder), "f.py311", "source")
+    files.save(("float32",), "code")
+    folder.parent.chmod(0o777)
+    assert files.load(("float32",)) is None
+    folder.parent.chmod(0o1777)  # as /tmp: nobody can rename what is not his
+    assert files.load(("float32",)) == "code"
+
+
+def test_the_kernels_are_kept_in_a_private_folder_where_the_usual_one_is_open(tmp_path: Path) -> None:
+    usual = tmp_path / "usual"
+    usual.mkdir()
+    assert kernel_folder(usual, tmp_path) == str(usual)
+    kernel_folder.cache_clear()
+    usual.chmod(0o777)
+    private = Path(kernel_folder(usual, tmp_path))
+    kernel_folder.cache_clear()
+    assert private.is_relative_to(tmp_path / ".cache") and private.stat().st_mode & 0o777 == 0o700
+    files = KernelFiles(str(private), "f.py311", "source")
+    files.save(("float32",), "code")
+    assert files.load(("float32",)) == "code"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
+def test_a_kernel_folder_of_another_user_is_not_used(tmp_path: Path) -> None:
+    os.chown(tmp_path, 12345, 12345)
+    assert not trusted(tmp_path)
 
 
 def kernel_names(source: ast.Module) -> set[str]:

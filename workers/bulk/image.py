@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
-import os
-import shutil
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,7 +12,6 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.fits.header import read_summary
-from psfcore.whole_files import partials, whole_file
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Taken
 from workers.catalogue.tables import ImageRow, ProductRow
@@ -24,7 +20,8 @@ from workers.contract.identities import product_identity
 from workers.contract.requests import Deconvolve
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.files import archive as archive_files
-from workers.files.store import sha256_of, sync
+from workers.files import beneath
+from workers.files.store import sha256_of
 from workers.intake import estimates
 from workers.intake.requests import resolved_deconvolution
 from workers.tasks import deconvolve as deconvolve_task
@@ -72,11 +69,12 @@ def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Ta
         wanted = _resolved(context, bulk, request, source)
         identity = product_identity(wanted)
         target = _target(context, request, source, identity)
-        if target is not None and taken.attempt > 1:
-            _remove_partial_files(target)
+        if target is not None and taken.attempt > 1 and target.parent.is_dir():
+            beneath.remove_partials(target, _output_roots(context))  # which a killed worker left
         before = _done_before(context, wanted, identity, request, target)
         if before is None and target is not None:
-            _make_folder(target.parent)
+            with _write_errors():  # before the image is deconvolved, so that no work is lost if this fails
+                beneath.make_folder(target.parent, _output_roots(context))
         if before is None and _waited(context, request, identity):
             before = _done_before(context, wanted, identity, request, target)
         return before or _done_now(context, wanted, request, source, target)
@@ -116,7 +114,8 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
     path = archive_files.check_under(Path(taken.source), allowed)
     with context.store.temporary() as copy:
         try:
-            sha256 = archive_files.copy_hashed(path, copy, context.settings.max_upload_bytes)
+            with beneath.opened(path, allowed) as file:
+                sha256 = archive_files.copy_hashed(file, copy, context.settings.max_upload_bytes)
         except OSError as error:
             reason = archive_files.reason_of(error)
             raise DataError(
@@ -141,8 +140,8 @@ def _target(context: Context, request: BulkWork, source: _Source, identity: str)
     """The path of the product's file in the output folder; None if only the service keeps it."""
     if request.output is None:
         return None
-    allowed = archive_files.roots(context.settings.bulk_output_roots)
-    folder = archive_files.check_under(Path(request.output.folder), allowed, "an output folder")
+    wanted = Path(request.output.folder)
+    folder = archive_files.check_under(wanted, _output_roots(context), "an output folder")
     return folder / archive_files.safe_name(source.name, identity)
 
 
@@ -151,7 +150,7 @@ def _done_before(
 ) -> Outcome | None:
     """The existing product, copied to the output folder if it is not there yet; None if there is no product."""
     if request.keeps_products:
-        row = context.catalogue.get(ProductRow, identity, context.owner)
+        row = context.made(ProductRow, identity)
         return None if row is None else _kept(context, row, target, reused=True)
     earlier = context.catalogue.bulks.progress.done_before(context.owner, identity, str(target))
     if earlier is None or target is None or not target.is_file() or sha256_of(target) != earlier.sha256:
@@ -184,7 +183,7 @@ def _done_now(
     estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
     psf_row = requested_psf(context, wanted)
     # The path is taken only now, because the store's local copy may have been removed during a wait or a PSF build.
-    image_file = source.copy or context.store.path(source.sha256)
+    image_file = source.copy or context.store.verified(source.sha256)
     image = deconvolve_task.load(context, wanted, image_file)
     started = time.perf_counter()
     made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
@@ -196,7 +195,7 @@ def _done_now(
             return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
         assert target is not None
         sha256, size_bytes = sha256_of(path), path.stat().st_size
-        _put(path, target)
+        _put(context, path, target)
     return Outcome(
         image_sha256=wanted.image_id,
         psf_id=wanted.psf_id,
@@ -216,7 +215,7 @@ def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: boo
     if target is not None and not (
         target.is_file() and target.stat().st_size == row.bytes and sha256_of(target) == row.file_sha256
     ):
-        _put(context.store.path(row.file_sha256), target)
+        _put(context, context.store.verified(row.file_sha256), target)
     return Outcome(
         image_sha256=row.image_id,
         psf_id=row.psf_id,
@@ -251,34 +250,14 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _remove_partial_files(target: Path) -> None:
-    """Remove partial copies of this file that a killed worker left."""
-    if target.parent.is_dir():
-        for partial in partials(target):
-            partial.unlink(missing_ok=True)
-
-
-def _make_folder(folder: Path) -> None:
-    """Make the output folder before the image is deconvolved, so that no work is lost if this fails.
-
-    Raises DataError "output-not-written".
-    """
+def _put(context: Context, source: Path, target: Path) -> None:
+    """Copy a file to its path in the output folder. Raises DataError "output-not-written"."""
     with _write_errors():
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        beneath.put(source, target, _output_roots(context))
 
 
-def _put(source: Path, target: Path) -> None:
-    """Copy a file to its path in one step: a reader sees either the whole file or no file.
-
-    Raises DataError "output-not-written".
-    """
-    with _write_errors():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with source.open("rb") as file, whole_file(target) as copy:
-            shutil.copyfileobj(file, copy, 2**20)
-        sync(target.parent)  # the folder entry must also be on the disk before the image counts as done
+def _output_roots(context: Context) -> tuple[Path, ...]:
+    return archive_files.roots(context.settings.bulk_output_roots)
 
 
 @contextmanager

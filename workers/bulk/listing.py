@@ -14,6 +14,7 @@ from workers.catalogue.jobs import Lease
 from workers.contract.bulk import BulkWork, Condition
 from workers.contract.phases import Fault, JobError
 from workers.files import archive as archive_files
+from workers.files import beneath
 from workers.tasks.context import Context
 
 LIST_AT_ONCE = 200
@@ -91,8 +92,10 @@ def _listed_one(context: Context, found: archive_files.Found, where: dict[str, C
     try:
         if found.error is not None:
             raise found.error
-        if not archive_files.matches(found.path, where, context.limits):
-            return None
+        if where:
+            with beneath.opened(found.path, archive_files.roots(context.settings.bulk_roots)) as file:
+                if not archive_files.matches(beneath.reopened(file), where, context.limits):
+                    return None
     except DataError as unreadable:
         error = JobError(fault=Fault.USER, code=unreadable.code, message=unreadable.message)
     except OSError as unreadable:

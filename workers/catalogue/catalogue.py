@@ -40,12 +40,15 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 from workers.catalogue.uws_jobs import UwsJobs
+from workers.catalogue.waiting.again import Again
+from workers.catalogue.waiting.turns import Turns
 from workers.contract.bulk import OPEN
 from workers.contract.identities import canonical_hash
 from workers.contract.phases import ENDED, Phase
 from workers.versions.status import PsfStatus
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
+Made = TypeVar("Made", ProductRow, PsfRow, ReportRow)
 AnyRow = TypeVar(
     "AnyRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, JobRow, PsfContextRow, BulkRow
 )
@@ -61,6 +64,8 @@ class Catalogue:
         self._engine = self._database.engine
         self.schema = Schema(self._database)
         self.jobs = Jobs(self._database)
+        self.again = Again(self._database)
+        self.turns = Turns(self._database, self.jobs)
         self.uws = UwsJobs(self._database, self.jobs)
         self.parts = Parts(self._database)
         self.bulks = Bulks(self._database)
@@ -86,6 +91,13 @@ class Catalogue:
         with self._database.reading() as session:
             session.execute(select(1))
 
+    def check_pages(self) -> None:
+        """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged.
+
+        This reads the whole file. PostgreSQL checks the pages that it reads itself.
+        """
+        self._database.check_pages()
+
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row with this identity, and whether it is new.
 
@@ -107,6 +119,19 @@ class Catalogue:
             if existing is None:
                 raise
             return existing, False
+
+    def refile(self, row: Made) -> Made:
+        """Let the existing row of this identity refer to the files of ``row``; returns the existing row."""
+        with self._database.writing.begin() as session:
+            there = session.get(type(row), (row.owner, row.id), with_for_update=True)
+            if there is None:  # it was deleted meanwhile
+                session.add(row)
+                add_bytes(session, row.owner, row.bytes)
+                return row
+            add_bytes(session, row.owner, row.bytes - there.bytes)
+            there.file_sha256, there.bytes = row.file_sha256, row.bytes
+            there.preview_sha256, there.details = row.preview_sha256, row.details
+            return there
 
     def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
         """The row with this identity, or None."""

@@ -68,8 +68,12 @@ class Census:
             session.execute(delete(WorkerRow).where(WorkerRow.name == worker))
 
     def workers(self, lease_s: float) -> Sequence[WorkerRow]:
-        """Worker processes whose last heartbeat is at most ``lease_s`` seconds old."""
-        query = select(WorkerRow).where(WorkerRow.heartbeat_at >= self._database.now - lease_s)
+        """Worker processes whose last heartbeat is at most ``lease_s`` seconds old.
+
+        A heartbeat in the future is one from before the database's clock was set back; it does not count.
+        """
+        now = self._database.now
+        query = select(WorkerRow).where(WorkerRow.heartbeat_at.between(now - lease_s, now + lease_s))
         with self._database.reading() as session:
             return session.scalars(query.order_by(WorkerRow.name)).all()
 
@@ -116,7 +120,9 @@ class Census:
 
     def count_silent(self, lease_s: float) -> int:
         """Number of executing jobs whose worker has been silent for longer than the lease."""
-        silent = (JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s)
+        now = self._database.now
+        heard = JobRow.heartbeat_at.between(now - lease_s, now + lease_s)
+        silent = (JobRow.phase == Phase.EXECUTING, ~heard)
         with self._database.reading() as session:
             return session.scalar(select(func.count()).select_from(JobRow).where(*silent)) or 0
 

@@ -21,10 +21,13 @@ from sqlalchemy import (
     literal_column,
 )
 from sqlalchemy.engine import CursorResult
+from sqlalchemy.exc import DatabaseError
 from sqlalchemy.orm import InstrumentedAttribute, Session, sessionmaker
+from sqlalchemy.pool import NullPool
 
 from psfcore.errors import DataError
 
+QUICK_CHECK = "PRAGMA quick_check(1)"  # SQLite compares all pages of the file, and reports the first fault
 PATIENCE_S = 30.0  # longest time to wait for other writers of SQLite
 
 
@@ -56,6 +59,17 @@ class Database:
             else "CAST(extract(epoch FROM statement_timestamp()) AS double precision)"
         )
         return literal_column(f"({now})", Double)
+
+    def check_pages(self) -> None:
+        """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged. Other databases are not checked."""
+        if not self.sqlite:
+            return
+        # A new connection, because the other ones keep pages in memory and do not read them again.
+        fresh = create_engine(self.engine.url, poolclass=NullPool)
+        with fresh.connect() as connection:
+            (found,) = connection.exec_driver_sql(QUICK_CHECK).one()
+        if found != "ok":
+            raise DatabaseError(QUICK_CHECK, None, sqlite3.DatabaseError(f"malformed: {found}"))
 
     def change(self, statement: Update) -> int:
         """Run one UPDATE in a separate transaction; returns the number of changed rows."""

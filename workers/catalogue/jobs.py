@@ -14,12 +14,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, case, literal, or_, select, update
+from sqlalchemy import ColumnElement, and_, case, func, literal, or_, select, update
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
-from sqlalchemy.orm import InstrumentedAttribute, aliased
+from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from workers.catalogue.database import Database
-from workers.catalogue.tables import JobRow, TermsRow
+from workers.catalogue.tables import JobRow, OwnerTurnRow, TermsRow
 from workers.contract.identities import canonical_hash
 from workers.contract.kinds import queue_of
 from workers.contract.phases import LIVE, Fault, JobError, Phase
@@ -126,9 +127,8 @@ class Jobs:
 
     def mark_submitted(self, *job_ids: str) -> None:
         """Record that the broker has received the jobs' ids."""
-        self._set(
-            [JobRow.id.in_(job_ids)], submitted_at=self._database.now, submissions=JobRow.submissions + 1
-        )
+        counted = {"submissions": JobRow.submissions + 1, "delayed": False}
+        self._set([JobRow.id.in_(job_ids)], submitted_at=self._database.now, **counted)
 
     def forget_submission(self, job_id: str) -> None:
         """Record that a worker took a queued job's message from the broker but did not claim the job."""
@@ -141,25 +141,40 @@ class Jobs:
         """
         lease = Lease(job_id, uuid.uuid4().hex)
         now = self._database.now
+        claimed = update(JobRow).where(JobRow.id == job_id, JobRow.phase == Phase.QUEUED)
+        claimed = claimed.values(
+            phase=Phase.EXECUTING,
+            attempt=JobRow.attempt + 1,
+            lease=lease.token,
+            started_at=now,
+            heartbeat_at=now,
+            worker=worker,
+            step=0,
+            steps=0,
+            stage="",
+            count_at=None,
+            count_step=0,
+        )
         try:
-            claimed = self._set(
-                [JobRow.id == job_id, JobRow.phase == Phase.QUEUED],
-                phase=Phase.EXECUTING,
-                attempt=JobRow.attempt + 1,
-                lease=lease.token,
-                started_at=now,
-                heartbeat_at=now,
-                worker=worker,
-                step=0,
-                steps=0,
-                stage="",
-                count_at=None,
-                count_step=0,
-            )
+            with self._database.writing.begin() as session:
+                found = session.execute(claimed.returning(JobRow.owner, JobRow.queue)).first()
+                if found is not None:
+                    self._count_turn(session, *found)
         except IntegrityError:  # because of the index one_at_work_a_result
             self.forget_submission(job_id)
             return None
-        return lease if claimed else None
+        return None if found is None else lease
+
+    def _count_turn(self, session: Session, owner: str, queue: str) -> None:
+        """Record that this owner was served last in a queue. Turns are numbered, because clocks may be set back."""
+        insert = sqlite.insert if self._database.sqlite else postgresql.insert
+        latest = select(func.coalesce(func.max(OwnerTurnRow.number), 0)).where(OwnerTurnRow.queue == queue)
+        turn = insert(OwnerTurnRow).values(owner=owner, queue=queue, number=latest.scalar_subquery() + 1)
+        session.execute(
+            turn.on_conflict_do_update(
+                index_elements=["owner", "queue"], set_={"number": turn.excluded.number}
+            )
+        )
 
     def heartbeat(self, lease: Lease) -> bool:
         """Record that the worker is alive; False if the lease is lost or the job was cancelled."""
@@ -203,9 +218,8 @@ class Jobs:
 
         The job is submitted again after the waiting time of ``unsubmitted``. A cancelled job is aborted instead.
         """
-        return self._set(
-            _held(lease), **self._again(), submitted_at=self._database.now, submissions=JobRow.attempt
-        )
+        delay = {"submitted_at": self._database.now, "submissions": JobRow.attempt, "delayed": True}
+        return self._set(_held(lease), **self._again(), **delay)
 
     def abort(self, lease: Lease) -> bool:
         """EXECUTING -> ABORTED, when the worker has stopped a cancelled job; False if the lease is lost."""
@@ -241,7 +255,13 @@ class Jobs:
         """Queue the jobs again whose worker has been silent for longer than ``lease_s``; returns the ids of these jobs.
 
         A cancelled job is aborted instead. A job that was already started ``max_attempts`` times ends in ERROR.
+        If the database's clock was set back, a heartbeat may lie in the future. It then counts as a heartbeat of this
+        moment, so that the lease of a lost worker does not last until the clock has caught up.
         """
+        now = self._database.now
+        ahead = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at > now + lease_s]
+        started_at = case((JobRow.started_at > now, now), else_=JobRow.started_at)
+        self._set(ahead, heartbeat_at=now, started_at=started_at)
         silent = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at < self._database.now - lease_s]
         too_often = and_(JobRow.cancel_requested.is_(False), JobRow.attempt >= max_attempts)
         error = JobError(
@@ -277,7 +297,9 @@ class Jobs:
             *((JobRow.submissions == number, wait) for number, wait in waits.items()),
             else_=resubmit_s * 2**8,
         )
-        due = or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < self._database.now - wait_s)
+        now = self._database.now
+        ahead = JobRow.submitted_at > now + resubmit_s  # the database's clock was set back since
+        due = or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < now - wait_s, ahead)
         query = select(JobRow.id, JobRow.queue).where(JobRow.phase == Phase.QUEUED, due, no_equal_at_work())
         found: list[Waiting] = []
         with self._database.reading() as session:
@@ -314,18 +336,6 @@ class Jobs:
             "ended_at": case((cancelled, self._database.now)),
             "lease": None,
         }
-
-    def run_times(self, kind: str, limit: int) -> list[tuple[dict[str, Any], float]]:
-        """Estimate and duration in seconds of the newest completed jobs of a kind."""
-        query = (
-            select(JobRow.estimate, JobRow.ended_at - JobRow.started_at)
-            .where(JobRow.kind == kind, JobRow.phase == Phase.COMPLETED)
-            .where(JobRow.estimate.is_not(None), JobRow.started_at.is_not(None))
-            .order_by(JobRow.created_at.desc())
-            .limit(limit)
-        )
-        with self._database.reading() as session:
-            return [(estimate or {}, float(seconds)) for estimate, seconds in session.execute(query)]
 
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
         """Run one UPDATE; returns whether it changed a row."""

@@ -9,15 +9,26 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
+from typing import TypeVar
 
-from sqlalchemy import JSON, String, Table, cast, literal, or_, select
+from sqlalchemy import JSON, String, Table, cast, literal, or_, select, tuple_
 
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.database import Database
 from workers.catalogue.owners import COUNTED
-from workers.catalogue.tables import Base, SolutionRow
+from workers.catalogue.tables import (
+    Base,
+    ImageRow,
+    ProductRow,
+    PsfRow,
+    ReportRow,
+    SolutionRow,
+    TransitRow,
+)
 
 BATCH = 1000
+Kept = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow
+Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 # This table is very long. The tables of images and products also refer to all of its files.
 _SKIPPED = frozenset({BulkItemRow.__tablename__})
@@ -54,6 +65,20 @@ class NamedFiles:
                     ).first():
                         named.add(digest)
         return frozenset(named)
+
+    def kept(self, table: type[Row]) -> Iterator[Row]:
+        """All rows of a table of things that have files; read in batches, so that no transaction stays open meanwhile."""
+        last: tuple[str, str] | None = None
+        while True:
+            query = select(table).order_by(table.owner, table.id).limit(BATCH)
+            if last is not None:
+                query = query.where(tuple_(table.owner, table.id) > last)
+            with self._database.reading() as session:
+                rows = session.scalars(query).all()
+            yield from rows
+            if len(rows) < BATCH:
+                return
+            last = (rows[-1].owner, rows[-1].id)
 
     def _in(self, table: Table, solutions_from: float) -> Iterator[str]:
         texts = [cast(one, String) for one in table.columns if isinstance(one.type, String | JSON)]

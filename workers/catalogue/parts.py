@@ -43,11 +43,21 @@ class Parts:
 
     def take(self, owner: str, request_key: str, lease_s: float) -> Part | None:
         """Take an open part, or a part whose worker has been silent for ``lease_s`` seconds; None if there is no such part."""
+        # As for jobs: a heartbeat in the future, from before the database's clock was set back, counts as one of now.
+        now = self._database.now
+        self._set(
+            [
+                PartRow.owner == owner,
+                PartRow.request_key == request_key,
+                PartRow.heartbeat_at > now + lease_s,
+            ],
+            heartbeat_at=now,
+        )
         free = [
             PartRow.owner == owner,
             PartRow.request_key == request_key,
             PartRow.result.is_(None),
-            or_(PartRow.token.is_(None), PartRow.heartbeat_at < self._database.now - lease_s),
+            or_(PartRow.token.is_(None), PartRow.heartbeat_at < now - lease_s),
         ]
         while True:
             with self._database.reading() as session:

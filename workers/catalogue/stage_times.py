@@ -1,15 +1,17 @@
-"""The total time that jobs spent in each stage, by kind of job."""
+"""The time that jobs took: the total time of each stage by kind of job, and the durations of the newest jobs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.dialects import postgresql, sqlite
 
 from workers.catalogue.database import Database
-from workers.catalogue.tables import StageTimeRow
+from workers.catalogue.tables import JobRow, StageTimeRow
+from workers.contract.phases import Phase
 
 MOST_LETTERS = 64  # longest name of a stage
 
@@ -51,3 +53,15 @@ class KeptStageTimes:
         query = select(StageTimeRow).order_by(StageTimeRow.kind, StageTimeRow.stage)
         with self._database.reading() as session:
             return {(row.kind, row.stage): Spent(row.seconds, row.steps) for row in session.scalars(query)}
+
+    def run_times(self, kind: str, limit: int) -> list[tuple[dict[str, Any], float]]:
+        """Estimate and duration in seconds of the newest completed jobs of a kind."""
+        query = (
+            select(JobRow.estimate, JobRow.ended_at - JobRow.started_at)
+            .where(JobRow.kind == kind, JobRow.phase == Phase.COMPLETED)
+            .where(JobRow.estimate.is_not(None), JobRow.started_at.is_not(None))
+            .order_by(JobRow.created_at.desc())
+            .limit(limit)
+        )
+        with self._database.reading() as session:
+            return [(estimate or {}, float(seconds)) for estimate, seconds in session.execute(query)]

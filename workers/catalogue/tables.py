@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Double, Index, String, text
+from sqlalchemy import JSON, BigInteger, Double, Index, String, false, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from workers.contract.phases import LIVE
@@ -239,6 +239,8 @@ class JobRow(Base):
     ended_at: Mapped[float | None]
     submitted_at: Mapped[float | None]
     submissions: Mapped[int] = mapped_column(default=0)
+    # A temporary failure ended the last attempt, and the job has not been submitted again yet.
+    delayed: Mapped[bool] = mapped_column(default=False, server_default=false())
     attempt: Mapped[int] = mapped_column(default=0)
     lease: Mapped[str | None] = mapped_column(String(32))
     heartbeat_at: Mapped[float | None]
@@ -293,6 +295,15 @@ class TermsRow(Base):
     destruction_at: Mapped[float | None] = mapped_column(default=None, index=True)
 
 
+class OwnerTurnRow(Base):
+    """When an owner's jobs of a queue were last claimed. In each queue, the claims are numbered."""
+
+    __tablename__ = "owner_turns"
+    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
+    queue: Mapped[str] = mapped_column(String(16), primary_key=True)
+    number: Mapped[int] = mapped_column(BigInteger)
+
+
 class ReportRow(Base):
     """A report about a transit or about a rerun; its id is the identity of the request."""
 
@@ -341,7 +352,9 @@ class WorkerRow(Base):
     """A running worker process. It renews its heartbeat and deletes the row when it ends."""
 
     __tablename__ = "workers"
-    name: Mapped[str] = mapped_column(String(128), primary_key=True)  # host:process, as in JobRow.worker
+    name: Mapped[str] = mapped_column(
+        String(128), primary_key=True
+    )  # host:process:random, as in JobRow.worker
     started_at: Mapped[float]
     heartbeat_at: Mapped[float]
     version: Mapped[str] = mapped_column(String(64))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from enum import StrEnum
 
+PREFIX = "heliopsf."  # separates our queues in the broker from those of other programs
+
 
 class Queue(StrEnum):
     """Queues of jobs, highest priority first."""
@@ -29,5 +31,10 @@ def by_urgency(names: Iterable[str]) -> list[str]:
 
 
 def broker_name(queue: Queue | str) -> str:
-    """The queue's name in the broker. The prefix separates it from the queues of other programs."""
-    return f"heliopsf.{queue}"
+    """The queue's name in the broker."""
+    return f"{PREFIX}{queue}"
+
+
+def queue_of_broker(name: str) -> Queue:
+    """The queue with this name in the broker. Raises ValueError for another name."""
+    return Queue(name.removeprefix(PREFIX))

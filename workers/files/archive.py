@@ -1,7 +1,7 @@
 """Files of an archive of images: allowed folders, patterns that match files, and names of output files.
 
 The path in a request is resolved first, with its symbolic links. The resolved path must lie below a folder that the
-operator allows. Every file that a pattern matches is checked in the same way, and checked again when it is read.
+operator allows. Every file that a pattern matches is checked in the same way, and checked again when it is read (``workers.files.beneath``).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, BinaryIO
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, first_image_header, optional_value
@@ -79,19 +79,17 @@ def find(glob: str, allowed: Sequence[Path], tick: Callable[[], None] = lambda: 
 
 def matches(path: Path, where: dict[str, Condition], limits: FitsLimits) -> bool:
     """Whether the header of a file's first image meets all conditions. Raises DataError if it cannot be read."""
-    if not where:
-        return True
     header = first_image_header(path, limits)
     return all(_met(optional_value(header, key), condition) for key, condition in where.items())
 
 
-def copy_hashed(source: Path, target: Path, max_bytes: int) -> str:
-    """Copy a file; returns the SHA-256 of the copy. Raises DataError "too-large", or OSError.
+def copy_hashed(file: BinaryIO, target: Path, max_bytes: int) -> str:
+    """Copy an opened file; returns the SHA-256 of the copy. Raises DataError "too-large", or OSError.
 
     The task uses the copy, because the file in the archive may change while the task runs.
     """
     digest, size = hashlib.sha256(), 0
-    with source.open("rb") as file, target.open("wb") as copy:
+    with target.open("wb") as copy:
         while chunk := file.read(_CHUNK):
             size += len(chunk)
             if size > max_bytes:

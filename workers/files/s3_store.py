@@ -17,7 +17,7 @@ import aiohttp
 import s3fs
 from botocore.exceptions import BotoCoreError
 
-from workers.files.store import Blob, Store, StoreAway, sha256_of, sync
+from workers.files.store import DAMAGED, BadFile, Blob, Store, StoreAway, sha256_of, sync
 
 LOOK_AFTER_S = 10.0  # shortest time between two measurements of the size of the copies
 IN_USE_S = 60.0  # a copy that was requested in the last minute is not removed: it may be opened soon
@@ -48,6 +48,45 @@ class RemoteStore(Store):
         except FileNotFoundError:
             self._fetch(digest, copy)
         return copy
+
+    def size(self, digest: str) -> int | None:
+        """The size of the file with this SHA-256, bytes; None if the store has no such file. Raises ``StoreAway``."""
+        with _answering():
+            try:
+                return int(self._s3.info(self._key(digest), refresh=True)["size"])
+            except FileNotFoundError:
+                return None
+
+    def _content_sha256(self, digest: str) -> str:
+        """SHA-256 of the object itself: a copy in the local folder may be good although the object is damaged."""
+        with self.temporary() as copy:
+            with _answering():
+                self._s3.get_file(self._key(digest), str(copy))
+            return sha256_of(copy)
+
+    def verified(self, digest: str) -> Path:
+        """As ``Store.verified``. A damaged copy is downloaded again. Raises ``StoreAway``, too."""
+        try:
+            return super().verified(digest)
+        except BadFile as error:
+            if error.code == "file-lost":
+                raise
+        super().path(digest).unlink(missing_ok=True)
+        return super().verified(digest)
+
+    def set_aside(self, digest: str) -> bool:
+        """As ``Store.set_aside``, below the prefix ``damaged`` of the bucket. Raises ``StoreAway``."""
+        with self.temporary() as copy, _answering():
+            try:
+                self._s3.get_file(self._key(digest), str(copy))
+            except FileNotFoundError:
+                return False
+            if sha256_of(copy) == digest:
+                return False
+            self._s3.cp_file(self._key(digest), f"{self._root}/damaged/{digest}")
+            self._s3.rm_file(self._key(digest))
+        super().path(digest).unlink(missing_ok=True)
+        return True
 
     def check(self) -> None:
         """Raise OSError if files cannot be stored now."""
@@ -131,9 +170,7 @@ class RemoteStore(Store):
             with _answering():
                 self._s3.get_file(self._key(digest), str(partial))
             if sha256_of(partial) != digest:
-                raise StoreAway(
-                    f"expected the file {digest} from the object store; the downloaded file has another hash: try again"
-                )
+                raise BadFile("file-damaged", f"expected the file {digest} as it was stored; {DAMAGED}")
             self._keep_copy(partial, copy)
 
     def _keep_copy(self, temporary: Path, copy: Path) -> None:

@@ -15,12 +15,27 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+from psfcore.errors import DataError
 from psfcore.transit.archive import ArchiveLimits, unpack
+
+ADVICE = (
+    "if it was uploaded, upload it again; if a job made it, submit the same request again, and the job makes it again; if "
+    "this does not help, tell the operator, who finds such files with `heliopsf store check`"
+)
+DAMAGED = f"its content has changed on the disk: {ADVICE}"
 
 
 class StoreAway(ConnectionError):
     """The storage does not respond now; a later attempt may succeed."""
+
+
+FileState = Literal["good", "lost", "damaged"]
+
+
+class BadFile(DataError):
+    """A file of the store is lost, or its content is not what was stored. code: "file-lost" or "file-damaged"."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +53,7 @@ class Store:
     def __init__(self, folder: Path, blobs: str = "blobs") -> None:
         self._blobs = folder / blobs
         self._tmp = folder / "tmp"
+        self._damaged = folder / "damaged"
         self._blobs.mkdir(parents=True, exist_ok=True)
         self._tmp.mkdir(parents=True, exist_ok=True)
 
@@ -55,6 +71,60 @@ class Store:
     def path(self, digest: str) -> Path:
         """The path of the file with this SHA-256. Open the file soon, because it may be removed. It need not exist."""
         return self._blobs / digest[:2] / digest
+
+    def size(self, digest: str) -> int | None:
+        """The size of the file with this SHA-256, bytes; None if the store has no such file."""
+        try:
+            return self.path(digest).stat().st_size
+        except FileNotFoundError:
+            return None
+
+    def state(self, digest: str, size: int | None, *, content: bool) -> FileState:
+        """Whether the file with this SHA-256 is good, lost or damaged. size: its recorded size, bytes; None: not recorded.
+
+        content: also read the file and compare its SHA-256.
+        """
+        there = self.size(digest)
+        if there is None:
+            return "lost"
+        if size not in (None, there):
+            return "damaged"
+        try:
+            good = not content or self._content_sha256(digest) == digest
+        except FileNotFoundError:  # it was removed meanwhile
+            return "lost"
+        return "good" if good else "damaged"
+
+    def _content_sha256(self, digest: str) -> str:
+        return sha256_of(self.path(digest))
+
+    def verified(self, digest: str) -> Path:
+        """The path of the file with this SHA-256, after its content was checked. Raises ``BadFile``."""
+        try:
+            path = self.path(digest)
+            found = sha256_of(path)
+        except FileNotFoundError:
+            raise lost(digest) from None
+        if found != digest:
+            raise BadFile("file-damaged", f"expected the file {digest} as it was stored; {DAMAGED}")
+        return path
+
+    def set_aside(self, digest: str) -> bool:
+        """Move a damaged file out of the store, into the folder ``damaged``, where nothing reads it.
+
+        False if the file does not exist, or if its content is good. A file that is stored at the same moment stays.
+        """
+        self._damaged.mkdir(exist_ok=True)
+        target, aside = self.path(digest), self._damaged / f"{digest}.{uuid.uuid4().hex}"
+        try:
+            os.replace(target, aside)
+        except FileNotFoundError:
+            return False
+        if sha256_of(aside) == digest:
+            os.replace(aside, target)
+            return False
+        sync(target.parent)
+        return True
 
     def check(self) -> None:
         """Raise OSError if files cannot be stored now."""
@@ -82,9 +152,9 @@ class Store:
 
     @contextmanager
     def unpacked(self, digest: str, limits: ArchiveLimits) -> Iterator[Path]:
-        """Unpack a stored archive into a folder that is removed at the end. Raises the errors of ``unpack``."""
+        """Unpack a stored archive into a folder that is removed at the end. Raises ``BadFile`` and the errors of ``unpack``."""
         with self.temporary_folder() as folder:
-            unpack(self.path(digest), folder, limits)
+            unpack(self.verified(digest), folder, limits)
             yield folder
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
@@ -132,6 +202,11 @@ class Store:
         """
         # In a local folder there is nothing to finish: remove() itself checks the file that it moved aside.
         return set()
+
+
+def lost(digest: str) -> BadFile:
+    """The error for a file that is not in the store, although the catalogue refers to it."""
+    return BadFile("file-lost", f"expected the file {digest} in the store; it is not there: {ADVICE}")
 
 
 def sha256_of(path: Path) -> str:

@@ -68,8 +68,9 @@ def checked(
     if found.memory_mib > settings.max_job_memory_mib:
         raise DataError(
             "too-much-memory",
-            f"expected a job of at most {settings.max_job_memory_mib} MiB (HELIOPSF_MAX_JOB_MEMORY_MIB); this one "
-            f"needs about {found.memory_mib} MiB: {KINDS[kind].memory_advice}",
+            f"expected a job of at most {settings.max_job_memory_mib} MiB (HELIOPSF_MAX_JOB_MEMORY_MIB; its default follows "
+            f"from the memory and the worker processes of the service's machine); this one needs about {found.memory_mib} "
+            f"MiB: {KINDS[kind].memory_advice}",
         )
     if found.seconds > settings.max_job_s:
         raise DataError(
@@ -106,7 +107,7 @@ def factor(kind: str, catalogue: Catalogue) -> float:
     value, until = known.get(kind, (1.0, -math.inf))
     if time.monotonic() < until:
         return value
-    times = catalogue.jobs.run_times(kind, MOST_JOBS)
+    times = catalogue.stage_times.run_times(kind, MOST_JOBS)
     ratios = [
         took_s / estimated["start_s"] for estimated, took_s in times if estimated.get("start_s", 0.0) > 0
     ]

@@ -7,7 +7,9 @@ import logging
 import os
 import socket
 import time
+import uuid
 from collections.abc import Callable
+from functools import cache
 
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 
@@ -34,7 +36,13 @@ TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
 
 def worker_name() -> str:
     """The name of this process, as jobs and the list of workers show it."""
-    return f"{socket.gethostname()}:{os.getpid()}"
+    return _name(os.getpid())
+
+
+@cache
+def _name(process: int) -> str:
+    """A name that no other process has: workers in different containers may have the same host name and process id."""
+    return f"{socket.gethostname()}:{process}:{uuid.uuid4().hex[:8]}"
 
 
 class Runner:
@@ -64,9 +72,24 @@ class Runner:
         if lease is None:
             log.info("job %s: nothing to do: it is not queued, or an identical job is running", job_id)
             return
-        job = self._catalogue.jobs.get(job_id)
+        self._run(lease, on_progress)
+
+    def run_next(self, told_id: str, queue: Queue) -> None:
+        """Run the job of a queue whose owner's turn it is. The message of the broker names the job ``told_id``."""
+        if self._stopping.asked:
+            left = self._catalogue.turns.leave_next(told_id, queue)
+            log.info("job %s: left in the queue because this worker is stopping", left)
+            return
+        lease = self._catalogue.turns.claim_next(told_id, queue, worker=worker_name())
+        if lease is None:
+            log.info("queue %s: nothing to do for the message of job %s", queue, told_id)
+            return
+        self._run(lease)
+
+    def _run(self, lease: Lease, on_progress: Progress | None = None) -> None:
+        job = self._catalogue.jobs.get(lease.job_id)
         if job is None:
-            log.info("job %s: nothing to do: it was deleted", job_id)
+            log.info("job %s: nothing to do: it was deleted", lease.job_id)
             return
         with logs.bound(job=job.id, owner=job.owner):
             log.info("job %s: %s starts, attempt %d", job.id, job.kind, job.attempt)

@@ -16,12 +16,13 @@ import time
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
+from celery import Task
 from celery.signals import setup_logging, worker_init, worker_process_init, worker_shutting_down
 
 from workers import logs
 from workers.broker import app as queue
 from workers.broker.order import TakeWhatCanStart
-from workers.contract.queues import broker_name
+from workers.contract.queues import broker_name, queue_of_broker
 from workers.run.stopping import Stopping
 from workers.settings import Settings, software_version
 
@@ -39,10 +40,10 @@ WAIT_S = 2.0  # time after which a database that does not answer is tried again
 stopping = Stopping()  # made before the fork, so that the children share it with their parent
 
 
-@app.task(name=queue.RUN_JOB)
-def run_job(job_id: str) -> None:
-    """Run one job by its id."""
-    _runner().run(job_id)
+@app.task(name=queue.RUN_JOB, bind=True)
+def run_job(task: Task, job_id: str) -> None:
+    """Run one job of the queue from which the message came. The message names one of its jobs."""
+    _runner().run_next(job_id, queue_of_broker(task.request.delivery_info["routing_key"]))
 
 
 @app.task(name=queue.ASSIST)

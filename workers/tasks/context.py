@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
+from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
+from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.contract.phases import JobError
+from workers.files.intact import intact
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.stage_timer import StageTimer
+from workers.versions.status import PsfStatus
+
+Result = TypeVar("Result", ProductRow, PsfRow, ReportRow)
 
 
 class TurnOver(Exception):
@@ -53,3 +60,29 @@ class Context:
     def limits(self) -> FitsLimits:
         """Limits for the FITS files that a task opens."""
         return FitsLimits(max_pixels=self.settings.max_pixels)
+
+    def made(self, table: type[Result], identity: str) -> Result | None:
+        """The result of an earlier job; None if there is none, or if a file of it is lost: the task then makes it again."""
+        row = self.catalogue.get(table, identity, self.owner)
+        return row if row is not None and intact(self.store, row) else None
+
+    def add(self, row: Result) -> Result:
+        """Add a result, whose files are in the store; returns the row in the catalogue.
+
+        If an earlier result has this identity and a file of it is lost, its row gets the new files. Raises DataError
+        "psf-not-the-same" if this would change the content of a PSF that was certified.
+        """
+        there, new = self.catalogue.add(row)
+        if new or intact(self.store, there):
+            return there
+        if (
+            isinstance(there, PsfRow)
+            and there.status != PsfStatus.DRAFT
+            and there.file_sha256 != row.file_sha256
+        ):
+            raise DataError(
+                "psf-not-the-same",
+                f"expected the lost file of PSF {there.id} to be made again bit for bit, because the PSF was certified; this "
+                "version of the software makes another file: ask the operator to restore the store from a backup",
+            )
+        return self.catalogue.refile(row)

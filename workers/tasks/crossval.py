@@ -43,7 +43,7 @@ def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
     """Cross-validate the fit of a transit; returns the report's id."""
     request = ResolvedCrossValidate.model_validate(parameters)
     identity = psf_fit_identity(request)
-    if context.catalogue.get(ReportRow, identity, context.owner) is not None:
+    if context.made(ReportRow, identity) is not None:
         return identity
     transit = load_transit(context, request)[0]
     wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)

@@ -47,7 +47,7 @@ def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
     """
     request = ResolvedDeconvolve.model_validate(parameters)
     identity = product_identity(request)
-    if context.catalogue.get(ProductRow, identity, context.owner) is not None:
+    if context.made(ProductRow, identity) is not None:
         return identity
     psf_row = requested_psf(context, request)
     image = _load_upload(context, request)
@@ -67,7 +67,7 @@ def _load_upload(context: Context, request: ResolvedDeconvolve) -> Image:
             f"expected the id of an uploaded image; got {request.image_id}, which is not in the catalogue: upload the "
             "image first",
         )
-    return load(context, request, context.store.path(request.image_id))
+    return load(context, request, context.store.verified(request.image_id))
 
 
 def load(context: Context, request: ResolvedDeconvolve, path: Path) -> Image:
@@ -103,8 +103,9 @@ class _Work:
     @cached_property
     def psf(self) -> Psf:
         """The PSF on the image's pixels."""
-        path = self.context.store.path(self.inputs.psf_row.file_sha256)
-        return self.prepared.on_pixels_of(self.inputs.image.header, path, self.context.limits)
+        digest = self.inputs.psf_row.file_sha256
+        find = partial(self.context.store.verified, digest)
+        return self.prepared.on_pixels_of(self.inputs.image.header, digest, find, self.context.limits)
 
     @property
     def prepared(self) -> PreparedPsfs:
@@ -140,7 +141,7 @@ class _Work:
     @cached_property
     def possible_psfs(self) -> list[Psf]:
         """PSFs that differ from the PSF by its errors, on the image's pixels; empty if the file of the PSF contains no errors."""
-        psf = read_psf(self.context.store.path(self.inputs.psf_row.file_sha256), self.context.limits)
+        psf = read_psf(self.context.store.verified(self.inputs.psf_row.file_sha256), self.context.limits)
         if psf.fitted is None:
             return []
         possible = possible_psfs(psf, threads=self.context.settings.threads)

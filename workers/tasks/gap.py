@@ -39,7 +39,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
     """Diagnose the gap of a transit; returns the report's id."""
     request = ResolvedGapDiagnose.model_validate(parameters)
     identity = gap_identity(request)
-    if context.catalogue.get(ReportRow, identity, context.owner) is not None:
+    if context.made(ReportRow, identity) is not None:
         return identity
     added = _added(context, request)
     parent = given_psf(context, request.psf_id)
@@ -145,7 +145,7 @@ def _save_psf(context: Context, report_id: str, found: Diagnosis, provenance: di
             },
             threads=context.settings.threads,
         )
-    context.catalogue.add(row)
+    context.add(row)
     return identity
 
 

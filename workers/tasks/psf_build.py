@@ -22,7 +22,7 @@ from workers.contract.requests import PsfBuild
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import no_such_psf, psf_row
+from workers.tasks.data.psfs import named_psf, psf_row
 from workers.versions.series import TOTAL
 
 
@@ -37,11 +37,11 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
 
     Raises DataError "no-such-psf", and "instrument-changed" if the recipe now gives another PSF.
     """
-    row = context.catalogue.get(PsfRow, request.psf_id, context.owner)
-    if row is not None:
-        return row
     if request.psf_recipe is None:
-        raise no_such_psf(request.psf_id)
+        return named_psf(context, request.psf_id)
+    made = context.made(PsfRow, request.psf_id)
+    if made is not None:
+        return made
     row = built_psf(context, request.psf_recipe)
     if row.id != request.psf_id:
         raise DataError(
@@ -55,7 +55,7 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
 def built_psf(context: Context, build: PsfBuild) -> PsfRow:
     """The row of the PSF of a recipe. If the catalogue does not contain this PSF, build it and add it."""
     identity = psf_identity(build)
-    row = context.catalogue.get(PsfRow, identity, context.owner)
+    row = context.made(PsfRow, identity)
     if row is not None:
         return row
     text = instrument_text(build)
@@ -95,7 +95,7 @@ def built_psf(context: Context, build: PsfBuild) -> PsfRow:
             details={"job_id": context.job_id, "libraries": library_versions()},
             threads=context.settings.threads,
         )
-    return context.catalogue.add(row)[0]
+    return context.add(row)
 
 
 def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> NDArray[np.float64] | None:
@@ -117,4 +117,4 @@ def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> N
             f"mask_id: expected the id of the mask image {named.file}, which mount.mask_image names; got none: upload the "
             "file and give its id",
         )
-    return read_image(context.store.path(build.mask_id), context.limits).pixels
+    return read_image(context.store.verified(build.mask_id), context.limits).pixels

@@ -24,7 +24,7 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
     """Fit the scatter to a transit and add the PSF to the catalogue; returns the PSF's id."""
     request = ResolvedPsfFit.model_validate(parameters)
     identity = psf_fit_identity(request)
-    if context.catalogue.get(PsfRow, identity, context.owner) is not None:
+    if context.made(PsfRow, identity) is not None:
         return identity
     transit, prepared = load_transit(context, request)
     fit = fit_transit(
@@ -87,4 +87,4 @@ def _save(
             },
             threads=context.settings.threads,
         )
-    context.catalogue.add(row)
+    context.add(row)

@@ -29,7 +29,7 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
     """Make a report on a transit; returns its id."""
     request = ResolvedReport.model_validate(parameters)
     identity = report_identity(request)
-    if context.catalogue.get(ReportRow, identity, context.owner) is not None:
+    if context.made(ReportRow, identity) is not None:
         return identity
     psf = given_psf(context, request.psf_id)
     transit, prepared = load_transit(context, request, diffraction=None if psf is None else _point())

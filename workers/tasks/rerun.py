@@ -104,14 +104,14 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
 
 def _instrument_text(context: Context, first: Thing) -> str:
     """The text of the instrument file that the first run used, because shipped files can change with the software."""
-    psf = read_psf(context.store.path(first.file_sha256), context.limits)
+    psf = read_psf(context.store.verified(first.file_sha256), context.limits)
     text: str = psf.provenance["instrument_toml"]
     return text
 
 
 def _arrays(context: Context, row: Thing) -> dict[str, NDArray[Any]]:
     """The image arrays of a product or PSF file, by name."""
-    path = context.store.path(row.file_sha256)
+    path = context.store.verified(row.file_sha256)
     if isinstance(row, ProductRow):
         return {"IMAGE": read_plane(path, context.limits), **read_planes(path)}
     psf = read_psf(path, context.limits)

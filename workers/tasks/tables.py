@@ -17,14 +17,15 @@ def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
     request = PsfTables.model_validate(parameters)
     row = named_psf(context, request.psf_id)
     context.report("reading", 0, 3)
-    psf = read_psf(context.store.path(row.file_sha256), context.limits)
+    psf = read_psf(context.store.verified(row.file_sha256), context.limits)
     context.report("making tables", 1, 3)
     tables_sha256 = keep_tables(psf, context.store, context.settings.threads)
     context.report("drawing", 2, 3)
     with context.store.temporary() as picture:
-        if row.preview_sha256 is None:
+        preview_sha256 = row.preview_sha256
+        if preview_sha256 is None or context.store.size(preview_sha256) is None:
             psf_png(psf, picture)
-        preview_sha256 = row.preview_sha256 or context.store.keep(picture)
+            preview_sha256 = context.store.keep(picture)
     context.report("drawing", 3, 3)
     context.catalogue.psfs.describe(
         row.id, context.owner, tables_sha256=tables_sha256, preview_sha256=preview_sha256

@@ -62,4 +62,4 @@ def _built_diffraction(
             "the file of the known PSF to the transit",
         )
     row = built_psf(context, request.diffraction_recipe)
-    return read_psf(context.store.path(row.file_sha256), context.limits, parts=False).kernel
+    return read_psf(context.store.verified(row.file_sha256), context.limits, parts=False).kernel

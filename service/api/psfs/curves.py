@@ -168,7 +168,7 @@ def get_cutout(
     if files.known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     try:
-        content = cutout(state.store.path(row.file_sha256), size, state.limits)
+        content = cutout(files.found(state.store, row.file_sha256, row.bytes), size, state.limits)
     except DataError as error:
         raise problem(error) from error
     headers["Content-Disposition"] = f'attachment; filename="psf-{psf_id[:12]}-{size}px.fits"'
@@ -197,7 +197,7 @@ def _headers(what: str) -> dict[str, str]:
 
 
 def _read(state: Shared, row: PsfRow, digest: str) -> Mapping[str, Any]:
-    tables: dict[str, Any] = json.loads(state.store.path(digest).read_bytes())
+    tables: dict[str, Any] = json.loads(files.found(state.store, digest).read_bytes())
     if tables["schema"] != psf_lookup.SCHEMA:
         raise _no_tables(row)
     return tables

@@ -191,7 +191,9 @@ def delete_psf(psf_id: Identity, caller: Submitting, state: Shared) -> PsfView:
 def get_psf_file(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the PSF; its hash is the ETag."""
     row = _find(state, caller, psf_id)
-    return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, f"psf-{psf_id[:12]}.fits")
+    return files.send(
+        request, state.store, row.file_sha256, files.FITS_TYPE, f"psf-{psf_id[:12]}.fits", size=row.bytes
+    )
 
 
 @router.get("/{psf_id}/preview", summary="The PSF's picture", response_class=Response)

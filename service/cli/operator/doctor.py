@@ -30,7 +30,8 @@ from service.cli.options import DATA, data_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.files.opened import open_store
-from workers.settings import Settings, cores, software_version
+from workers.machine import cores
+from workers.settings import Settings, software_version
 
 State = Literal["ok", "warning", "broken"]
 SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
@@ -336,7 +337,10 @@ def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]
         started = time.perf_counter()
         catalogue.ping()
         took_ms = 1e3 * (time.perf_counter() - started)
+        catalogue.check_pages()
     except SQLAlchemyError as error:
+        if checks.damaged(error):
+            advice = "stop the service, and restore a copy of the database"
         yield None, Finding("database", "broken", f"{where}: {checks.database_said(error)}", advice)
     else:
         yield catalogue, Finding("database", "ok", f"{where} answers in {took_ms:.0f} ms")

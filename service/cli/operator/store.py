@@ -1,4 +1,4 @@
-"""``heliopsf store``: removes files that nothing refers to, shows how much each owner stores, and sets quotas."""
+"""``heliopsf store``: finds damaged files, removes files that nothing refers to, shows stored sizes, and sets quotas."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from service.cli.options import DATA, read_settings, user_errors
 from workers.catalogue.keys import OWNER
 from workers.catalogue.owners import MIB, Usage
 from workers.files.collection import collect
+from workers.files.examination import examine
 from workers.files.opened import open_store
+from workers.intake.again import repair
 
 DAY_S = 86_400
 
 
-@click.group(short_help="Clean up stored files; set quotas.")
+@click.group(short_help="Check and clean up stored files; set quotas.")
 def store() -> None:
-    """Clean up the files of a service. Run it on the machine of the service, with its settings."""
+    """Check and clean up the files of a service. Run it on the machine of the service, with its settings."""
 
 
 @store.command("collect", short_help="Remove files that nothing refers to.")
@@ -64,6 +66,38 @@ def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: P
     )
     if recounted:
         click.echo(f"corrected the byte count of {', '.join(recounted)}")
+
+
+@store.command("check", short_help="Find lost and damaged files.")
+@click.option("--sizes", is_flag=True, help="Compare only the sizes of files; do not read the files")
+@click.option(
+    "--repair",
+    "repairs",
+    is_flag=True,
+    help="Set damaged files aside, and queue the jobs that make lost results again",
+)
+@DATA
+def check_command(sizes: bool, repairs: bool, data: Path | None) -> None:
+    """Compare every file of the store with its recorded SHA-256. If a file is lost or damaged, the exit status is 1.
+
+    Each line names a product, PSF, report, solution or upload with such a file. Uploads cannot be made again: their owners
+    must upload them again.
+    """
+    settings = read_settings(data)
+    count = 0
+    with user_errors(), opened_catalogue(data) as catalogue:
+        files = open_store(settings)
+        for fault in examine(catalogue, files, content=not sizes):
+            count += 1
+            bad = ", ".join(f"{state} {digest}" for digest, state in fault.files)
+            line = f"{fault.what:<8}  {fault.row.owner}  {fault.row.id}  {bad}"
+            click.echo(f"{line}: {repair(fault, catalogue, files)}" if repairs else line)
+    if count == 0:
+        click.echo("all files are good")
+        return
+    advice = "" if repairs else "; to let jobs make them again where this is possible, add --repair"
+    click.echo(f"{count} things have lost or damaged files{advice}", err=True)
+    raise click.exceptions.Exit(1)
 
 
 @store.command("usage", short_help="Show how much each owner stores.")

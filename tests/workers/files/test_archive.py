@@ -232,6 +232,6 @@ def test_names_of_products(name: str, safe: str) -> None:
 
 def test_a_file_that_is_too_large_is_not_copied_to_its_end(tmp_path: Path) -> None:
     (tmp_path / "large").write_bytes(b"x" * (3 * 2**20))
-    with pytest.raises(DataError, match="at most 1048576 bytes"):
-        archive_files.copy_hashed(tmp_path / "large", tmp_path / "copy", 2**20)
+    with (tmp_path / "large").open("rb") as file, pytest.raises(DataError, match="at most 1048576 bytes"):
+        archive_files.copy_hashed(file, tmp_path / "copy", 2**20)
     assert (tmp_path / "copy").stat().st_size <= 2**20

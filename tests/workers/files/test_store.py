@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from tests.s3 import opened_store, s3_bucket
 from workers.files import s3_store as remote_store
 from workers.files.opened import open_store
-from workers.files.store import Store, StoreAway
+from workers.files.store import BadFile, Store, StoreAway
 from workers.settings import Settings
 
 CONTENT = b"light" * 1000
@@ -50,6 +50,53 @@ def test_a_kept_file_is_whole_under_its_hash_and_nothing_else_is_left(store: Sto
     assert elsewhere(store, tmp_path).path(digest).read_bytes() == CONTENT
     assert [p for p in (tmp_path / "data").rglob("*") if p.is_file()] == [store.path(digest)]
     store.check()
+
+
+def spoil(store: Store, digest: str, content: bytes | None) -> None:
+    """Change the content of a stored file, as a bad disk does; None: lose it."""
+    if type(store) is Store:
+        path = store.path(digest)
+        path.unlink() if content is None else path.write_bytes(content)
+        return
+    key = store._key(digest)  # type: ignore[attr-defined]
+    s3 = s3fs.S3FileSystem(skip_instance_cache=True)
+    s3.rm_file(key) if content is None else s3.pipe_file(key, content)
+    Store.path(store, digest).unlink()
+
+
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [(CONTENT[:-1], "file-damaged"), (bytes(len(CONTENT)), "file-damaged"), (None, "file-lost")],
+)
+def test_a_file_that_is_not_what_was_stored_is_not_read(
+    store: Store, content: bytes | None, code: str
+) -> None:
+    digest = kept(store)
+    assert store.verified(digest).read_bytes() == CONTENT and store.size(digest) == len(CONTENT)
+    assert store.state(digest, len(CONTENT), content=True) == "good"
+    spoil(store, digest, content)
+    state = code.removeprefix("file-")
+    assert store.state(digest, len(CONTENT), content=True) == state
+    same_size = content is not None and len(content) == len(CONTENT)
+    assert store.state(digest, len(CONTENT), content=False) == ("good" if same_size else state)
+    with pytest.raises(BadFile) as refused:
+        store.verified(digest)
+    assert refused.value.code == code
+    assert store.set_aside(digest) is (content is not None)
+    assert store.size(digest) is None
+    assert kept(store) == digest and store.verified(digest).read_bytes() == CONTENT, "stored again"
+    assert not store.set_aside(digest), "a good file stays"
+    assert store.state(digest, len(CONTENT), content=True) == "good"
+
+
+def test_a_damaged_copy_of_a_good_object_is_downloaded_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with opened_store("s3", tmp_path, monkeypatch, store_cache_mib=1) as store:
+        digest = kept(store)
+        store.path(digest).write_bytes(b"damaged")
+        assert store.state(digest, len(CONTENT), content=True) == "good"
+        assert store.verified(digest).read_bytes() == CONTENT
 
 
 def test_an_abandoned_file_is_removed(store: Store, tmp_path: Path) -> None:
@@ -230,7 +277,7 @@ def test_a_damaged_download_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
         s3fs.S3FileSystem(skip_instance_cache=True).pipe_file(
             f"{url.removeprefix('s3://')}/blobs/{digest[:2]}/{digest}", b"something else"
         )
-        with pytest.raises(StoreAway, match="another hash"):
+        with pytest.raises(BadFile, match="its content has changed"):
             store.path(digest)
         assert not (tmp_path / "data" / "copies" / digest[:2] / digest).exists()
 

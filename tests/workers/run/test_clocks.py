@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import select, update
+from sqlalchemy.orm import InstrumentedAttribute
 
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PartRow, WorkerRow
 from workers.contract.phases import Phase
+from workers.run import runner
 
 OFF_S = [600.0, -600.0]
 LEASE_S = 30.0
@@ -135,3 +138,73 @@ def test_the_database_s_clock_goes_on_within_a_transaction_of_many_statements(ca
         time.sleep(0.05)
         second = session.scalars(select(database.now)).one()
     assert 0.03 < second - first < 10.0 and abs(second - TRUE_TIME()) < 5.0
+
+
+BACK_S = 3600.0
+
+
+def clock_back(catalogue: Catalogue, *columns: InstrumentedAttribute[float | None]) -> None:
+    """Set the database's clock back by an hour: the times that it wrote now lie in the future."""
+    with catalogue._engine.begin() as connection:
+        for column in columns:
+            values = {column.key: column + BACK_S}
+            connection.execute(update(column.class_).where(column.is_not(None)).values(values))
+
+
+def test_a_lost_job_is_not_held_until_the_clock_has_caught_up(catalogue: Catalogue) -> None:
+    job_id, _ = started(catalogue)
+    clock_back(catalogue, JobRow.heartbeat_at, JobRow.started_at)
+    assert catalogue.census.count_silent(LEASE_S) == 1
+    assert catalogue.jobs.give_up_silent(SOON_S / 2, 3) == [], "it has another lease to give a sign of life"
+    time.sleep(SOON_S)
+    assert catalogue.jobs.give_up_silent(SOON_S / 2, 3) == [job_id]
+
+
+def test_a_running_job_survives_a_clock_that_is_set_back(catalogue: Catalogue) -> None:
+    job_id, lease = started(catalogue)
+    clock_back(catalogue, JobRow.heartbeat_at, JobRow.started_at)
+    assert catalogue.jobs.give_up_silent(LEASE_S, 3) == []
+    assert catalogue.jobs.heartbeat(lease)
+    assert catalogue.jobs.give_up_silent(LEASE_S, 3) == [] and catalogue.census.count_silent(LEASE_S) == 0
+    found = row(catalogue, job_id)
+    assert found.phase == Phase.EXECUTING and found.started_at is not None
+    assert found.started_at < TRUE_TIME() + 5.0, "its time limit counts from now"
+
+
+def test_a_message_that_was_lost_is_repeated_although_the_clock_was_set_back(catalogue: Catalogue) -> None:
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+    catalogue.jobs.mark_submitted(job.id)
+    clock_back(catalogue, JobRow.submitted_at)
+    assert [one.id for one in catalogue.jobs.unsubmitted(LEASE_S)] == [job.id]
+    catalogue.jobs.mark_submitted(job.id)
+    assert catalogue.jobs.unsubmitted(LEASE_S) == [], "once"
+
+
+def test_a_worker_that_is_gone_does_not_count_until_the_clock_has_caught_up(catalogue: Catalogue) -> None:
+    catalogue.census.announce("gone", TRUE_TIME(), "1")
+    clock_back(catalogue, WorkerRow.heartbeat_at)
+    catalogue.census.announce("here", TRUE_TIME(), "1")
+    assert [worker.name for worker in catalogue.census.workers(LEASE_S)] == ["here"]
+
+
+def test_a_part_of_a_lost_worker_is_not_held_until_the_clock_has_caught_up(catalogue: Catalogue) -> None:
+    catalogue.parts.open("o", "k", 1)
+    assert catalogue.parts.take("o", "k", LEASE_S) is not None
+    clock_back(catalogue, PartRow.heartbeat_at)
+    assert catalogue.parts.take("o", "k", SOON_S / 2) is None
+    time.sleep(SOON_S)
+    assert catalogue.parts.take("o", "k", SOON_S / 2) is not None
+
+
+def test_workers_of_one_host_name_and_process_id_have_different_names(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As in containers: each has its own process ids, and may have the host name of another."""
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    monkeypatch.setattr("socket.gethostname", lambda: "worker")
+    names = set()
+    for _container in range(2):
+        runner._name.cache_clear()
+        names.add(runner.worker_name())
+        assert runner.worker_name() in names, "one process keeps its name"
+    assert len(names) == 2 and all(name.startswith("worker:1:") for name in names)

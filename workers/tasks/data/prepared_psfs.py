@@ -29,16 +29,18 @@ class PreparedPsfs:
         self.max_bytes = max_bytes
         self._kept: OrderedDict[Hashable, tuple[object, int]] = OrderedDict()
 
-    def on_pixels_of(self, header: Header, path: Path, limits: FitsLimits) -> Psf:
+    def on_pixels_of(
+        self, header: Header, name: Hashable, find: Callable[[], Path], limits: FitsLimits
+    ) -> Psf:
         """The PSF of a file on the pixels of an image with this header; repeated calls return the same object.
 
-        The file must never change.
+        name: names the content of the file. find: returns the path of the file; it is called only if the PSF is not kept.
         """
-        whole = self._once((path, limits), lambda: read_psf(path, limits, parts=False), _kernel_bytes)
+        whole = self._once((name, limits), lambda: read_psf(find(), limits, parts=False), _kernel_bytes)
         factor = binning_factor(whole, header)
         if factor == 1:
             return whole
-        return self._once((path, limits, factor), lambda: rebinned(whole, factor), _kernel_bytes)
+        return self._once((name, limits, factor), lambda: rebinned(whole, factor), _kernel_bytes)
 
     def engine_for(self, psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
         """The engine for a PSF and a shape. Pass the same PSF object again: the cache compares identity, not content."""

@@ -118,7 +118,7 @@ def keep(made: Made, path: Path) -> ProductRow:
         preview_sha256=made.preview_sha256,
         details=made.details | {"changes_picture_sha256": picture},
     )
-    return context.catalogue.add(row)[0]
+    return context.add(row)
 
 
 def save_preview(inputs: Inputs, result: Deconvolved) -> str:

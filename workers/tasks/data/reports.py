@@ -46,7 +46,7 @@ def keep_report(
     """
     file_sha256 = context.store.keep(text)
     of_page = {} if page is None else {"page_sha256": context.store.keep(page)}
-    context.catalogue.add(
+    context.add(
         ReportRow(
             owner=context.owner,
             id=identity,

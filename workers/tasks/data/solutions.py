@@ -98,7 +98,9 @@ def _kept(context: Context, identity: str, transit: Transit) -> Solution | None:
     if row is None:
         return None
     try:
-        return read_solution(context.store.path(row.file_sha256), transit, threads=context.settings.threads)
+        return read_solution(
+            context.store.verified(row.file_sha256), transit, threads=context.settings.threads
+        )
     except (DataError, FileNotFoundError) as error:
         log.warning("job %s: removed the kept solution %s: %s", context.job_id, identity, error)
         context.catalogue.owners.forget_solutions([row])

@@ -14,6 +14,7 @@ from psfcore.fits.psfs import read_psf
 from psfcore.psf_sampling import psf_for_image
 from service.local import LocalService
 from tests.conftest import write_image, write_psf
+from workers.tasks import deconvolve
 from workers.tasks.data import prepared_psfs
 from workers.tasks.data.prepared_psfs import PreparedPsfs
 
@@ -23,9 +24,9 @@ SHAPE = (96, 128)
 
 def test_a_psf_is_read_once_and_equals_the_file(psf_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = PreparedPsfs(2**30)
-    first = prepared.on_pixels_of(Header(), psf_file, LIMITS)
+    first = prepared.on_pixels_of(Header(), psf_file, lambda: psf_file, LIMITS)
     monkeypatch.delattr(prepared_psfs, "read_psf")
-    assert prepared.on_pixels_of(Header({"CDELT1": 7.0}), psf_file, LIMITS) is first
+    assert prepared.on_pixels_of(Header({"CDELT1": 7.0}), psf_file, lambda: psf_file, LIMITS) is first
     np.testing.assert_array_equal(first.kernel, read_psf(psf_file, LIMITS, parts=False).kernel)
 
 
@@ -35,10 +36,13 @@ def test_a_binned_image_gets_the_psf_of_its_pixels_once(tmp_path: Path) -> None:
     write_psf(tmp_path / "psf.fits")
     fits.setval(tmp_path / "psf.fits", "CDELT1", value=0.5)
     prepared, binned = PreparedPsfs(2**30), Header({"CDELT1": 1.0, "CDELT2": 1.0})
-    whole = prepared.on_pixels_of(Header({"CDELT1": 0.5}), tmp_path / "psf.fits", LIMITS)
+    whole = prepared.on_pixels_of(Header({"CDELT1": 0.5}), "psf", lambda: tmp_path / "psf.fits", LIMITS)
     assert whole.plate_scale_arcsec == 0.5
-    found = prepared.on_pixels_of(binned, tmp_path / "psf.fits", LIMITS)
-    assert found is not whole and prepared.on_pixels_of(binned, tmp_path / "psf.fits", LIMITS) is found
+    found = prepared.on_pixels_of(binned, "psf", lambda: tmp_path / "psf.fits", LIMITS)
+    assert (
+        found is not whole
+        and prepared.on_pixels_of(binned, "psf", lambda: tmp_path / "psf.fits", LIMITS) is found
+    )
     np.testing.assert_array_equal(found.kernel, psf_for_image(whole, binned).kernel)
 
 
@@ -74,6 +78,7 @@ def test_jobs_share_prepared_psfs(
     local: LocalService, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[object] = []
+    deconvolve._prepared.cache_clear()  # other tests use the same PSF
     real = prepared_psfs.new_engine
     monkeypatch.setattr(prepared_psfs, "new_engine", lambda *given: made.append(given) or real(*given))
     psf_id = local.upload_psf(psf_file)["id"]

@@ -1,0 +1,20 @@
+"""The order in which the owners of waiting jobs are served."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0013"
+down_revision = "0012"
+
+
+def upgrade() -> None:
+    """Make the table and the column. In a database of an earlier version, no owner has been served yet."""
+    op.create_table(
+        "owner_turns",
+        sa.Column("owner", sa.String(64), primary_key=True),
+        sa.Column("queue", sa.String(16), primary_key=True),
+        sa.Column("number", sa.BigInteger, nullable=False),
+    )
+    op.add_column("jobs", sa.Column("delayed", sa.Boolean, nullable=False, server_default=sa.false()))

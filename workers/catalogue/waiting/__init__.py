@@ -1,0 +1,1 @@
+"""Whose waiting job comes next, and ended jobs that run again."""

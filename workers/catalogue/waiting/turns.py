@@ -1,0 +1,68 @@
+"""Turns: which waiting job of a queue a worker claims when a message of the broker reaches it.
+
+The broker delivers messages in the order in which jobs were submitted. If each message started the job that it names,
+one owner's many jobs would delay the single job of another. Therefore a message is only the right to start one job of
+its queue, and the database says which: there are as many messages as waiting jobs, so each job gets one. If messages are
+lost, the reconciler submits the jobs again that still wait. A message without a waiting job has no effect.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import and_, func, or_, select, update
+
+from workers.catalogue.database import Database
+from workers.catalogue.jobs import Jobs, Lease, no_equal_at_work
+from workers.catalogue.tables import JobRow, OwnerTurnRow
+from workers.contract.phases import Phase
+from workers.contract.queues import Queue
+
+
+class Turns:
+    """Claims jobs of the table of jobs by turns; each method is one or more transactions of ``Jobs``."""
+
+    def __init__(self, database: Database, jobs: Jobs) -> None:
+        self._database, self._jobs = database, jobs
+
+    def claim_next(self, told_id: str, queue: Queue, worker: str) -> Lease | None:
+        """Claim the job of a queue whose owner's turn it is; None if no job of the queue can start now.
+
+        A message of the broker is the right to start one job of its queue; ``told_id`` is the job that it names. The
+        owner whose jobs of this queue were claimed least recently comes first, so that the many jobs of one owner do not
+        delay the single job of another. Of an owner's jobs, the oldest comes first; a job that was handed back counts
+        from its last start. The number of an owner's running jobs does not count: an owner with one long job would
+        otherwise wait until nobody else has a job.
+        """
+        while (job_id := self._next(told_id, queue)) is not None:
+            lease = self._jobs.claim(job_id, worker)
+            if lease is not None:
+                return lease
+        # The message is used up, so jobs that wait for an identical job need another message later.
+        blocked = [JobRow.phase == Phase.QUEUED, JobRow.queue == queue, ~no_equal_at_work()]
+        received = JobRow.submitted_at.is_not(None)
+        self._database.change(update(JobRow).where(*blocked, received).values(submitted_at=None))
+        return None
+
+    def leave_next(self, told_id: str, queue: Queue) -> str | None:
+        """Record that a worker took a message from the broker but starts no job; returns the id of the job that it leaves.
+
+        This is the job that ``claim_next`` would have claimed. It is submitted again.
+        """
+        job_id = self._next(told_id, queue)
+        if job_id is not None:
+            self._jobs.forget_submission(job_id)
+        return job_id
+
+    def _next(self, told_id: str, queue: Queue) -> str | None:
+        """The job of a queue that comes next, of those that the broker has received."""
+        received = and_(JobRow.submitted_at.is_not(None), JobRow.delayed.is_(False))
+        turn = and_(OwnerTurnRow.owner == JobRow.owner, OwnerTurnRow.queue == JobRow.queue)
+        query = (
+            select(JobRow.id)
+            .outerjoin(OwnerTurnRow, turn)
+            .where(JobRow.phase == Phase.QUEUED, JobRow.queue == queue, no_equal_at_work())
+            .where(or_(JobRow.id == told_id, received))
+            .order_by(func.coalesce(OwnerTurnRow.number, 0))
+            .order_by(func.coalesce(JobRow.started_at, JobRow.created_at), JobRow.id)
+        )
+        with self._database.reading() as session:
+            return session.scalars(query.limit(1)).first()

@@ -1,0 +1,64 @@
+"""Compare the files of the store with what the catalogue says about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.named_files import Kept
+from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
+from workers.files.intact import files_of
+from workers.files.store import FileState, Store
+
+NAMES: dict[type[Any], str] = {
+    ImageRow: "image",
+    TransitRow: "transit",
+    PsfRow: "psf",
+    ProductRow: "product",
+    ReportRow: "report",
+    SolutionRow: "solution",
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A row of the catalogue whose files are not all good. files: SHA-256 and state of each lost or damaged file."""
+
+    row: Kept
+    files: tuple[tuple[str, FileState], ...]
+
+    @property
+    def what(self) -> str:
+        """The kind of thing that lacks a file, for example "product"."""
+        return NAMES[type(self.row)]
+
+
+def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iterator[Fault]:
+    """Find the rows whose files are lost or damaged.
+
+    content: read each file and compare its SHA-256; otherwise only compare sizes, as far as they are recorded. A file to
+    which several rows refer is read once. Raises ``workers.files.store.StoreAway``.
+    """
+    states: dict[str, FileState] = {}
+    for table in NAMES:
+        for row in catalogue.named_files.kept(table):
+            bad = []
+            for digest, size in _files(row):
+                if digest not in states:
+                    states[digest] = store.state(digest, size, content=content)
+                if states[digest] != "good":
+                    bad.append((digest, states[digest]))
+            if bad:
+                yield Fault(row, tuple(bad))
+
+
+def _files(row: Kept) -> Iterator[tuple[str, int | None]]:
+    match row:
+        case ImageRow() | TransitRow():
+            yield row.id, row.bytes
+        case SolutionRow():
+            yield row.file_sha256, row.bytes
+        case _:
+            yield from files_of(row)

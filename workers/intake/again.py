@@ -1,0 +1,101 @@
+"""Results whose files were lost or damaged: which jobs make them again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import ValidationError
+
+from psfcore.errors import DataError
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import (
+    ImageRow,
+    JobRow,
+    ProductRow,
+    PsfRow,
+    ReportRow,
+    SolutionRow,
+    TransitRow,
+)
+from workers.contract.identities import request_identity
+from workers.contract.kinds import KINDS, Result
+from workers.contract.phases import Phase
+from workers.contract.queues import Queue
+from workers.contract.requests import PsfTables
+from workers.files.examination import Fault
+from workers.files.intact import intact
+from workers.files.store import Store
+from workers.lineage import made_by
+
+TABLES: dict[Result, type[Any]] = {
+    Result.PRODUCT: ProductRow,
+    Result.PSF: PsfRow,
+    Result.REPORT: ReportRow,
+}
+
+
+def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
+    """Queue a completed job again if its result was deleted or a file of it is lost; returns whether this was done."""
+    table = TABLES.get(KINDS[job.kind].result)
+    if job.phase != Phase.COMPLETED or table is None or job.result_id is None:
+        return False
+    row = catalogue.get(table, job.result_id, job.owner)
+    return (row is None or not intact(store, row)) and catalogue.again.reopen(job.id)
+
+
+def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
+    """Set damaged files aside, and queue the job that makes a result again; returns what was done or has to be done."""
+    row = fault.row
+    for digest, state in fault.files:
+        if state == "damaged":
+            store.set_aside(digest)
+    match row:
+        case SolutionRow():
+            catalogue.owners.forget_solutions([row])
+            return "removed; the next job on the transit makes it again"
+        case ImageRow() | TransitRow():
+            return f"owner {row.owner} must upload the file again ({row.filename or 'without a name'})"
+        case _:
+            try:
+                return f"job {make_again(row, catalogue, store)} makes it again"
+            except DataError as error:
+                return f"cannot be made again: {error.message}"
+
+
+def make_again(row: ProductRow | PsfRow | ReportRow, catalogue: Catalogue, store: Store) -> str:
+    """Queue the job that makes a result again; returns the job's id. A file of the result must be missing.
+
+    Of an uploaded PSF, a job makes only the tables and the picture again.
+
+    Raises DataError "not-made-here" for an upload, and "parameters-unknown" or "parameters-outdated" if the job of a
+    result was deleted and cannot be repeated from what the catalogue records.
+    """
+    if isinstance(row, PsfRow) and row.origin == "uploaded" and store.size(row.file_sha256) == row.bytes:
+        tables = PsfTables(psf_id=row.id)
+        key = request_identity("psf-tables")(tables)
+        drawing, _ = catalogue.jobs.submit("psf-tables", tables.model_dump(mode="json"), key, row.owner)
+        catalogue.again.reopen(drawing.id)
+        return drawing.id
+    job = catalogue.again.that_made(row.owner, row.id)
+    if job is not None and KINDS[job.kind].result in TABLES and job.work_key == row.id:
+        catalogue.again.reopen(job.id)
+        return job.id
+    if isinstance(row, ReportRow):
+        raise _unknown(row)
+    made = made_by(catalogue, row)
+    kind = KINDS[made.kind]
+    assert kind.resolved is not None and kind.identity is not None
+    try:
+        identity = kind.identity(kind.resolved.model_validate(made.parameters))
+    except ValidationError:  # the text of an instrument file is only in the lost file of the PSF
+        raise _unknown(row) from None
+    if identity != row.id:
+        raise _unknown(row)
+    return catalogue.jobs.submit(kind.name, made.parameters, row.id, row.owner, queue=Queue.BULK)[0].id
+
+
+def _unknown(row: ProductRow | PsfRow | ReportRow) -> DataError:
+    return DataError(
+        "parameters-unknown",
+        f"expected a job that makes {row.id} again; its job was deleted, or needs a file that is lost: submit the request again",
+    )
