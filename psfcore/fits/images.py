@@ -18,7 +18,7 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import card_trouble
+from psfcore.fits.cards import card_trouble
 from psfcore.fits.hdus import ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import FitsLimits, optional_exposure_s, optional_number, optional_text, read_summary
 from psfcore.image import Image, MaskBit
