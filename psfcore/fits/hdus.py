@@ -35,6 +35,7 @@ PIXEL_TROUBLE = (
     AttributeError,
     ArithmeticError,
     RuntimeError,
+    AssertionError,  # astropy raises it for the name of a column
     struct.error,
     zlib.error,
 )

@@ -218,10 +218,19 @@ def _kept_header(source: fits.Header) -> fits.Header:
             continue
         readable = _readable(card)
         if readable is None:
-            kept.add_history("card kept as text: " + ascii_text(card.image.rstrip()))
+            kept.add_history(_as_text(card))
         else:
             kept.append(readable, end=True)
     return kept
+
+
+def _as_text(card: fits.Card) -> str:
+    try:
+        return "card kept as text: " + ascii_text(card.image.rstrip())
+    except (
+        card_trouble()
+    ):  # astropy repairs a damaged card before it shows it, and some cards cannot be repaired
+        return f"card {ascii_text(card.keyword)} left out: it cannot be read"
 
 
 def _readable(card: fits.Card) -> fits.Card | None:

@@ -31,6 +31,7 @@ from psfcore.drawing.plots import (
     write_png,
 )
 from psfcore.errors import DataError
+from psfcore.fits.header import optional_text
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
@@ -125,7 +126,7 @@ def treat(
     step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
     return Treated(
         name=name,
-        taken=_taken(image),
+        taken=optional_text(image.header, "DATE-BEG", "DATE-OBS", "T_OBS"),
         psf=f"{fitting.name} {fitting.version}",
         found=found,
         steps_done=result.steps_done,
@@ -284,11 +285,3 @@ def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[st
                 "extreme_pct": max(ups) if kind == "bright" else min(ups),
             }
     return out
-
-
-def _taken(image: Image) -> str | None:
-    for key in ("DATE-BEG", "DATE-OBS", "T_OBS"):
-        value = image.header.get(key)
-        if isinstance(value, str) and value.strip():
-            return value.strip()
-    return None

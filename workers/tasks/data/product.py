@@ -17,6 +17,7 @@ from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
+from psfcore.fits.header import optional_text
 from psfcore.fits.images import write_image
 from psfcore.image import Image, MaskBit
 from workers.catalogue.tables import ProductRow, PsfRow
@@ -144,9 +145,9 @@ def _history(inputs: Inputs, result: Deconvolved) -> list[str]:
 
 def _title(inputs: Inputs) -> str:
     header = inputs.image.header
-    parts = [header.get("DETECTOR") or header.get("INSTRUME") or "image"]
-    parts += [str(header[key]) for key in ("DATE-BEG", "DATE-OBS") if header.get(key)][:1]
-    return f"{' '.join(map(str, parts))}   PSF {inputs.psf_row.name} {inputs.psf_row.version}"
+    seen_by = optional_text(header, "DETECTOR", "INSTRUME") or "image"
+    date = optional_text(header, "DATE-BEG", "DATE-OBS")
+    return f"{seen_by}{f' {date}' if date else ''}   PSF {inputs.psf_row.name} {inputs.psf_row.version}"
 
 
 def details_of(
