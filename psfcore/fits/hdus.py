@@ -6,6 +6,7 @@ gives equal bytes.
 
 from __future__ import annotations
 
+import errno
 import struct
 import zlib
 from pathlib import Path
@@ -50,7 +51,9 @@ def read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.fl
         if summary.codec is not None:
             _check_tiles(path, summary)
         # uint=False: otherwise astropy converts unsigned integers (BZERO 32768) before it applies BLANK.
-        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, uint=False) as hdus:
+        # astropy also looks at the HDU after a first one, which is not checked. It must not prepare it for decompression.
+        options = {"uint": False, "disable_image_compression": summary.codec is None}
+        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, **options) as hdus:
             hdu = hdus[summary.hdu]
             if hdu.shape != summary.shape:
                 raise _other_shape(summary, hdu.shape)
@@ -97,8 +100,8 @@ def _check_tiles(path: str | Path, summary: HeaderSummary) -> None:
 
 
 def _raise_if_storage(error: Exception) -> None:
-    """Raise the error again if the disk caused it, and not the content of the file."""
-    if isinstance(error, OSError) and error.errno is not None:
+    """Raise the error again if the disk caused it, and not the content of the file, such as a negative size."""
+    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
         raise error
 
 

@@ -88,13 +88,13 @@ def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
 
 
 def optional_text(header: Header, *keys: str) -> str | None:
-    """Text of the first of the cards `keys` that holds a non-empty string of printable characters; None if no card does.
+    """Text of the first of the cards `keys` that holds a non-empty string; None if no card does.
 
     Surrounding spaces are removed.
     """
     for key in keys:
         value = _lenient(header, key)
-        if isinstance(value, str) and value.strip() and value.isprintable():
+        if isinstance(value, str) and value.strip():
             return value.strip()
     return None
 

@@ -75,10 +75,11 @@ def build_an_instrument(content: bytes, folder: Path) -> str:
 
 
 def _instrument_mib(content: bytes) -> float:
+    """The estimated memory of a build that is accepted; 0 if it is refused."""
     text = content.decode("utf-8", "replace")
     try:
-        parameters = {"instrument_file": text, "size": SIZE_PX}
-        return float(_build(parameters, None, "")[1])  # type: ignore[arg-type]
+        check_workload(parse_instrument(text, "fuzz.toml"), "fuzz.toml")
+        return float(_build({"instrument_file": text, "size": SIZE_PX})[1])
     except DataError:
         return 0.0
 

@@ -71,8 +71,10 @@ class Build(_Frozen):
     cell_ns: float
     cell_bytes: float
     window_ns: float  # for each window and pixel of an edge of the grid
-    entry_ns: float  # for each entry of the list of edges, and each S
+    outlines: int  # outlines of a mount that ``mask_s`` includes
+    entry_ns: float  # for each further entry of the list of edges, and each S
     entry_bytes: float
+    spectrum_bytes: float  # for each row of the mask and pixel of an edge of the grid
     image_bytes: float  # for each pixel of a mask image
 
 

@@ -90,7 +90,7 @@ def estimate(
     if kind == "deconvolve":
         cpu_s, mib = _deconvolution(parameters, catalogue, owner)
     elif kind == "psf-build":
-        cpu_s, mib = _build(parameters, catalogue, owner)
+        cpu_s, mib = _build(parameters, _mask_px(parameters, catalogue, owner))
     else:
         cpu_s, mib = _linear(kind, parameters, catalogue, owner)
     start_s = cpu_s / threads**COSTS.threads_exponent
@@ -128,7 +128,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
         psf_shape = tuple(psf.details["shape"])
     elif parameters.get("psf_recipe") is not None:  # the PSF may still have to be built
         recipe = parameters["psf_recipe"]
-        built_s, built_mib = _build(recipe, catalogue, owner)
+        built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
         psf_shape = (recipe["size"], recipe["size"])
     method = parameters["method"]
     margin = 2 * _margin_px(method, (ny, nx), max(psf_shape))
@@ -157,7 +157,13 @@ def _of_method(figures: Mapping[str, float], method: Mapping[str, Any]) -> float
     return figures.get(method["name"], max(figures.values()))
 
 
-def _build(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:
+def _mask_px(recipe: Mapping[str, Any], catalogue: Catalogue, owner: str) -> int:
+    """Number of pixels of the mask image of a PSF build; 0 if it has none."""
+    image = catalogue.get(ImageRow, recipe.get("mask_id") or "", owner)
+    return 0 if image is None else math.prod(image.summary["shape"])
+
+
+def _build(parameters: Mapping[str, Any], mask_px: int = 0) -> tuple[float, float]:
     cost = COSTS.kinds.psf_build
     size = max(parameters["size"], cost.grid_px)
     grid = size / cost.grid_px
@@ -171,7 +177,9 @@ def _build(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> t
     if work.mask:
         samples = max(cost.fewest_samples, work.samples)
         line_s += cost.mask_s * (samples / cost.fewest_samples) ** cost.samples_exponent
-        line_s += cost.entry_ns * 1e-9 * work.mount_entries * samples
+        further = max(0, work.mount_entries - cost.outlines * work.mask_cells)
+        masks = 2 if instrument.meshes else 1  # the mount alone, and with the meshes
+        line_s += masks * cost.entry_ns * 1e-9 * further * samples
     line_s *= grid**cost.grid_exponent
     line_s += 1e-9 * (cost.airy_ns * work.airy_points + cost.cell_ns * sum(work.cells))
     line_s += 1e-9 * cost.window_ns * sum(work.windows) * size
@@ -180,11 +188,9 @@ def _build(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> t
     arrays = max(
         cost.airy_bytes * work.airy_points,
         cost.cell_bytes * max(work.cells, default=0),
-        cost.entry_bytes * work.mount_entries,
+        cost.entry_bytes * work.mount_entries + cost.spectrum_bytes * work.mask_cells * size,
     )
-    mask_image = None if build.mask_id is None else catalogue.get(ImageRow, build.mask_id, owner)
-    if mask_image is not None:
-        arrays += cost.image_bytes * math.prod(mask_image.summary["shape"])
+    arrays += cost.image_bytes * mask_px
     return len(instrument.spectral_lines) * line_s, meshes_mib + cost.grid_mib * grid**2 + arrays / MIB
 
 
@@ -201,7 +207,8 @@ def _linear(
         cpu_s += parameters["runs"] * (run_s + run_ns * 1e-9 * pixels)
     built_s, built_mib = 0.0, 0.0
     if parameters.get("diffraction_recipe") is not None:
-        built_s, built_mib = _build(parameters["diffraction_recipe"], catalogue, owner)
+        recipe = parameters["diffraction_recipe"]
+        built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
     return built_s + cpu_s, max(built_mib, cost.base_mib + cost.pixel_bytes * pixels / MIB)
 
 

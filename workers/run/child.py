@@ -47,7 +47,7 @@ class Child:
         stacks = _POOLS * self._threads * (stack if stack != resource.RLIM_INFINITY else 8 * MIB)
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
         limit = data_bytes() + allowed_mib(estimate_mib) * MIB + stacks
-        limits = [known for known in (limit, soft, hard) if known != resource.RLIM_INFINITY]
+        limits = [known for known in (limit, soft, hard, sys.maxsize) if known != resource.RLIM_INFINITY]
         resource.setrlimit(resource.RLIMIT_DATA, (min(limits), hard))
         try:
             yield

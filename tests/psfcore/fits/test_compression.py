@@ -138,6 +138,13 @@ def test_a_table_of_billions_of_columns_needs_no_memory(tmp_path: Path, tfields:
     assert done.stdout == "bad-card\n", f"{done.returncode}: {done.stdout}{done.stderr}"
 
 
+def test_what_follows_an_image_is_not_prepared(tmp_path: Path) -> None:
+    """astropy looks at the second HDU when it opens a file."""
+    (tmp_path / "file.fits").write_bytes(good() + compressed(TFIELDS=2**32)[2880:])
+    done = read_in_a_child(tmp_path / "file.fits", 200)
+    assert done.stdout == "no-signal\n", f"{done.returncode}: {done.stdout}{done.stderr}"
+
+
 def read_in_a_child(path: Path, mib: int) -> subprocess.CompletedProcess[str]:
     """Read an image in a process that may use `mib` MiB of private memory; it prints the code of the error."""
     code = (
