@@ -23,11 +23,11 @@ from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.combined import DIFFRACTION, available_parts, diffraction_patterns
 from psfcore.errors import DataError
 from psfcore.instruments.model import Instrument
+from psfcore.instruments.workload import LARGEST_SIZE_PX, check_workload
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
 
 SMALLEST_SIZE_PX = 64
-LARGEST_SIZE_PX = 4096
 SCATTER = "SCATTER"
 Kernel = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -48,9 +48,10 @@ def build_psf(
     component: build only this component, one of component_names(); the result is then a PSF without components.
     mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see fits.mask_file).
     progress: called with (step, steps); it may raise to stop the work.
-    Raises DataError "bad-size", "unknown-component", "bad-mount".
+    Raises DataError "bad-size", "unknown-component", "bad-mount", "bad-instrument-file" if its arrays are too large.
     """
     _check_size(size)
+    check_workload(instrument, instrument.name)
     names = component_names(instrument) if component is None else (component,)
     _check_component(instrument, names)
     grid = max(size, REACH_GRID_PX)

@@ -84,6 +84,11 @@ class Settings(BaseSettings):
     resubmit_s: float = Field(
         30.0, gt=0, description="time after which a queued job is sent to the broker for the second time, s"
     )
+    cancel_s: float = Field(
+        10.0,
+        gt=0,
+        description="time after which a worker process is ended and replaced if its job does not stop after it was cancelled or took too long, s",
+    )
     max_attempts: int = Field(3, ge=1, description="number of attempts after which a job fails")
     stop_s: float = Field(
         15.0,
@@ -208,6 +213,11 @@ class Settings(BaseSettings):
         needs a few seconds to end.
         """
         return self.stop_s + self.heartbeat_s + 6.0
+
+    @property
+    def silent_s(self) -> float:
+        """Time without a heartbeat after which a worker process is ended and replaced, s. Its job's lease was lost long before."""
+        return 2 * self.lease_s + self.cancel_s
 
     @property
     def presence_s(self) -> float:

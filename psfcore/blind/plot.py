@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from psfcore.blind.effects.registry import KNOWN, UNKNOWN
 from psfcore.blind.score_table import Score
 from psfcore.blind.scoring import INCONCLUSIVE, NONE, UNKNOWN_VERDICT
-from psfcore.drawing.plots import INK
+from psfcore.drawing.plots import INK, write_png
 
 _VERDICTS = (NONE, UNKNOWN_VERDICT, INCONCLUSIVE)
 
@@ -35,7 +34,7 @@ def score_png(found: Score, path: str | Path) -> None:
     matrix, power = figure.subplots(1, 2, width_ratios=(1.9, 1))
     _matrix(matrix, found)
     _power(power, found)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def _matrix(axes: Axes, found: Score) -> None:

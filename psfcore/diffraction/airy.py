@@ -31,10 +31,10 @@ from scipy.integrate import cumulative_simpson
 from scipy.special import j0, j1, jn_zeros
 
 from psfcore.compiled import compiled
+from psfcore.instruments.workload import AIRY_STEP
 
 _MM_PER_ANGSTROM = 1e-7
 _UM_PER_MM = 1e3
-_TABLE_STEP = 0.02  # step in v of the table of B; B needs a step of about 1 to change noticeably
 NEAR_PX = 24
 # Number of points of the integral along an edge: within NEAR_PX of an axis, and farther out.
 NEAR_POINTS, FAR_POINTS = 48, 16
@@ -71,10 +71,10 @@ def airy_kernel(
     )
     half = size // 2
     v_per_px = math.pi / resolved_px
-    v = np.arange(0, v_per_px * (half + 1) * math.sqrt(2) + 2 * _TABLE_STEP, _TABLE_STEP)
+    v = np.arange(0, v_per_px * (half + 1) * math.sqrt(2) + 2 * AIRY_STEP, AIRY_STEP)
     table = airy_light_beyond(v, obscuration_diameter_mm / diameter_mm)
     near, far = (np.polynomial.legendre.leggauss(points) for points in (NEAR_POINTS, FAR_POINTS))
-    flux = _edge_fluxes(table, v_per_px / _TABLE_STEP, half, near, far)
+    flux = _edge_fluxes(table, v_per_px / AIRY_STEP, half, near, far)
     # Flux through the right edge minus flux through the left edge.
     out_x = np.diff(flux, axis=0, prepend=-flux[:1])[: half + 1]
     quarter = -(out_x.T + out_x)

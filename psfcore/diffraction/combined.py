@@ -34,10 +34,8 @@ from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, rotated_mesh_kernel
 from psfcore.diffraction.pupil import Pupil, entrance_pupil
 from psfcore.instruments.model import Instrument, Mesh, SpectralLine
+from psfcore.instruments.workload import MOST_MASK_SAMPLES, PERIOD_PX, windows_of
 
-MOST_SAMPLES = 32
-PERIOD_PX = 4096  # size of the transform: light wraps around at 4096 px, not at the 2048 px that are kept
-NARROW_WINDOWS = 400  # a series of at least 400 windows has narrow orders
 STEPS_A_PUPIL = 20  # steps of progress for each component
 AIRY, ENTRANCE_MESH, MOUNT, ENTRANCE = "AIRY", "ENTRANCE_MESH", "MOUNT", "ENTRANCE"
 FILTER_WHEEL, DIFFRACTION = "FILTER_WHEEL", "DIFFRACTION"
@@ -57,7 +55,7 @@ class Route:
 
     def __str__(self) -> str:
         if not self.mask:
-            too_many = f"{self.samples} samples a pixel are more than {MOST_SAMPLES}"
+            too_many = f"{self.samples} samples a pixel are more than {MOST_MASK_SAMPLES}"
             return f"{too_many}: analytic Airy pattern, entrance meshes as series, no mount"
         meshes = "in it" if self.meshes_in_mask else "as series"
         return f"Fraunhofer transform of the mask, {self.samples} samples a pixel, entrance meshes {meshes}"
@@ -82,7 +80,7 @@ def route_of(instrument: Instrument) -> Route:
         )
         for line in instrument.spectral_lines
     )
-    mask = samples <= MOST_SAMPLES
+    mask = samples <= MOST_MASK_SAMPLES
     plain = all(mesh.share == 1 and mesh.angle_deg % 90 == 0 for mesh in _meshes(instrument, "entrance"))
     return Route(
         samples=samples,
@@ -279,8 +277,7 @@ class _OneWavelength:
             "distance_mm": self.instrument.mesh_distance_mm(mesh),
             "pitch_um": mesh.pitch_um,
             "wire_um": mesh.wire_um,
-            # The orders get their width from the pattern of the aperture, so the orders of the series must be narrow.
-            "windows": max(mesh.windows, NARROW_WINDOWS) if mesh.place == "entrance" else mesh.windows,
+            "windows": windows_of(mesh),
             "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
             "size": self.size,
         }

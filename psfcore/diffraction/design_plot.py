@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from psfcore.diffraction.design_study import DesignStudy, MeshDesign
+from psfcore.drawing.plots import write_png
 
 _COLOURS = ("#1b4f8a", "#7b3fa0", "#c2402f", "#e0a100", "#2b8a6e", "#1b1b1b")
 _Number = Callable[[MeshDesign], float | None]
@@ -44,7 +44,7 @@ def design_png(study: DesignStudy, path: str | Path) -> None:
         axes.set_title(title, fontsize=11, loc="left")
         axes.set(xlabel="Pitch (um)", ylabel=label)
     figure.axes[0].legend(frameon=False, fontsize=9)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def _panel(axes: Any, study: DesignStudy, value: _Number) -> None:

@@ -39,10 +39,10 @@ from numpy.typing import NDArray
 from scipy.special import sici
 
 from psfcore.compiled import compiled
+from psfcore.instruments.workload import FINEST_CELL_PX
 
 _UM_PER_ANGSTROM = 1e-4
 _UM_PER_MM = 1e3
-_FINEST_CELL_PX = 0.02
 _LARGEST_CELL_PX = 0.4
 # The density of cells is proportional to the square root of light times width. _CELLS_AN_ORDER sets how many cells
 # are distributed over the light of one order, _CELLS_IN_ALL how many more over the light of the whole axis. An order that holds less than _FAINT_SHARE of all light gets fewer cells.
@@ -135,7 +135,7 @@ def _cells(
     whole lobe, or, where there is little light, several lobes. The middle of a cell is the centroid of its light.
     """
     lobe_px = spacing_px / windows
-    parts = max(1, int(np.ceil(lobe_px / _FINEST_CELL_PX)))
+    parts = max(1, int(np.ceil(lobe_px / FINEST_CELL_PX)))
     count = int(np.ceil(reach_px / lobe_px * parts))
     edges = np.asarray(np.arange(count + 1) * (lobe_px / parts), dtype=np.float64)
     points, weights = np.polynomial.legendre.leggauss(_GAUSS_POINTS)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from psfcore.diffraction.fresnel_study import DistanceResult, FresnelStudy
+from psfcore.drawing.plots import write_png
 
 SHOWN_PX = 30
 _FRESNEL, _COMBINED, _DIFFERENCE, _INK = "#1f6fb4", "#e0761a", "#2b8a4e", "#222222"
@@ -48,7 +48,7 @@ def fresnel_png(study: FresnelStudy, path: str | Path, *, distance_mm: float | N
     for axes in (centre_axes, curve_axes, distance_axes):
         axes.grid(which="major", color="#dddddd", linewidth=0.7)
         axes.spines["top"].set_visible(False)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def _draw_centre(axes: Any, shown: DistanceResult, centre: int) -> None:

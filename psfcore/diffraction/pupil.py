@@ -38,6 +38,7 @@ CIRCLE_CORNERS = 4096
 _UM_PER_MM = 1e3
 # A ring that crosses the rim is a mistake in the instrument file; by rounding a ring may exceed the rim by this length.
 _RIM_TOLERANCE_MM = 1e-6
+_FARTHEST_CORNER = 100
 
 Corners = NDArray[np.float64]
 Outline = tuple[Corners, ...]
@@ -80,7 +81,7 @@ def entrance_pupil(
 
     mount_image: pixels [y, x] of the mount's mask image; row 0 is at the lowest y, and 0 is opaque.
     Raises DataError "bad-mount", with the name of the key: if the hub or a ray is as wide as the aperture, if a ring
-    crosses the rim, or if the mask image is missing or cannot be used.
+    crosses the rim, if a corner is far outside, or if the mask image is missing or cannot be used.
     """
     radius_mm = aperture.diameter_mm / 2
     opening: Outline = (circle(radius_mm),)
@@ -139,7 +140,13 @@ def _mount_outlines(mount: Mount, rim_mm: float) -> list[Outline]:
             raise DataError("bad-mount", f"{wanted}; got {inner_mm:g} to {outer_mm:g} mm")
         hole = (circle(inner_mm)[::-1],) if inner_mm > 0 else ()
         outlines.append((circle(outer_mm), *hole))
-    return outlines + [(np.array(polygon.corners_mm, dtype=np.float64),) for polygon in mount.polygons]
+    for index, polygon in enumerate(mount.polygons):
+        corners = np.array(polygon.corners_mm, dtype=np.float64)
+        if np.abs(corners).max() > _FARTHEST_CORNER * 2 * rim_mm:
+            wanted = f"mount.polygons.{index}: expected corners within {_FARTHEST_CORNER} diameters of the aperture"
+            raise DataError("bad-mount", f"{wanted}; got a corner at {np.abs(corners).max():g} mm")
+        outlines.append((corners,))
+    return outlines
 
 
 def _mask_picture(

@@ -5,14 +5,19 @@ Each plot has its own figure on the Agg canvas, so threads and processes share n
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, FuncNorm, LinearSegmentedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.text import Text
+from matplotlib.ticker import FixedFormatter, FuncFormatter
 from numpy.typing import NDArray
 
 from psfcore.psf import Psf, crop_centred, cumulative_curve, radial_profile
@@ -51,6 +56,30 @@ INK = "#222222"
 Plane = NDArray[np.floating]
 
 
+def write_png(figure: Figure, target: str | Path | IO[bytes], **options: Any) -> None:
+    """Draw a figure and write it as PNG. options: of ``FigureCanvasAgg.print_png``.
+
+    Matplotlib reads texts between two dollar signs as formulas, and fails if they are none. Titles and labels contain names from
+    files, so they are drawn as they are. Only the numbers at the axes are formulas, such as 10^3.
+    """
+    for text in _plain_texts(figure):
+        text.set_parse_math(False)
+    FigureCanvasAgg(figure).print_png(target, **options)
+
+
+def _plain_texts(artist: Artist) -> Iterator[Text]:
+    """All texts of a figure except the numbers at its axes."""
+    if isinstance(artist, Axis):
+        yield artist.label
+        if isinstance(artist.get_major_formatter(), FixedFormatter | FuncFormatter):
+            yield from artist.get_ticklabels()
+        return
+    if isinstance(artist, Text):
+        yield artist
+    for child in artist.get_children():
+        yield from _plain_texts(child)
+
+
 def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str) -> None:
     """Draw three panels [y, x], first row at the bottom: before, after (same stretch), change in percent.
 
@@ -80,7 +109,7 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
         else:
             axes.set_yticks([])
         colourbar(figure, axes, drawn, beyond="both" if name == "Change" else "max")
-    FigureCanvasAgg(figure).print_png(str(path), pil_kwargs={"compress_level": 3})
+    write_png(figure, path, pil_kwargs={"compress_level": 3})
 
 
 def psf_png(psf: Psf, path: str | Path) -> None:
@@ -122,7 +151,7 @@ def psf_png(psf: Psf, path: str | Path) -> None:
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
     figure.legend(loc="outside lower center", ncols=len(kernels), frameon=False, reverse=True)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
-from psfcore.drawing.plots import CHANGE, INK
+from psfcore.drawing.plots import CHANGE, INK, write_png
 from psfcore.evaluation.evaluation import Evaluation
 from psfcore.evaluation.frame import FrameEvaluation, Slice
 from psfcore.evaluation.report import summaries
@@ -74,7 +73,7 @@ def evaluation_png(
         draw_offsets(offsets, study)
         charts += offsets
     tidy(charts)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def tidy(charts: Sequence[Any]) -> None:

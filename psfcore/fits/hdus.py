@@ -6,6 +6,7 @@ gives equal bytes.
 
 from __future__ import annotations
 
+import errno
 import struct
 import zlib
 from pathlib import Path
@@ -18,6 +19,7 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
+from psfcore.fits.compression import compression_of
 from psfcore.fits.header import HeaderSummary
 from psfcore.fits.tiles import check_tiles
 
@@ -34,6 +36,7 @@ PIXEL_TROUBLE = (
     AttributeError,
     ArithmeticError,
     RuntimeError,
+    AssertionError,  # astropy raises it for the name of a column
     struct.error,
     zlib.error,
 )
@@ -42,14 +45,18 @@ PIXEL_TROUBLE = (
 def read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.float64], fits.Header]:
     """Pixels [y, x] (float64) and header of the image that `summary` describes.
 
-    Raises DataError "unreadable-pixels" or "tile-too-large", and OSError if the disk fails.
+    Raises DataError "unreadable-pixels", "bad-tile" or "tile-too-large", and OSError if the disk fails.
     """
     try:
         if summary.codec is not None:
             _check_tiles(path, summary)
         # uint=False: otherwise astropy converts unsigned integers (BZERO 32768) before it applies BLANK.
-        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, uint=False) as hdus:
+        # astropy also looks at the HDU after a first one, which is not checked. It must not prepare it for decompression.
+        options = {"uint": False, "disable_image_compression": summary.codec is None}
+        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, **options) as hdus:
             hdu = hdus[summary.hdu]
+            if hdu.shape != summary.shape:
+                raise _other_shape(summary, hdu.shape)
             header = hdu.header.copy()
             data = hdu.data
             pixels = np.array(data, dtype=np.float64)
@@ -60,19 +67,23 @@ def read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.fl
         message = f"expected readable pixels in HDU {summary.hdu} of {Path(path).name}; got: {error!s:.120}"
         raise DataError("unreadable-pixels", message) from None
     if pixels.shape != summary.shape:
-        message = f"expected {summary.shape} pixels, as the header declares; got {pixels.shape}"
-        raise DataError("unreadable-pixels", message)
+        raise _other_shape(summary, pixels.shape)
     return pixels, header
+
+
+def _other_shape(summary: HeaderSummary, got: tuple[int, ...]) -> DataError:
+    return DataError(
+        "unreadable-pixels", f"expected {summary.shape} pixels, as the header declares; got {got}"
+    )
 
 
 class _TableHeap:
     """The heap after the rows of a binary table. It holds the compressed tiles."""
 
-    def __init__(self, hdu: fits.BinTableHDU) -> None:
+    def __init__(self, hdu: fits.BinTableHDU, first: int) -> None:
         place = hdu.fileinfo()
         self._file = place["file"]
-        rows_bytes = hdu.header["NAXIS1"] * hdu.header["NAXIS2"]
-        self._first = place["datLoc"] + int(hdu.header.get("THEAP", rows_bytes))
+        self._first = place["datLoc"] + first
 
     def read(self, offset: int, count: int) -> bytes:
         self._file.seek(self._first + offset)
@@ -80,19 +91,17 @@ class _TableHeap:
 
 
 def _check_tiles(path: str | Path, summary: HeaderSummary) -> None:
-    """Raise DataError "tile-too-large" if a tile, when decompressed, has more pixels than its header declares."""
+    """Check the tiles, and the header again as astropy reads it. Raises HeaderError and the errors of `check_tiles`."""
     with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as hdus:
         table = hdus[summary.hdu]
-        tile_pixels = int(table.header.get("ZTILE1", summary.shape[1])) * int(table.header.get("ZTILE2", 1))
-        formats = {column.name: column.format for column in table.columns}
-        rows = np.asarray(table.data).view(np.ndarray)
-        assert summary.codec is not None
-        check_tiles(rows, formats, _TableHeap(table), summary.codec, tile_pixels)
+        ny, nx = summary.shape
+        image = compression_of(table.header, nx, ny)
+        check_tiles(np.asarray(table.data).view(np.ndarray), image, _TableHeap(table, image.first))
 
 
 def _raise_if_storage(error: Exception) -> None:
-    """Raise the error again if the disk caused it, and not the content of the file."""
-    if isinstance(error, OSError) and error.errno is not None:
+    """Raise the error again if the disk caused it, and not the content of the file, such as a negative size."""
+    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
         raise error
 
 

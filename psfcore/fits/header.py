@@ -12,16 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import (
-    FitsLimits,
-    card_count,
-    card_flag,
-    card_text,
-    card_trouble,
-    first_image,
-    open_source,
-    walk,
-)
+from psfcore.fits.blocks import FitsLimits, first_image, open_source, walk
+from psfcore.fits.cards import card_count, card_flag, card_text, card_trouble
 from psfcore.instruments.files import match_instrument
 
 if TYPE_CHECKING:

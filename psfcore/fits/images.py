@@ -17,7 +17,7 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import card_trouble
+from psfcore.fits.cards import card_trouble
 from psfcore.fits.hdus import ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import FitsLimits, optional_exposure_s, optional_text, read_summary
 from psfcore.fits.planes import Meanings, check_plane, plane_hdu
@@ -154,10 +154,19 @@ def _kept_header(source: fits.Header) -> fits.Header:
             continue
         readable = _readable(card)
         if readable is None:
-            kept.add_history("card kept as text: " + ascii_text(card.image.rstrip()))
+            kept.add_history(_as_text(card))
         else:
             kept.append(readable, end=True)
     return kept
+
+
+def _as_text(card: fits.Card) -> str:
+    try:
+        return "card kept as text: " + ascii_text(card.image.rstrip())
+    except (
+        card_trouble()
+    ):  # astropy repairs a damaged card before it shows it, and some cards cannot be repaired
+        return f"card {ascii_text(card.keyword)} left out: it cannot be read"
 
 
 def _readable(card: fits.Card) -> fits.Card | None:

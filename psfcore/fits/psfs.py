@@ -13,6 +13,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
+from psfcore.fits.columns import read_columns
 from psfcore.fits.hdus import PIXEL_TROUBLE, ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import (
     FitsLimits,
@@ -177,6 +178,8 @@ def _read_extras(
             for hdu in hdus[1:]:
                 if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
                     components[hdu.name] = np.array(hdu.data, dtype=np.float64)
+                elif not _is_plain_table(hdu):
+                    continue
                 elif hdu.name == "INSTRUMENT":
                     text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
                     provenance["instrument_toml"] = text.decode("utf-8")
@@ -186,3 +189,10 @@ def _read_extras(
         message = f"expected readable extensions in {Path(path).name}; got: {error!s:.120}"
         raise DataError("unreadable-pixels", message) from None
     return components, provenance, fitted
+
+
+def _is_plain_table(hdu: Any) -> bool:
+    """Whether an HDU is a table whose columns need exactly its rows, as in the files of write_psf."""
+    if not isinstance(hdu, fits.BinTableHDU):
+        return False
+    return not any(column.in_heap for column in read_columns(hdu.header))

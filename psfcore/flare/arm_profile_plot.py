@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from psfcore.drawing.plots import INK
+from psfcore.drawing.plots import INK, write_png
 from psfcore.flare.arm_profile import BOX_PX, MATCHED_PX, FlareComparison, FlareFit
 
 _OBSERVED, _TOTAL, _ALONE = "#6d6d6d", "#c2402f", "#7b3fa0"
@@ -43,7 +42,7 @@ def flare_png(
         axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def _heading(found: FlareComparison) -> str:

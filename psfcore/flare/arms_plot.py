@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from psfcore.drawing.plots import write_png
 from psfcore.flare.arms import ArmMeasurement
 
 _COLOURS = ("#c2402f", "#1b4f8a", "#2b8a6e", "#e0a100", "#7b3fa0", "#1b1b1b")
@@ -32,7 +32,7 @@ def arms_png(image: NDArray[np.float64], found: ArmMeasurement, path: str | Path
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.35))
     _draw_image(figure, left, image, found, unit)
     _draw_cuts(right, image, found)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def _draw_image(

@@ -24,7 +24,16 @@ _LEAST, _MOST = 1e-9, 1e9
 Size = Annotated[float, Field(ge=_LEAST, le=_MOST, allow_inf_nan=False)]
 SizeOrNone = Annotated[float, Field(ge=0, le=_MOST, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Place = Annotated[float, Field(ge=-_MOST, le=_MOST, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
+# The numbers of parts of an instrument. Memory and time of a PSF grow with them; the shipped instruments have at most 3
+# meshes of 551 windows, 8 rays, 2 rings and 1 spectral line.
+MOST_BYTES = 65_536
+MOST_LINES, MOST_MIRRORS, MOST_MESHES, MOST_WINDOWS = 64, 16, 16, 10_000
+MOST_RAYS, MOST_RINGS, MOST_POLYGONS, MOST_CORNERS = 256, 64, 64, 1024
+MOST_KEYS = 64
+Windows = Annotated[int, Field(ge=1, le=MOST_WINDOWS)]
+Name = Annotated[str, Field(max_length=80)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 
 
@@ -48,7 +57,7 @@ class Detector(_Frozen):
     pixels: Count
     readout_pixels: Count
     plate_scale_arcsec: Size
-    gain_modes: dict[str, GainMode] = {}
+    gain_modes: Annotated[dict[Name, GainMode], Field(max_length=MOST_KEYS)] = {}
 
 
 class Aperture(_Frozen):
@@ -70,13 +79,13 @@ class SpectralLine(_Frozen):
     """A spectral line of the bandpass and its share of the light; the shares are normalised to sum 1."""
 
     wavelength_angstrom: Size
-    weight: Positive
+    weight: Size
 
 
 class Mirror(_Frozen):
     """A conic mirror. Its sag is r^2 / (R (1 + sqrt(1 - (1 + K) r^2 / R^2)))."""
 
-    name: str
+    name: Name
     radius_mm: Size
     conic: Number
     diameter_mm: Size
@@ -100,11 +109,11 @@ class Mesh(_Frozen):
     ``share``: the fraction of the light that crosses this mesh, if several meshes are mounted side by side.
     """
 
-    name: str
+    name: Name
     place: Literal["entrance", "filter_wheel"]
     pitch_um: Size
     wire_um: Size
-    windows: Count
+    windows: Windows
     angle_deg: Number = 0.0
     share: Annotated[float, Field(gt=0, le=1)] = 1.0
 
@@ -118,7 +127,7 @@ class Mesh(_Frozen):
 class Rays(_Frozen):
     """Straight bars from the hub (or the centre) to the rim, at equal angles."""
 
-    count: Count
+    count: Annotated[int, Field(ge=1, le=MOST_RAYS)]
     width_mm: Size
     first_angle_deg: Number = 0.0
 
@@ -133,7 +142,7 @@ class Ring(_Frozen):
 class Polygon(_Frozen):
     """An opaque polygon with corners (x, y) in mm from the centre of the aperture."""
 
-    corners_mm: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=3)]
+    corners_mm: Annotated[tuple[tuple[Place, Place], ...], Field(min_length=3, max_length=MOST_CORNERS)]
 
 
 class MaskImage(_Frozen):
@@ -150,11 +159,31 @@ class Mount(_Frozen):
     """The mount of the entrance filter. ``basis``: the origin of its description."""
 
     basis: Literal["drawing", "assumed"]
-    rays: tuple[Rays, ...] = ()
-    rings: tuple[Ring, ...] = ()
+    rays: Annotated[tuple[Rays, ...], Field(max_length=MOST_RAYS)] = ()
+    rings: Annotated[tuple[Ring, ...], Field(max_length=MOST_RINGS)] = ()
     hub_diameter_mm: SizeOrNone = 0.0
-    polygons: tuple[Polygon, ...] = ()
+    polygons: Annotated[tuple[Polygon, ...], Field(max_length=MOST_POLYGONS)] = ()
     mask_image: MaskImage | None = None
+
+    @model_validator(mode="after")
+    def _few_outlines(self) -> Mount:
+        for most, got, parts in (
+            (MOST_RAYS, self.ray_count, "rays"),
+            (MOST_CORNERS, self.corner_count, "corners of polygons"),
+        ):
+            if got > most:
+                raise ValueError(f"expected at most {most} {parts} in all; got {got}")
+        return self
+
+    @property
+    def ray_count(self) -> int:
+        """Number of rays of all groups."""
+        return sum(rays.count for rays in self.rays)
+
+    @property
+    def corner_count(self) -> int:
+        """Number of corners of all polygons."""
+        return sum(len(polygon.corners_mm) for polygon in self.polygons)
 
 
 class Scatter(_Frozen):
@@ -173,13 +202,13 @@ class Instrument(_Frozen):
     version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")]
     status: Literal["draft", "released"]
     wavelength_angstrom: Size
-    bandpass: tuple[SpectralLine, ...] = ()
+    bandpass: Annotated[tuple[SpectralLine, ...], Field(max_length=MOST_LINES)] = ()
     focal_length_mm: Size
-    match: dict[str, str] = {}
+    match: Annotated[dict[Name, Name], Field(max_length=MOST_KEYS)] = {}
     aperture: Aperture
-    mirrors: tuple[Mirror, ...] = ()
+    mirrors: Annotated[tuple[Mirror, ...], Field(max_length=MOST_MIRRORS)] = ()
     distances: Distances | None = None
-    meshes: tuple[Mesh, ...] = ()
+    meshes: Annotated[tuple[Mesh, ...], Field(max_length=MOST_MESHES)] = ()
     mount: Mount | None = None
     detector: Detector
     scatter: Scatter | None = None
@@ -214,7 +243,8 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     is_file = isinstance(name_or_path, Path) or name_or_path.endswith(".toml")
     path = Path(name_or_path) if is_file else instrument_path(str(name_or_path))
     try:
-        text = path.read_text("utf-8")
+        with path.open("rb") as file:
+            text = file.read(MOST_BYTES + 1).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise DataError("bad-instrument-file", f"{path.name}: expected TOML in UTF-8; {reason}") from None
@@ -226,6 +256,8 @@ def parse_instrument(text: str, label: str) -> Instrument:
 
     Raises DataError "bad-instrument-file": one line with the key, the expected and the given value.
     """
+    if len(text) > MOST_BYTES:
+        raise DataError("bad-instrument-file", f"{label}: expected at most {MOST_BYTES} characters; got more")
     try:
         return Instrument.model_validate(_parse_toml(text))
     except ValidationError as error:

@@ -6,12 +6,12 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from psfcore.drawing.page import PLOT_DPI
+from psfcore.drawing.plots import write_png
 from psfcore.evaluation.evaluation import Evaluation
 from psfcore.evaluation.plot import (
     draw_absolute,
@@ -334,7 +334,7 @@ def _plain_ticks(axes: Any) -> None:
 
 def _png(figure: Figure) -> bytes:
     out = BytesIO()
-    FigureCanvasAgg(figure).print_png(out)
+    write_png(figure, out)
     return out.getvalue()
 
 

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from psfcore.drawing.plots import INK
+from psfcore.drawing.plots import INK, write_png
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.as_published.published import Published
 from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
@@ -63,7 +62,7 @@ def fit_png(fit: TransitFit, path: str | Path) -> None:
         axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def _draw_weights(axes: Any, fit: TransitFit) -> None:

@@ -25,6 +25,10 @@ from psfcore.noise_figures import NoiseFigures
 MANIFEST_NAME = "transit.json"
 MAX_IMAGES = 2000
 MAX_MANIFEST_BYTES = 4 * 2**20
+# Every value of a JSON text except the first follows one of these characters. Python needs about 100 bytes for a value,
+# so the number of values is limited before the text is read. An image of today's format has 5 values.
+_BEFORE_VALUES = (b",", b"[", b"{")
+MAX_VALUES = 64 * MAX_IMAGES
 FARTHEST_PX = 1e6
 LARGEST_RADIUS_PX = 4096.0
 _DRIVE = re.compile(r"[A-Za-z]:")
@@ -133,12 +137,19 @@ def parse_manifest(content: bytes) -> TransitManifest:
     """
     if len(content) > MAX_MANIFEST_BYTES:
         raise _bad(f"expected at most {MAX_MANIFEST_BYTES} bytes; got more")
+    values = sum(content.count(character) for character in _BEFORE_VALUES)
+    if values > MAX_VALUES:
+        raise _bad(f"expected at most {MAX_VALUES} of the characters ',', '[' and '{{'; got {values}")
     try:
         data = json.loads(content.decode("utf-8-sig"))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError, ValueError) as error:
         raise _bad(f"expected JSON in UTF-8; got: {str(error) or type(error).__name__:.120}") from None
     if not isinstance(data, dict):
         raise _bad(f"expected a JSON object; got {type(data).__name__}")
+    # pydantic builds a model of every image before it counts the images.
+    images = data.get("images")
+    if isinstance(images, list) and len(images) > MAX_IMAGES:
+        raise _bad(f"images: expected at most {MAX_IMAGES} images; got {len(images)}")
     try:
         manifest = TransitManifest.model_validate(data)
     except ValidationError as error:

@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
 from workers.contract.methods import Method, Parameters, RichardsonLucy
 
@@ -57,7 +58,9 @@ class PsfBuild(Parameters):
     algorithm_version: ClassVar[int] = 2
     instrument: str | None = Field(None, description="name of a shipped instrument file, for example hri_euv")
     instrument_file: str | None = Field(
-        None, max_length=65536, description="text of your own instrument file (TOML), instead of `instrument`"
+        None,
+        max_length=MOST_BYTES,
+        description="text of your own instrument file (TOML), instead of `instrument`",
     )
     mask_id: Identity | None = Field(
         None,

@@ -51,17 +51,31 @@ class Deconvolution(_Frozen):
 
 
 class Build(_Frozen):
-    """Time of a PSF build for each spectral line of the bandpass. A mask is sampled at S^2 points per pixel; ``samples`` limits S."""
+    """Time of a PSF build for each spectral line of the bandpass, and its memory. A mask is sampled at S^2 points per pixel.
+
+    The sizes are those of ``psfcore.instruments.workload``. Suffix _ns: time for each point, cell, window or entry;
+    _bytes: memory.
+    """
 
     disc_s: float
     mesh_s: float
     mask_s: float
-    samples: tuple[int, int]  # smallest and largest S; a mask that needs a larger S is treated as a disc
+    fewest_samples: int  # smallest S
     samples_exponent: float
     grid_px: int
     grid_exponent: float
     grid_mib: float
     meshes_mib: float
+    airy_ns: float
+    airy_bytes: float
+    cell_ns: float
+    cell_bytes: float
+    window_ns: float  # for each window and pixel of an edge of the grid
+    outlines: int  # outlines of a mount that ``mask_s`` includes
+    entry_ns: float  # for each further entry of the list of edges, and each S
+    entry_bytes: float
+    spectrum_bytes: float  # for each row of the mask and pixel of an edge of the grid
+    image_bytes: float  # for each pixel of a mask image
 
 
 class Costs(_Frozen):

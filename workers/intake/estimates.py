@@ -22,6 +22,7 @@ from weakref import WeakKeyDictionary
 
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
+from psfcore.instruments.workload import workload
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.contract.identities import instrument_text
@@ -90,7 +91,7 @@ def estimate(
     if kind == "deconvolve":
         cpu_s, mib = _deconvolution(parameters, catalogue, owner)
     elif kind == "psf-build":
-        cpu_s, mib = _build(parameters)
+        cpu_s, mib = _build(parameters, _mask_px(parameters, catalogue, owner))
     else:
         cpu_s, mib = _linear(kind, parameters, catalogue, owner)
     start_s = cpu_s / threads**COSTS.threads_exponent
@@ -128,7 +129,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
         psf_shape = tuple(psf.details["shape"])
     elif parameters.get("psf_recipe") is not None:  # the PSF may still have to be built
         recipe = parameters["psf_recipe"]
-        built_s, built_mib = _build(recipe)
+        built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
         psf_shape = (recipe["size"], recipe["size"])
     method = parameters["method"]
     margin = 2 * _margin_px(method, (ny, nx), max(psf_shape))
@@ -157,27 +158,41 @@ def _of_method(figures: Mapping[str, float], method: Mapping[str, Any]) -> float
     return figures.get(method["name"], max(figures.values()))
 
 
-def _build(parameters: Mapping[str, Any]) -> tuple[float, float]:
+def _mask_px(recipe: Mapping[str, Any], catalogue: Catalogue, owner: str) -> int:
+    """Number of pixels of the mask image of a PSF build; 0 if it has none."""
+    image = catalogue.get(ImageRow, recipe.get("mask_id") or "", owner)
+    return 0 if image is None else math.prod(image.summary["shape"])
+
+
+def _build(parameters: Mapping[str, Any], mask_px: int = 0) -> tuple[float, float]:
     cost = COSTS.kinds.psf_build
-    grid = max(parameters["size"], cost.grid_px) / cost.grid_px
+    size = max(parameters["size"], cost.grid_px)
+    grid = size / cost.grid_px
     if not (parameters.get("instrument") or parameters.get("instrument_file")):
         # This is a rerun. The text of the instrument file is in the file of the PSF, which is not read here.
         return cost.mask_s, cost.meshes_mib + cost.grid_mib * grid**2
     build = PsfBuild.model_validate(parameters)
     instrument = parse_instrument(instrument_text(build), build.instrument or "instrument_file")
-    shortest_mm = min(line.wavelength_angstrom for line in instrument.spectral_lines) * 1e-7
-    resolved_mm = shortest_mm * instrument.focal_length_mm / (instrument.detector.pixel_pitch_um * 1e-3)
-    fewest, most = cost.samples
-    samples = max(fewest, 2 * instrument.aperture.diameter_mm / resolved_mm)
-    mask = samples <= most and (instrument.mount is not None or bool(instrument.meshes))
+    work = workload(instrument, size)
     line_s = cost.disc_s + cost.mesh_s * len(instrument.meshes)
-    if mask:
-        line_s += cost.mask_s * (samples / fewest) ** cost.samples_exponent
-    meshes_mib = cost.meshes_mib if mask or instrument.meshes else 0.0
-    return (
-        len(instrument.spectral_lines) * line_s * grid**cost.grid_exponent,
-        meshes_mib + cost.grid_mib * grid**2,
+    if work.mask:
+        samples = max(cost.fewest_samples, work.samples)
+        line_s += cost.mask_s * (samples / cost.fewest_samples) ** cost.samples_exponent
+        further = max(0, work.mount_entries - cost.outlines * work.mask_cells)
+        masks = 2 if instrument.meshes else 1  # the mount alone, and with the meshes
+        line_s += masks * cost.entry_ns * 1e-9 * further * samples
+    line_s *= grid**cost.grid_exponent
+    line_s += 1e-9 * (cost.airy_ns * work.airy_points + cost.cell_ns * sum(work.cells))
+    line_s += 1e-9 * cost.window_ns * sum(work.windows) * size
+    meshes_mib = cost.meshes_mib if work.mask or instrument.meshes else 0.0
+    # Meshes, the analytic pattern and the mask are computed one after the other.
+    arrays = max(
+        cost.airy_bytes * work.airy_points,
+        cost.cell_bytes * max(work.cells, default=0),
+        cost.entry_bytes * work.mount_entries + cost.spectrum_bytes * work.mask_cells * size,
     )
+    arrays += cost.image_bytes * mask_px
+    return len(instrument.spectral_lines) * line_s, meshes_mib + cost.grid_mib * grid**2 + arrays / MIB
 
 
 def _linear(
@@ -193,7 +208,8 @@ def _linear(
         cpu_s += parameters["runs"] * (run_s + run_ns * 1e-9 * pixels)
     built_s, built_mib = 0.0, 0.0
     if parameters.get("diffraction_recipe") is not None:
-        built_s, built_mib = _build(parameters["diffraction_recipe"])
+        recipe = parameters["diffraction_recipe"]
+        built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
     return built_s + cpu_s, max(built_mib, cost.base_mib + cost.pixel_bytes * pixels / MIB)
 
 

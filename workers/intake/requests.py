@@ -11,6 +11,7 @@ from psfcore.fits.header import IMAGE, check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import parse_instrument
+from psfcore.instruments.workload import check_workload
 from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
@@ -82,7 +83,8 @@ def resolve_by_ids(asked: Asked) -> Parameters:
 def resolve_psf_build(asked: Asked) -> Parameters:
     """Check the instrument file and the mask of a PSF build."""
     build: PsfBuild = asked.parameters
-    parse_instrument(instrument_text(build), build.instrument or "instrument_file")
+    label = build.instrument or "instrument_file"
+    check_workload(parse_instrument(instrument_text(build), label), label)
     if build.mask_id is not None:
         _image(asked.catalogue, build.mask_id, asked.owner)
     return build

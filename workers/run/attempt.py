@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextvars
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +15,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.contract.phases import Phase
+from workers.contract.phases import Fault, JobError, Phase
+from workers.run.child import Child
 from workers.run.stopping import Stopping
 from workers.tasks.stage_timer import StageTimer
 
@@ -33,6 +35,10 @@ class TookTooLong(Exception):
             f"time: send a smaller request, or ask the operator for a higher limit"
         )
 
+    def as_error(self) -> JobError:
+        """The error of the job."""
+        return JobError(fault=Fault.USER, code="took-too-long", message=str(self))
+
 
 class Cancelled(Exception):
     """The job was cancelled, or this worker lost its lease. The task must stop and write no result."""
@@ -40,7 +46,11 @@ class Cancelled(Exception):
 
 @dataclass
 class Attempt:
-    """A claimed job while it runs. A report of progress later than ``limit_s`` after ``started`` stops the job."""
+    """A claimed job while it runs. A report of progress later than ``limit_s`` after ``started`` stops the job.
+
+    child: the process, if it may be ended. It is ended if the job does not stop within ``cancel_s`` after it had to, and
+    if the thread of the heartbeats cannot run for ``silent_s``.
+    """
 
     catalogue: Catalogue
     lease: Lease
@@ -48,6 +58,9 @@ class Attempt:
     stopping: Stopping
     also_report: Progress | None
     limit_s: float
+    child: Child | None = None
+    cancel_s: float = math.inf
+    silent_s: float = math.inf
     started: float = field(default_factory=time.monotonic)
     stopped: threading.Event = field(default_factory=threading.Event)
     ended: threading.Event = field(default_factory=threading.Event)
@@ -59,6 +72,8 @@ class Attempt:
         """Send heartbeats from another thread while the block runs."""
         run = contextvars.copy_context().run
         name = f"heartbeat {self.lease.job_id}"
+        if self.child is not None:
+            self.child.expect_news_within(self.silent_s)
         heart = threading.Thread(target=run, args=(self._beat,), name=name, daemon=True)
         heart.start()
         try:
@@ -66,11 +81,15 @@ class Attempt:
         finally:
             self.ended.set()
             heart.join()
+            if self.child is not None:
+                self.child.expect_no_news()
 
     def _beat(self) -> None:
         """Send heartbeats until the attempt ends or is cancelled. If the worker has to stop, hand the job back."""
         while not self.ended.wait(self.heartbeat_s):
             try:
+                if self.child is not None:
+                    self.child.expect_news_within(self.silent_s)
                 if self.stopping.due and self.catalogue.jobs.hand_back(self.lease):
                     log.warning("job %s: handed back because this worker is stopping", self.lease.job_id)
                     self.stopped.set()
@@ -80,9 +99,35 @@ class Attempt:
                 # Try again at the next heartbeat. If the database stays away, the lease expires and another worker gets the job.
                 log.warning("job %s: could not write the heartbeat: %s", self.lease.job_id, error)
                 continue
+            except MemoryError as error:
+                # The job is at its limit, which concerns the task. The next heartbeat may find memory again.
+                log.warning("job %s: no memory for the heartbeat: %s", self.lease.job_id, error)
+                continue
             if not alive:
                 self.stopped.set()
+                self._end_if_deaf()
                 return
+            if time.monotonic() - self.started > self.limit_s + self.cancel_s:
+                self._give_up(
+                    lambda: self.catalogue.jobs.fail(self.lease, TookTooLong(self.limit_s).as_error())
+                )
+
+    def _end_if_deaf(self) -> None:
+        """Wait until the task has noticed that it must stop. If it does not, end the process."""
+        if self.child is not None and not self.ended.wait(self.cancel_s):
+            self._give_up(lambda: self.catalogue.jobs.abort(self.lease))
+
+    def _give_up(self, record: Callable[[], bool]) -> None:
+        """Record the outcome of a job whose task does not respond, and end the process."""
+        if self.child is None:
+            return
+        log.error("job %s: its task does not stop: ending this process, which is replaced", self.lease.job_id)
+        try:
+            record()
+        except SQLAlchemyError as error:
+            # The lease expires, and then the job is aborted or queued again.
+            log.warning("job %s: could not write its outcome: %s", self.lease.job_id, error)
+        self.child.end()
 
     def report(self, stage: str, step: int, steps: int) -> None:
         """Tasks call this at each step. Raises ``Cancelled`` or ``TookTooLong`` if the work must stop."""

@@ -8,7 +8,8 @@ import os
 import socket
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
@@ -24,6 +25,7 @@ from workers.contract.phases import Fault, JobError, Phase
 from workers.contract.queues import Queue
 from workers.files.store import Store
 from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTooLong
+from workers.run.child import MARGIN, Child, allowed_mib, is_out_of_memory
 from workers.run.stopping import Stopping
 from workers.settings import Settings
 from workers.tasks.context import Context, TurnOver
@@ -56,11 +58,15 @@ class Runner:
         call_for_help: Callable[[str, int], None] = lambda job_id, workers: None,
         stopping: Stopping | None = None,
         submit: Callable[[str, Queue], bool] = lambda job_id, queue: False,
+        child: Child | None = None,
     ) -> None:
-        """submit: function that sends an unfinished job to the broker again. If it returns False, the reconciler sends the job."""
+        """submit: function that sends an unfinished job to the broker again. If it returns False, the reconciler sends the job.
+        child: this process, if its memory may be limited and it may be ended; None: the process is somebody else's.
+        """
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit
         self._stopping = stopping or Stopping()
+        self._child = child
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
         """Run the job if it is queued. Otherwise do nothing: the message was delivered twice, or the job was cancelled or claimed."""
@@ -95,7 +101,15 @@ class Runner:
             log.info("job %s: %s starts, attempt %d", job.id, job.kind, job.attempt)
             settings = self._settings
             attempt = Attempt(
-                self._catalogue, lease, settings.heartbeat_s, self._stopping, on_progress, settings.max_job_s
+                self._catalogue,
+                lease,
+                settings.heartbeat_s,
+                self._stopping,
+                on_progress,
+                settings.max_job_s,
+                child=self._child,
+                cancel_s=settings.cancel_s,
+                silent_s=settings.silent_s,
             )
             try:
                 with attempt.beating():
@@ -123,7 +137,8 @@ class Runner:
         )
         with logs.bound(job=job.id, owner=job.owner):
             try:
-                assistant(context, job.parameters)
+                with self._limited(job):
+                    assistant(context, job.parameters)
             except Cancelled:
                 log.info("job %s: this worker stops assisting", job_id)
             except Exception:
@@ -147,22 +162,22 @@ class Runner:
         )
         try:
             self._check_room(job)
-            result_id = KINDS[job.kind].load_task()(context, job.parameters)
+            with self._limited(job):
+                result_id = KINDS[job.kind].load_task()(context, job.parameters)
         except TurnOver:
             self._let_others_go_first(job, lease)
         except Cancelled:
             aborted = self._persist(lambda: self._catalogue.jobs.abort(lease))
             log.info("job %s: %s", job.id, "aborted" if aborted else "lease lost; another worker has the job")
         except TookTooLong as error:
-            self._fail(lease, Fault.USER, "took-too-long", str(error))
+            self._fail(lease, error.as_error())
         except DataError as error:
-            self._fail(lease, Fault.USER, error.code, error.message)
+            self._fail(lease, JobError(fault=Fault.USER, code=error.code, message=error.message))
         except TRANSIENT as error:
             self._retry(job, lease, error)
         except Exception as error:
             log.exception("job %s failed", job.id)
-            internal = _internal(job, error)
-            self._fail(lease, internal.fault, internal.code, internal.message)
+            self._fail(lease, self._unexpected(job, error))
         else:
             completed = self._persist(lambda: self._catalogue.jobs.complete(lease, result_id))
             outcome = (
@@ -211,13 +226,37 @@ class Runner:
         except (Cancelled, *TRANSIENT):
             raise
         except TookTooLong as error:
-            return JobError(fault=Fault.USER, code="took-too-long", message=str(error))
+            return error.as_error()
         except DataError as error:
             return JobError(fault=Fault.USER, code=error.code, message=error.message)
         except Exception as error:
             log.exception("job %s: a piece of its work failed", job.id)
-            return _internal(job, error)
+            return self._unexpected(job, error)
         return None
+
+    @contextmanager
+    def _limited(self, job: JobRow) -> Iterator[None]:
+        """Limit the memory of the block to the estimate of the job, if this process may be limited."""
+        if self._child is None:
+            yield
+            return
+        with self._child.limited(self._estimate_mib(job)):
+            yield
+
+    def _estimate_mib(self, job: JobRow) -> int:
+        """The memory for which the job was admitted, MiB. Without an estimate, it is the operator's limit."""
+        return int((job.estimate or {}).get("memory_mib", self._settings.max_job_memory_mib))
+
+    def _unexpected(self, job: JobRow, error: Exception) -> JobError:
+        """The error of a job whose task raised an exception that is no error of the user: no memory left, or a fault of the software."""
+        if not is_out_of_memory(error):
+            return _internal(job, error)
+        estimate_mib = self._estimate_mib(job)
+        limit = f"expected a job of at most {allowed_mib(estimate_mib)} MiB, {MARGIN:g} times its estimate of {estimate_mib} MiB"
+        if self._child is None:
+            limit = f"expected enough memory for a job of about {estimate_mib} MiB"
+        message = f"{limit}; it asked for more: {KINDS[job.kind].memory_advice}"
+        return JobError(fault=Fault.USER, code="out-of-memory", message=message)
 
     def _let_others_go_first(self, job: JobRow, lease: Lease) -> None:
         if not self._persist(lambda: self._catalogue.jobs.hand_back(lease)):
@@ -233,12 +272,11 @@ class Runner:
             self._persist(lambda: self._catalogue.jobs.requeue(lease))
         else:
             message = f"expected a temporary failure to pass; {job.attempt} attempts failed ({type(error).__name__}): try again later"
-            self._fail(lease, Fault.TRANSIENT, "gave-up", message)
+            self._fail(lease, JobError(fault=Fault.TRANSIENT, code="gave-up", message=message))
 
-    def _fail(self, lease: Lease, fault: Fault, code: str, message: str) -> None:
-        error = JobError(fault=fault, code=code, message=message)
+    def _fail(self, lease: Lease, error: JobError) -> None:
         self._persist(lambda: self._catalogue.jobs.fail(lease, error))
-        log.warning("job %s: %s (%s)", lease.job_id, message, code)
+        log.warning("job %s: %s (%s)", lease.job_id, error.message, error.code)
 
     def _persist(self, write: Callable[[], bool]) -> bool:
         """Write the outcome of a job. While the database does not answer, try again for the length of a lease."""

@@ -137,8 +137,8 @@ def _be_present() -> None:
                 _catalogue().census.take_leave(worker_name())
             else:
                 _catalogue().census.announce(worker_name(), started_at, software_version())
-        except SQLAlchemyError as error:
-            log.warning("could not announce this worker: %s", str(error).splitlines()[0])
+        except (SQLAlchemyError, MemoryError) as error:  # no memory: the job of this process is at its limit
+            log.warning("could not announce this worker: %s", str(error).split("\n")[0])
         if leaving:
             return
         again = time.monotonic() + settings.presence_s
@@ -152,6 +152,7 @@ def _runner() -> Runner:
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
     from workers.files.opened import open_store
+    from workers.run.child import Child
     from workers.run.registry import load_tasks
     from workers.run.runner import Runner
 
@@ -163,6 +164,7 @@ def _runner() -> Runner:
         call_for_help=lambda job_id, workers: queue.call_for_help(app, job_id, workers),
         stopping=stopping,
         submit=lambda job_id, queue_name: queue.submit(app, job_id, queue_name),
+        child=Child(settings.threads),
     )
 
 

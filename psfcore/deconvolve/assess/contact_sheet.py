@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -21,8 +20,18 @@ from numpy.typing import NDArray
 from psfcore.deconvolve.assess.changes import Changes, measure_changes
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
-from psfcore.drawing.plots import CHANGE, CHANGE_LIMIT_PCT, GOLD, INK, binned, change_pct, square_root_stretch
+from psfcore.drawing.plots import (
+    CHANGE,
+    CHANGE_LIMIT_PCT,
+    GOLD,
+    INK,
+    binned,
+    change_pct,
+    square_root_stretch,
+    write_png,
+)
 from psfcore.errors import DataError
+from psfcore.fits.header import optional_text
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
@@ -117,7 +126,7 @@ def treat(
     step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
     return Treated(
         name=name,
-        taken=_taken(image),
+        taken=optional_text(image.header, "DATE-BEG", "DATE-OBS", "T_OBS"),
         psf=f"{fitting.name} {fitting.version}",
         found=found,
         steps_done=result.steps_done,
@@ -196,7 +205,7 @@ def contact_sheet_png(
         _draw_row(figure, row, index + 1, left, top, (width, height))
     for line, text in enumerate(_failure_lines(failures)):
         figure.text(0.3 / width, (foot - 0.2 - 0.2 * line) / height, text, fontsize=9, color=_DOUBTFUL)
-    FigureCanvasAgg(figure).print_png(str(path), pil_kwargs={"compress_level": 6})
+    write_png(figure, path, pil_kwargs={"compress_level": 6})
 
 
 def _draw_row(
@@ -276,11 +285,3 @@ def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[st
                 "extreme_pct": max(ups) if kind == "bright" else min(ups),
             }
     return out
-
-
-def _taken(image: Image) -> str | None:
-    for key in ("DATE-BEG", "DATE-OBS", "T_OBS"):
-        value = image.header.get(key)
-        if isinstance(value, str) and value.strip():
-            return value.strip()
-    return None

@@ -17,7 +17,7 @@ from psfcore.deconvolve.assess.changes import Changes, Range, Structure
 from psfcore.deconvolve.assess.contact_sheet import THUMBNAIL_PX, Treated
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing.plots import binned
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.header import FitsLimits, optional_text
 from psfcore.fits.images import read_image
 from psfcore.fits.planes import read_planes
 
@@ -35,11 +35,10 @@ def changes_in_product(
     image, after = read_image(before, limits), read_image(product, limits)
     suspected = (read_planes(product)["QUALITY"] & QualityBit.ARTEFACT) > 0
     step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
-    dates = (image.header.get(key) for key in DATE_KEYS)
     return Treated(
         name=name,
-        taken=next((date.strip() for date in dates if isinstance(date, str) and date.strip()), None),
-        psf=f"{after.header.get('PSFNAME')} {after.header.get('PSFVERS')}",
+        taken=optional_text(image.header, *DATE_KEYS),
+        psf=f"{optional_text(after.header, 'PSFNAME')} {optional_text(after.header, 'PSFVERS')}",
         found=changes_from_json(details["changes"], suspected),
         steps_done=details["steps_done"],
         stopped_because=details["stopped_because"],

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LogNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from psfcore.drawing.plots import (
     change_pct,
     colourbar,
     square_root_stretch,
+    write_png,
 )
 
 PANEL_PX = 640
@@ -75,7 +75,7 @@ def changes_png(
     left, bottom, width, height = _place(5)
     _draw_histogram(figure.add_axes((left + 0.02, bottom, width, height)), before, after, unit)
     figure.text(0.045, 0.022, _figures(found), fontsize=10, color=INK, va="center")
-    FigureCanvasAgg(figure).print_png(str(path), pil_kwargs={"compress_level": 3})
+    write_png(figure, path, pil_kwargs={"compress_level": 3})
 
 
 def _place(index: int) -> tuple[float, float, float, float]:

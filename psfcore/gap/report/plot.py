@@ -13,14 +13,13 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Wedge
 from numpy.typing import NDArray
 
 from psfcore.drawing.page import PLOT_DPI
-from psfcore.drawing.plots import CHANGE, INK
+from psfcore.drawing.plots import CHANGE, INK, write_png
 from psfcore.evaluation.plot import tidy
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.cells import RINGS, DiscCells
@@ -301,7 +300,7 @@ def gap_png(found: Diagnosis, report: Report) -> bytes:
     draw_where(where.subplots(), report)
     draw_effects(effects.subplots(), report)
     out = BytesIO()
-    FigureCanvasAgg(figure).print_png(out)
+    write_png(figure, out)
     return out.getvalue()
 
 
@@ -341,5 +340,5 @@ def _figure(width_in: float, height_in: float) -> Any:
 
 def _png(figure: Figure) -> bytes:
     out = BytesIO()
-    FigureCanvasAgg(figure).print_png(out)
+    write_png(figure, out)
     return out.getvalue()

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from psfcore.drawing.plots import INK
+from psfcore.drawing.plots import INK, write_png
 from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.bands import Bands, ShellBands
 from psfcore.scatter.validation.cross_validation import FoldFit
@@ -49,7 +48,7 @@ def cross_validation_png(
         axes.set_axisbelow(True)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    FigureCanvasAgg(figure).print_png(str(path))
+    write_png(figure, path)
 
 
 def draw_weights(axes: Axes, shells: ShellBands) -> None:

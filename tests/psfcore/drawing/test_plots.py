@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import sys
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from psfcore.drawing.plots import preview_png, psf_png
+from psfcore.drawing import plots
+from psfcore.drawing.plots import preview_png, psf_png, write_png
 from tests.psfcore.conftest import gaussian, make_psf
 
 
@@ -58,3 +62,34 @@ def test_a_psf_is_drawn_without_pyplot(tmp_path: Path) -> None:
     psf_png(psf, tmp_path / "psf.png")
     assert matplotlib.image.imread(tmp_path / "psf.png").std() > 0.05
     assert "matplotlib.pyplot" not in sys.modules
+
+
+@pytest.mark.parametrize("name", ["$\\frac{$", "$a$ and $\\nothing$", "100 $", "\\$", "$" * 9])
+def test_names_with_dollar_signs_are_drawn_as_they_are(tmp_path: Path, name: str) -> None:
+    plane = np.arange(64.0 * 64).reshape(64, 64)
+    preview_png(plane, plane * 1.1, tmp_path / "p.png", title=name, unit=name)
+    assert matplotlib.image.imread(tmp_path / "p.png").shape[1] == 1560
+    psf = dataclasses.replace(make_psf(gaussian(64, 2.0)), name=name, version=name)
+    psf_png(psf, tmp_path / "psf.png")
+    assert matplotlib.image.imread(tmp_path / "psf.png").std() > 0.05
+
+
+def test_the_numbers_of_a_logarithmic_axis_stay_powers(tmp_path: Path) -> None:
+    figure = Figure()
+    axes = figure.subplots()
+    axes.loglog([1, 1000], [1, 1000])
+    axes.set_title("$x$")
+    write_png(figure, tmp_path / "p.png")
+    assert axes.xaxis.get_major_ticks()[0].label1.get_parse_math()
+    assert not axes.title.get_parse_math()
+
+
+def test_every_picture_is_written_by_the_function_that_draws_names_as_they_are() -> None:
+    here = Path(plots.__file__)
+    package = here.parents[1]
+    wrong = [
+        path.name
+        for path in package.rglob("*.py")
+        if path != here and re.search(r"print_png|savefig|FigureCanvasAgg", path.read_text("utf-8"))
+    ]
+    assert wrong == []

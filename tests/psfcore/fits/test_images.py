@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.fits.images import read_image, write_image
 from psfcore.image import Image, MaskBit
 from psfcore.simulate.observe import demo_image
@@ -306,3 +306,31 @@ def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path) -> None:
     image = read_image(path, FitsLimits(max_pixels=2**20))
     assert image.mask[3, 4] == MaskBit.NONFINITE and np.isnan(image.pixels[3, 4])
     assert image.pixels[0, 5] == 32773 and np.count_nonzero(image.mask) == 1
+
+
+GARBAGE = [
+    b"PSFNAME = 'dr\x0c\x01|-|'",
+    b"TELESCOP= 'not closed",
+    b"INSTRUME= 3 2 x / y",
+    b"DATE-OBS= \x00\xff",
+    b"CDELT1  = 1E999",
+    b"HIERARCH = 'x' = 'y'",
+    b"\x07BELL   = 1",
+]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("card", GARBAGE)
+def test_a_product_of_an_image_with_a_garbage_card_is_written(
+    tmp_path: Path, limits: FitsLimits, card: bytes
+) -> None:
+    header = fits.Header({"FILLER": "to be replaced", "OBSERVER": "me"})
+    fits.PrimaryHDU(np.arange(400.0).reshape(20, 20), header).writeto(tmp_path / "good.fits")
+    content = (tmp_path / "good.fits").read_bytes()
+    at = content.index(b"FILLER  ")
+    (tmp_path / "bad.fits").write_bytes(content[:at] + card.ljust(80) + content[at + 80 :])
+    read_summary(tmp_path / "bad.fits", limits)
+    write_image(tmp_path / "product.fits", read_image(tmp_path / "bad.fits", limits), cards={})
+    with fits.open(tmp_path / "product.fits") as hdus:
+        hdus.verify("exception")
+        assert hdus[0].header["OBSERVER"] == "me"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -156,3 +157,22 @@ def test_plain_names(name: str) -> None:
 def test_the_practice_manifest_is_read(shared: Path) -> None:
     manifest = read_manifest(shared / "data/practice/p1")
     assert manifest.pointings == {1: 10, 2: 10, 3: 10} and len(manifest.files) == 31
+
+
+MANY = {
+    "a million images": b'{"schema": "transit/1", "images": [' + 1_400_000 * b"{}," + b"{}]}",
+    "a million lists": b'{"schema": "transit/1", "deep": [' + 1_000_000 * b"[]," + b"[]]}",
+    "nested lists": b'{"schema": "transit/1", "deep": ' + 1_000_000 * b"[" + 1_000_000 * b"]" + b"}",
+    "more images than allowed": b'{"schema": "transit/1", "images": [' + 60_000 * b"{}," + b"{}]}",
+}
+
+
+@pytest.mark.parametrize("name", MANY)
+def test_values_are_counted_before_they_become_objects(name: str) -> None:
+    tracemalloc.start()
+    with pytest.raises(DataError) as caught:
+        parse_manifest(MANY[name])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert caught.value.code == "bad-manifest" and "expected at most" in caught.value.message
+    assert peak < 16 * 2**20, f"{peak / 2**20:.0f} MiB"

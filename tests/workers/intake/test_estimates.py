@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 
 from psfcore.errors import DataError
+from psfcore.instruments.model import parse_instrument
+from psfcore.instruments.workload import check_workload
 from service.client.http import ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
@@ -121,17 +123,17 @@ def test_a_psf_that_may_have_to_be_built_first_counts(catalogue: Catalogue) -> N
     [
         (
             "bandpass = ["
-            + ",".join("{wavelength_angstrom=171.0,weight=1.0}" for _ in range(500))
+            + ",".join("{wavelength_angstrom=171.0,weight=1.0}" for _ in range(64))
             + "]\n[aperture]",
-            500,
+            64,
         ),
         (
             "meshes = ["
             + ",".join(
-                "{name='m',place='filter_wheel',pitch_um=9.0,wire_um=1.0,windows=9}" for _ in range(500)
+                "{name='m',place='filter_wheel',pitch_um=9.0,wire_um=1.0,windows=9}" for _ in range(16)
             )
             + "]\n[aperture]",
-            400,
+            56,
         ),
     ],
 )
@@ -150,8 +152,22 @@ def test_an_instrument_file_of_extremes_can_be_estimated(extremes: tuple[str, ..
     for key, value in zip(keys, extremes, strict=True):
         text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
     mount = "\n[mount]\nbasis = 'assumed'\nrays = [{count = 4, width_mm = 1e-9}]\n"
-    seconds, mib = _build(PsfBuild(instrument_file=text + mount).model_dump(mode="json"))
-    assert 0 < seconds < 600 and 0 < mib < 4096
+    parameters = PsfBuild(instrument_file=text + mount).model_dump(mode="json")
+    seconds, mib = _build(parameters)
+    assert seconds > 0 and mib > 0
+    try:
+        check_workload(parse_instrument(text + mount, "extreme.toml"), "extreme.toml")
+    except DataError as error:
+        assert error.code == "bad-instrument-file"
+    else:
+        assert seconds < 600 and mib < 6000
+
+
+def test_a_mask_image_counts(catalogue: Catalogue) -> None:
+    build = {"instrument_file": SMALL_INSTRUMENT, "size": 64}
+    plain = needs(catalogue, "psf-build", PsfBuild(**build).model_dump(mode="json"))
+    masked = PsfBuild(**build, mask_id=image(catalogue, 4096)).model_dump(mode="json")
+    assert needs(catalogue, "psf-build", masked)[1] >= plain[1] + 4096**2 * 3 * 8 / 2**20
 
 
 def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:

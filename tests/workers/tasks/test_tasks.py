@@ -219,3 +219,35 @@ def test_error_planes_need_known_noise(
     error = read_planes(tmp_path / "o.fits")["ERROR"]
     assert error.shape == (96, 128) and (error > 0).all()
     assert product["details"]["noise_amplification"] > 1
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_formula_as_a_name_and_a_garbage_detector_do_not_lose_the_product(
+    local: LocalService, tmp_path: Path
+) -> None:
+    write_image(tmp_path / "image.fits", DETECTOR="$\\frac{$", FILLER="x" * 30)
+    content = (tmp_path / "image.fits").read_bytes()
+    at = content.index(b"FILLER  ")
+    (tmp_path / "image.fits").write_bytes(content[:at] + b"INSTRUME= 3 2 x".ljust(80) + content[at + 80 :])
+    write_psf(tmp_path / "psf.fits")
+    with fits.open(tmp_path / "psf.fits", mode="update") as hdus:
+        hdus[0].header["PSFNAME"] = "$\\frac{$"
+    psf = local.upload_psf(tmp_path / "psf.fits")
+    product = local.deconvolve(
+        tmp_path / "image.fits",
+        psf_id=psf["id"],
+        steps=2,
+        preview=tmp_path / "p.png",
+        changes=tmp_path / "c.png",
+    )
+    assert product["id"] and (tmp_path / "p.png").stat().st_size > 0 < (tmp_path / "c.png").stat().st_size
+
+
+def test_a_damaged_detector_is_not_named_in_the_title(local: LocalService, tmp_path: Path) -> None:
+    write_image(tmp_path / "image.fits", FILLER="x" * 30)
+    content = (tmp_path / "image.fits").read_bytes()
+    at = content.index(b"FILLER  ")
+    (tmp_path / "image.fits").write_bytes(content[:at] + b"DETECTOR= 'open".ljust(80) + content[at + 80 :])
+    write_psf(tmp_path / "psf.fits")
+    psf = local.upload_psf(tmp_path / "psf.fits")
+    assert local.deconvolve(tmp_path / "image.fits", psf_id=psf["id"], steps=2)["id"]

@@ -182,9 +182,9 @@ def _history(inputs: Inputs, result: Deconvolved, warnings: Sequence[Warned]) ->
 
 def _title(inputs: Inputs) -> str:
     header = inputs.image.header
-    parts = [header.get("DETECTOR") or header.get("INSTRUME") or "image"]
-    parts += [str(header[key]) for key in ("DATE-BEG", "DATE-OBS") if header.get(key)][:1]
-    return f"{' '.join(map(str, parts))}   PSF {inputs.psf_row.name} {inputs.psf_row.version}"
+    seen_by = optional_text(header, "DETECTOR", "INSTRUME") or "image"
+    date = optional_text(header, "DATE-BEG", "DATE-OBS")
+    return f"{seen_by}{f' {date}' if date else ''}   PSF {inputs.psf_row.name} {inputs.psf_row.version}"
 
 
 def details_of(

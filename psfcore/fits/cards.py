@@ -1,0 +1,64 @@
+"""Read single cards of a FITS header: whole numbers, flags and texts.
+
+A card that defines the structure of a file must be correct and occur once. Source: FITS standard 4.0 (Pence et al. 2010;
+IAU FITS working group 2018), section 4.4.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+from psfcore.errors import HeaderError
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+LARGEST_COUNT = 2**63 - 1
+
+
+@cache
+def card_trouble() -> tuple[type[Exception], ...]:
+    """Exceptions that astropy raises for a damaged card. Which one depends on the damage."""
+    from astropy.io.fits.verify import VerifyError
+
+    return VerifyError, ValueError, TypeError, IndexError, OverflowError
+
+
+def card_value(header: Header, key: str) -> object:
+    """Value of a structural card, or None. Raises HeaderError if the card is unreadable or occurs more than once."""
+    try:
+        if header.count(key) > 1:
+            raise HeaderError("bad-card", f"expected card {key} once; got it {header.count(key)} times")
+        return header[key]
+    except KeyError:
+        return None
+    except HeaderError:
+        raise
+    except card_trouble():
+        raise HeaderError("bad-card", f"expected a readable card {key}; its value cannot be read") from None
+
+
+def card_count(
+    header: Header, key: str, *, smallest: int = 0, largest: int = LARGEST_COUNT, default: int | None = None
+) -> int:
+    """Whole number in a structural card. Raises HeaderError "bad-card" if it is missing or out of range."""
+    value = card_value(header, key)
+    if value is None and default is not None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, int) or not smallest <= value <= largest:
+        raise HeaderError(
+            "bad-card", f"expected {key} = integer from {smallest} to {largest}; got {value!r:.40}"
+        )
+    return value
+
+
+def card_flag(header: Header, key: str) -> bool:
+    """Whether a structural card has the value T."""
+    return card_value(header, key) is True
+
+
+def card_text(header: Header, key: str) -> str | None:
+    """Text of a structural card, without surrounding spaces; None if the card is missing or does not hold text."""
+    value = card_value(header, key)
+    return value.strip() if isinstance(value, str) else None

@@ -1,0 +1,175 @@
+"""Check the header of a tile-compressed image, and read from it how the tiles are stored, before any decoder runs.
+
+Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 7.3 and 10.1. The decoders of
+astropy are C functions that trust the header. With BYTEPIX = 8, the decoder of RICE_1 returns twice the bytes that it
+has written: the second half is memory of the process. With a large BLOCKSIZE, it reads and writes past its buffers.
+Dithering without a valid ZDITHER0 reads outside the table of random numbers. Therefore every card on which a decoder
+depends must have a value of the standard. This module reads no pixels, so the web process can import it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from psfcore.errors import HeaderError
+from psfcore.fits.cards import card_count, card_text, card_value
+from psfcore.fits.columns import ITEM_BYTES, MOST_COLUMNS, read_columns
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+ALLOWED_CODECS = ("RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS")
+MOST_TILES = 65_536  # astropy decodes tile by tile in Python, about 0.1 ms each
+COMPRESSED, GZIPPED, UNCOMPRESSED = "COMPRESSED_DATA", "GZIP_COMPRESSED_DATA", "UNCOMPRESSED_DATA"
+_RICE_BYTEPIX, _RICE_BLOCKSIZE = (1, 2, 4), (16, 32)  # section 10.4.1
+_RICE_DEFAULTS = {"BYTEPIX": 4, "BLOCKSIZE": 32}
+_DITHERS = ("SUBTRACTIVE_DITHER_1", "SUBTRACTIVE_DITHER_2")
+_NO_DITHERS = (None, "NO_DITHER", "NONE")
+_DITHER_SEEDS = 1, 10_000  # section 10.2: the values of ZDITHER0
+_LARGEST_INT = 2**31 - 1
+_ITEMS_OF = {COMPRESSED: "BIJ", GZIPPED: "BIJ", UNCOMPRESSED: "BIJED"}
+_NUMBERS_OF = {"ZSCALE": "ED", "ZZERO": "ED", "ZBLANK": "BIJ"}
+_NUMBERS = "LBIJKED"  # of a column that the decoders do not use
+
+
+@dataclass(frozen=True)
+class Compression:
+    """How a compressed image is stored.
+
+    shape: pixels (ny, nx). tile: pixels (ny, nx) of a tile that is not cut off at the edge of the image. items: bytes of
+    an item of the heap, by column. first, heap_bytes: start of the heap after the rows of the table, and its size, bytes.
+    bytepix,
+    blocksize: bytes of a pixel and pixels of a block for RICE_1. quantised: whether pixels are integers with a scale and a zero for each tile.
+    """
+
+    codec: str
+    shape: tuple[int, int]
+    tile: tuple[int, int]
+    items: dict[str, int]
+    first: int
+    heap_bytes: int
+    bytepix: int
+    blocksize: int
+    quantised: bool
+
+
+def compression_of(header: Header, nx: int, ny: int) -> Compression:
+    """How the image of nx x ny pixels in a table with ZIMAGE = T is stored.
+
+    Raises HeaderError "codec-not-allowed", "bad-tiles", "bad-card".
+    """
+    codec = card_text(header, "ZCMPTYPE")
+    if codec not in ALLOWED_CODECS:
+        wanted = ", ".join(ALLOWED_CODECS)
+        raise HeaderError("codec-not-allowed", f"expected compression by one of {wanted}; got {codec}")
+    tile = _tile(header, nx, ny)
+    bitpix = card_count(header, "ZBITPIX", smallest=-64, largest=64)
+    settings = _settings(header)
+    bytepix, blocksize = _rice(settings, bitpix) if codec == "RICE_1" else (abs(bitpix) // 8, 1)
+    items, quantised = _columns(header)
+    _check_dither(header)
+    first, heap_bytes = _heap(header)
+    return Compression(codec, (ny, nx), tile, items, first, heap_bytes, bytepix, blocksize, quantised)
+
+
+def _tile(header: Header, nx: int, ny: int) -> tuple[int, int]:
+    tile_x = card_count(header, "ZTILE1", largest=_LARGEST_INT, default=nx)
+    tile_y = card_count(header, "ZTILE2", largest=_LARGEST_INT, default=1)
+    if not tile_x or not tile_y:
+        raise HeaderError("bad-tiles", f"expected tiles of at least one pixel; got {tile_x} x {tile_y}")
+    tiles = math.prod(-(-n // tile) for n, tile in ((nx, tile_x), (ny, tile_y)))
+    rows = card_count(header, "NAXIS2")
+    if rows != tiles:
+        message = f"expected one table row per tile, {tiles} rows for {nx} x {ny} pixels; got {rows}"
+        raise HeaderError("bad-tiles", message)
+    if tiles > MOST_TILES:
+        raise HeaderError("bad-tiles", f"expected at most {MOST_TILES} tiles; got {tiles}: use larger tiles")
+    return min(tile_y, ny), min(tile_x, nx)
+
+
+def _settings(header: Header) -> dict[str, object]:
+    """The parameters ZNAMEn = ZVALn of the codec, by name in capitals. Each name may occur once."""
+    settings: dict[str, object] = {}
+    for number in range(1, MOST_COLUMNS + 1):
+        if card_value(header, f"ZNAME{number}") is None:
+            break
+        name = (card_text(header, f"ZNAME{number}") or "").upper()
+        value = card_value(header, f"ZVAL{number}")
+        known = {"BYTEPIX", "BLOCKSIZE", "SCALE", "SMOOTH", "NOISEBIT"}
+        if name not in known or name in settings:
+            wanted = f"expected ZNAME{number} of {', '.join(sorted(known))}, each once"
+            raise HeaderError("bad-card", f"{wanted}; got {name!r:.40}")
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST_INT:
+            raise HeaderError("bad-card", f"expected a number in ZVAL{number} ({name}); got {value!r:.40}")
+        settings[name] = value
+    return settings
+
+
+def _rice(settings: dict[str, object], bitpix: int) -> tuple[int, int]:
+    """BYTEPIX and BLOCKSIZE of RICE_1. Raises HeaderError "bad-card" if one of them is not a value of the standard."""
+    found: list[int] = []
+    for name, allowed in (("BYTEPIX", _RICE_BYTEPIX), ("BLOCKSIZE", _RICE_BLOCKSIZE)):
+        value = settings.get(name, _RICE_DEFAULTS[name])
+        if not isinstance(value, int) or value not in allowed:
+            raise HeaderError("bad-card", f"expected {name} of {allowed} for RICE_1; got {value!r:.40}")
+        found.append(value)
+    bytepix, blocksize = found
+    if "BYTEPIX" in settings and bytepix > abs(bitpix) // 8:
+        wanted = (
+            f"expected BYTEPIX of at most {abs(bitpix) // 8}, the bytes of a pixel with ZBITPIX = {bitpix}"
+        )
+        raise HeaderError("bad-card", f"{wanted}; got {bytepix}")
+    return bytepix, blocksize
+
+
+def _columns(header: Header) -> tuple[dict[str, int], bool]:
+    """Bytes of a heap item by column, and whether the image is quantised."""
+    columns = read_columns(header)
+    for number, column in enumerate(columns, start=1):
+        if column.name in _ITEMS_OF:
+            wanted = f"1P or 1Q of {', '.join(_ITEMS_OF[column.name])}"
+            good = column.in_heap and column.repeat == 1 and column.item in _ITEMS_OF[column.name]
+        else:
+            wanted = f"one number of {', '.join(_NUMBERS_OF.get(column.name, _NUMBERS))}"
+            good = column.repeat == 1 and column.form in _NUMBERS_OF.get(column.name, _NUMBERS)
+        if not good:
+            raise HeaderError("bad-card", f"expected column {column.name:.40} as {wanted}; got {column}")
+        for key in ("TSCAL", "TZERO", "TDIM"):
+            if card_value(header, f"{key}{number}") is not None:
+                raise HeaderError(
+                    "bad-card", f"expected no card {key}{number} in a compressed image; got one"
+                )
+    names = {column.name for column in columns}
+    if COMPRESSED not in names:
+        raise HeaderError("bad-card", f"expected a column {COMPRESSED} in a compressed image; got none")
+    if ("ZSCALE" in names) != ("ZZERO" in names):
+        raise HeaderError("bad-card", "expected both columns ZSCALE and ZZERO, or neither; got one of them")
+    items = {column.name: ITEM_BYTES[column.item] for column in columns if column.in_heap}
+    return items, "ZSCALE" in names
+
+
+def _check_dither(header: Header) -> None:
+    method = card_text(header, "ZQUANTIZ")
+    if card_value(header, "ZQUANTIZ") is not None and method not in (*_DITHERS, *_NO_DITHERS):
+        wanted = ", ".join((*_DITHERS, "NO_DITHER"))
+        raise HeaderError("bad-card", f"expected ZQUANTIZ of {wanted}; got {method!r:.40}")
+    smallest, largest = _DITHER_SEEDS
+    if method in _DITHERS:
+        card_count(header, "ZDITHER0", smallest=smallest, largest=largest)
+    else:
+        card_count(header, "ZDITHER0", largest=largest, default=0)
+    card_count(header, "ZBLANK", smallest=-_LARGEST_INT - 1, largest=_LARGEST_INT, default=0)
+
+
+def _heap(header: Header) -> tuple[int, int]:
+    """Start of the heap after the start of the table's data, and its size, bytes (section 7.3.5)."""
+    for key, value in (("BITPIX", 8), ("NAXIS", 2), ("GCOUNT", 1)):
+        card_count(header, key, smallest=value, largest=value)
+    table_bytes = card_count(header, "NAXIS1") * card_count(header, "NAXIS2")
+    after_rows = card_count(header, "PCOUNT")
+    first = card_count(
+        header, "THEAP", smallest=table_bytes, largest=table_bytes + after_rows, default=table_bytes
+    )
+    return first, table_bytes + after_rows - first

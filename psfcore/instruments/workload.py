@@ -1,0 +1,106 @@
+"""The sizes of the arrays that the diffraction of an instrument needs, computed from its file before any array exists.
+
+An instrument file of a kilobyte can describe a mesh of so many orders, or an aperture so wide, that its pattern needs
+terabytes. `check_workload` refuses such a file; estimates of memory and time use the same sizes. This module imports no
+numerical library, so that the web process can import it.
+
+| symbol | name | unit |
+|---|---|---|
+| S | samples: samples per pixel and axis that resolve the pattern of the aperture, 2 D p / (lambda f) | - |
+| N | mask_cells: cells along an edge of the mask of the entrance pupil | - |
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from psfcore.errors import DataError
+from psfcore.instruments.model import Instrument, Mesh
+
+LARGEST_SIZE_PX = 4096
+PERIOD_PX = 4096  # size of the transform: light wraps around at 4096 px, not at the 2048 px that are kept
+MOST_MASK_SAMPLES = 32  # a mask that needs more samples per pixel is replaced by an analytic pattern
+NARROW_WINDOWS = 400  # a series of at least 400 windows has narrow orders
+FINEST_CELL_PX = 0.02  # cells of the pattern of a rotated mesh are at most this wide before they are combined
+AIRY_STEP = 0.02  # step in v of the table of the analytic pattern
+MOST_SAMPLES = 256
+MOST_CELLS = 2_000_000
+_MM_PER_ANGSTROM, _MM_PER_UM = 1e-7, 1e-3
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Sizes of the arrays for one spectral line, the shortest wavelength.
+
+    airy_points: points of the table of the analytic pattern. cells: cells of one axis of each rotated mesh. windows:
+    terms of the series of each mesh that is parallel to the pixels. mask: whether the mask of the pupil is transformed.
+    mount_entries: entries of the list of edges by rows of the mask.
+    """
+
+    samples: float
+    airy_points: int
+    cells: tuple[int, ...]
+    windows: tuple[int, ...]
+    mask: bool
+    mask_cells: int
+    mount_entries: int
+
+
+def workload(instrument: Instrument, size: int) -> Workload:
+    """The sizes for a PSF of `size` px; the grid is at least that large."""
+    shortest_mm = min(line.wavelength_angstrom for line in instrument.spectral_lines) * _MM_PER_ANGSTROM
+    pixel_mm = instrument.detector.pixel_pitch_um * _MM_PER_UM
+    samples = 2 * instrument.aperture.diameter_mm * pixel_mm / (shortest_mm * instrument.focal_length_mm)
+    corner_px = (size // 2 + 1.5) * math.sqrt(2)
+    meshes = [mesh for mesh in instrument.meshes if _distance_mm(instrument, mesh) is not None]
+    mask = samples <= MOST_MASK_SAMPLES and (instrument.mount is not None or bool(instrument.meshes))
+    mask_cells = 2 * math.ceil(max(size, PERIOD_PX) * samples / 4) + 2 if mask else 0
+    mount = instrument.mount
+    outlines = 0 if mount is None else mount.ray_count + 4 * len(mount.rings) + mount.corner_count
+    return Workload(
+        samples=samples,
+        airy_points=math.ceil(math.pi * samples / 2 * corner_px / AIRY_STEP),
+        cells=tuple(
+            _cells(instrument, mesh, shortest_mm, corner_px) for mesh in meshes if mesh.angle_deg % 90 != 0
+        ),
+        windows=tuple(windows_of(mesh) for mesh in meshes if mesh.angle_deg % 90 == 0),
+        mask=mask,
+        mask_cells=mask_cells,
+        mount_entries=outlines * mask_cells,
+    )
+
+
+def windows_of(mesh: Mesh) -> int:
+    """Number of windows of the series of a mesh.
+
+    At the entrance, the orders get their width from the pattern of the aperture, so the orders of the series must be narrow.
+    """
+    return max(mesh.windows, NARROW_WINDOWS) if mesh.place == "entrance" else mesh.windows
+
+
+def check_workload(instrument: Instrument, label: str) -> None:
+    """Raise DataError "bad-instrument-file" if the largest PSF of an instrument needs too large arrays."""
+    largest = workload(instrument, LARGEST_SIZE_PX)
+    if largest.samples > MOST_SAMPLES:
+        wanted = f"aperture.diameter_mm: expected a pattern that {MOST_SAMPLES} samples a pixel resolve"
+        needs = "2 x diameter x pixel pitch / (wavelength x focal length)"
+        raise DataError("bad-instrument-file", f"{label}: {wanted}; got {needs} = {largest.samples:.3g}")
+    if max(largest.cells, default=0) > MOST_CELLS:
+        wanted = f"meshes: expected at most {MOST_CELLS} cells along an axis of a rotated mesh"
+        advice = "use fewer windows, a smaller pitch_um or a longer distance"
+        raise DataError("bad-instrument-file", f"{label}: {wanted}; got {max(largest.cells):.3g}: {advice}")
+
+
+def _distance_mm(instrument: Instrument, mesh: Mesh) -> float | None:
+    if mesh.place != "entrance" and instrument.distances is None:
+        return None  # the error of a missing table is raised when the PSF is built
+    return instrument.mesh_distance_mm(mesh)
+
+
+def _cells(instrument: Instrument, mesh: Mesh, wavelength_mm: float, corner_px: float) -> int:
+    """Cells of one axis of the pattern of a rotated mesh, before they are combined (see `mesh_series`)."""
+    reach_mm2 = wavelength_mm * instrument.mesh_distance_mm(mesh)
+    spacing_px = reach_mm2 / (mesh.pitch_um * _MM_PER_UM) / (instrument.detector.pixel_pitch_um * _MM_PER_UM)
+    lobe_px = spacing_px / windows_of(mesh)
+    return math.ceil(corner_px / lobe_px * max(1, math.ceil(lobe_px / FINEST_CELL_PX)))

@@ -1,0 +1,130 @@
+"""Reads inputs one after the other in a process of its own, under the memory limit of a job.
+
+`python -m tests.fuzz.child KIND FIRST STOP FOLDER` writes a line when it starts a seed and a line with its outcome: a result,
+the code of a DataError, or a fault. If the process dies, the last line names the seed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import json
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from psfcore import build
+from psfcore.diffraction import combined, fraunhofer
+from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.images import read_image, write_image
+from psfcore.fits.psfs import read_psf
+from psfcore.instruments.model import parse_instrument
+from psfcore.instruments.workload import check_workload
+from psfcore.scatter import power_law
+from psfcore.transit.manifest import parse_manifest
+from tests.fuzz.fits_inputs import compressed_image, plain_image
+from tests.fuzz.text_inputs import instrument, manifest
+from workers.intake.cost_model import COSTS
+from workers.intake.estimates import _build
+from workers.run.child import Child
+
+LIMITS = FitsLimits(max_pixels=128 * 128, max_header_bytes=64 * 1024, max_hdus=8)
+SIZE_PX = 64
+_M_PERTURB = -6  # option of mallopt(3): new memory is filled with this byte
+
+
+def read_an_image(content: bytes, folder: Path) -> str:
+    """Read an image twice, between different contents of fresh memory, and write a product from it."""
+    path, product = folder / "input.fits", folder / "product.fits"
+    path.write_bytes(content)
+    summary = read_summary(path, LIMITS)
+    json.dumps(dataclasses.asdict(summary), allow_nan=False)
+    images = []
+    for filling in (0x11, 0x77):
+        ctypes.CDLL(None).mallopt(_M_PERTURB, filling)
+        images.append(read_image(path, LIMITS))
+    image = images[0]
+    assert np.array_equal(image.pixels, images[1].pixels, equal_nan=True), "pixels hold memory of the process"
+    cards = {"PSFNAME": (summary.psf_name or "none", "name of the PSF")}
+    write_image(product, image, cards=cards, history=[f"from {summary.instrume}"])
+    assert read_image(product, LIMITS).pixels.shape == summary.shape
+    if summary.psf_name is not None:
+        read_psf(path, LIMITS)
+    return "result"
+
+
+def read_a_manifest(content: bytes, folder: Path) -> str:
+    """Check a transit.json."""
+    parse_manifest(content)
+    return "result"
+
+
+def build_an_instrument(content: bytes, folder: Path) -> str:
+    """Build the PSF of an instrument file."""
+    described = parse_instrument(content.decode("utf-8", "replace"), "fuzz.toml")
+    check_workload(described, "fuzz.toml")
+    psf = build.build_psf(described, size=SIZE_PX)
+    assert psf.kernel.shape == (SIZE_PX, SIZE_PX) and np.isfinite(psf.kernel).all()
+    return "result"
+
+
+def _instrument_mib(content: bytes) -> float:
+    """The estimated memory of a build that is accepted; 0 if it is refused."""
+    text = content.decode("utf-8", "replace")
+    try:
+        check_workload(parse_instrument(text, "fuzz.toml"), "fuzz.toml")
+        return float(_build({"instrument_file": text, "size": SIZE_PX})[1])
+    except DataError:
+        return 0.0
+
+
+Reader = Callable[[bytes, Path], str]
+Maker = Callable[[int], bytes]
+KINDS: dict[str, tuple[Maker, Reader]] = {
+    "tiles": (compressed_image, read_an_image),
+    "headers": (plain_image, read_an_image),
+    "manifests": (manifest, read_a_manifest),
+    "instruments": (instrument, build_an_instrument),
+}
+
+
+def _small_grids() -> None:
+    """Build PSFs on the grid that is kept, 64 px, in place of 2048 px and 4096 px: a thousand times faster."""
+    build.REACH_GRID_PX = SIZE_PX
+    combined.PERIOD_PX = SIZE_PX
+    fraunhofer.SURVEY_CELLS = 2 * SIZE_PX
+    defaults = power_law.amplitude_for_total.__kwdefaults__
+    assert defaults is not None
+    defaults["reach_grid_px"] = SIZE_PX
+
+
+def main(kind: str, first: int, stop: int, folder: Path) -> None:
+    """Read the inputs of the seeds from `first` to `stop` - 1."""
+    warnings.simplefilter("ignore")
+    np.seterr(all="ignore")
+    _small_grids()
+    make, read = KINDS[kind]
+    child = Child(threads=1)
+    for seed in range(first, stop):
+        print(f"start {seed}", flush=True)
+        content = make(seed)
+        estimate_mib = COSTS.worker_mib + (_instrument_mib(content) if kind == "instruments" else 0.0)
+        started = time.monotonic()
+        try:
+            with child.limited(round(estimate_mib)):
+                outcome = read(content, folder)
+        except DataError as error:
+            outcome = error.code
+        except Exception:  # noqa: BLE001  (any other exception is what the fuzzing looks for)
+            outcome = "fault " + json.dumps(traceback.format_exc())
+        print(f"end {seed} {time.monotonic() - started:.2f} {outcome}", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4]))

@@ -1,0 +1,172 @@
+"""FITS files with damaged cards and bytes, made from a seed: equal seeds give equal files."""
+
+from __future__ import annotations
+
+import io
+from functools import cache
+
+import numpy as np
+from astropy.io import fits
+
+CARD = 80
+NUMBERS = (
+    *(-(2**63), -(2**31), -1000, -64, -32, -2, -1, 0, 1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 17, 31, 32, 33, 64, 255, 256, 999),
+    *(1000, 4096, 10_000, 10_001, 2**15, 2**16, 2**24, 2**31 - 1, 2**31, 2**32, 2**40, 2**62, 2**63, 10**30),
+)  # fmt: skip
+TEXTS = (
+    *("T", "F", "''", "'x'", "nan", "inf", "1E400", "-1.5", "1E-300", "(1,2)", "&", "", "'RICE_1'", "'GZIP_1'", "'GZIP_2'"),
+    *("'NOCOMPRESS'", "'HCOMPRESS_1'", "'PLIO_1'", "'RICE_ONE'", "'1PB(9)'", "'1PI'", "'1QB'", "'1PD'", "'999999999J'"),
+    *("'PX'", "'1D'", "'SUBTRACTIVE_DITHER_1'", "'SUBTRACTIVE_DITHER_2'", "'NO_DITHER'", "'BYTEPIX'", "'BLOCKSIZE'"),
+    *("'$\\frac{$'", "'a$b$c'", "'BINTABLE'", "'IMAGE'", "'TABLE'", "'2020-01-01T00:00:00'", "'not closed", "3 2 x"),
+)  # fmt: skip
+ADDED = (
+    *("ZNAME1", "ZVAL1", "ZNAME2", "ZVAL2", "ZNAME3", "ZVAL3", "ZDITHER0", "ZQUANTIZ", "ZBLANK", "BLANK", "BSCALE"),
+    *("BZERO", "THEAP", "TSCAL1", "TZERO1", "TDIM1", "TNULL1", "TFORM2", "TTYPE2", "ZTILE1", "ZTILE2", "ZTILE3", "ZNAXIS3"),
+    *("ZMASKCMP", "GROUPS", "PCOUNT", "GCOUNT", "EXTNAME", "EXTVER", "TFIELDS", "NAXIS3", "CHECKSUM", "DATASUM", "INHERIT"),
+    *("PSFNAME", "PSFVERS", "INSTRUME", "DETECTOR", "DATE-OBS", "DATE-BEG", "BUNIT", "SATURATE", "CDELT1", "CUNIT1"),
+    *("HISTORY", "COMMENT", "CONTINUE", "HIERARCH", "END", "", "DP1", "LONGSTRN", "GAINCOMB", "XPOSURE", "PXBEG1"),
+)  # fmt: skip
+
+
+def compressed_image(seed: int) -> bytes:
+    """A tile-compressed image with one to four faults in its header, its rows or its heap."""
+    rng = np.random.default_rng([1, seed])
+    bases = _compressed_bases()
+    return _damaged(bases[int(rng.integers(len(bases)))], rng, first_card=_second_header)
+
+
+def plain_image(seed: int) -> bytes:
+    """An image, or a PSF as heliopsf writes it, with one to four faults in any header."""
+    rng = np.random.default_rng([2, seed])
+    bases = _plain_bases()
+    return _damaged(bases[int(rng.integers(len(bases)))], rng, first_card=lambda _: 0)
+
+
+def _damaged(base: bytes, rng: np.random.Generator, *, first_card) -> bytes:  # type: ignore[no-untyped-def]
+    content = bytearray(base)
+    start = first_card(base)
+    for _ in range(int(rng.integers(1, 5))):
+        cards = _cards(bytes(content), start)
+        if not cards:
+            break
+        at = int(rng.choice(cards))
+        match int(rng.integers(10)):
+            case 0 | 1 | 2 | 3:
+                _put(content, at, bytes(content[at : at + 8]), _value(rng))
+            case 4:
+                _put(content, at, str(rng.choice(ADDED)).ljust(8).encode(), _value(rng))
+            case 5:
+                content[at : at + CARD] = content[(other := int(rng.choice(cards))) : other + CARD]
+            case 6:
+                content[at : at + CARD] = b" " * CARD
+            case 7:
+                low = at + int(rng.integers(CARD))
+                junk = rng.bytes(int(rng.integers(1, 12)))
+                content[low : low + len(junk)] = junk
+            case 8:
+                low = int(rng.integers(len(content)))
+                junk = rng.bytes(int(rng.integers(1, 9)))
+                content[low : low + len(junk)] = junk
+            case _:
+                if rng.random() < 0.2:
+                    del content[int(rng.integers(len(content))) :]
+    return bytes(content)
+
+
+def _value(rng: np.random.Generator) -> bytes:
+    if rng.random() < 0.6:
+        return f"{rng.choice(np.array(NUMBERS, dtype=object)):>20}".encode()
+    return str(rng.choice(TEXTS)).encode()
+
+
+def _put(content: bytearray, at: int, key: bytes, value: bytes) -> None:
+    content[at : at + CARD] = (key[:8].ljust(8) + b"= " + value).ljust(CARD)[:CARD]
+
+
+def _cards(content: bytes, start: int) -> list[int]:
+    """The places of the cards of all headers from `start`."""
+    found, at, inside = [], start, True
+    while at + CARD <= len(content):
+        card = content[at : at + CARD]
+        if not inside and at % 2880 == 0 and card.startswith((b"XTENSION", b"SIMPLE ")):
+            inside = True
+        if inside:
+            found.append(at)
+            inside = not card.startswith(b"END ")
+        at += CARD
+    return found
+
+
+def _second_header(content: bytes) -> int:
+    return content.index(b"XTENSION")
+
+
+@cache
+def _compressed_bases() -> tuple[bytes, ...]:
+    rng = np.random.default_rng(0)
+    bases = []
+    for codec in ("RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS"):
+        for dtype in ("u1", "i2", "i4", "f4", "f8"):
+            for tile in ((1, 67), (20, 30)):
+                pixels = rng.integers(1, 120, (64, 67)).astype(dtype)
+                if dtype.startswith("f"):
+                    pixels += rng.normal(0, 3, pixels.shape).astype(dtype)
+                for quantise in (0, 1, 2) if dtype.startswith("f") else (None,):
+                    if quantise == 0 and codec == "RICE_1":
+                        continue
+                    options = {} if not quantise else {"quantize_method": quantise, "dither_seed": 7}
+                    level = {} if quantise is None else {"quantize_level": float(16 if quantise else 0)}
+                    hdu = fits.CompImageHDU(
+                        pixels, compression_type=codec, tile_shape=tile, **options, **level
+                    )
+                    bases.append(_written([fits.PrimaryHDU(), hdu]))
+    return tuple(bases)
+
+
+@cache
+def _plain_bases() -> tuple[bytes, ...]:
+    rng = np.random.default_rng(0)
+    bases = []
+    for dtype in ("u1", "i2", "i4", "i8", "f4", "f8"):
+        header = fits.Header(
+            {"TELESCOP": "SOLO", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174, "BUNIT": "DN/s"}
+        )
+        header.update(
+            {"DATE-BEG": "2022-03-17T00:00:00", "XPOSURE": 2.0, "CDELT1": 0.492, "CUNIT1": "arcsec"}
+        )
+        header.update({"GAINCOMB": "combined", "PXBEG1": 1, "PXEND1": 66, "LONG": "x" * 100})
+        header["HIERARCH a long key"] = 3.5
+        header.add_history("made")
+        pixels = rng.integers(1, 120, (64, 66)).astype(dtype)
+        bases.append(_written([fits.PrimaryHDU(pixels, header)]))
+        bases.append(_written([fits.PrimaryHDU(), fits.ImageHDU(pixels, header), fits.ImageHDU(pixels)]))
+    bases += [_psf(), _psf()]
+    return tuple(bases)
+
+
+def _psf() -> bytes:
+    """A PSF with components and tables in the layout of `psfcore.fits.psfs.write_psf`."""
+    y, x = np.indices((64, 64)) - 32
+    kernel = np.exp(-0.5 * (x**2 + y**2) / 1.5**2).astype("f4")
+    kernel /= kernel.sum(dtype=float)
+    first = fits.PrimaryHDU(kernel, fits.Header({"PSFNAME": "mine", "PSFVERS": "1.0.0", "PSFSTAT": "draft"}))
+    toml = np.frombuffer(b'name = "mine"', dtype=np.uint8)[None]
+    text = fits.BinTableHDU.from_columns(
+        [fits.Column("TOML", f"{toml.size}B", array=toml)], name="INSTRUMENT"
+    )
+    fit = fits.BinTableHDU.from_columns(
+        [
+            fits.Column("parameter", "16A", array=np.array(["b_px", "c"])),
+            fits.Column("coordinate", "D", array=np.array([1.0, 2.0])),
+            fits.Column("covariance", "2D", array=np.eye(2)),
+        ],
+        name="FIT",
+    )
+    fit.header["SHAPE"] = "softened-power-law"
+    return _written([first, fits.ImageHDU(kernel, name="SCATTER"), text, fit])
+
+
+def _written(hdus: list[fits.PrimaryHDU]) -> bytes:
+    file = io.BytesIO()
+    fits.HDUList(hdus).writeto(file)
+    return file.getvalue()

@@ -1,0 +1,161 @@
+"""An instrument file cannot ask for more memory than its estimate, and counts beyond all telescopes are refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psfcore.build import build_psf
+from psfcore.diffraction import airy, mesh_series
+from psfcore.diffraction.pupil import MaskGrid, entrance_pupil
+from psfcore.errors import DataError
+from psfcore.instruments.files import instrument_names
+from psfcore.instruments.model import MOST_BYTES, load_instrument, parse_instrument
+from psfcore.instruments.workload import MOST_CELLS, PERIOD_PX, check_workload, workload
+from tests.conftest import REPOSITORY, SMALL_INSTRUMENT
+from workers.intake.cost_model import COSTS
+from workers.intake.estimates import _build
+
+MIB = 2**20
+MESH = "[[meshes]]\nname = 'm'\nplace = 'entrance'\npitch_um = 300.0\nwire_um = 30.0\n"
+POLYGON = "{ corners_mm = [[0, 0], [1, 0], [1, 1]] }"
+
+
+def small(added: str = "", **values: str) -> str:
+    """The small instrument with other values of its keys, and more tables."""
+    lines = SMALL_INSTRUMENT.splitlines()
+    changed = [
+        next((f"{k} = {v}" for k, v in values.items() if line.startswith(f"{k} =")), line) for line in lines
+    ]
+    return "\n".join(changed) + "\n" + added
+
+
+def mount(text: str) -> str:
+    return small("[mount]\nbasis = 'assumed'\n" + text)
+
+
+TOO_MANY = {
+    "windows": small(MESH + "windows = 100000\nangle_deg = 45.0"),
+    "rays of one set": mount("rays = [{ count = 257, width_mm = 0.01 }]"),
+    "rays of all sets": mount(f"rays = [{','.join(100 * ['{ count = 100, width_mm = 0.01 }'])}]"),
+    "rings": mount(f"rings = [{','.join(65 * ['{ radius_mm = 1, width_mm = 0.01 }'])}]"),
+    "polygons": mount(f"polygons = [{','.join(65 * [POLYGON])}]"),
+    "corners": mount(f"polygons = [{{ corners_mm = [{','.join(1025 * ['[0, 1]'])}] }}]"),
+    "corners of all polygons": mount(f"polygons = [{','.join(3 * ['{ corners_mm = [' + ','.join(400 * ['[0, 1]']) + '] }'])}]"),
+    "meshes": small(17 * (MESH + "windows = 9\n")),
+    "lines": small(65 * "[[bandpass]]\nwavelength_angstrom = 171.0\nweight = 1.0\n"),
+    "gain modes": small("[detector.gain_modes]\n" + "\n".join(f"m{n} = {{ basis = 'assumed' }}" for n in range(65))),
+    "characters": small("# " + "x" * MOST_BYTES),
+}  # fmt: skip
+TOO_LARGE = {
+    "cells of a rotated mesh": small(MESH + "windows = 10000\nangle_deg = 45.0", focal_length_mm="100.0"),
+    "samples of the aperture": small(diameter_mm="4e6"),
+}
+
+
+@pytest.mark.parametrize("name", TOO_MANY)
+def test_too_many_parts_are_refused_when_the_file_is_read(name: str) -> None:
+    with pytest.raises(DataError) as caught:
+        parse_instrument(TOO_MANY[name], "greedy.toml")
+    assert (
+        caught.value.code == "bad-instrument-file" and "at most" in caught.value.message
+    ) or "less than" in caught.value.message
+
+
+@pytest.mark.parametrize("name", TOO_LARGE)
+def test_too_large_arrays_are_refused_before_they_exist(name: str) -> None:
+    instrument = parse_instrument(TOO_LARGE[name], "greedy.toml")
+    tracemalloc.start()
+    with pytest.raises(DataError, match=r"expected .*; got") as caught:
+        build_psf(instrument)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert caught.value.code == "bad-instrument-file" and peak < MIB
+
+
+@pytest.mark.parametrize("name", instrument_names())
+def test_shipped_instruments_are_far_from_the_limits(name: str) -> None:
+    instrument = load_instrument(name)
+    check_workload(instrument, name)
+    work = workload(instrument, 4096)
+    assert max(work.cells, default=0) < MOST_CELLS / 5 and work.samples < 100
+
+
+def test_the_sizes_are_those_of_the_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
+    aia, size = load_instrument("aia_171"), 64
+    work = workload(aia, size)
+    entrance = aia.meshes[0]
+    optics = {"wavelength_angstrom": aia.wavelength_angstrom, "pixel_pitch_um": aia.detector.pixel_pitch_um}
+    seen: list[int] = []
+
+    def cells(edges: Any, light: Any, spacing_px: float) -> Any:
+        seen.append(len(edges) - 1)
+        return np.arange(1)
+
+    monkeypatch.setattr(mesh_series, "_first_of_each_cell", cells)
+    mesh_series.rotated_mesh_kernel(
+        **optics,
+        distance_mm=aia.focal_length_mm,
+        pitch_um=entrance.pitch_um,
+        wire_um=entrance.wire_um,
+        windows=entrance.windows,
+        angle_deg=entrance.angle_deg,
+        size=size,
+    )
+
+    def light_beyond(v: Any, obscured: float) -> Any:
+        seen.append(len(v))
+        return np.ones(len(v))
+
+    monkeypatch.setattr(airy, "airy_light_beyond", light_beyond)
+    aperture = aia.aperture
+    airy.airy_kernel(
+        **optics, focal_length_mm=aia.focal_length_mm, diameter_mm=aperture.diameter_mm, size=size
+    )
+    for got, expected in zip(seen, (work.cells[0], work.airy_points), strict=True):
+        assert 0.9 * expected <= got <= 1.02 * expected
+
+
+def test_the_mask_and_its_edges_are_not_larger_than_said() -> None:
+    hri = load_instrument("hri_euv")
+    work = workload(hri, PERIOD_PX)
+    cell_mm = (
+        hri.wavelength_angstrom
+        * 1e-7
+        * hri.focal_length_mm
+        / (PERIOD_PX * hri.detector.pixel_pitch_um * 1e-3)
+    )
+    grid = MaskGrid(entrance_pupil(hri.aperture, mount=hri.mount), cell_mm)
+    assert work.mask and abs(grid.cells - work.mask_cells) <= 4
+    assert len(grid._entries) <= work.mount_entries + 8 * work.mask_cells
+
+
+GREEDY = small(MESH + "windows = 400\nangle_deg = 45.0\n", focal_length_mm="200.0", diameter_mm="20.0")
+
+
+def test_a_greedy_file_within_the_limits_keeps_to_its_estimate() -> None:
+    """The mesh is computed on the full grid, in a process that may use 1.5 times the estimate."""
+    instrument = parse_instrument(GREEDY, "greedy.toml")
+    check_workload(instrument, "greedy.toml")
+    assert max(workload(instrument, 2048).cells) > 400_000
+    estimate_mib = round(COSTS.worker_mib + _build({"instrument_file": GREEDY, "size": 2048})[1])
+    code = (
+        "import sys\nfrom psfcore.build import build_psf\nfrom psfcore.instruments.model import parse_instrument\n"
+        "from workers.run.child import Child\n"
+        "with Child(1).limited(int(sys.argv[1])):\n"
+        "    print(build_psf(parse_instrument(sys.stdin.read(), 'greedy.toml')).kernel.shape)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(estimate_mib)],
+        input=GREEDY,
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=170,
+    )
+    assert done.stdout == "(2048, 2048)\n", done.stderr

@@ -1,0 +1,212 @@
+"""A job that takes too much memory fails, and one that does not stop is ended; its worker goes on with the next job."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from celery import Celery
+
+from tests.whole.stack import wait_for
+from workers.broker import app as queue
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.run.child import MARGIN, MIB, Child, data_bytes, is_out_of_memory
+from workers.settings import Settings
+
+# A worker of one process, whose jobs do what their parameters say.
+WORKER = """
+import ctypes
+import time
+import numpy as np
+import workers.tasks.psf_build
+
+def task(context, parameters):
+    context.report("at work", 1, 2)
+    match parameters["what"]:
+        case "greedy":
+            kept = []
+            while True:
+                kept.append(np.ones(2**20))
+                assert len(kept) * 8 <= parameters["most_mib"], "more memory than the limit"
+        case "large":
+            kept = np.ones(parameters["mib"] * 2**17)
+        case "deaf":
+            time.sleep(600)
+        case "deaf in C":
+            ctypes.PyDLL(None).sleep(600)  # with the interpreter's lock: no other thread can run
+    return "result"
+
+workers.tasks.psf_build.psf_build = task
+import workers.run.registry
+workers.run.registry.load_tasks = lambda: None  # this process has loaded the only task, before it starts others
+from workers.run.worker import main
+main()
+"""
+LEASE_S = 2.0
+
+
+@dataclass
+class Worker:
+    """A worker process, its catalogue and its broker."""
+
+    process: subprocess.Popen[bytes]
+    catalogue: Catalogue
+    broker: Celery
+    log: Path
+    submitted: int = 0
+
+    def submit(self, what: str, *, estimate_mib: int = 100, **parameters: Any) -> JobRow:
+        """Submit a job."""
+        self.submitted += 1
+        job, _ = self.catalogue.jobs.submit(
+            "psf-build",
+            {"what": what, **parameters},
+            f"key {self.submitted}",
+            DEFAULT_OWNER,
+            estimate={"memory_mib": estimate_mib, "seconds": 1.0, "start_s": 1.0},
+        )
+        assert queue.submit(self.broker, job.id)
+        return job
+
+    def row(self, job: JobRow) -> JobRow:
+        """The job's row."""
+        row = self.catalogue.jobs.get(job.id)
+        assert row is not None
+        return row
+
+    def wait(self, job: JobRow, phase: str) -> JobRow:
+        """The job's row when it has this phase."""
+        wait_for(lambda: self.row(job).phase == phase, f"{phase}; {self.log.read_text()}", 60.0)
+        return self.row(job)
+
+    def child(self) -> int:
+        """The process that runs the jobs."""
+        (child,) = psutil.Process(self.process.pid).children()
+        return int(child.pid)
+
+
+@pytest.fixture(scope="module")
+def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Worker]:
+    folder = tmp_path_factory.mktemp("worker")
+    data = folder / "data"
+    data.mkdir()
+    environment = {
+        "HELIOPSF_DATA_DIR": str(data),
+        "HELIOPSF_BROKER_URL": "filesystem://",
+        "HELIOPSF_STOP_S": "0.1",
+        "HELIOPSF_HEARTBEAT_S": "0.1",
+        "HELIOPSF_LEASE_S": str(LEASE_S),
+        "HELIOPSF_CANCEL_S": "0.3",
+        "HELIOPSF_WORKER_THREADS": "2",
+        "HELIOPSF_LOG_FORMAT": "json",
+        "OMP_NUM_THREADS": "1",
+    }
+    settings = Settings(data_dir=data, broker_url="filesystem://")
+    catalogue = Catalogue(settings.catalogue_url)
+    catalogue.upgrade()
+    with (folder / "worker.log").open("wb") as written:
+        process = subprocess.Popen(
+            [sys.executable, "-c", WORKER],
+            env={k: v for k, v in os.environ.items() if not k.startswith("HELIOPSF_")} | environment,
+            stdout=subprocess.DEVNULL,
+            stderr=written,
+        )
+    try:
+        yield Worker(process, catalogue, queue.make_app(settings), folder / "worker.log")
+    finally:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        catalogue.close()
+
+
+def test_a_greedy_job_fails_at_its_limit_and_the_next_one_runs(worker: Worker) -> None:
+    job = worker.submit("greedy", estimate_mib=200, most_mib=1000)
+    row = worker.wait(job, "ERROR")
+    assert row.error is not None
+    assert (row.error["code"], row.error["fault"]) == ("out-of-memory", "user")
+    assert "expected a job of at most 300 MiB, 1.5 times its estimate of 200 MiB" in row.error["message"]
+    before = worker.child()
+    worker.wait(worker.submit("large", estimate_mib=200, mib=250), "COMPLETED")
+    assert worker.child() == before, "the same process: memory beyond the estimate was free again"
+
+
+def test_a_job_that_ignores_its_cancellation_is_ended_with_its_process(worker: Worker) -> None:
+    job = worker.submit("deaf")
+    worker.wait(job, "EXECUTING")
+    before = worker.child()
+    worker.catalogue.jobs.cancel(job.id)
+    row = worker.wait(job, "ABORTED")
+    assert row.result_id is None and row.lease is None
+    worker.wait(worker.submit("nothing"), "COMPLETED")
+    assert worker.child() != before, "a new process"
+
+
+def test_a_job_that_blocks_the_interpreter_loses_its_process(worker: Worker) -> None:
+    job = worker.submit("deaf in C")
+    worker.wait(job, "EXECUTING")
+    before = worker.child()
+    worker.catalogue.jobs.cancel(job.id)
+    worker.wait(worker.submit("nothing"), "COMPLETED")
+    assert worker.child() != before, "a new process"
+    worker.catalogue.jobs.give_up_silent(LEASE_S, max_attempts=3)  # as the reconciler does
+    worker.wait(job, "ABORTED")
+
+
+def test_the_limit_holds_in_the_block_and_ends_with_it() -> None:
+    child = Child(threads=1)
+    beyond = (round(MARGIN * 200) + 100) * MIB // 8
+    with pytest.raises(MemoryError), child.limited(200):
+        np.empty(beyond)
+    assert np.empty(beyond).size == beyond
+
+
+def test_memory_that_is_only_reserved_is_not_counted() -> None:
+    import mmap
+
+    before = data_bytes()
+    with mmap.mmap(-1, 2**34, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ):
+        assert data_bytes() - before < 2**30
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (MemoryError(), True),
+        (OSError(12, "Cannot allocate memory"), True),
+        (RuntimeError("can't start new thread"), True),
+        (OSError(28, "No space left on device"), False),
+        (RuntimeError("other"), False),
+        (ValueError("other"), False),
+    ],
+)
+def test_which_errors_say_that_no_memory_is_left(error: Exception, expected: bool) -> None:
+    assert is_out_of_memory(error) is expected
+
+
+def test_a_thread_beyond_the_limit_is_no_memory() -> None:
+    """The stacks of threads count."""
+    code = (
+        "import resource, threading, time\n"
+        "from workers.run.child import data_bytes, is_out_of_memory\n"
+        "threading.stack_size(2**30)\n"
+        "limit = data_bytes() + 2**29\n"
+        "resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))\n"
+        "try:\n    threading.Thread(target=time.sleep, args=(0,)).start()\n"
+        "except RuntimeError as error:\n    print(is_out_of_memory(error))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "True\n", done.stderr

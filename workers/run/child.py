@@ -1,0 +1,91 @@
+"""The process in which jobs run: the operating system limits its memory, and it is ended if a job does not stop.
+
+The limit is RLIMIT_DATA. Linux counts private writable memory against it: the heap, arrays, and the stacks of threads. It
+does not count memory that is only reserved, or files that are mapped for reading; RLIMIT_AS would count both, and numba,
+LLVM and the memory allocator reserve much more than they use. An allocation beyond the limit raises MemoryError. On
+systems other than Linux, memory is not limited.
+
+A worker process that has ended is replaced by its parent (Celery's prefork pool). Other processes of the worker go on.
+"""
+
+from __future__ import annotations
+
+import errno
+import faulthandler
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+MIB = 2**20
+MARGIN = 1.5  # estimates of memory are correct within this factor
+# Each thread of a library has a stack, which counts in full. OpenBLAS, numba, the Fourier transforms and the tasks each
+# have as many threads as the settings say.
+_POOLS = 4
+_EXIT_STATUS = 1
+
+
+class Child:
+    """This process, which runs jobs for a worker and may be ended."""
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+
+    @contextmanager
+    def limited(self, estimate_mib: int) -> Iterator[None]:
+        """Limit the memory that the block may use to MARGIN times the estimate, in addition to the memory in use already."""
+        if sys.platform != "linux":
+            yield
+            return
+        import resource
+
+        stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
+        stacks = _POOLS * self._threads * (stack if stack != resource.RLIM_INFINITY else 8 * MIB)
+        soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        limit = data_bytes() + allowed_mib(estimate_mib) * MIB + stacks
+        limits = [known for known in (limit, soft, hard, sys.maxsize) if known != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_DATA, (min(limits), hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+    def expect_news_within(self, seconds: float) -> None:
+        """End the process unless this is called again, or ``expect_no_news`` is, within this time.
+
+        The clock runs in a thread without Python code, so it also ends a process whose C code never returns.
+        """
+        faulthandler.dump_traceback_later(seconds, exit=True, file=2)
+
+    def expect_no_news(self) -> None:
+        """Stop the clock of ``expect_news_within``."""
+        faulthandler.cancel_dump_traceback_later()
+
+    def end(self) -> None:
+        """End the process now, without clean-up: its main thread does not respond."""
+        for handler in logging.getLogger().handlers:
+            handler.flush()
+        os._exit(_EXIT_STATUS)
+
+
+def allowed_mib(estimate_mib: int) -> int:
+    """The memory that a job with this estimate may use, MiB."""
+    return round(MARGIN * estimate_mib)
+
+
+def data_bytes() -> int:
+    """Private writable memory of this process, as RLIMIT_DATA counts it (proc(5), statm, sixth field)."""
+    pages = int(Path("/proc/self/statm").read_text().split()[5])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an exception says that no memory was left: for an array, a mapping, or the stack of a thread."""
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    no_thread = isinstance(error, RuntimeError) and "can't start new thread" in str(error)
+    return no_thread or isinstance(error, MemoryError)
