@@ -181,8 +181,9 @@ def wavelength_angstrom(header: Header) -> float | None:
     unknown.
     """
     value = optional_number(header, "WAVELNTH")
-    unit = str(_lenient(header, "WAVEUNIT") or "angstrom").replace(" ", "").lower()
-    factor = _ANGSTROM_PER_UNIT.get(unit)
+    power = optional_number(header, "WAVEUNIT")
+    unit = optional_text(header, "WAVEUNIT") or ("angstrom" if power is None else f"{power:g}")
+    factor = _ANGSTROM_PER_UNIT.get(unit.replace(" ", "").lower())
     return None if value is None or value <= 0 or factor is None else value * factor
 
 

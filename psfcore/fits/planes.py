@@ -52,9 +52,7 @@ def plane_hdu(
     for bit, meaning in (meanings or {}).items():
         hdu.header[f"QBIT{bit.bit_length() - 1}"] = (bit.name or "", f"value {int(bit)}: {meaning}")
     if meanings:
-        hdu.header.add_comment(
-            "0 marks a good pixel. Other values are sums of the values of the cards QBITn."
-        )
+        hdu.header.add_comment("0 marks a good pixel; other values are sums of the values of QBITn.")
     for card in image_header.cards:
         if _PLACE_CARD.fullmatch(card.keyword):
             hdu.header.append(card, end=True)

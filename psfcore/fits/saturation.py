@@ -39,6 +39,7 @@ COMPARED = 100
 MASKED_BELOW = 1e-6
 DOUBTED_BELOW = 1e-3
 AIA_LEVEL_DN = 15000.0
+_BLOCK_ROWS = 256
 REQUEST, INSTRUMENT, PIXELS = "request", "instrument file", "pixels"
 _LEVEL_CARDS = ("SATURATE", "DATASAT")
 _SETTING = "set the level with saturation_dn (--saturation)"
@@ -72,7 +73,7 @@ def with_saturation(
     if found == "NSATPIX" and mask is not image.mask:
         warning = _missing_from(image, mask)
     if requested_dn is None:
-        top, count, chance = largest_value(image.pixels[mask == 0])
+        top, count, chance = largest_value(image.pixels, mask == 0)
         if chance < MASKED_BELOW:
             if found is not None:
                 warning = (
@@ -89,22 +90,31 @@ def with_saturation(
     return replace(image, mask=mask, saturation=Saturation(level, found, warning))
 
 
-def largest_value(values: NDArray[np.float64]) -> tuple[float, int, float]:
-    """The largest value, the number n of pixels that have it, and the probability P(n) of Eq. (1).
+def largest_value(pixels: NDArray[np.float64], valid: NDArray[np.bool_]) -> tuple[float, int, float]:
+    """The largest valid value, the number n of pixels that have it, and the probability P(n) of Eq. (1).
 
-    values: the valid pixels, one axis. P is 1 if no pixel is below the largest value.
+    pixels: [y, x]. valid: True for the pixels to look at. P is 1 if no valid pixel is below the largest value.
     """
-    if values.size == 0:
-        return np.nan, 0, 1.0
-    top = float(values.max())
-    below = values[values < top]
-    count = values.size - below.size
-    if below.size == 0:
+    top = float(np.max(pixels, initial=-np.inf, where=valid))
+    count = int(np.count_nonzero((pixels == top) & valid))
+    brightest = _brightest_below(pixels, valid, top)
+    if brightest.size == 0:
         return top, count, 1.0
-    compared = min(COMPARED, below.size)
-    brightest = np.partition(below, below.size - compared)[-compared:]
-    mean_per_value = compared / np.unique(brightest).size
+    mean_per_value = brightest.size / np.unique(brightest).size
     return top, count, float(pdtrc(count - 1, mean_per_value))  # Eq. (1)
+
+
+def _brightest_below(
+    pixels: NDArray[np.float64], valid: NDArray[np.bool_], top: float
+) -> NDArray[np.float64]:
+    """The COMPARED largest valid values below `top`. Rows are read in blocks, so that large images need no copy."""
+    found = np.empty(0)
+    for first in range(0, pixels.shape[0], _BLOCK_ROWS):
+        rows = slice(first, first + _BLOCK_ROWS)
+        found = np.concatenate([found, pixels[rows][valid[rows] & (pixels[rows] < top)]])
+        if found.size > COMPARED:
+            found = np.partition(found, found.size - COMPARED)[-COMPARED:]
+    return found
 
 
 def _levels(image: Image, requested_dn: float | None, instrument_dn: float | None) -> Mapping[str, float]:

@@ -35,7 +35,7 @@ def test_the_real_hri_image(stack: Stack, shared: Path, tmp_path: Path) -> None:
     assert abs(change["flux_change_pct"]) < 1
     assert change["bright_change_pct"] > 10
     assert change["dark_change_pct"] < -5
-    sunpy_map = pytest.importorskip("sunpy.map").Map(output)
+    sunpy_map = pytest.importorskip("sunpy.map").Map(output)[0]
     assert sunpy_map.detector == "HRI_EUV" and sunpy_map.data.shape == (2048, 2048)
     before = fits.getheader(shared / HRI, 1)
     for card in ("CRVAL1", "CRPIX2", "PC1_2", "CDELT1", "RSUN_ARC", "DATE-BEG", "XPOSURE"):

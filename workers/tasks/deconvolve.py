@@ -120,9 +120,9 @@ class _Work:
             psf = replace(psf, instrument=row.instrument)
         if psf.wavelength_angstrom is None and row.channel is not None and row.channel.isdecimal():
             psf = replace(psf, wavelength_angstrom=float(row.channel))
-        found: dict[str, str | None] = {
-            "channel": check_channel(psf, self.inputs.image.header, other_channel=self.request.other_channel)
-        }
+        # A rerun repeats what was allowed once, also by versions that did not compare channels.
+        allowed = self.request.other_channel or self.context.anew
+        found = {"channel": check_channel(psf, self.inputs.image.header, other_channel=allowed)}
         if self.inputs.image.saturation is not None:
             found["saturation"] = self.inputs.image.saturation.warning
         return [Warned(code, message) for code, message in found.items() if message is not None]

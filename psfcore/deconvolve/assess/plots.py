@@ -102,9 +102,7 @@ def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
         yscale="log",
         xlabel=f"Mean of {_HISTOGRAM_BLOCK_PX} x {_HISTOGRAM_BLOCK_PX} px ({unit})",
     )
-    axes.set_title(
-        "Number of blocks by brightness; dashed: percentiles 1 and 99", fontsize=11, color=INK, loc="left"
-    )
+    axes.set_title("Blocks by brightness; dashed: percentiles 1, 99", fontsize=11, color=INK, loc="left")
     axes.tick_params(labelsize=8.5)
     axes.legend(frameon=False, loc="upper left")
     for side in ("top", "right"):

@@ -94,6 +94,7 @@ def test_neighbouring_channels_differ_and_rounded_ones_do_not() -> None:
         ({"WAVELNTH": 171}, 171.0),
         ({"WAVELNTH": 17.1, "WAVEUNIT": "nm"}, 171.0),
         ({"WAVELNTH": 171, "WAVEUNIT": -10}, 171.0),
+        ({"WAVELNTH": 171, "WAVEUNIT": None}, 171.0),
         ({"WAVELNTH": 1710, "WAVEUNIT": "0.01 nm"}, None),
         ({"WAVELNTH": 0}, None),
         ({}, None),

@@ -111,11 +111,15 @@ def test_few_equal_pixels_give_a_warning_and_no_mask() -> None:
 
 
 def test_the_chance_is_the_poisson_probability() -> None:
-    values = np.concatenate([np.repeat(np.arange(1.0, 51.0), 2), np.full(9, 60.0)])
-    top, count, chance = largest_value(values)
-    assert (top, count) == (60.0, 9)
+    """Nine pixels have the largest value; below it, two pixels have each value. The image has several blocks of rows."""
+    pixels = np.concatenate([np.repeat(np.arange(0.0, 2400.0), 2), np.full(9, 5000.0), np.full(791, -1.0)])
+    pixels = np.random.default_rng(1).permutation(pixels).reshape(700, 8)
+    valid = np.ones(pixels.shape, bool)
+    top, count, chance = largest_value(pixels, valid)
+    assert (top, count) == (5000.0, 9)
     assert chance == pytest.approx(sum(poisson.pmf(n, 2.0) for n in range(9, 60)), rel=1e-9)
-    assert largest_value(np.full(20, 3.0)) == (3.0, 20, 1.0), "a flat image shows nothing"
+    assert largest_value(pixels, pixels < 5000)[:2] == (2399.0, 2)
+    assert largest_value(np.full((20, 20), 3.0), np.ones((20, 20), bool)) == (3.0, 400, 1.0)
 
 
 @pytest.mark.parametrize(

@@ -178,7 +178,7 @@ def test_a_bulk_that_fills_the_quota_stops_and_goes_on_with_room(
 ) -> None:
     (tmp_path / "archive").mkdir()
     for number in range(4):
-        write_image(tmp_path / "archive" / f"{number}.fits", shape=(256, 256), seed=number)
+        write_image(tmp_path / "archive" / f"{number}.fits", shape=(288, 288), seed=number)
     request = {
         "files": [{"glob": f"{tmp_path}/archive/*"}],
         "psf_id": upload(api, psf_file, "/v1/psfs"),

@@ -126,7 +126,7 @@ def test_a_deconvolution_with_it_carries_the_psfs_own_error(
     service: LocalService, fitted: dict[str, Any], tmp_path: Path
 ) -> None:
     image = tmp_path / "image.fits"
-    write_image(image, CDELT1=0.492, CDELT2=0.492)
+    write_image(image, CDELT1=0.492, CDELT2=0.492, DETECTOR="HRI_EUV")
     wanted = {"psf_id": fitted["psf"]["id"], "noise": (6.0, 2.0), "error_draws": 4, "steps": 3}
     service.deconvolve(image, tmp_path / "o.fits", **wanted)
     planes = read_planes(tmp_path / "o.fits")

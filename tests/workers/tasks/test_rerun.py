@@ -80,6 +80,22 @@ def test_a_product_of_an_earlier_version_is_made_again_although_the_new_one_exis
     assert report["same"] and (report["id"], report["again"]["id"]) == (old_id, made["id"])
 
 
+def test_a_product_made_before_channels_were_compared_is_made_again(
+    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
+) -> None:
+    fits.setval(image_file, "WAVELNTH", value=193)
+    fits.setval(psf_file, "WAVELNTH", value=171)
+    psf_id = local.upload_psf(psf_file)["id"]
+    made = local.deconvolve(image_file, psf_id=psf_id, steps=2, other_channel=True)
+    with local._catalogue._database.writing.begin() as session:
+        row = session.get(ProductRow, (OWNER, made["id"]))
+        assert row is not None
+        before = {n: v for n, v in row.details["parameters"].items() if n != "other_channel"}
+        row.details = row.details | {"parameters": before}
+    _, report = again(local, "product", made["id"], tmp_path / "r.json")
+    assert report["same"]
+
+
 def test_every_rerun_is_a_job_of_its_own(local: LocalService, made: dict[str, Any], tmp_path: Path) -> None:
     first, _ = again(local, "product", made["id"], tmp_path / "1.json")
     second, _ = again(local, "product", made["id"], tmp_path / "2.json")
