@@ -132,7 +132,7 @@ def map_case(context: Any, case: Any) -> Any:
 
 def _known(name: str, value: Any) -> Any:
     """An id that was made up, or one that is there. What is no id stays none: it is to be refused."""
-    is_id = isinstance(value, str) and (name == "uws" or re.fullmatch(r"[0-9a-f]{32}|[0-9a-f]{64}", value))
+    is_id = isinstance(value, str) and (name == "uws" or re.fullmatch(r"[0-9a-f]{8,64}", value))
     return KNOWN[name] if is_id and name in KNOWN and sum(value.encode("utf-8", "replace")) % 2 else value
 
 

@@ -299,7 +299,7 @@ def test_client_and_commands_take_a_key_and_never_show_it(
     assert "s3cret" not in str(malformed.value)
     seen: list[str | None] = []
     monkeypatch.setattr(
-        "service.client.http.Client.__init__", lambda self, server, key=None: seen.append(key) or 1 / 0
+        "service.client.http.Client.__init__", lambda self, server, key=None, **_: seen.append(key) or 1 / 0
     )
     CliRunner().invoke(main, ["psf", "list", "--key", key])
     monkeypatch.setenv("HELIOPSF_KEY", "from-the-environment")

@@ -136,6 +136,7 @@ def test_nothing_stays_of_a_refused_form(
         ("psf-fit", "transit", b"hello, I am a transit", 415, "expected a .zip, .tar or .tar.gz"),
         ("psf-fit", "transit", tar_without_images(), 422, "expected a file transit.json"),
     ],
+    ids=["no FITS", "empty", "no header", "too large", "no archive", "no transit.json"],
 )
 def test_a_file_is_checked_as_an_upload_is(
     api: TestClient, image_file: Path, kind: str, name: str, content: bytes, status: int, told: str
@@ -167,6 +168,7 @@ PART = b'--x\r\nContent-Disposition: form-data; name="f"; filename="a"\r\n\r\nSI
         (BOUNDARY, PART.replace(b'"a"', b'"\xff"') + b"--x--", "in UTF-8"),
         (BOUNDARY, b'--x\r\nContent-Disposition: form-data; name="a"\r\n\r\n\xff\r\n--x--', "in UTF-8"),
     ],
+    ids=["no boundary", "cut", "no form", "twice", "no name", "name of a file", "field"],
 )  # fmt: skip
 def test_a_broken_form_is_refused(
     api: TestClient, settings: Settings, media_type: str, body: bytes, told: str
