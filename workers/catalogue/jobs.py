@@ -323,7 +323,7 @@ class Jobs:
     def at_work_on(self, owner: str, work_key: str) -> bool:
         """Whether a job with this result executes now."""
         query = select(JobRow.id).where(
-            JobRow.owner == owner, JobRow.work_key == work_key, _is_at_work(JobRow.phase)
+            JobRow.owner == owner, JobRow.work_key == work_key, is_at_work(JobRow.phase)
         )
         with self._database.reading() as session:
             return session.scalars(query.limit(1)).first() is not None
@@ -348,12 +348,13 @@ def no_equal_at_work() -> ColumnElement[bool]:
     at_work = select(other.id).where(
         other.owner == JobRow.owner,
         other.work_key == JobRow.work_key,
-        _is_at_work(other.phase),
+        is_at_work(other.phase),
     )
     return ~at_work.exists()
 
 
-def _is_at_work(phase: InstrumentedAttribute[str]) -> ColumnElement[bool]:
+def is_at_work(phase: InstrumentedAttribute[str]) -> ColumnElement[bool]:
+    """The condition that a job executes."""
     # The phase is a literal in the text of the statement. Only then do the databases use the partial index.
     return phase == literal(Phase.EXECUTING.value, literal_execute=True)
 

@@ -89,6 +89,8 @@ def _folder(folder: Path, allowed: Sequence[Path], *, make: bool) -> Iterator[in
     """Open a folder below an allowed one, part by part and without following links. make: make the missing parts."""
     resolved = check_under(folder, allowed)
     root = next(one for one in allowed if resolved.is_relative_to(one))
+    if make:
+        root.mkdir(parents=True, exist_ok=True)
     handle = os.open(root, _FOLDER)
     try:
         for part in resolved.relative_to(root).parts:

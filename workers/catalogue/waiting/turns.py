@@ -8,10 +8,10 @@ lost, the reconciler submits the jobs again that still wait. A message without a
 
 from __future__ import annotations
 
-from sqlalchemy import and_, func, or_, select, update
+from sqlalchemy import Select, and_, func, or_, select, update
 
 from workers.catalogue.database import Database
-from workers.catalogue.jobs import Jobs, Lease, no_equal_at_work
+from workers.catalogue.jobs import Jobs, Lease, is_at_work, no_equal_at_work
 from workers.catalogue.tables import JobRow, OwnerTurnRow
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue
@@ -54,15 +54,38 @@ class Turns:
 
     def _next(self, told_id: str, queue: Queue) -> str | None:
         """The job of a queue that comes next, of those that the broker has received."""
-        received = and_(JobRow.submitted_at.is_not(None), JobRow.delayed.is_(False))
-        turn = and_(OwnerTurnRow.owner == JobRow.owner, OwnerTurnRow.queue == JobRow.queue)
-        query = (
-            select(JobRow.id)
-            .outerjoin(OwnerTurnRow, turn)
-            .where(JobRow.phase == Phase.QUEUED, JobRow.queue == queue, no_equal_at_work())
-            .where(or_(JobRow.id == told_id, received))
-            .order_by(func.coalesce(OwnerTurnRow.number, 0))
-            .order_by(func.coalesce(JobRow.started_at, JobRow.created_at), JobRow.id)
-        )
         with self._database.reading() as session:
-            return session.scalars(query.limit(1)).first()
+            for owner in session.scalars(_owners(queue)).all():
+                found = session.scalars(_oldest(owner, told_id, queue)).first()
+                if found is not None:
+                    return found
+        return None
+
+
+def _owners(queue: Queue) -> Select[str]:
+    """The owners whose jobs wait in a queue, the one who was served least recently first."""
+    number = func.coalesce(OwnerTurnRow.number, 0)
+    turn = and_(OwnerTurnRow.owner == JobRow.owner, OwnerTurnRow.queue == JobRow.queue)
+    waiting = select(JobRow.owner).outerjoin(OwnerTurnRow, turn)
+    waiting = waiting.where(JobRow.phase == Phase.QUEUED, JobRow.queue == queue)
+    return waiting.group_by(JobRow.owner, OwnerTurnRow.number).order_by(number, JobRow.owner)
+
+
+def _oldest(owner: str, told_id: str, queue: Queue) -> Select[str]:
+    """The owner's oldest job that could start now.
+
+    It was received by the broker, or the broker has just delivered its id, before the server recorded its submission.
+    """
+    received = and_(JobRow.submitted_at.is_not(None), JobRow.delayed.is_(False))
+    # Not no_equal_at_work(): that condition is tested for each waiting job, of which there may be many thousands.
+    at_work = select(JobRow.work_key).where(
+        JobRow.owner == owner, is_at_work(JobRow.phase), JobRow.work_key.is_not(None)
+    )
+    oldest = (
+        select(JobRow.id)
+        .where(JobRow.owner == owner, JobRow.phase == Phase.QUEUED, JobRow.queue == queue)
+        .where(or_(JobRow.id == told_id, received))
+        .where(or_(JobRow.work_key.is_(None), JobRow.work_key.not_in(at_work)))
+        .order_by(func.coalesce(JobRow.started_at, JobRow.created_at), JobRow.id)
+    )
+    return oldest.limit(1)

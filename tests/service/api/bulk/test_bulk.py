@@ -25,6 +25,7 @@ from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.keys import Scope
 from workers.contract.queues import Queue
+from workers.files import beneath
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -208,9 +209,9 @@ def test_an_unwritable_output_folder_fails_before_the_deconvolution(
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "run").write_text("a file where the folder is to be")
     # Root may write to any folder: what the system would answer to another user.
-    monkeypatch.setattr(bulk_image.os, "access", lambda *_: False)
+    monkeypatch.setattr(beneath.os, "access", lambda *_, **__: False)
     monkeypatch.delattr(bulk_image.deconvolve_task, "make")
-    for folder, reason in (("run", "File exists"), ("other", "Permission denied")):
+    for folder, reason in (("run", "Not a directory"), ("other", "Permission denied")):
         bulk = asked(
             api,
             files=[{"glob": f"{archive}/2020/image*"}],

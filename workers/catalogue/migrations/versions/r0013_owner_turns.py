@@ -10,7 +10,7 @@ down_revision = "0012"
 
 
 def upgrade() -> None:
-    """Make the table and the column. In a database of an earlier version, no owner has been served yet."""
+    """Make the table and the column, and add the owner to an index. In a database of an earlier version, no owner has been served yet."""
     op.create_table(
         "owner_turns",
         sa.Column("owner", sa.String(64), primary_key=True),
@@ -18,3 +18,5 @@ def upgrade() -> None:
         sa.Column("number", sa.BigInteger, nullable=False),
     )
     op.add_column("jobs", sa.Column("delayed", sa.Boolean, nullable=False, server_default=sa.false()))
+    op.drop_index("jobs_waiting", "jobs")
+    op.create_index("jobs_waiting", "jobs", ["phase", "queue", "created_at", "submitted_at", "owner"])
