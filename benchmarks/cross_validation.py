@@ -101,7 +101,7 @@ def exact(stack: Stack, transit_id: str, runs: int, seed: int, f_s: float) -> tu
 
 def folds_of(stack: Stack, job: dict[str, Any]) -> tuple[FoldFit, ...]:
     report = stack.data.parent / "report.json"
-    stack.client.download(stack.client.get(job["result"])["file"], report)
+    stack.client.download(stack.client.get(job["result"])["file"], report, overwrite=True)
     return tuple(FoldFit.from_json(fold) for fold in json.loads(report.read_text())["folds"])
 
 

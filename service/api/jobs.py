@@ -137,7 +137,7 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
 
 
 @router.post("/identity", summary="The id that the result of a job has or would have")
-def get_identity(body: JobRequest, caller: Reading, state: Shared) -> Identified:
+def get_identity(body: JobRequest, caller: Submitting, state: Shared) -> Identified:
     """Resolve a request without starting a job. Equal requests have equal ids, so a client can skip results that it holds.
 
     For a kind whose jobs always make a new result (`rerun`), the id is different each time.

@@ -85,11 +85,9 @@ def changes(
     table_file, sheet_file = output / TABLE, output / SHEET
     with user_errors():
         check_output_folder(output)
-        check_outputs(
-            (table_file, sheet_file),
-            inputs=(*files, psf if psf and Path(psf).is_file() else None),
-            overwrite=overwrite,
-        )
+        if output.is_dir():
+            psf_file = psf if psf and Path(psf).is_file() else None
+            check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
     with user_errors(), connection(server, local) as service, progress_bar() as report:
         parameters = {
             "psf_id": named_psf(service, psf),
@@ -113,6 +111,7 @@ def changes(
             "products": products,
             "inputs_sha256": inputs,
         }
+        output.mkdir(parents=True, exist_ok=True)
         write_json(table_file, content, overwrite=overwrite)
         with written(sheet_file, overwrite=overwrite) as picture:
             contact_sheet_png(treated, failures, picture, most=most)

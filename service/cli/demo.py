@@ -51,6 +51,7 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
     if image is not None:
         product_file, picture = _results_for(image, output)
         check_outputs((product_file, picture), inputs=(image,), overwrite=True)
+    output.mkdir(exist_ok=True)
     with (output / LOG).open("w") as log:
         server = subprocess.Popen(
             [

@@ -143,8 +143,8 @@ def _files_of(
 
 
 def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> None:
-    """Make an output folder. Raises ``ClickException`` if it cannot be written, if it holds files and ``overwrite`` is
-    false, or if it holds an input."""
+    """Raise ``ClickException`` if an output folder cannot be made or written, if it holds files and ``overwrite`` is false,
+    or if it holds an input."""
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise click.ClickException(f"{folder} is not empty; name another folder, or use --overwrite")
     for path in inputs:
@@ -152,6 +152,9 @@ def check_fresh_folder(folder: Path, inputs: Sequence[Path] = (), *, overwrite: 
             raise click.ClickException(
                 f"cannot write to {folder}: it holds the input {path}; name another folder"
             )
+    parent = folder.resolve().parent
+    if not parent.is_dir():
+        raise click.ClickException(f"cannot write {folder}: there is no folder {parent}")
     with user_errors():
         check_output_folder(folder)
 

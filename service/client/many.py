@@ -62,6 +62,7 @@ def deconvolve_many(
     no answer from the service.
     """
     check_output_folder(folder)
+    Path(folder).mkdir(parents=True, exist_ok=True)
     found = _products_in(Path(folder))
     for number, image in enumerate(map(Path, images)):
         progress(number, len(images))

@@ -45,12 +45,15 @@ def check_outputs(
 
 
 def check_output_folder(folder: Name) -> None:
-    """Make an output folder if it does not exist. Raises ``ServiceError`` "output-not-writable" if files cannot be written into it."""
-    with _not_writable(Path(folder)):
-        if Path(folder).is_file():
-            raise NotADirectoryError(None, "expected a folder; this is a file")
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        probe(Path(folder) / "output")
+    """Raise ``ServiceError`` "output-not-writable" if files could not be written into a folder. The folder need not exist:
+    then the nearest folder above it is tried, and nothing is made."""
+    there = Path(folder)
+    with _not_writable(there):
+        while not there.exists():
+            there = there.parent
+        if not there.is_dir():
+            raise NotADirectoryError(None, f"expected a folder; {there} is a file")
+        probe(there / "output")
 
 
 @contextmanager

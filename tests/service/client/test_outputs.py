@@ -94,7 +94,6 @@ def test_what_cannot_be_written_is_noticed_by_trying(tmp_path: Path, monkeypatch
             check_output_folder(folder)
         assert caught.value.code == "output-not-writable"
     check_output_folder(tmp_path / "a" / "b")
-    assert list((tmp_path / "a" / "b").iterdir()) == []
 
     def full(_descriptor: int) -> None:
         raise OSError(28, os.strerror(28))
@@ -102,4 +101,4 @@ def test_what_cannot_be_written_is_noticed_by_trying(tmp_path: Path, monkeypatch
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(ServiceError, match="No space left"):
         check_outputs((tmp_path / "x",))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "file"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]

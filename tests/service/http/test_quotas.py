@@ -35,7 +35,10 @@ def settings(settings: Settings, tmp_path: Path) -> Settings:
 
 
 def large(path: Path, kib: int) -> Path:
-    fits.PrimaryHDU(np.ones((kib, 256), "f4")).writeto(path)
+    """A file that can be uploaded as an image and as a PSF: all light is in its central pixel."""
+    pixels = np.zeros((kib, 256), "f4")
+    pixels[kib // 2, 128] = 1.0
+    fits.PrimaryHDU(pixels).writeto(path)
     return path
 
 

@@ -11,6 +11,7 @@ import pytest
 from astropy.io import fits
 
 from psfcore.deconvolve.methods.registry import method_names
+from psfcore.errors import DataError
 from psfcore.fits.planes import read_planes
 from service.cli.options import METHODS
 from service.client.http import ServiceError
@@ -110,13 +111,10 @@ def test_pixels_that_cannot_be_used_are_the_users_error(
     assert "expected" in str(caught.value)
 
 
-def test_a_psf_that_sums_to_three_is_the_users_error(
-    local: LocalService, image_file: Path, tmp_path: Path
-) -> None:
+def test_a_psf_that_sums_to_three_is_the_users_error(local: LocalService, tmp_path: Path) -> None:
     write_psf(tmp_path / "three.fits", scale=3.0)
-    psf_id = local.upload_psf(tmp_path / "three.fits")["id"]
-    with pytest.raises(ServiceError, match="expected"):
-        local.deconvolve(image_file, psf_id=psf_id)
+    with pytest.raises(DataError, match="expected"):
+        local.upload_psf(tmp_path / "three.fits")
 
 
 def test_a_built_psf_carries_its_provenance(local: LocalService, tmp_path: Path) -> None:

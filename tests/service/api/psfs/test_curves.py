@@ -167,7 +167,9 @@ def test_an_uploaded_psf_says_which_job_makes_its_tables(
 def test_invalid_weights_are_a_users_error(
     api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
 ) -> None:
-    fits.PrimaryHDU(np.zeros((32, 32), "f4")).writeto(tmp_path / "dark.fits")
+    # Compressed weights are not checked at upload.
+    packed = fits.CompImageHDU(np.zeros((32, 32), "i4"))
+    fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / "dark.fits")
     psf_id = upload(api, tmp_path / "dark.fits", "/v1/psfs")
     job = api.post("/v1/jobs", json={"kind": "psf-tables", "parameters": {"psf_id": psf_id}}).json()
     run_jobs()
@@ -231,7 +233,7 @@ def test_a_cutout_of_an_upload(api: TestClient, tmp_path: Path) -> None:
     fits.PrimaryHDU(kernel).writeto(tmp_path / "double.fits")  # float64, not square
     fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(kernel)]).writeto(tmp_path / "second.fits")
     (tmp_path / "packed.fits.gz").write_bytes(gzip.compress((tmp_path / "double.fits").read_bytes()))
-    fits.PrimaryHDU((kernel * 1e4).astype("i4")).writeto(tmp_path / "whole.fits")
+    fits.PrimaryHDU((kernel == kernel.max()).astype("i4")).writeto(tmp_path / "whole.fits")
     double = upload(api, tmp_path / "double.fits", "/v1/psfs")
     answer = api.get(f"/v1/psfs/{double}/cutout?size=7")
     assert np.array_equal(fits.getdata(io.BytesIO(answer.content)), kernel[17:24, 22:29])
@@ -374,8 +376,8 @@ def test_the_command_compares_cuts_and_bins_files(psf_file: Path, tmp_path: Path
         ("query", psf_file, "--radius", -1),
         ("query", psf_file, "--annulus", 5, 4),
         ("query", psf_file, "--compare", A),
-        ("cutout", psf_file, "--size", 65, "-o", cut),
-        ("rebin", psf_file, "--factor", 99, "-o", cut),
+        ("cutout", psf_file, "--size", 65, "-o", tmp_path / "new.fits"),
+        ("rebin", psf_file, "--factor", 99, "-o", tmp_path / "new.fits"),
     ):
         refused = run(*wrong)
         assert refused.exit_code != 0 and "expected" in refused.output, (wrong, refused.output)
