@@ -11,15 +11,18 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Parameters(BaseModel):
-    """Base class of the parameters of a job, or of a part of a job. Unknown names are refused; values cannot be changed afterwards."""
+    """Base class of the parameters of a job, or of a part of a job. Unknown names are refused; values cannot be changed afterwards.
 
+    algorithm_version: raise it when the same parameters give another result; it is part of the identity of the result.
+    """
+
+    algorithm_version: ClassVar[int]
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class _Method(Parameters):
     """Parameters that every method of deconvolution has. Each method adds its own."""
 
-    algorithm_version: ClassVar[int]
     stop: Literal["fixed", "discrepancy"] = Field(
         "fixed",
         description="`fixed`: stop after `steps` iterations; `discrepancy`: stop earlier, when the residual is as small "
