@@ -75,10 +75,10 @@ def compression_of(header: Header, nx: int, ny: int) -> Compression:
 
 
 def _tile(header: Header, nx: int, ny: int) -> tuple[int, int]:
-    tile_x = card_count(header, "ZTILE1", largest=_LARGEST_INT, default=nx)
-    tile_y = card_count(header, "ZTILE2", largest=_LARGEST_INT, default=1)
-    if not tile_x or not tile_y:
-        raise HeaderError("bad-tiles", f"expected tiles of at least one pixel; got {tile_x} x {tile_y}")
+    tile_x, tile_y = card_count(header, "ZTILE1", default=nx), card_count(header, "ZTILE2", default=1)
+    if not (1 <= tile_x <= _LARGEST_INT and 1 <= tile_y <= _LARGEST_INT):
+        wanted = f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis"
+        raise HeaderError("bad-tiles", f"{wanted}; got {tile_x} x {tile_y}")
     tiles = math.prod(-(-n // tile) for n, tile in ((nx, tile_x), (ny, tile_y)))
     rows = card_count(header, "NAXIS2")
     if rows != tiles:

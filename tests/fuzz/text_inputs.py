@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from typing import Any
 
@@ -58,7 +59,7 @@ def _json(content: Any) -> bytes:
 
 
 def _any(rng: np.random.Generator) -> Any:
-    return VALUES[int(rng.integers(len(VALUES)))]
+    return copy.deepcopy(VALUES[int(rng.integers(len(VALUES)))])  # a later fault may change it
 
 
 def instrument(seed: int) -> bytes:
