@@ -129,7 +129,8 @@ def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
     log_file.parent.mkdir(parents=True, exist_ok=True)
     with log_file.open("ab") as output:
         return subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
+            # -P: nothing is imported from the working folder, to which other users may be able to write.
+            [sys.executable, "-P", "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
             env=os.environ | environment(settings),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,  # Celery prints a banner here; the logs go to standard error
