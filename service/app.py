@@ -20,6 +20,7 @@ from service.http.state import State
 from service.operation import docs, health, metrics
 from service.uws import routes as uws
 from workers.catalogue.catalogue import Catalogue
+from workers.files.modes import private_folder
 from workers.files.opened import open_store
 from workers.settings import Settings, software_version
 
@@ -37,7 +38,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         from workers.broker import app as queue
         from workers.broker.reconciler import Reconciler
 
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
+        private_folder(settings.data_dir)
         catalogue = Catalogue(settings.catalogue_url)
         catalogue.upgrade()
         store = open_store(settings)

@@ -22,6 +22,7 @@ from service.app import create_app
 from service.http.access import check_can_serve
 from workers import logs
 from workers.catalogue.catalogue import Catalogue
+from workers.files.modes import private_folder
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -65,7 +66,7 @@ def _prepare(settings: Settings, host: str) -> None:
 
     Raises ``SchemaError``, ``NoKeyYet``.
     """
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    private_folder(settings.data_dir)
     catalogue = Catalogue(settings.catalogue_url)
     try:
         catalogue.upgrade()
@@ -126,7 +127,7 @@ def _keep_worker(settings: Settings, stopping: threading.Event) -> None:
 
 def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
     log_file = settings.data_dir / "worker.log"
-    log_file.parent.mkdir(parents=True, exist_ok=True)
+    private_folder(log_file.parent)
     with log_file.open("ab") as output:
         return subprocess.Popen(
             # -P: nothing is imported from the working folder, to which other users may be able to write.

@@ -24,6 +24,7 @@ from workers.contract.identities import product_identity
 from workers.contract.requests import Deconvolve
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.files import archive as archive_files
+from workers.files.modes import open_file, open_folder
 from workers.files.store import sha256_of, sync
 from workers.intake import estimates
 from workers.intake.requests import resolved_deconvolution
@@ -263,7 +264,7 @@ def _make_folder(folder: Path) -> None:
     Raises DataError "output-not-written".
     """
     with _write_errors():
-        folder.mkdir(parents=True, exist_ok=True)
+        open_folder(folder)
         if not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
@@ -274,8 +275,9 @@ def _put(source: Path, target: Path) -> None:
     Raises DataError "output-not-written".
     """
     with _write_errors():
-        target.parent.mkdir(parents=True, exist_ok=True)
+        open_folder(target.parent)
         with source.open("rb") as file, whole_file(target) as copy:
+            open_file(copy)
             shutil.copyfileobj(file, copy, 2**20)
         sync(target.parent)  # the folder entry must also be on the disk before the image counts as done
 
