@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+import anyio
 from fastapi import FastAPI
 
 from service.api import bulk, bulk_results, events, images, jobs, lineage, products, reports, transits
@@ -23,6 +24,8 @@ from workers.catalogue.catalogue import Catalogue
 from workers.files.modes import private_folder
 from workers.files.opened import open_store
 from workers.settings import Settings, software_version
+
+CUTOUTS_AT_ONCE = 2
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
@@ -45,7 +48,8 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         store.sweep()
         reconciler = Reconciler(catalogue, queue.make_app(settings), settings)
         streams = Streams(settings.streams_per_caller)
-        app.state.heliopsf = State(settings, catalogue, store, reconciler, access, rates, streams)
+        cutouts = anyio.CapacityLimiter(CUTOUTS_AT_ONCE)
+        app.state.heliopsf = State(settings, catalogue, store, reconciler, access, rates, streams, cutouts)
         reconciler.start()
         yield
         reconciler.stop()

@@ -238,7 +238,7 @@ class LocalService(Operations):
         row = self._psf(psf_id)
         limits = FitsLimits(max_pixels=self._settings.max_pixels)
         try:
-            Path(output).write_bytes(cutout(self._store.path(row.file_sha256), size, limits))
+            cutout(self._store.path(row.file_sha256), size, limits).write(Path(output))
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
 

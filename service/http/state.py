@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
+import anyio
 from fastapi import Depends, Request
 
 from psfcore.fits.header import FitsLimits
@@ -29,6 +30,8 @@ class State:
     access: Access
     rates: Rates
     streams: Streams
+    # Cut-outs wait here and not in the threads that all requests share: a cut-out keeps a core busy.
+    cutouts: anyio.CapacityLimiter
 
     @property
     def limits(self) -> FitsLimits:
