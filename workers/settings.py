@@ -41,6 +41,11 @@ class Settings(BaseSettings):
         ge=0,
         description="largest size of an owner's stored files, unless the owner has a limit of its own, MiB; 0: unlimited",
     )
+    min_free_mib: int = Field(
+        256,
+        ge=0,
+        description="smallest free space of the disk of data_dir, MiB; with less, uploads and jobs are refused and /readyz answers 503",
+    )
     database_url: str | None = Field(
         None, description="SQLAlchemy URL of the database; default: SQLite in data_dir"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -23,6 +24,7 @@ from workers.files.store import StoreAway
 
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
+FULL = {errno.ENOSPC, errno.EDQUOT}
 # HTTP status of a DataError, by its code; 422 for every other code.
 STATUS_OF = {
     "no-psf-fits": 404,
@@ -107,6 +109,18 @@ def answer(
     return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
+NO_ROOM = "expected free space on the disk of the service; the disk is full: ask the operator to make room, then try again"
+
+
+def _disk_full(error: SQLAlchemyError) -> bool:
+    """Whether the database could not write because its disk is full (SQLite: SQLITE_FULL, PostgreSQL: 53100)."""
+    original = getattr(error, "orig", None)
+    return (
+        getattr(original, "sqlite_errorname", None) == "SQLITE_FULL"
+        or getattr(original, "sqlstate", None) == "53100"
+    )
+
+
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {"model": ProblemDocument, "description": "The request was refused; `detail` says why."},
 }
@@ -148,12 +162,21 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(PoolTimeoutError)
     def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:
         log.error("database: %s", error)
+        if _disk_full(error):
+            return answer(507, "storage-full", NO_ROOM)
         return answer(
             503,
             "database-away",
             "the database of the service does not answer; try again in a moment",
             headers={"Retry-After": "5"},
         )
+
+    @app.exception_handler(OSError)
+    def _system(_request: Request, error: OSError) -> JSONResponse:
+        if error.errno not in FULL:
+            raise error  # it is answered as an internal error
+        log.error("storage: %s", error)
+        return answer(507, "storage-full", NO_ROOM)
 
     @app.exception_handler(StoreAway)
     def _store(_request: Request, error: StoreAway) -> JSONResponse:

@@ -21,7 +21,7 @@ from workers.catalogue.database import Database
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.keys import Keys
 from workers.catalogue.named_files import NamedFiles
-from workers.catalogue.owners import Owners, add_bytes, hold_to_quota
+from workers.catalogue.owners import Owners, add_bytes, counted_bytes, hold_to_quota
 from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs
 from workers.catalogue.schema import Schema
@@ -88,10 +88,11 @@ class Catalogue:
             with self._database.writing.begin() as session:
                 session.add(row)
                 session.flush()
-                add_bytes(session, row.owner, row.bytes)
+                count = counted_bytes(row)
+                add_bytes(session, row.owner, count)
                 if quota_mib is not None:
                     removable = isinstance(row, SolutionRow)
-                    hold_to_quota(session, row.owner, row.bytes, quota_mib, removable=removable)
+                    hold_to_quota(session, row.owner, count, quota_mib, removable=removable)
             return row, True
         except IntegrityError:
             existing = self.get(type(row), row.id, row.owner)
