@@ -16,7 +16,8 @@ from service.api.psfs import status as psf_status
 from service.api.psfs import versions as psfs
 from service.http import description, guard, observation, problems
 from service.http.access import Access
-from service.http.rates import Rates, Streams
+from service.http.bodies import BodyLimits
+from service.http.rates import AtOnce, Rates
 from service.http.state import State
 from service.operation import docs, health, metrics
 from service.uws import routes as uws
@@ -47,9 +48,12 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         store = open_store(settings)
         store.sweep()
         reconciler = Reconciler(catalogue, queue.make_app(settings), settings)
-        streams = Streams(settings.streams_per_caller)
+        streams = AtOnce(settings.streams_per_caller, "too-many-streams", "streams of events")
+        requests = AtOnce(settings.requests_per_caller, "too-many-requests-at-once", "requests")
         cutouts = anyio.CapacityLimiter(CUTOUTS_AT_ONCE)
-        app.state.heliopsf = State(settings, catalogue, store, reconciler, access, rates, streams, cutouts)
+        app.state.heliopsf = State(
+            settings, catalogue, store, reconciler, access, rates, streams, requests, cutouts
+        )
         reconciler.start()
         yield
         reconciler.stop()
@@ -65,7 +69,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     )
     problems.install(app)
     description.install(app)
-    guard.install(app, access, settings.max_body_mib * 2**20)
+    guard.install(app, access, BodyLimits.of(settings))
     app.state.requests = observation.install(app)
     # psf_choice comes before psfs, so that "best" is not taken for an id.
     versions = (psf_choice, psf_status, contexts, affected, lineage)

@@ -121,7 +121,18 @@ class Settings(BaseSettings):
         "",
         description="host names of the service besides localhost, separated by commas; *: any name",
     )
-    max_body_mib: int = Field(16, ge=1, le=1024, description="largest request that is not an upload, MiB")
+    max_body_kib: int = Field(
+        256, ge=16, le=1_048_576, description="largest request that is neither an upload nor a bulk run, KiB"
+    )
+    max_bulk_body_mib: int = Field(16, ge=1, le=1024, description="largest request for a bulk run, MiB")
+    body_s: float = Field(
+        30.0,
+        gt=0,
+        description="time that a client has for the body of a request, s; the time that the smallest speed needs is added",
+    )
+    body_kib_per_s: int = Field(
+        16, ge=1, description="smallest speed of the body of a request after the first body_s seconds, KiB/s"
+    )
     reads_per_minute: int = Field(
         12_000, ge=0, description="largest number of read requests of one caller per minute; 0: unlimited"
     )
@@ -132,6 +143,11 @@ class Settings(BaseSettings):
     )
     upload_mib_per_minute: int = Field(
         16_384, ge=0, description="largest size of the uploads of one caller per minute, MiB; 0: unlimited"
+    )
+    requests_per_caller: int = Field(
+        128,
+        ge=1,
+        description="largest number of requests of one caller that one server answers at a time, event streams included",
     )
     streams_per_caller: int = Field(
         32,

@@ -24,6 +24,7 @@ from workers.files.store import StoreAway
 
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
+MOST_ERRORS = 20  # errors of one request that an answer lists
 FULL = {errno.ENOSPC, errno.EDQUOT}
 # HTTP status of a DataError, by its code; 422 for every other code.
 STATUS_OF = {
@@ -79,15 +80,17 @@ class ProblemDocument(BaseModel):
     detail: str = Field(description="what was expected, what was received, and what to do next")
 
 
-class Problem(Exception):
-    """An error with its HTTP status. Any endpoint may raise it. The answer is then a problem document."""
+class Problem(HTTPException):
+    """An error with its HTTP status. Any endpoint may raise it. The answer is then a problem document.
+
+    It is an HTTPException, because FastAPI passes on no other exception of a body that it reads.
+    """
 
     def __init__(
         self, status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
     ) -> None:
-        super().__init__(detail)
-        self.status, self.code, self.detail, self.more = status, code, detail, more
-        self.headers = dict(headers or {})
+        super().__init__(status, detail, dict(headers or {}))
+        self.status, self.code, self.more = status, code, more
 
 
 def problem(error: DataError, **more: Any) -> Problem:
@@ -138,12 +141,14 @@ def install(app: FastAPI) -> None:
         body = getattr(request.scope.get("route"), "body_field", None)
         model = None if body is None else body.field_info.annotation
         errors = []
-        for found in error.errors():
+        for found in error.errors()[:MOST_ERRORS]:
             # The location of a field of the body starts with "body", which is not part of the model.
             inside = cast(ErrorDetails, found | {"loc": found["loc"][1:]})
             [(_, message)] = explained([inside], model if found["loc"][:1] == ("body",) else None)
             errors.append({"at": "/".join(map(str, found["loc"])), "message": message})
         detail = "; ".join(f"{e['at']}: {e['message']}" for e in errors)
+        if len(error.errors()) > MOST_ERRORS:
+            detail += f"; and {len(error.errors()) - MOST_ERRORS} more errors"
         return answer(422, "invalid-request", detail, errors=errors)
 
     @app.exception_handler(HTTPException)
