@@ -20,6 +20,7 @@ from fastapi import FastAPI
 
 from service.app import create_app
 from service.http.access import check_can_serve
+from service.http.connections import ACCEPTED_AT_ONCE, LISTEN, ConnectionLimits, bounded
 from workers import logs
 from workers.catalogue.catalogue import Catalogue
 from workers.files.modes import private_folder
@@ -48,6 +49,12 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
                 access_log=False,
                 server_header=False,
                 timeout_graceful_shutdown=ceil(settings.stop_s),
+                http=bounded(ConnectionLimits.of(settings)),
+                ws="none",
+                backlog=ACCEPTED_AT_ONCE,
+                # Without a setting no header says where a request comes from: a client could write any address there.
+                proxy_headers=bool(settings.proxies),
+                forwarded_allow_ips=list(settings.proxies),
             )
         )
         _prepare(settings, host)
@@ -77,6 +84,12 @@ def _prepare(settings: Settings, host: str) -> None:
 
 class _Server(uvicorn.Server):
     """Tells the application about a shutdown. Requests that wait for a job are then answered at once."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen. ``backlog`` is how many connections the event loop accepts at once; the system keeps more."""
+        await super().startup(sockets)
+        for listener in sockets or []:
+            listener.listen(LISTEN)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Tell the application, then let the server handle the signal."""

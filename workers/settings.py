@@ -121,6 +121,24 @@ class Settings(BaseSettings):
         "",
         description="host names of the service besides localhost, separated by commas; *: any name",
     )
+    trusted_proxies: str = Field(
+        "",
+        description="addresses or networks of reverse proxies, separated by commas; the service believes their headers X-Forwarded-For and X-Forwarded-Proto",
+    )
+    max_connections: int = Field(
+        1024,
+        ge=8,
+        le=100_000,
+        description="largest number of connections that are open on one server at a time",
+    )
+    header_s: float = Field(
+        10.0, gt=0, description="longest time that a client may take to send the header of a request, s"
+    )
+    stalled_s: float = Field(
+        60.0,
+        gt=0,
+        description="time after which a connection is closed whose client takes nothing of its answer, s",
+    )
     max_body_kib: int = Field(
         256, ge=16, le=1_048_576, description="largest request that is neither an upload nor a bulk run, KiB"
     )
@@ -191,6 +209,11 @@ class Settings(BaseSettings):
     def host_names(self) -> tuple[str, ...]:
         """The host names that the operator allows, in lower case."""
         return tuple(name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip())
+
+    @property
+    def proxies(self) -> tuple[str, ...]:
+        """The reverse proxies that the operator trusts."""
+        return tuple(name.strip() for name in self.trusted_proxies.split(",") if name.strip())
 
     @property
     def queues(self) -> tuple[Queue, ...]:
