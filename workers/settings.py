@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from importlib.metadata import version
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Literal
 
@@ -195,6 +196,18 @@ class Settings(BaseSettings):
         queues_named(names)
         return names
 
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _addresses(cls, proxies: str) -> str:
+        for name in _named(proxies):
+            try:
+                ip_network(name)
+            except ValueError as error:
+                raise ValueError(
+                    f"expected IP addresses or networks, separated by commas; {error}"
+                ) from error
+        return proxies
+
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
         """Default settings with this data folder. They ignore the environment, so that they cannot touch a running service."""
@@ -203,17 +216,17 @@ class Settings(BaseSettings):
     @property
     def added_effects(self) -> tuple[str, ...]:
         """Modules or files with effects that a diagnosis tests in addition to the effects of the library."""
-        return tuple(name.strip() for name in self.gap_effects.split(",") if name.strip())
+        return _named(self.gap_effects)
 
     @property
     def host_names(self) -> tuple[str, ...]:
         """The host names that the operator allows, in lower case."""
-        return tuple(name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip())
+        return _named(self.allowed_hosts.lower())
 
     @property
     def proxies(self) -> tuple[str, ...]:
         """The reverse proxies that the operator trusts."""
-        return tuple(name.strip() for name in self.trusted_proxies.split(",") if name.strip())
+        return _named(self.trusted_proxies)
 
     @property
     def queues(self) -> tuple[Queue, ...]:
@@ -266,6 +279,11 @@ class Settings(BaseSettings):
     def archive_limits(self) -> ArchiveLimits:
         """Limits on the unpacked size of a transit's archive."""
         return ArchiveLimits(max_bytes=self.max_transit_unpacked_mib * 2**20)
+
+
+def _named(names: str) -> tuple[str, ...]:
+    """The names in a list that is separated by commas."""
+    return tuple(name.strip() for name in names.split(",") if name.strip())
 
 
 def cores() -> int:
