@@ -49,19 +49,19 @@ class BodyLimits:
     def received(self, path: str, headers: Headers, receive: Receive) -> Receive:
         """The body of a request, within these limits. Uploads have their own limits on the size, in ``service.http.uploads``.
 
-        Raises ``Problem`` 413 at once if the declared length is too large. Otherwise the reader of the body gets 413 as soon
-        as the body is too large, and 408 as soon as it is too slow.
+        Whoever reads the body gets ``Problem`` 413 if its declared length is too large, before anything is received, or as
+        soon as it is too large; and 408 as soon as it is too slow.
         """
         most = None if path in LARGE else self.bulk_bytes if path == BULK else self.usual_bytes
         declared = headers.get("content-length", "")
-        if most is not None and declared.isdecimal() and int(declared) > most:
-            raise _too_large(path, most)
         got, waited_s, more = 0, 0.0, True
 
         async def limited() -> Message:
             nonlocal got, waited_s, more
             if not more:  # the body is complete; the next message is the end of the connection
                 return await receive()
+            if most is not None and declared.isdecimal() and int(declared) > most:
+                raise _too_large(path, most)
             # Only the time that the client needs counts, not the time in which this server does something with the body.
             allowed_s = self.seconds + got / self.bytes_per_s
             started = time.monotonic()

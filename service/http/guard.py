@@ -38,11 +38,14 @@ class _Guard:
         try:
             self._check_host(headers)
             _check_origin(scope["method"], headers)
-            receive = self._bodies.received(scope["path"], headers, receive)
         except problems.Problem as problem:
             refusal = problems.answer(problem.status, problem.code, problem.detail)
             await refusal(scope, receive, kept)
             return
+        # Nobody reads the body of a request that changes nothing. A stream of events receives only to learn when its client
+        # leaves, so no limit may end it.
+        if scope["method"] not in SAFE_METHODS:
+            receive = self._bodies.received(scope["path"], headers, receive)
         try:
             await self._app(scope, receive, kept)
         finally:

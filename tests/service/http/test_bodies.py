@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,29 @@ def test_a_body_that_drips_is_not_awaited_either(live: Live) -> None:
             except TimeoutError:
                 continue
     assert answer.startswith(b"HTTP/1.1 408")
+
+
+@pytest.mark.parametrize("declared", [10, 10**9])
+def test_a_body_that_nobody_reads_breaks_no_stream(
+    live: Live, caplog: pytest.LogCaptureFixture, declared: int
+) -> None:
+    """A stream of events waits for the end of the connection; a body that is late or long is none."""
+    job, _ = live.service.catalogue.jobs.submit("psf-build", {}, f"k{declared}", "ann")
+    headers = {"Content-Length": str(declared)} | bearer(live.service.key("ann"))
+    with (
+        live.begin("GET", f"/v1/jobs/{job.id}/events", headers) as connection,
+        connection.makefile("rb") as file,
+    ):
+
+        def until(event: bytes) -> list[bytes]:
+            return list(takewhile(lambda line: line not in (b"", event), iter(file.readline, None)))
+
+        assert until(b"event: progress\n")[0].startswith(b"HTTP/1.1 200")
+        time.sleep(0.7)  # longer than body_s
+        live.service.catalogue.jobs.cancel(job.id)
+        until(b"event: end\n")
+        assert file.readline().startswith(b"data:"), "the last event came"
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
 
 
 def test_a_long_body_at_a_fair_speed_is_received(live: Live) -> None:
