@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+import anyio
 from fastapi import FastAPI
 
 from service.api import bulk, bulk_results, events, images, jobs, lineage, products, reports, transits
@@ -15,13 +16,17 @@ from service.api.psfs import status as psf_status
 from service.api.psfs import versions as psfs
 from service.http import description, guard, observation, problems
 from service.http.access import Access
-from service.http.rates import Rates, Streams
+from service.http.bodies import BodyLimits
+from service.http.rates import AtOnce, Rates
 from service.http.state import State
 from service.operation import docs, health, metrics
 from service.uws import routes as uws
 from workers.catalogue.catalogue import Catalogue
+from workers.files.modes import private_folder
 from workers.files.opened import open_store
 from workers.settings import Settings, software_version
+
+CUTOUTS_AT_ONCE = 2
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
@@ -37,14 +42,18 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         from workers.broker import app as queue
         from workers.broker.reconciler import Reconciler
 
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
+        private_folder(settings.data_dir)
         catalogue = Catalogue(settings.catalogue_url)
         catalogue.upgrade()
         store = open_store(settings)
         store.sweep()
         reconciler = Reconciler(catalogue, queue.make_app(settings), settings)
-        streams = Streams(settings.streams_per_caller)
-        app.state.heliopsf = State(settings, catalogue, store, reconciler, access, rates, streams)
+        streams = AtOnce(settings.streams_per_caller, "too-many-streams", "streams of events")
+        requests = AtOnce(settings.requests_per_caller, "too-many-requests-at-once", "requests")
+        cutouts = anyio.CapacityLimiter(CUTOUTS_AT_ONCE)
+        app.state.heliopsf = State(
+            settings, catalogue, store, reconciler, access, rates, streams, requests, cutouts
+        )
         reconciler.start()
         yield
         reconciler.stop()
@@ -60,7 +69,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     )
     problems.install(app)
     description.install(app)
-    guard.install(app, access, settings.max_body_mib * 2**20)
+    guard.install(app, access, BodyLimits.of(settings))
     app.state.requests = observation.install(app)
     # psf_choice comes before psfs, so that "best" is not taken for an id.
     versions = (psf_choice, psf_status, contexts, affected, lineage)

@@ -275,11 +275,11 @@ class LocalService(Operations):
         row = self._psf(psf_id)
         limits = FitsLimits(max_pixels=self._settings.max_pixels)
         try:
-            content = cutout(self._store.path(row.file_sha256), size, limits)
+            part = cutout(self._store.verified(row.file_sha256), size, limits)
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
         with written(output, overwrite=overwrite) as partial:
-            partial.write_bytes(content)
+            part.write(partial)
 
     def _tables(self, psf_id: str) -> dict[str, Any]:
         digest = self._psf(psf_id).details.get("tables_sha256")

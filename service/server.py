@@ -20,8 +20,10 @@ from fastapi import FastAPI
 
 from service.app import create_app
 from service.http.access import check_can_serve
+from service.http.connections import ACCEPTED_AT_ONCE, LISTEN, ConnectionLimits, bounded
 from workers import logs
 from workers.catalogue.catalogue import Catalogue
+from workers.files.modes import private_folder
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -47,6 +49,12 @@ def serve(settings: Settings, host: str, port: int, announce: Callable[[str], No
                 access_log=False,
                 server_header=False,
                 timeout_graceful_shutdown=ceil(settings.stop_s),
+                http=bounded(ConnectionLimits.of(settings)),
+                ws="none",
+                backlog=ACCEPTED_AT_ONCE,
+                # Without a setting no header says where a request comes from: a client could write any address there.
+                proxy_headers=bool(settings.proxies),
+                forwarded_allow_ips=list(settings.proxies),
             )
         )
         _prepare(settings, host)
@@ -65,7 +73,7 @@ def _prepare(settings: Settings, host: str) -> None:
 
     Raises ``SchemaError``, ``NoKeyYet``.
     """
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    private_folder(settings.data_dir)
     catalogue = Catalogue(settings.catalogue_url)
     try:
         catalogue.upgrade()
@@ -76,6 +84,12 @@ def _prepare(settings: Settings, host: str) -> None:
 
 class _Server(uvicorn.Server):
     """Tells the application about a shutdown. Requests that wait for a job are then answered at once."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen. ``backlog`` is how many connections the event loop accepts at once; the system keeps more."""
+        await super().startup(sockets)
+        for listener in sockets or []:
+            listener.listen(LISTEN)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Tell the application, then let the server handle the signal."""
@@ -126,10 +140,11 @@ def _keep_worker(settings: Settings, stopping: threading.Event) -> None:
 
 def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
     log_file = settings.data_dir / "worker.log"
-    log_file.parent.mkdir(parents=True, exist_ok=True)
+    private_folder(log_file.parent)
     with log_file.open("ab") as output:
         return subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
+            # -P: nothing is imported from the working folder, to which other users may be able to write.
+            [sys.executable, "-P", "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
             env=os.environ | environment(settings),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,  # Celery prints a banner here; the logs go to standard error

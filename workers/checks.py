@@ -49,14 +49,19 @@ def database(catalogue: Catalogue) -> None:
     _pages_good_until[catalogue] = ended + (ended - started) / PAGES_SHARE
 
 
-def storage(folder: Path) -> None:
-    """Check that the data folder is writable."""
+def storage(folder: Path, min_free_mib: int) -> None:
+    """Check that the data folder is writable and that its disk has this much free space, MiB."""
     try:
         with TemporaryFile(dir=folder) as probe:
             probe.write(b"heliopsf")
             probe.flush()
     except OSError as error:
         raise Unusable(f"the data folder cannot be written to ({error.strerror or _kind(error)})") from error
+    free_mib = free_bytes(folder) / 2**20
+    if free_mib < min_free_mib:
+        raise Unusable(
+            f"the disk of the data folder has {free_mib:.0f} MiB of free space, expected {min_free_mib} MiB or more"
+        )
 
 
 def object_store(store: Store) -> None:
@@ -105,7 +110,7 @@ def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, 
     """The checks that must pass before requests are accepted, by name."""
     checks: dict[str, Callable[[], None]] = {
         "database": lambda: database(catalogue),
-        "storage": lambda: storage(settings.data_dir),
+        "storage": lambda: storage(settings.data_dir, settings.min_free_mib),
     }
     if settings.store_url is not None:
         checks["object store"] = lambda: object_store(store)

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import re
 import sys
+import threading
+import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
@@ -86,6 +89,43 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+class Seldom(logging.Filter):
+    """Lets one record of each kind pass in ``every_s`` seconds, and adds to the next one how many were left out.
+
+    Records are of one kind if their messages have the same first line before values are filled in. It is meant for messages
+    that clients can cause without a key: they would fill the disk.
+    """
+
+    def __init__(
+        self, about: Callable[[logging.LogRecord], bool] = lambda _record: True, every_s: float = 60.0
+    ) -> None:
+        """about: the records that are meant; all others pass."""
+        super().__init__()
+        self._about, self._every_s = about, every_s
+        self._said: dict[tuple[str, str], tuple[float, int]] = {}
+        self._lock = threading.Lock()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is written."""
+        if not self._about(record):
+            return True
+        kind = (record.name, str(record.msg).partition("\n")[0])
+        now = time.monotonic()
+        with self._lock:
+            said_at, left_out = self._said.get(kind, (-math.inf, 0))
+            if now - said_at < self._every_s:
+                self._said[kind] = (said_at, left_out + 1)
+                return False
+            self._said[kind] = (now, 0)
+        if left_out:
+            record.msg = f"{record.msg} ({left_out} more such messages were left out)"
+        return True
+
+
+_SELDOM_WARNINGS = Seldom(lambda record: record.levelno < logging.ERROR)
+_SELDOM_ACCEPTS = Seldom(lambda record: record.getMessage().startswith("socket.accept()"))
+
+
 def configure(settings: Settings) -> None:
     """Write the logs of the process to standard error. Repeated calls change nothing."""
     stream = sys.__stderr__ or sys.stderr
@@ -96,4 +136,7 @@ def configure(settings: Settings) -> None:
     # These libraries log every request, connection and plug-in. Our own log lines say the same, with the request id.
     for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime.plugins"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    # Clients without a key can cause these: requests that are not HTTP, and more connections than the system allows.
+    logging.getLogger("uvicorn.error").addFilter(_SELDOM_WARNINGS)
+    logging.getLogger("asyncio").addFilter(_SELDOM_ACCEPTS)
     logging.captureWarnings(True)

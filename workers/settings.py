@@ -7,6 +7,7 @@ Scientific choices are never settings; they are parameters of a job.
 from __future__ import annotations
 
 from importlib.metadata import version
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Literal
 
@@ -44,6 +45,11 @@ class Settings(BaseSettings):
         0,
         ge=0,
         description="largest size of an owner's stored files, unless the owner has a limit of its own, MiB; 0: unlimited",
+    )
+    min_free_mib: int = Field(
+        256,
+        ge=0,
+        description="smallest free space of the disk of data_dir, MiB; with less, uploads and jobs are refused and /readyz answers 503",
     )
     database_url: str | None = Field(
         None, description="SQLAlchemy URL of the database; default: SQLite in data_dir"
@@ -125,7 +131,36 @@ class Settings(BaseSettings):
         "",
         description="host names of the service besides localhost, separated by commas; *: any name",
     )
-    max_body_mib: int = Field(16, ge=1, le=1024, description="largest request that is not an upload, MiB")
+    trusted_proxies: str = Field(
+        "",
+        description="addresses or networks of reverse proxies, separated by commas; the service believes their headers X-Forwarded-For and X-Forwarded-Proto",
+    )
+    max_connections: int = Field(
+        1024,
+        ge=8,
+        le=100_000,
+        description="largest number of connections that are open on one server at a time",
+    )
+    header_s: float = Field(
+        10.0, gt=0, description="longest time that a client may take to send the header of a request, s"
+    )
+    stalled_s: float = Field(
+        60.0,
+        gt=0,
+        description="time after which a connection is closed whose client takes nothing of its answer, s",
+    )
+    max_body_kib: int = Field(
+        256, ge=16, le=1_048_576, description="largest request that is neither an upload nor a bulk run, KiB"
+    )
+    max_bulk_body_mib: int = Field(16, ge=1, le=1024, description="largest request for a bulk run, MiB")
+    body_s: float = Field(
+        30.0,
+        gt=0,
+        description="time that a client has for the body of a request, s; the time that the smallest speed needs is added",
+    )
+    body_kib_per_s: int = Field(
+        16, ge=1, description="smallest speed of the body of a request after the first body_s seconds, KiB/s"
+    )
     reads_per_minute: int = Field(
         12_000, ge=0, description="largest number of read requests of one caller per minute; 0: unlimited"
     )
@@ -136,6 +171,11 @@ class Settings(BaseSettings):
     )
     upload_mib_per_minute: int = Field(
         16_384, ge=0, description="largest size of the uploads of one caller per minute, MiB; 0: unlimited"
+    )
+    requests_per_caller: int = Field(
+        128,
+        ge=1,
+        description="largest number of requests of one caller that one server answers at a time, event streams included",
     )
     streams_per_caller: int = Field(
         32,
@@ -167,6 +207,18 @@ class Settings(BaseSettings):
         queues_named(names)
         return names
 
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _addresses(cls, proxies: str) -> str:
+        for name in _named(proxies):
+            try:
+                ip_network(name)
+            except ValueError as error:
+                raise ValueError(
+                    f"expected IP addresses or networks, separated by commas; {error}"
+                ) from error
+        return proxies
+
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
         """Default settings with this data folder. They ignore the environment, so that they cannot touch a running service."""
@@ -175,12 +227,17 @@ class Settings(BaseSettings):
     @property
     def added_effects(self) -> tuple[str, ...]:
         """Modules or files with effects that a diagnosis tests in addition to the effects of the library."""
-        return tuple(name.strip() for name in self.gap_effects.split(",") if name.strip())
+        return _named(self.gap_effects)
 
     @property
     def host_names(self) -> tuple[str, ...]:
         """The host names that the operator allows, in lower case."""
-        return tuple(name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip())
+        return _named(self.allowed_hosts.lower())
+
+    @property
+    def proxies(self) -> tuple[str, ...]:
+        """The reverse proxies that the operator trusts."""
+        return _named(self.trusted_proxies)
 
     @property
     def queues(self) -> tuple[Queue, ...]:
@@ -243,6 +300,11 @@ class Settings(BaseSettings):
 def _memory_of_a_job_mib(worker_processes: int) -> int:
     """The memory that one job may need if every process of a worker runs a job of this size on this machine, MiB."""
     return max(1, int(MEMORY_OF_JOBS * memory_bytes() / worker_processes) // 2**20)
+
+
+def _named(names: str) -> tuple[str, ...]:
+    """The names in a list that is separated by commas."""
+    return tuple(name.strip() for name in names.split(",") if name.strip())
 
 
 def software_version() -> str:

@@ -2,7 +2,7 @@
 
 A FITS image stores its rows one after the other (FITS standard 4.0, section 3.3.2), so a cut-out consists of a range
 of bytes from each row. The image must be uncompressed and in the first HDU. Every PSF that heliopsf writes is stored
-in this way.
+in this way. A cut-out is read in pieces, because a server may send many of them at the same time.
 """
 
 from __future__ import annotations
@@ -10,6 +10,9 @@ from __future__ import annotations
 import math
 import sys
 from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -21,15 +24,42 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
 _FLOATS = {-32: "f", -64: "d"}
+_PIECE_BYTES = 2**18
 # Cards that describe the whole image and would be wrong in a cut-out.
 _DROPPED = ("EXTEND", "CHECKSUM", "DATASUM", "DATAMIN", "DATAMAX", "DATAMEAN", "PCOUNT", "GCOUNT")
 
 
-def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
-    """Return the bytes of a FITS file that holds the central (size, size) px of a PSF.
+@dataclass(frozen=True)
+class Cutout:
+    """A FITS file that holds the central (size, size) px of a PSF. The centre of the PSF is at [size // 2, size // 2]."""
 
-    The centre of the PSF is at [size // 2, size // 2]. Raises DataError "cutout-too-large" if the PSF is smaller, and
-    "cutout-not-plain" if the file is compressed or does not hold plain floats.
+    path: Path
+    header: bytes
+    rows: _Rows
+
+    @property
+    def length(self) -> int:
+        """Number of bytes of the FITS file."""
+        return len(self.header) + self.rows.length + -self.rows.length % BLOCK_BYTES
+
+    def pieces(self) -> Iterator[bytes]:
+        """The bytes of the FITS file, one piece after the other. Raises OSError, and EOFError if the PSF's file has become shorter."""
+        yield self.header
+        with self.path.open("rb") as file:
+            yield from self.rows.read(file)
+        yield bytes(-self.rows.length % BLOCK_BYTES)
+
+    def write(self, target: Path) -> None:
+        """Write the FITS file. Raises the errors of ``pieces``."""
+        with target.open("wb") as file:
+            file.writelines(self.pieces())
+
+
+def cutout(path: Path, size: int, limits: FitsLimits) -> Cutout:
+    """Prepare the cut-out of the central (size, size) px of a PSF. The pixels are read once, for their sum.
+
+    Raises DataError "cutout-too-large" if the PSF is smaller, and "cutout-not-plain" if the file is compressed or does not
+    hold plain floats.
     """
     summary = read_summary(path, limits)
     ny, nx = summary.shape
@@ -49,12 +79,57 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> bytes:
                 "cutout-not-plain",
                 "expected a PSF without BSCALE and BZERO. Download the file and run `heliopsf psf cutout` on it",
             )
-        pixels = _middle(file, file.tell(), (ny, nx), size, abs(summary.bitpix) // 8)
-    weights = array(_FLOATS[summary.bitpix], pixels)
-    if sys.byteorder == "little":
-        weights.byteswap()
-    text = _cut_header(header, (ny, nx), size, math.fsum(weights)).tostring().encode("ascii")
-    return text + pixels + bytes(-len(pixels) % BLOCK_BYTES)
+        rows = _Rows(file.tell(), (ny, nx), size, summary.bitpix)
+        total = math.fsum(chain.from_iterable(map(rows.weights, rows.read(file))))
+    text = _cut_header(header, (ny, nx), size, total).tostring().encode("ascii")
+    return Cutout(path, text, rows)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The central rows of an image of shape (ny, nx), whose first pixel is at byte ``first`` of its file."""
+
+    first: int
+    shape: tuple[int, int]
+    size: int
+    bitpix: int
+
+    @property
+    def length(self) -> int:
+        """Number of bytes of the pixels."""
+        return self.size * self._row_bytes
+
+    @property
+    def _pixel_bytes(self) -> int:
+        return abs(self.bitpix) // 8
+
+    @property
+    def _row_bytes(self) -> int:
+        return self.size * self._pixel_bytes
+
+    def read(self, file: BinaryIO) -> Iterator[bytes]:
+        """The pixels as they are stored, some rows at a time."""
+        ny, nx = self.shape
+        top, left = ny // 2 - self.size // 2, nx // 2 - self.size // 2
+        piece = bytearray()
+        for row in range(top, top + self.size):
+            file.seek(self.first + (row * nx + left) * self._pixel_bytes)
+            pixels = file.read(self._row_bytes)
+            if len(pixels) < self._row_bytes:
+                raise EOFError(f"expected {self._row_bytes} bytes of row {row} of the PSF; got {len(pixels)}")
+            piece += pixels
+            if len(piece) >= _PIECE_BYTES:
+                yield bytes(piece)
+                piece.clear()
+        yield bytes(piece)
+
+    def weights(self, piece: bytes) -> array[float]:
+        """The pixels of a piece as numbers."""
+        found: array[float] = array(_FLOATS[self.bitpix])
+        found.frombytes(piece)
+        if sys.byteorder == "little":
+            found.byteswap()
+        return found
 
 
 def _header(file: BinaryIO) -> Header:
@@ -67,16 +142,6 @@ def _header(file: BinaryIO) -> Header:
         block = file.read(BLOCK_BYTES)  # the loop ends, because read_summary found an END card
         raw += block
     return Header.fromstring(bytes(raw))
-
-
-def _middle(file: BinaryIO, first: int, shape: tuple[int, int], size: int, pixel_bytes: int) -> bytes:
-    ny, nx = shape
-    top, left = ny // 2 - size // 2, nx // 2 - size // 2
-    rows = []
-    for row in range(top, top + size):
-        file.seek(first + (row * nx + left) * pixel_bytes)
-        rows.append(file.read(size * pixel_bytes))
-    return b"".join(rows)
 
 
 def _cut_header(header: Header, shape: tuple[int, int], size: int, total: float) -> Header:

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from service.http.callers import Bulk, Caller, Reading
+from service.http.callers import Bulk, Caller, KeyFirst, Reading
 from service.http.paging import Cursor, Limit, Page, following, page, place, position
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room
@@ -21,7 +21,7 @@ from workers.contract.bulk import BulkPhase, BulkRequest, ItemState
 from workers.contract.phases import JobError
 
 log = logging.getLogger(__name__)
-router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)
+router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES, route_class=KeyFirst)
 BulkId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 LOOK_FROM = 1.0  # a person should inspect images with this artefact score or a higher one
 

@@ -27,7 +27,7 @@ from service.api.bulk import BulkId, BulkView
 from service.api.bulk import find as find_bulk
 from service.api.jobs import JobId, JobView
 from service.api.jobs import find as find_job
-from service.http.callers import Reading
+from service.http.callers import Caller, Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from workers.contract.bulk import BULK_ENDED, BulkPhase
@@ -81,7 +81,7 @@ async def follow_job(
         said = (row.phase, row.attempt, row.stage, row.step, row.steps, row.cancel_requested, row.queue)
         return Seen(_id(*said), lambda: JobView.of(row), Phase(row.phase).ended)
 
-    return await _stream(request, state, caller.name, look, last_id)
+    return await _stream(request, state, caller, look, last_id)
 
 
 @router.get(
@@ -103,7 +103,7 @@ async def follow_bulk(
         said = (row.phase, row.total, row.done, row.failed)
         return Seen(_id(*said), lambda: BulkView.of(row, state), BulkPhase(row.phase) in BULK_ENDED)
 
-    return await _stream(request, state, caller.name, look, last_id)
+    return await _stream(request, state, caller, look, last_id)
 
 
 class _Stream(StreamingResponse):
@@ -121,25 +121,35 @@ class _Stream(StreamingResponse):
             self._close()
 
 
-async def _stream(request: Request, state: Shared, who: str, look: Look, last_id: str | None) -> Response:
+async def _stream(
+    request: Request, state: Shared, caller: Caller, look: Look, last_id: str | None
+) -> Response:
     now = await run_in_threadpool(look)
     if now is not None and now.ended and now.id == last_id:
         return Response(status_code=204)  # 204 tells a browser not to reconnect
-    state.streams.open(who)
+    state.streams.open(caller.name)
     ends_at = time.monotonic() + state.settings.stream_s
 
     def over() -> bool:
         return time.monotonic() > ends_at or getattr(request.app.state, "stopping", False)
 
-    events = _events(look, over, last_id)
-    return _Stream(events, lambda: state.streams.close(who))
+    def may_read() -> bool:
+        return not state.access.keys or state.catalogue.keys.is_good(caller.name)
+
+    events = _events(look, may_read, over, last_id)
+    return _Stream(events, lambda: state.streams.close(caller.name))
 
 
-async def _events(look: Look, over: Callable[[], bool], last_id: str | None) -> AsyncIterator[str]:
+async def _events(
+    look: Look, may_read: Callable[[], bool], over: Callable[[], bool], last_id: str | None
+) -> AsyncIterator[str]:
+    """The texts of a stream. It ends with the job or bulk run, when ``over``, and when the key is revoked or expires."""
     yield f"retry: {COME_BACK_MS}\n\n"
     said_at = time.monotonic()
     while not over():
         try:
+            if not await run_in_threadpool(may_read):
+                return  # a client that connects again gets 401 with the reason
             now = await run_in_threadpool(look)
             text = await run_in_threadpool(_event, now, last_id)
         except SQLAlchemyError as error:

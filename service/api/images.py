@@ -50,9 +50,8 @@ async def upload_image(request: Request, response: Response, caller: Submitting,
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
     async with uploads.receive(request, state.store, state.limits, limit, take) as upload:
-        await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
-    row = image_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
-    row, new = await run_in_threadpool(take.add, row)
+        row = image_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
+        row, new = await run_in_threadpool(take.keep, upload.path, upload.sha256, row)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/images/{row.id}"
     return ImageView.of(row)

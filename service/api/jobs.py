@@ -10,7 +10,7 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from service.http.callers import Caller, Reading, Submitting
+from service.http.callers import Caller, KeyFirst, Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room
@@ -24,7 +24,7 @@ from workers.intake.again import reopened
 from workers.intake.requests import resolve
 
 log = logging.getLogger(__name__)
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES, route_class=KeyFirst)
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 
 

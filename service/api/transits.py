@@ -97,9 +97,8 @@ async def upload_transit(
         settings.max_transit_bytes,
         take,
     ) as upload:
-        await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
-    row = transit_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
-    row, new = await run_in_threadpool(take.add, row)
+        row = transit_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
+        row, new = await run_in_threadpool(take.keep, upload.path, upload.sha256, row)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/transits/{row.id}"
     return TransitDetails.of(row)

@@ -56,6 +56,7 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
         server = subprocess.Popen(
             [
                 sys.executable,
+                "-P",  # nothing is imported from the working folder
                 "-m",
                 "service.cli",
                 "serve",

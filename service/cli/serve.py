@@ -29,11 +29,13 @@ def serve(host: str, port: int, data: Path | None) -> None:
     from service.server import serve as run
     from workers import checks
     from workers.catalogue.schema import SchemaError
+    from workers.files.modes import keep_private, private_folder
 
     settings = data_settings(data)
     where = settings.data_dir.resolve()
+    keep_private()
     try:
-        where.mkdir(parents=True, exist_ok=True)
+        private_folder(where)
         with TemporaryFile(dir=where):
             pass
     except OSError as error:
@@ -62,6 +64,7 @@ def worker(
     The order of the queues in --queues has no effect.
     """
     from service.server import environment
+    from workers.files.modes import keep_private
 
     # Celery imports the worker's module, which reads its settings from the environment.
     update: dict[str, Any] = {"worker_processes": processes, "worker_queues": queues}
@@ -77,4 +80,5 @@ def worker(
     os.environ |= environment(settings.model_copy(update=given))
     from workers.run.worker import main as run
 
+    keep_private()
     run(stop_with_parent)

@@ -7,20 +7,27 @@ in it belongs to one owner.
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import binascii
+from collections.abc import Callable, Coroutine, Iterable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
+from weakref import WeakValueDictionary
 
-from fastapi import Depends, Request, Security
+from fastapi import Depends, Request, Response, Security
+from fastapi.concurrency import run_in_threadpool
 from fastapi.openapi.models import HTTPBase, HTTPBearer
+from fastapi.params import Security as SecurityParameter
+from fastapi.routing import APIRoute
 from fastapi.security import SecurityScopes
 from fastapi.security.base import SecurityBase
 
 from service.http import short_ids
+from service.http.bodies import BULK, JsonRequest
 from service.http.problems import Problem
 from service.http.rates import Bucket
-from service.http.state import Shared, State
+from service.http.state import Shared, State, state_of
 from workers.catalogue.keys import OWNER, KeyRefused, Scope
 from workers.catalogue.tables import DEFAULT_OWNER
 
@@ -59,9 +66,16 @@ def _caller(
     _basic: Annotated[None, Depends(_AS_PASSWORD)],
 ) -> Caller:
     """The caller of a request. Raises ``Problem`` if its key does not have a scope that the route needs, or if it reached its rate limit."""
+    let_in: Caller | None = getattr(request.state, "let_in", None)  # set by KeyFirst
+    return let_in or _admit(request, state, needed.scopes)
+
+
+def _admit(request: Request, state: State, scopes: Iterable[str]) -> Caller:
     caller = _let_in(request, state)
     request.state.caller = caller
-    for scope in map(Scope, needed.scopes):
+    state.requests.open(caller.name)
+    request.state.at_end = lambda: state.requests.close(caller.name)  # called by service.http.guard
+    for scope in map(Scope, scopes):
         if scope not in caller.scopes:
             raise Problem(
                 403,
@@ -107,6 +121,41 @@ def _sent_key(request: Request) -> str:
             raise KeyRefused("bad-key", "expected HTTP Basic as base64 of user:key") from error
     raise KeyRefused(
         "no-key", "expected a key: 'Authorization: Bearer hpsf_...', or as the password of Basic"
+    )
+
+
+class KeyFirst(APIRoute):
+    """A route with a JSON body. It checks the caller before it reads the body; FastAPI alone does it afterwards.
+
+    An owner sends one bulk run at a time, because its body may be large.
+    """
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The handler of the route. Raises TypeError if the endpoint has no parameter for its caller."""
+        handle = super().get_route_handler()
+        scopes = _scopes_of(self.endpoint)
+        turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+
+        async def answer(request: Request) -> Response:
+            caller = await run_in_threadpool(_admit, request, state_of(request), scopes)
+            request.state.let_in = caller
+            reading = JsonRequest(request.scope, request.receive)
+            if self.path != BULK or self.methods != {"POST"}:
+                return await handle(reading)
+            async with turns.setdefault(caller.owner, asyncio.Lock()):
+                return await handle(reading)
+
+        return answer
+
+
+def _scopes_of(endpoint: Callable[..., Any]) -> list[str]:
+    """The scopes that the caller of an endpoint needs, from the annotation of the parameter."""
+    for annotation in get_type_hints(endpoint, include_extras=True).values():
+        for mark in getattr(annotation, "__metadata__", ()):
+            if isinstance(mark, SecurityParameter) and mark.dependency is _caller:
+                return list(mark.scopes or ())
+    raise TypeError(
+        f"expected a parameter of {endpoint.__name__} for its caller, such as `caller: Submitting`; got none"
     )
 
 

@@ -6,24 +6,23 @@ from urllib.parse import urlsplit
 
 from fastapi import FastAPI
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http import problems
 from service.http.access import Access
-from service.http.uploads import has_own_limit
+from service.http.bodies import BodyLimits
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 
 
-def install(app: FastAPI, access: Access, max_body_bytes: int) -> None:
+def install(app: FastAPI, access: Access, bodies: BodyLimits) -> None:
     """Guard every request of the application."""
-    app.add_middleware(_Guard, access=access, max_body_bytes=max_body_bytes)
+    app.add_middleware(_Guard, access=access, bodies=bodies)
 
 
 class _Guard:
-    def __init__(self, app: ASGIApp, access: Access, max_body_bytes: int) -> None:
-        self._app, self._access, self._max_body_bytes = app, access, max_body_bytes
+    def __init__(self, app: ASGIApp, access: Access, bodies: BodyLimits) -> None:
+        self._app, self._access, self._bodies = app, access, bodies
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -39,13 +38,20 @@ class _Guard:
         try:
             self._check_host(headers)
             _check_origin(scope["method"], headers)
-            if not has_own_limit(scope["path"]):
-                receive = _bounded(headers, receive, self._max_body_bytes)
         except problems.Problem as problem:
             refusal = problems.answer(problem.status, problem.code, problem.detail)
             await refusal(scope, receive, kept)
             return
-        await self._app(scope, receive, kept)
+        # Nobody reads the body of a request that changes nothing. A stream of events receives only to learn when its client
+        # leaves, so no limit may end it.
+        if scope["method"] not in SAFE_METHODS:
+            receive = self._bodies.received(scope["path"], headers, receive)
+        try:
+            await self._app(scope, receive, kept)
+        finally:
+            at_end = scope.get("state", {}).get("at_end")
+            if at_end is not None:
+                at_end()
 
     def _check_host(self, headers: Headers) -> None:
         """Refuse unknown host names. Otherwise a web page of another site could reach an open service by DNS rebinding.
@@ -88,27 +94,6 @@ def _host_name(sent: str) -> str:
         return urlsplit(f"//{sent}").hostname or ""
     except ValueError:
         return ""
-
-
-def _bounded(headers: Headers, receive: Receive, most: int) -> Receive:
-    """The body of a request that is not an upload, up to its largest size."""
-    declared = headers.get("content-length", "")
-    too_large = (
-        f"expected a request of at most {most} bytes; got more (the operator can raise HELIOPSF_MAX_BODY_MIB)"
-    )
-    if declared.isdecimal() and int(declared) > most:
-        raise problems.Problem(413, "too-large", too_large)
-    got = 0
-
-    async def bounded() -> Message:
-        nonlocal got
-        message = await receive()
-        got += len(message.get("body", b""))
-        if got > most:
-            raise HTTPException(413, too_large)  # FastAPI passes on no other exception while it reads a body
-        return message
-
-    return bounded
 
 
 def _keep(headers: MutableHeaders, scope: Scope) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -23,6 +24,8 @@ from workers.files.store import StoreAway
 
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
+MOST_ERRORS = 20  # errors of one request that an answer lists
+FULL = {errno.ENOSPC, errno.EDQUOT}
 # HTTP status of a DataError, by its code; 422 for every other code.
 STATUS_OF = {
     "already-deconvolved": 409,
@@ -85,15 +88,17 @@ class ProblemDocument(BaseModel):
     detail: str = Field(description="what was expected, what was received, and what to do next")
 
 
-class Problem(Exception):
-    """An error with its HTTP status. Any endpoint may raise it. The answer is then a problem document."""
+class Problem(HTTPException):
+    """An error with its HTTP status. Any endpoint may raise it. The answer is then a problem document.
+
+    It is an HTTPException, because FastAPI passes on no other exception of a body that it reads.
+    """
 
     def __init__(
         self, status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
     ) -> None:
-        super().__init__(detail)
-        self.status, self.code, self.detail, self.more = status, code, detail, more
-        self.headers = dict(headers or {})
+        super().__init__(status, detail, dict(headers or {}))
+        self.status, self.code, self.more = status, code, more
 
 
 def problem(error: DataError, **more: Any) -> Problem:
@@ -115,6 +120,18 @@ def answer(
     return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
+NO_ROOM = "expected free space on the disk of the service; the disk is full: ask the operator to make room, then try again"
+
+
+def _disk_full(error: SQLAlchemyError) -> bool:
+    """Whether the database could not write because its disk is full (SQLite: SQLITE_FULL, PostgreSQL: 53100)."""
+    original = getattr(error, "orig", None)
+    return (
+        getattr(original, "sqlite_errorname", None) == "SQLITE_FULL"
+        or getattr(original, "sqlstate", None) == "53100"
+    )
+
+
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {"model": ProblemDocument, "description": "The request was refused; `detail` says why."},
 }
@@ -132,12 +149,14 @@ def install(app: FastAPI) -> None:
         body = getattr(request.scope.get("route"), "body_field", None)
         model = None if body is None else body.field_info.annotation
         errors = []
-        for found in error.errors():
+        for found in error.errors()[:MOST_ERRORS]:
             # The location of a field of the body starts with "body", which is not part of the model.
             inside = cast(ErrorDetails, found | {"loc": found["loc"][1:]})
             [(_, message)] = explained([inside], model if found["loc"][:1] == ("body",) else None)
             errors.append({"at": "/".join(map(str, found["loc"])), "message": message})
         detail = "; ".join(f"{e['at']}: {e['message']}" for e in errors)
+        if len(error.errors()) > MOST_ERRORS:
+            detail += f"; and {len(error.errors()) - MOST_ERRORS} more errors"
         return answer(422, "invalid-request", detail, errors=errors)
 
     @app.exception_handler(HTTPException)
@@ -156,6 +175,8 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(PoolTimeoutError)
     def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:
         log.error("database: %s", error)
+        if _disk_full(error):
+            return answer(507, "storage-full", NO_ROOM)
         return answer(
             503,
             "database-away",
@@ -173,6 +194,13 @@ def install(app: FastAPI) -> None:
             "database-damaged",
             "the database of the service is damaged; tell the operator, who must restore a copy",
         )
+
+    @app.exception_handler(OSError)
+    def _system(_request: Request, error: OSError) -> JSONResponse:
+        if error.errno not in FULL:
+            raise error  # it is answered as an internal error
+        log.error("storage: %s", error)
+        return answer(507, "storage-full", NO_ROOM)
 
     @app.exception_handler(StoreAway)
     def _store(_request: Request, error: StoreAway) -> JSONResponse:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.state import State
+from workers import checks
 from workers.catalogue.catalogue import Row
-from workers.catalogue.owners import NOT_KEPT, OverQuota, Usage
-from workers.catalogue.tables import PsfRow
-from workers.files.collection import remove_unnamed
+from workers.catalogue.owners import MIB, NOT_KEPT, OverQuota, Usage, counted_bytes
 
 
 class Allowed:
@@ -21,24 +22,41 @@ class Allowed:
     def __call__(self, count: int) -> None:
         """Count further bytes. Raises ``Problem`` 429 if they exceed the rate limit, and 413 if they exceed the quota."""
         self._asked += count
+        check_disk(self._state, self._asked)
         usage = _usage(self._state, self._caller.owner)
         if not usage.allows(self._asked):
             raise _file_too_large(usage, self._asked)
         self._state.rates.take_bytes(self._caller.name, count)
 
-    def add(self, row: Row) -> tuple[Row, bool]:
-        """Add the row of the upload to the catalogue. Raises ``Problem`` 413 if other uploads have filled the quota meanwhile."""
-        try:
-            return self._state.catalogue.add(row, self._state.settings.quota_mib)
-        except OverQuota as over:
-            # Nothing stays of a refused upload: its file was stored before its row.
-            digest = row.file_sha256 if isinstance(row, PsfRow) else row.id
-            remove_unnamed(self._state.catalogue, self._state.store, [digest])
-            raise _file_too_large(over.usage, row.bytes) from over
+    def keep(self, file: Path, digest: str, row: Row) -> tuple[Row, bool]:
+        """Store the uploaded file, and add its row to the catalogue; returns the row, and whether it is new.
+
+        If the row is refused or fails, the file is removed again. Raises ``Problem`` 413 if other uploads have filled the
+        quota meanwhile.
+        """
+        with self._state.store.kept_if(file, digest):
+            try:
+                return self._state.catalogue.add(row, self._state.settings.quota_mib)
+            except OverQuota as over:
+                raise _file_too_large(over.usage, counted_bytes(row)) from over
+
+
+def check_disk(state: State, more_bytes: int = 0) -> None:
+    """Raise ``Problem`` 507 if the disk of the data folder would be full after this number of bytes."""
+    free = checks.free_bytes(state.settings.data_dir)
+    least = state.settings.min_free_mib * MIB
+    if free - more_bytes < least:
+        raise Problem(
+            507,
+            "storage-full",
+            f"expected {least / MIB:.0f} MiB of free disk space after this request (HELIOPSF_MIN_FREE_MIB); "
+            f"{max(0, free - more_bytes) / MIB:.0f} MiB would be left: ask the operator to make room, then try again",
+        )
 
 
 def check_room(state: State, owner: str) -> None:
-    """Raise ``Problem`` 507 if the owner's quota is full, because no result could be stored."""
+    """Raise ``Problem`` 507 if the owner's quota or the disk is full, because no result could be stored."""
+    check_disk(state)
     usage = _usage(state, owner)
     if usage.full:
         raise _exceeded(507, usage, NOT_KEPT)

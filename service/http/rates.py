@@ -1,4 +1,5 @@
-"""Limits for each caller: reads, submissions and uploaded bytes per minute, and streams that are open at the same time.
+"""Limits for each caller: reads, submissions and uploaded bytes per minute, and requests and streams that are open at the
+same time.
 
 If the broker is Redis, all servers count together in Redis; otherwise each process counts alone. Each caller has
 an allowance of its own, so that a runaway script does not delay the others.
@@ -113,27 +114,30 @@ class Rates:
         return self._limiter
 
 
-class Streams:
-    """Counts the streams that each caller has open in this process, and limits them."""
+class AtOnce:
+    """Counts what each caller has open in this process, and limits it."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, most: int, code: str, what: str) -> None:
+        """most: the limit for each caller. code, what: the code of the error, and what is counted, in the plural."""
+        self._most, self._code, self._what = most, code, what
         self._open: Counter[str] = Counter()
         self._lock = threading.Lock()
 
     def open(self, who: str) -> None:
-        """Count one more stream. Raises ``Problem`` 429 if the caller already has the largest number of streams open."""
+        """Count one more. Raises ``Problem`` 429 if the caller already has the largest number open."""
         with self._lock:
             if self._open[who] >= self._most:
                 raise Problem(
                     429,
-                    "too-many-streams",
-                    f"expected at most {self._most} open streams of events per caller; close a stream first",
+                    self._code,
+                    f"expected at most {self._most} {self._what} of one caller at the same time; got one more: wait until "
+                    "one of them has ended",
+                    headers={"Retry-After": "1"},
                 )
             self._open[who] += 1
 
     def close(self, who: str) -> None:
-        """Count one stream fewer."""
+        """Count one fewer."""
         with self._lock:
             self._open[who] -= 1
             if not self._open[who]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
+import anyio
 from fastapi import Depends, Request
 
 from psfcore.fits.header import FitsLimits
 from service.http.access import Access
-from service.http.rates import Rates, Streams
+from service.http.rates import AtOnce, Rates
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
 from workers.settings import Settings
@@ -28,7 +29,10 @@ class State:
     reconciler: Reconciler
     access: Access
     rates: Rates
-    streams: Streams
+    streams: AtOnce
+    requests: AtOnce
+    # Cut-outs wait here and not in the threads that all requests share: a cut-out keeps a core busy.
+    cutouts: anyio.CapacityLimiter
 
     @property
     def limits(self) -> FitsLimits:
@@ -36,10 +40,11 @@ class State:
         return FitsLimits(max_pixels=self.settings.max_pixels)
 
 
-def _state(request: Request) -> State:
+def state_of(request: Request) -> State:
+    """The objects of the application that answers a request."""
     state = request.app.state.heliopsf
     assert isinstance(state, State)
     return state
 
 
-Shared = Annotated[State, Depends(_state)]
+Shared = Annotated[State, Depends(state_of)]

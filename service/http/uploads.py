@@ -242,6 +242,11 @@ def fits_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
     return _inspected(path, _Fits(limits))
 
 
+def psf_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
+    """As ``fits_summary``, for a PSF. Raises ``Problem`` 422 if the file is plainly no PSF."""
+    return _inspected(path, _PsfFile(limits))
+
+
 def archive_contents(path: Path, limits: ArchiveLimits) -> ArchiveContents:
     """The contents of a received archive of a transit. Raises ``Problem`` 413, 415 or 422 if it cannot be used."""
     return _inspected(path, _Archive(limits))

@@ -94,8 +94,7 @@ def keep(state: State, caller: Caller, sent: Sent, kind: str) -> None:
     named = {name: sent.parts[part] for name, part in _named(sent, kind).items()}
     allowed = Allowed(state, caller)  # the bytes were counted against the caller's rate when they arrived
     additions = [_addition(state, caller.owner, name, part, allowed) for name, part in named.items()]
-    for part, add in zip(named.values(), additions, strict=True):
-        state.store.keep(part.path, part.sha256)
+    for add in additions:
         add()
 
 
@@ -138,17 +137,17 @@ def _named(sent: Sent, kind: str) -> dict[str, str]:
 def _addition(
     state: State, owner: str, name: str, part: Part, allowed: Allowed
 ) -> Callable[[], tuple[object, bool]]:
-    """A function that adds the row of a file to the catalogue. Raises ``Problem`` 413, 415 or 422 if the file cannot be used."""
+    """A function that stores a file and adds its row to the catalogue. Raises ``Problem`` 413, 415 or 422 if the file cannot be used."""
     settings, file = state.settings, (owner, part.sha256, part.bytes, part.filename)
+    keep = partial(allowed.keep, part.path, part.sha256)
     if name == "transit":
         uploads.check_size(part.bytes, settings.max_transit_bytes)
         contents = uploads.archive_contents(part.path, settings.archive_limits)
-        return partial(allowed.add, transit_row(*file, contents))
+        return partial(keep, transit_row(*file, contents))
     uploads.check_size(part.bytes, settings.max_upload_bytes)
-    summary = uploads.fits_summary(part.path, state.limits)
     if name == "psf":
-        return partial(allowed.add, uploaded_psf_row(*file, summary))
-    return partial(allowed.add, image_row(*file, summary))
+        return partial(keep, uploaded_psf_row(*file, uploads.psf_summary(part.path, state.limits)))
+    return partial(keep, image_row(*file, uploads.fits_summary(part.path, state.limits)))
 
 
 class _Receiver:

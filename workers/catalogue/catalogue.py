@@ -23,7 +23,7 @@ from workers.catalogue.database import Database, begins_with
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.keys import Keys
 from workers.catalogue.named_files import NamedFiles
-from workers.catalogue.owners import Owners, add_bytes, hold_to_quota
+from workers.catalogue.owners import Owners, add_bytes, counted_bytes, hold_to_quota
 from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs
 from workers.catalogue.schema import Schema
@@ -109,10 +109,11 @@ class Catalogue:
             with self._database.writing.begin() as session:
                 session.add(row)
                 session.flush()
-                add_bytes(session, row.owner, row.bytes)
+                count = counted_bytes(row)
+                add_bytes(session, row.owner, count)
                 if quota_mib is not None:
                     removable = isinstance(row, SolutionRow)
-                    hold_to_quota(session, row.owner, row.bytes, quota_mib, removable=removable)
+                    hold_to_quota(session, row.owner, count, quota_mib, removable=removable)
             return row, True
         except IntegrityError:
             existing = self.get(type(row), row.id, row.owner)
@@ -126,11 +127,12 @@ class Catalogue:
             there = session.get(type(row), (row.owner, row.id), with_for_update=True)
             if there is None:  # it was deleted meanwhile
                 session.add(row)
-                add_bytes(session, row.owner, row.bytes)
+                add_bytes(session, row.owner, counted_bytes(row))
                 return row
-            add_bytes(session, row.owner, row.bytes - there.bytes)
+            before = counted_bytes(there)
             there.file_sha256, there.bytes = row.file_sha256, row.bytes
             there.preview_sha256, there.details = row.preview_sha256, row.details
+            add_bytes(session, row.owner, counted_bytes(there) - before)
             return there
 
     def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
@@ -164,7 +166,7 @@ class Catalogue:
                     f"expected a PSF that nothing uses; {user} uses PSF {psf_id}: it can only be deleted without this",
                 )
             session.delete(row)
-            add_bytes(session, owner, -row.bytes)
+            add_bytes(session, owner, -counted_bytes(row))
             _unshare_jobs(session, owner, psf_id)
             return row
 
@@ -186,7 +188,7 @@ class Catalogue:
             if row is None:
                 return False
             session.delete(row)
-            add_bytes(session, owner, -row.bytes)
+            add_bytes(session, owner, -counted_bytes(row))
             _unshare_jobs(session, owner, identity)
             return True
 

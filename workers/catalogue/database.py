@@ -98,8 +98,8 @@ def open_engine(url: str) -> Engine:
     if not url.startswith("sqlite"):
         # Without a limit, a request to an unreachable database would wait for minutes.
         patience = {"connect_timeout": 5} if url.startswith("postgresql") else {}
-        return create_engine(url, pool_pre_ping=True, connect_args=patience, json_serializer=_strict_json)
-    engine = create_engine(url, connect_args={"timeout": PATIENCE_S}, json_serializer=_strict_json)
+        return create_engine(url, pool_pre_ping=True, connect_args=patience, json_serializer=strict_json)
+    engine = create_engine(url, connect_args={"timeout": PATIENCE_S}, json_serializer=strict_json)
 
     @event.listens_for(engine, "connect")
     def _pragmas(connection: Any, _record: Any) -> None:
@@ -136,7 +136,7 @@ def _write_ahead(connection: sqlite3.Connection) -> None:
             time.sleep(0.02)
 
 
-def _strict_json(value: Any) -> str:
+def strict_json(value: Any) -> str:
     """Write JSON. Raises ValueError for NaN and infinity: PostgreSQL refuses them, and clients cannot read them."""
     return json.dumps(value, allow_nan=False)
 

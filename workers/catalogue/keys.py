@@ -14,7 +14,7 @@ import time
 from collections.abc import Collection, Sequence
 from enum import StrEnum
 
-from sqlalchemy import func, or_, select, update
+from sqlalchemy import Select, func, or_, select, update
 
 from workers.catalogue.database import Database
 from workers.catalogue.tables import KeyRow
@@ -115,15 +115,24 @@ class Keys:
 
     def any_good(self) -> bool:
         """Whether any key is valid now."""
-        good = select(KeyRow.id).where(
-            KeyRow.revoked_at.is_(None), or_(KeyRow.expires_at.is_(None), KeyRow.expires_at > time.time())
-        )
         with self._database.reading() as session:
-            return session.scalars(good.limit(1)).first() is not None
+            return session.scalars(_good().limit(1)).first() is not None
+
+    def is_good(self, identity: str) -> bool:
+        """Whether the key with this id is valid now: neither revoked nor expired."""
+        with self._database.reading() as session:
+            return session.scalars(_good().where(KeyRow.id == identity)).first() is not None
 
     def _note_use(self, identity: str, now: float) -> None:
         unnoted = or_(KeyRow.last_used_at.is_(None), KeyRow.last_used_at < now - _USE_NOTED_EVERY_S)
         self._database.change(update(KeyRow).where(KeyRow.id == identity, unnoted).values(last_used_at=now))
+
+
+def _good() -> Select[str]:
+    """The ids of all keys that are valid now."""
+    return select(KeyRow.id).where(
+        KeyRow.revoked_at.is_(None), or_(KeyRow.expires_at.is_(None), KeyRow.expires_at > time.time())
+    )
 
 
 def _hash(secret: str) -> str:

@@ -1,7 +1,8 @@
 """The number of bytes that each owner keeps, and the owner's quota.
 
-The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The count changes
-in the transaction that adds the row.
+The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The rows count too,
+because many small files take more room in the database than on the disk. The count changes in the transaction that adds the
+row.
 
 A solution can be made again, so it never takes room from anything else: the oldest solutions are removed if an upload or
 another solution needs their room.
@@ -12,13 +13,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import ColumnElement, String, cast, delete, func, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, strict_json
 from workers.catalogue.tables import (
+    Base,
     ImageRow,
     OwnerRow,
     ProductRow,
@@ -30,6 +32,7 @@ from workers.catalogue.tables import (
 
 COUNTED = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 MIB = 2**20
+ROW_BYTES = 2**10  # the columns of a row without its JSON, and its entries in the indexes
 NOT_KEPT = "the result of this job could not be kept"  # a reason for Usage.no_room
 
 
@@ -104,7 +107,7 @@ class Owners:
             rows = session.scalars(select(OwnerRow).with_for_update()).all()
             truth: dict[str, int] = {}
             for table in COUNTED:
-                sums = select(table.owner, func.sum(table.bytes)).group_by(table.owner)
+                sums = select(table.owner, func.sum(_counted(table))).group_by(table.owner)
                 for owner, total in session.execute(sums):
                     truth[owner] = truth.get(owner, 0) + int(total)
             for row in rows:
@@ -132,6 +135,14 @@ class Owners:
                     session, row.owner, 0
                 )  # locks the owner first, as `hold_to_quota` does: no deadlock
                 _forget(session, row)
+
+
+def counted_bytes(row: ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow) -> int:
+    """What a row counts: its file and the row itself. A solution counts its file alone: it can be removed at any time."""
+    if isinstance(row, SolutionRow):
+        return row.bytes
+    about = row.summary if isinstance(row, ImageRow | TransitRow) else row.details
+    return row.bytes + ROW_BYTES + len(strict_json(about))
 
 
 def add_bytes(session: Session, owner: str, count: int) -> None:
@@ -184,6 +195,15 @@ def _forget(session: Session, row: SolutionRow) -> None:
     assert isinstance(result, CursorResult)
     if result.rowcount:
         add_bytes(session, row.owner, -row.bytes)
+
+
+def _counted(table: type[Base]) -> ColumnElement[int]:
+    """``counted_bytes`` of the rows of a table, in SQL."""
+    columns = table.__table__.c
+    about = columns.get("summary", columns.get("details"))
+    if about is None:
+        return columns.bytes
+    return columns.bytes + ROW_BYTES + func.length(cast(about, String))
 
 
 def _usage(session: Session, owner: str, quota_mib: int) -> Usage:

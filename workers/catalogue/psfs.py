@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.database import Database
+from workers.catalogue.owners import add_bytes, counted_bytes
 from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesRow
 from workers.versions.series import UPLOADED, series_of
 from workers.versions.status import PsfStatus, check_transition, check_version
@@ -71,7 +72,9 @@ class Psfs:
         with self._database.writing.begin() as session:
             row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
             if row is not None:
+                before = counted_bytes(row)
                 row.details = {**row.details, "tables_sha256": tables_sha256}
+                add_bytes(session, owner, counted_bytes(row) - before)
                 row.preview_sha256 = preview_sha256
 
     # Searches -----------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, StringConstraints, model_validator
 
 from workers.contract.requests import Identity, Treatment
 
@@ -117,7 +117,7 @@ class BulkWork(_Strict):
 class BulkRequest(BulkWork):
     """Deconvolve many images with one PSF, or each with the PSF that a context pins for it."""
 
-    images: list[Identity] = Field(
+    images: Annotated[list[Identity], FailFast()] = Field(
         default_factory=list, max_length=MOST_UPLOADED, description="ids returned by the uploads of images"
     )
 

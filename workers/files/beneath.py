@@ -21,6 +21,7 @@ from typing import BinaryIO
 from psfcore.errors import DataError
 from psfcore.whole_files import PARTIAL
 from workers.files.archive import check_under
+from workers.files.modes import open_file, open_folder, open_made_folder
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 # O_NONBLOCK: to open a pipe would otherwise wait for its other end.
@@ -66,6 +67,7 @@ def put(source: Path, target: Path, allowed: Sequence[Path]) -> None:
         partial = f".{target.name}.{uuid.uuid4().hex}{PARTIAL}"
         try:
             with open(os.open(partial, _NEW_FILE, 0o666, dir_fd=folder), "wb") as copy:
+                open_file(copy)
                 shutil.copyfileobj(file, copy, _CHUNK)
                 copy.flush()
                 os.fsync(copy.fileno())
@@ -90,7 +92,7 @@ def _folder(folder: Path, allowed: Sequence[Path], *, make: bool) -> Iterator[in
     resolved = check_under(folder, allowed)
     root = next(one for one in allowed if resolved.is_relative_to(one))
     if make:
-        root.mkdir(parents=True, exist_ok=True)
+        open_folder(root)
     handle = os.open(root, _FOLDER)
     try:
         for part in resolved.relative_to(root).parts:
@@ -107,6 +109,7 @@ def _folder(folder: Path, allowed: Sequence[Path], *, make: bool) -> Iterator[in
 def _make(name: str, folder: int) -> None:
     try:
         os.mkdir(name, dir_fd=folder)
+        open_made_folder(name, folder)
     except FileExistsError:
         return
 

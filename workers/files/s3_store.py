@@ -102,6 +102,15 @@ class RemoteStore(Store):
         self._keep_copy(temporary, super().path(digest))
         return digest
 
+    def kept_at(self, digest: str) -> float | None:
+        """The time when a file was last stored; None if it is not in the store. Raises ``StoreAway``."""
+        with _answering():
+            try:
+                stored_at: float = self._s3.info(self._key(digest), refresh=True)["LastModified"].timestamp()
+            except FileNotFoundError:
+                return None
+        return stored_at
+
     def blobs(self) -> Iterator[Blob]:
         """All files of the store, in the order of the first digit of their hashes. Raises ``StoreAway``."""
         for digit in "0123456789abcdef":
@@ -152,12 +161,8 @@ class RemoteStore(Store):
 
     def _is_old(self, digest: str, kept_before: float) -> bool:
         """Whether the file exists and was last stored before this time."""
-        try:
-            about = self._s3.info(self._key(digest), refresh=True)
-        except FileNotFoundError:
-            return False
-        kept_at: float = about["LastModified"].timestamp()
-        return kept_at < kept_before
+        kept_at = self.kept_at(digest)
+        return kept_at is not None and kept_at < kept_before
 
     def _key(self, digest: str) -> str:
         return f"{self._root}/blobs/{digest[:2]}/{digest}"

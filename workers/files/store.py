@@ -7,6 +7,7 @@ File names are hashes; they never come from a client.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import shutil
 import time
@@ -166,9 +167,35 @@ class Store:
         target = self.path(digest)
         target.parent.mkdir(exist_ok=True)
         sync(temporary)
+        # To the nanosecond, so that remove() can tell this file from an equal one that is stored at the same moment. The
+        # system itself sets times only to a few milliseconds.
+        os.utime(temporary, ns=(time.time_ns(), time.time_ns()))
         os.replace(temporary, target)
         sync(target.parent)
         return digest
+
+    def kept_at(self, digest: str) -> float | None:
+        """The time when a file was last stored; None if it is not in the store."""
+        try:
+            return (self._blobs / digest[:2] / digest).stat().st_mtime
+        except FileNotFoundError:
+            return None
+
+    @contextmanager
+    def kept_if(self, temporary: Path, digest: str) -> Iterator[None]:
+        """Keep a complete file while the block adds its row to the catalogue. If the block fails, the file is removed again.
+
+        The file stays if it was there before, or if it is stored again meanwhile: then another row may need it.
+        """
+        known = self.kept_at(digest) is not None
+        self.keep(temporary, digest)
+        kept_at = self.kept_at(digest)
+        try:
+            yield
+        except BaseException:
+            if not known and kept_at is not None:
+                self.remove(digest, kept_before=math.nextafter(kept_at, math.inf))
+            raise
 
     def blobs(self) -> Iterator[Blob]:
         """All files of the store."""

@@ -5,12 +5,19 @@ from __future__ import annotations
 import dataclasses
 import time
 from pathlib import PurePath
+from typing import Any
 
 from psfcore.fits.header import HeaderSummary
 from psfcore.transit.archive import ArchiveContents
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.versions.series import UPLOADED, channel_of, instrument_of, series_of
 from workers.versions.status import PsfStatus
+
+TEXT_LENGTH = 200
+NAME_LENGTH, VERSION_LENGTH = (
+    80,
+    40,
+)  # as in the query of an upload: the columns are indexed, and indexes have a limit
 
 
 def image_row(
@@ -23,7 +30,7 @@ def image_row(
         created_at=time.time(),
         bytes=size_bytes,
         filename=filename,
-        summary=dataclasses.asdict(summary),
+        summary=_summary(summary),
     )
 
 
@@ -67,9 +74,9 @@ def uploaded_psf_row(
     """The row of an uploaded PSF, with status draft.
 
     A name, version, instrument or channel that the request does not give is taken from the header. Without a name in the
-    header, the PSF gets the name of the file.
+    header, the PSF gets the name of the file. Longer texts of the header are cut.
     """
-    header = dataclasses.asdict(summary)
+    header = _summary(summary)
     instrument = instrument or instrument_of(header)
     channel = channel or channel_of(instrument, summary.wavelnth)
     kind = kind or UPLOADED
@@ -77,8 +84,8 @@ def uploaded_psf_row(
         owner=owner,
         id=sha256,
         created_at=time.time(),
-        name=name or summary.psf_name or PurePath(filename or "uploaded").stem,
-        version=version or summary.psf_version or f"0.0.0+{sha256[:8]}",
+        name=name or label(summary.psf_name or PurePath(filename or "").stem, NAME_LENGTH) or "uploaded",
+        version=version or label(summary.psf_version, VERSION_LENGTH) or f"0.0.0+{sha256[:8]}",
         instrument=instrument,
         channel=channel,
         kind=kind,
@@ -95,3 +102,16 @@ def uploaded_psf_row(
             "filename": filename,
         },
     )
+
+
+def label(text: str | None, most: int) -> str:
+    """The printable characters of a text that a file or a client chose, at most ``most`` of them."""
+    return "".join(c for c in (text or "")[: 2 * most] if c.isprintable())[:most].strip()
+
+
+def _summary(summary: HeaderSummary) -> dict[str, Any]:
+    """The summary of a header as JSON. A card may continue over thousands of cards; its text is cut."""
+    return {
+        name: label(value, TEXT_LENGTH) if isinstance(value, str) else value
+        for name, value in dataclasses.asdict(summary).items()
+    }

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from psfcore.errors import DataError
 from service.api.psfs.filters import TEXT
-from service.http.callers import Certifying, Reading
+from service.http.callers import Certifying, KeyFirst, Reading
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
@@ -18,7 +18,7 @@ from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow
 from workers.contract.requests import ContextName, Identity
 from workers.versions.validity import TIME, Validity, iso
 
-router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES)
+router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES, route_class=KeyFirst)
 
 Time = Annotated[str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; UTC without a zone")]
 Reason = Annotated[

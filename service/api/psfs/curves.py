@@ -11,12 +11,14 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
+import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from psfcore.fits.cutout import cutout
+from psfcore.fits.cutout import Cutout, cutout
 from psfcore.tables import lookup as psf_lookup
 from service.http import downloads as files
 from service.http.callers import Caller, Reading
@@ -155,7 +157,7 @@ def get_comparison(
 
 
 @router.get("/{psf_id}/cutout", summary="The central part of a PSF as FITS", response_class=Response)
-def get_cutout(
+async def get_cutout(
     psf_id: Identity,
     size: Annotated[int, Query(ge=1, description="edge length in px, at most the edge length of the PSF")],
     request: Request,
@@ -163,16 +165,21 @@ def get_cutout(
     state: Shared,
 ) -> Response:
     """The central part of the PSF, not renormalised. Its centre is at [size // 2, size // 2]."""
-    row = _find(state, caller, psf_id)
+    row = await run_in_threadpool(_find, state, caller, psf_id)
     headers = _headers(f"{row.file_sha256} cutout {size}")
     if files.known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
+
+    def cut() -> Cutout:
+        return cutout(files.found(state.store, row.file_sha256, row.bytes), size, state.limits)
+
     try:
-        content = cutout(files.found(state.store, row.file_sha256, row.bytes), size, state.limits)
+        made = await anyio.to_thread.run_sync(cut, limiter=state.cutouts)
     except DataError as error:
         raise problem(error) from error
     headers["Content-Disposition"] = f'attachment; filename="psf-{psf_id[:12]}-{size}px.fits"'
-    return Response(content, media_type=files.FITS_TYPE, headers=headers)
+    headers["Content-Length"] = str(made.length)
+    return StreamingResponse(made.pieces(), media_type=files.FITS_TYPE, headers=headers)
 
 
 def _answer(

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from psfcore.errors import DataError
 from service.api.psfs.filters import TEXT
-from service.http.callers import Caller, Certifying, Reading
+from service.http.callers import Caller, Certifying, KeyFirst, Reading
 from service.http.problems import RESPONSES, problem
 from service.http.state import Shared, State
 from workers.catalogue.psfs import StatusAsked
@@ -21,7 +21,7 @@ from workers.versions.status import MAY_BECOME, PsfStatus, next_version
 from workers.versions.validity import TIME, Validity, iso
 
 log = logging.getLogger(__name__)
-router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
+router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES, route_class=KeyFirst)
 
 Time = Annotated[str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; UTC without a zone")]
 Word = Annotated[str, Field(pattern=WORD)]

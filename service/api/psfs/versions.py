@@ -126,20 +126,19 @@ async def upload_psf(
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
     async with uploads.receive_psf(request, state.store, state.limits, limit, take) as upload:
-        await run_in_threadpool(state.store.keep, upload.path, upload.sha256)
-    row = uploaded_psf_row(
-        caller.owner,
-        upload.sha256,
-        upload.bytes,
-        upload.filename,
-        upload.summary,
-        name=name,
-        version=version,
-        instrument=instrument,
-        channel=channel,
-        kind=kind,
-    )
-    row, new = await run_in_threadpool(take.add, row)
+        row = uploaded_psf_row(
+            caller.owner,
+            upload.sha256,
+            upload.bytes,
+            upload.filename,
+            upload.summary,
+            name=name,
+            version=version,
+            instrument=instrument,
+            channel=channel,
+            kind=kind,
+        )
+        row, new = await run_in_threadpool(take.keep, upload.path, upload.sha256, row)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/psfs/{row.id}"
     return PsfView.of(row)

@@ -17,6 +17,7 @@ from service.cli.options import FILE, OUTPUT_FOLDER, limits, user_errors
 # The diagnosis runs as a command in another process, which does not know the withheld effects.
 DIAGNOSE = (
     sys.executable,
+    "-P",  # nothing is imported from the working folder
     "-c",
     "from service.cli.main import main; main()",
     "gap",

@@ -13,6 +13,7 @@ from service.cli.options import DATA, data_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.schema import SchemaError, SchemaStatus
+from workers.files.modes import keep_private, private_folder
 
 SENTENCES = {
     "empty": "the database is empty; the first start of a server makes its tables at revision {wanted}",
@@ -65,8 +66,9 @@ def sentence(found: SchemaStatus) -> str:
 def opened_catalogue(data: Path | None) -> Iterator[Catalogue]:
     """The catalogue of a data folder. Its database is not upgraded; an error of the database becomes a ``ClickException``."""
     settings = data_settings(data)
+    keep_private()
     if settings.database_url is None:
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
+        private_folder(settings.data_dir)
     try:
         catalogue = Catalogue(settings.catalogue_url)
     except (ArgumentError, ImportError, ValueError) as error:

@@ -176,7 +176,7 @@ def storage(settings: Settings) -> Finding:
         )
     if there == folder:
         try:
-            checks.storage(folder)
+            checks.storage(folder, settings.min_free_mib)
         except checks.Unusable as fault:
             found = f"{folder}: {fault}"
             return Finding("storage", "broken", found, "give this user write access, or free disk space")

@@ -14,16 +14,18 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from sqlalchemy import update
 
 from service.api import events
 from service.app import create_app
 from service.client.http import Client, ServiceError
+from tests.service.keyed import bearer, keyed
 from tests.whole.stack import free_port, wait_for
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import DEFAULT_OWNER
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow, KeyRow
 from workers.contract.bulk import BulkPhase
 from workers.settings import Settings
 
@@ -211,3 +213,39 @@ def test_a_stream_ends_after_its_time_and_can_be_continued(
         assert said.count("event: progress") == 1 and "event: end" not in said
         known = said.split("id: ")[1].split()[0]
         assert "event:" not in api.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": known}).text
+
+
+@pytest.mark.parametrize("how", ["revoked", "expired"])
+def test_a_stream_ends_with_its_key(settings: Settings, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    monkeypatch.setattr(events, "LOOK_EVERY_S", 0.02)
+    with keyed(settings, stream_s=10.0) as service:  # guards against a hang
+        key = service.key("ann")
+        identity = key.split("_")[1]
+        job, _ = service.catalogue.jobs.submit("psf-build", {}, "k", "ann")
+        end = update(KeyRow).where(KeyRow.id == identity)
+        end = end.values(revoked_at=1.0) if how == "revoked" else end.values(expires_at=1.0)
+        get, looks = service.catalogue.jobs.get, 0
+
+        def look(job_id: str) -> JobRow | None:
+            nonlocal looks
+            looks += 1
+            if looks == 5:  # the stream is open and has sent an event
+                service.catalogue._database.change(end)
+            return get(job_id)
+
+        monkeypatch.setattr(service.catalogue.jobs, "get", look)
+        said = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
+        assert said.status_code == 200 and looks == 5
+        assert said.text.count("event: progress") == 1 and "event: end" not in said.text
+        refused = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
+        assert (refused.status_code, refused.json()["type"]) == (401, f"urn:heliopsf:key-{how}")
+
+
+def test_an_owner_follows_nothing_of_another_s(settings: Settings) -> None:
+    with keyed(settings) as service:
+        job, _ = service.catalogue.jobs.submit("psf-build", {}, "k", "ann")
+        for identity in (job.id, "0" * 32):
+            refused = service.client("bob").get(f"/v1/jobs/{identity}/events")
+            assert refused.status_code == 404 and refused.json()["type"] == "urn:heliopsf:no-such-job"
+            refused = service.client("bob").get(f"/v1/bulk/{identity}/events")
+            assert refused.status_code == 404 and refused.json()["type"] == "urn:heliopsf:no-such-bulk"

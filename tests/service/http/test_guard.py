@@ -248,7 +248,7 @@ def test_the_api_reference_loads_nothing_from_other_hosts(service: Keyed) -> Non
 
 def test_a_body_that_is_no_file_is_bounded_before_it_is_read(settings: Settings) -> None:
     with TestClient(
-        create_app(settings.model_copy(update={"max_body_mib": 1})), raise_server_exceptions=False
+        create_app(settings.model_copy(update={"max_body_kib": 1024})), raise_server_exceptions=False
     ) as api:
         large = b'{"kind": "' + bytes(2**21) + b'"}'
         json_type = {"Content-Type": "application/json"}

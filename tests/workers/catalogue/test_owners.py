@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import MIB, OverQuota
-from workers.catalogue.tables import ImageRow, SolutionRow
+from workers.catalogue.owners import MIB, ROW_BYTES, OverQuota, counted_bytes
+from workers.catalogue.tables import ImageRow, PsfRow, SolutionRow
+
+ROW = ROW_BYTES + len("{}")  # what the row of such an image counts, besides its file
 
 
-def image(number: int, size_bytes: int) -> ImageRow:
-    return ImageRow(owner="o", id=f"{number:064x}", created_at=1.0, bytes=size_bytes, summary={})
+def image(number: int, counted: int) -> ImageRow:
+    """An image that counts this number of bytes: its file and its row."""
+    return ImageRow(owner="o", id=f"{number:064x}", created_at=1.0, bytes=counted - ROW, summary={})
 
 
 def send(catalogue: Catalogue, row: ImageRow, quota_mib: int = 1) -> bool:
@@ -21,7 +25,7 @@ def send(catalogue: Catalogue, row: ImageRow, quota_mib: int = 1) -> bool:
         return catalogue.add(row, quota_mib)[1]
     except OverQuota as over:
         assert over.usage.limit_bytes is not None
-        assert over.usage.limit_bytes < over.usage.used_bytes + row.bytes
+        assert over.usage.limit_bytes < over.usage.used_bytes + counted_bytes(row)
         return False
 
 
@@ -35,14 +39,14 @@ def test_simultaneous_uploads_are_accepted_up_to_the_quota(catalogue: Catalogue)
 
 def test_an_owner_s_own_limit_counts(catalogue: Catalogue) -> None:
     catalogue.owners.set_quota("o", 2)
-    assert send(catalogue, image(1, 2 * MIB)) and not send(catalogue, image(2, 1))
+    assert send(catalogue, image(1, 2 * MIB)) and not send(catalogue, image(2, ROW))
     catalogue.owners.set_quota("o", 0)
-    assert send(catalogue, image(2, 1))
+    assert send(catalogue, image(2, ROW))
     catalogue.owners.set_quota("o", None)
-    assert not send(catalogue, image(3, 1)) and send(catalogue, image(3, 1), quota_mib=0)
+    assert not send(catalogue, image(3, ROW)) and send(catalogue, image(3, ROW), quota_mib=0)
 
 
-@pytest.mark.parametrize("size_bytes", [0, MIB])
+@pytest.mark.parametrize("size_bytes", [ROW, MIB])
 def test_results_of_jobs_are_not_held_to_the_quota(catalogue: Catalogue, size_bytes: int) -> None:
     assert send(catalogue, image(1, MIB))
     assert catalogue.add(image(2, size_bytes))[1]
@@ -96,3 +100,17 @@ def test_a_solution_is_forgotten_once(catalogue: Catalogue) -> None:
     catalogue.owners.forget_solutions(rows)
     catalogue.owners.forget_solutions(rows)
     assert kept(catalogue) == [] and catalogue.owners.usage("o", 0).used_bytes == 0
+
+
+def test_the_json_of_a_row_counts_too_and_when_it_changes(catalogue: Catalogue) -> None:
+    identity = "a" * 64
+    psf = PsfRow(
+        owner="o", id=identity, created_at=1.0, name="n", version="1", kind="total", status="draft", origin="uploaded",
+        file_sha256=identity, bytes=5, details={"text": "sun \u2609" * 100},
+    )  # fmt: skip
+    assert catalogue.add(psf)[1]
+    before = catalogue.owners.usage("o", 0).used_bytes
+    assert before == 5 + ROW_BYTES + len(json.dumps(psf.details))
+    catalogue.psfs.describe(identity, "o", tables_sha256="b" * 64, preview_sha256="c" * 64)
+    assert catalogue.owners.usage("o", 0).used_bytes == before + len(', "tables_sha256": ""') + 64
+    assert catalogue.owners.recount() == []

@@ -129,6 +129,7 @@ def test_a_database_from_before_revisions_is_adopted_with_its_data(catalogue: Ca
     assert image is not None and image.summary == {"instrument": "hri_euv"}
     assert psf is not None and psf.version == "1.0.0+0" and psf.details["shape"] == [4, 4]
     assert product is not None and product.psf_id == psf.id and product.created_at == 2.0
+    assert catalogue.owners.recount() == [], "the rows count since revision 0012"
 
 
 @pytest.mark.parametrize(

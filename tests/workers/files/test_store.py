@@ -307,3 +307,41 @@ def test_an_unavailable_server_is_a_transient_failure(
 def test_an_invalid_url_is_refused(tmp_path: Path, url: str) -> None:
     with pytest.raises(ValidationError):
         Settings(data_dir=tmp_path, store_url=url)
+
+
+def failing(store: Store, content: bytes, meanwhile: bytes | None = None) -> None:
+    """Keep a file for a row that then fails; ``meanwhile``: another upload stores this in between."""
+    with store.temporary() as path:
+        path.write_bytes(content)
+        with pytest.raises(ZeroDivisionError), store.kept_if(path, hashlib.sha256(content).hexdigest()):
+            assert store.path(hashlib.sha256(content).hexdigest()).read_bytes() == content
+            if meanwhile is not None:
+                kept(store, meanwhile)
+            raise ZeroDivisionError
+
+
+def test_the_file_of_a_row_that_fails_is_removed(store: Store) -> None:
+    failing(store, CONTENT)
+    assert list(store.blobs()) == [] and store.kept_at(hashlib.sha256(CONTENT).hexdigest()) is None
+
+
+def test_it_stays_if_it_was_there_before(store: Store) -> None:
+    digest = kept(store)
+    failing(store, CONTENT)
+    assert [blob.digest for blob in store.blobs()] == [digest]
+
+
+def test_it_stays_if_it_was_stored_again_meanwhile(tmp_path: Path) -> None:
+    """In S3, whose clock counts seconds, ``settle`` puts it back."""
+    store = Store(tmp_path)
+    failing(store, CONTENT, meanwhile=CONTENT)
+    assert [blob.digest for blob in store.blobs()] == [hashlib.sha256(CONTENT).hexdigest()]
+
+
+def test_the_file_of_a_row_that_is_added_stays(store: Store) -> None:
+    with store.temporary() as path:
+        path.write_bytes(CONTENT)
+        digest = hashlib.sha256(CONTENT).hexdigest()
+        with store.kept_if(path, digest):
+            pass
+    assert store.path(digest).read_bytes() == CONTENT

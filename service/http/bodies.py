@@ -1,0 +1,114 @@
+"""Bounds on the body of a request: its size, its time, and the number of values in it.
+
+A body costs memory and time before anything is known about its content. Therefore its size is bounded while it arrives, a
+client that sends too slowly is answered, and the values in JSON are counted before they are made into objects.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import anyio
+from fastapi import Request
+from fastapi.concurrency import run_in_threadpool
+from starlette.datastructures import Headers
+from starlette.types import Message, Receive
+
+from service.http.problems import Problem
+from service.http.uploads import has_own_limit
+from workers.settings import Settings
+
+BULK = "/v1/bulk"  # the only address at which large JSON is expected
+# The largest request, a bulk run of 100,000 uploaded images, has one list and one value for each image. Python makes a
+# list or an object for each bracket, and pydantic may report an error for each member of an object.
+MOST_OF = {b"[": 25_000, b"{": 25_000, b":": 25_000, b",": 200_000}
+
+
+@dataclass(frozen=True)
+class BodyLimits:
+    """Largest bodies in bytes, and the slowest body: ``seconds``, and from then on ``bytes_per_s``."""
+
+    usual_bytes: int
+    bulk_bytes: int
+    seconds: float
+    bytes_per_s: int
+
+    @classmethod
+    def of(cls, settings: Settings) -> BodyLimits:
+        """The limits in the settings."""
+        return cls(
+            settings.max_body_kib * 2**10,
+            settings.max_bulk_body_mib * 2**20,
+            settings.body_s,
+            settings.body_kib_per_s * 2**10,
+        )
+
+    def received(self, path: str, headers: Headers, receive: Receive) -> Receive:
+        """The body of a request, within these limits. Uploads have their own limits on the size, in ``service.http.uploads``.
+
+        Whoever reads the body gets ``Problem`` 413 if its declared length is too large, before anything is received, or as
+        soon as it is too large; and 408 as soon as it is too slow.
+        """
+        most = None if has_own_limit(path) else self.bulk_bytes if path == BULK else self.usual_bytes
+        declared = headers.get("content-length", "")
+        got, waited_s, more = 0, 0.0, True
+
+        async def limited() -> Message:
+            nonlocal got, waited_s, more
+            if not more:  # the body is complete; the next message is the end of the connection
+                return await receive()
+            if most is not None and declared.isdecimal() and int(declared) > most:
+                raise _too_large(path, most)
+            # Only the time that the client needs counts, not the time in which this server does something with the body.
+            allowed_s = self.seconds + got / self.bytes_per_s
+            started = time.monotonic()
+            with anyio.move_on_after(allowed_s - waited_s) as waiting:
+                message = await receive()
+            if waiting.cancelled_caught:
+                raise _too_slow(got, allowed_s)
+            waited_s += time.monotonic() - started
+            got += len(message.get("body", b""))
+            more = message.get("more_body", False)
+            if most is not None and got > most:
+                raise _too_large(path, most)
+            return message
+
+        return limited
+
+
+class JsonRequest(Request):
+    """A request whose JSON is counted before it is parsed, and parsed in a thread, so that other requests do not wait."""
+
+    async def json(self) -> Any:
+        """The content of the body. Raises ``Problem`` 413 for too many values, and ValueError if it is not JSON."""
+        content = await self.body()
+        for sign, most in MOST_OF.items():
+            found = content.count(sign)
+            if found > most:
+                raise Problem(
+                    413,
+                    "too-many-values",
+                    f"expected JSON with at most {most} characters '{sign.decode()}'; got {found}: send less in one request",
+                )
+        return await run_in_threadpool(json.loads, content)
+
+
+def _too_large(path: str, most: int) -> Problem:
+    setting = "HELIOPSF_MAX_BULK_BODY_MIB" if path == BULK else "HELIOPSF_MAX_BODY_KIB"
+    return Problem(
+        413,
+        "too-large",
+        f"expected a request of at most {most} bytes; got more (the operator can raise {setting})",
+    )
+
+
+def _too_slow(got: int, allowed_s: float) -> Problem:
+    return Problem(
+        408,
+        "body-too-slow",
+        f"expected more of the body of the request within {allowed_s:.0f} s; got {got} bytes: send the request again over "
+        "a faster connection",
+    )

@@ -1,0 +1,173 @@
+"""Bounds on connections: how many are open, and how long a client may take to send a header or to take an answer.
+
+uvicorn has no time limit for the header of a first request and none for a client that does not read its answer. Its
+``limit_concurrency`` refuses everybody as soon as connections without a request fill the server. This protocol closes the
+connection that has waited longest for a request instead, so a client that sends its request at once is always answered.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from workers import logs
+from workers.settings import Settings
+
+log = logging.getLogger(__name__)
+log.addFilter(logs.Seldom())
+# The event loop accepts this number of connections before it looks at any of them. It is small, because each one needs a
+# file descriptor before the bound on connections can apply.
+ACCEPTED_AT_ONCE = 16
+LISTEN = 512  # connections that the system keeps until the server accepts them
+# File descriptors that the server needs besides its connections: its database connections (SQLite: three each), its logs,
+# and its worker.
+OWN_DESCRIPTORS = 64 + ACCEPTED_AT_ONCE
+PER_CONNECTION = 2  # its socket, and the file that it sends or receives
+FEWEST = 8
+_FULL = (
+    b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: application/problem+json\r\nRetry-After: 5\r\n"
+    b"Connection: close\r\nContent-Length: %d\r\n\r\n%s"
+)
+_FULL_BODY = (
+    b'{"type": "urn:heliopsf:too-many-connections", "title": "Service Unavailable", "status": 503, "detail": '
+    b'"expected a free connection of the server; all are in use: try again in a few seconds"}'
+)
+
+
+@dataclass(frozen=True)
+class ConnectionLimits:
+    """most: number of connections that are open at the same time. header_s: time for the header of a request, from the
+    connection or from the last answer. stalled_s: time in which a client that reads its answer takes at least a part of it."""
+
+    most: int
+    header_s: float
+    stalled_s: float
+
+    @classmethod
+    def of(cls, settings: Settings) -> ConnectionLimits:
+        """The limits in the settings. Fewer connections if the system does not allow enough file descriptors."""
+        return cls(_most(settings.max_connections), settings.header_s, settings.stalled_s)
+
+
+class BoundedConnection(H11Protocol):
+    """A connection of uvicorn, with these bounds. A subclass sets ``limits``."""
+
+    limits: ClassVar[ConnectionLimits]
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self._header_timer: asyncio.TimerHandle | None = None
+        self._stalled_timer: asyncio.TimerHandle | None = None
+        self._waits_since = self.loop.time()
+
+    @property
+    def answering(self) -> bool:
+        """Whether a request has arrived on this connection that is not answered completely."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Accept the connection, if need be in place of one that waits for a request."""
+        super().connection_made(transport)
+        if self._open_connections() > self.limits.most and not self._close_the_longest_waiting():
+            log.warning(
+                "refused a connection: all %d connections of this server are answering requests",
+                self.limits.most,
+            )
+            transport.write(_FULL % (len(_FULL_BODY), _FULL_BODY))
+            transport.close()
+            return
+        self._await_header()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop the timers."""
+        self._stop_header_timer()
+        self.resume_writing()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Receive a part of a request. The time for its header ends when the header is complete, not at every part."""
+        super().data_received(data)
+        if self.answering:
+            self._stop_header_timer()
+
+    def on_response_complete(self) -> None:
+        """Await the next request. Until it comes, the rest of a body that nobody reads is received and dropped."""
+        super().on_response_complete()
+        if not self.answering and not self.transport.is_closing():
+            self._await_header()
+
+    def pause_writing(self) -> None:
+        """Start to wait for a client that does not take its answer."""
+        super().pause_writing()
+        self._stalled_timer = self.loop.call_later(self.limits.stalled_s, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """The client has taken a part of its answer, or the connection ends."""
+        if self._stalled_timer is not None:
+            self._stalled_timer.cancel()
+            self._stalled_timer = None
+        super().resume_writing()
+
+    def _await_header(self) -> None:
+        self._stop_header_timer()
+        self._waits_since = self.loop.time()
+        self._header_timer = self.loop.call_later(self.limits.header_s, self.transport.abort)
+
+    def _stop_header_timer(self) -> None:
+        if self._header_timer is not None:
+            self._header_timer.cancel()
+            self._header_timer = None
+
+    def _open_connections(self) -> int:
+        if len(self.connections) <= self.limits.most:
+            return len(self.connections)
+        return sum(not one.transport.is_closing() for one in self.connections)
+
+    def _close_the_longest_waiting(self) -> bool:
+        """Close the other connection that has waited longest for a request; False if all are answering requests."""
+        waiting = [
+            one
+            for one in self.connections
+            if isinstance(one, BoundedConnection)
+            and one is not self
+            and not one.answering
+            and not one.transport.is_closing()
+        ]
+        if not waiting:
+            return False
+        min(waiting, key=lambda one: one._waits_since).transport.abort()
+        log.warning(
+            "all %d connections of this server are open: each new one closes the one that has waited longest for a request",
+            self.limits.most,
+        )
+        return True
+
+
+def bounded(limits: ConnectionLimits) -> type[BoundedConnection]:
+    """The protocol with these limits, for uvicorn."""
+    return type("LimitedConnection", (BoundedConnection,), {"limits": limits})
+
+
+def _most(wanted: int) -> int:
+    """The number of connections for which there are file descriptors. Raises the process's limit as far as this is needed."""
+    needed = OWN_DESCRIPTORS + PER_CONNECTION * wanted
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and soft < needed:
+        soft = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return wanted
+    most = max(FEWEST, (soft - OWN_DESCRIPTORS) // PER_CONNECTION)
+    log.warning(
+        "expected %d file descriptors for %d connections; the system allows %d (ulimit -n): at most %d connections are open",
+        needed,
+        wanted,
+        soft,
+        most,
+    )
+    return most

@@ -1,0 +1,292 @@
+"""Bodies: the key comes first, then sizes, time limits, and how many values JSON may have."""
+
+from __future__ import annotations
+
+import json
+import re
+import select
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from tests.service.keyed import Keyed, bearer, keyed
+from tests.whole.stack import free_port, wait_for
+from workers.catalogue.keys import Scope
+from workers.settings import Settings
+
+JSON = {"Content-Type": "application/json"}
+KIB = 2**10
+
+
+@dataclass
+class Live:
+    """A server in a thread that asks for keys."""
+
+    address: tuple[str, int]
+    service: Keyed
+
+    def begin(self, method: str, path: str, headers: dict[str, str], body: bytes = b"") -> socket.socket:
+        """Send the header of a request, and the beginning of its body."""
+        connection = socket.create_connection(self.address, timeout=20)
+        lines = "".join(f"{name}: {value}\r\n" for name, value in ({"Host": "localhost"} | headers).items())
+        connection.sendall(f"{method} {path} HTTP/1.1\r\n{lines}\r\n".encode() + body)
+        return connection
+
+    def answer(self, connection: socket.socket) -> bytes:
+        """The whole answer, header and body, to a request whose body was not sent to its end."""
+        with connection.makefile("rb") as file:
+            head = b"".join(iter(file.readline, b"\r\n"))
+            (length,) = re.findall(rb"(?i)content-length: (\d+)", head)
+            return head + file.read(int(length))
+
+
+@contextmanager
+def running(folder: Path, **changes: object) -> Iterator[Live]:
+    settings = Settings(data_dir=folder, database_url=None, broker_url="filesystem://", access="keys")
+    app, port = create_app(settings.model_copy(update=changes)), free_port()
+    server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", timeout_graceful_shutdown=1))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        wait_for(lambda: server.started, "the server listens", timeout_s=20)
+        yield Live(("127.0.0.1", port), Keyed(TestClient(app), app.state.heliopsf.catalogue))
+    finally:
+        server.should_exit = True
+        thread.join(20)
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    with running(tmp_path_factory.mktemp("bodies"), body_s=0.5, body_kib_per_s=64) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
+    settings = Settings(
+        data_dir=tmp_path_factory.mktemp("bodies"),
+        database_url=None,
+        broker_url="filesystem://",
+        allowed_hosts="testserver",
+    )
+    with keyed(settings) as running:
+        yield running
+
+
+# The key first --------------------------------------------------------------------------------------
+
+
+def routes_that_take_a_body() -> list[tuple[str, str]]:
+    app = create_app(Settings(database_url=None, broker_url="filesystem://"))
+    found = [
+        (method.upper(), path.replace("{psf_id}", 64 * "a").replace("{bulk_id}", 32 * "a"))
+        for path, operations in app.openapi()["paths"].items()
+        for method in operations
+        if method in ("post", "put", "patch")
+    ]
+    assert len(found) >= 15 and ("POST", "/v1/jobs") in found and ("POST", "/v1/images") in found
+    return found
+
+
+@pytest.mark.parametrize("authorization", ["", "Bearer nonsense"])
+def test_without_a_key_no_body_is_awaited(live: Live, authorization: str) -> None:
+    """The answer comes while the body has not: nothing of it was read or parsed."""
+    headers = JSON | {"Content-Length": "1000"} | ({"Authorization": authorization} if authorization else {})
+    for method, path in routes_that_take_a_body():
+        with live.begin(method, path, headers, b"[[],[],") as connection:
+            assert connection.recv(100).startswith(b"HTTP/1.1 401"), (method, path)
+
+
+def test_without_the_scope_no_body_is_awaited(live: Live) -> None:
+    headers = JSON | {"Content-Length": "1000"} | bearer(live.service.key("reader", Scope.READ))
+    for method, path in (("POST", "/v1/jobs"), ("POST", "/v1/bulk"), ("PUT", "/v1/contexts/default")):
+        with live.begin(method, path, headers, b"{") as connection:
+            assert connection.recv(100).startswith(b"HTTP/1.1 403"), (method, path)
+
+
+# Sizes ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_only_a_bulk_run_may_be_large(service: Keyed, declared: bool) -> None:
+    ann = service.client("ann")
+    body = json.dumps({"images": ["a" * 64] * 5000, "psf_id": "b" * 64}).encode()
+    assert 256 * KIB < len(body) < 2**20
+
+    def sent(path: str, **headers: str) -> Any:
+        content = body if declared else iter([body[:1000], body[1000:]])
+        return ann.post(path, content=content, headers=JSON | headers)
+
+    for path in ("/v1/jobs", "/v1/contexts"):
+        refused = sent(path)
+        assert (refused.status_code, refused.json()["type"]) == (413, "urn:heliopsf:too-large")
+        assert "262144 bytes" in refused.json()["detail"]
+        assert refused.headers["content-type"] == "application/problem+json"
+    form = sent("/uws/jobs", **{"Content-Type": "application/x-www-form-urlencoded"})
+    assert form.status_code == 413 and "262144 bytes" in form.text
+    bulk = sent("/v1/bulk")
+    assert bulk.status_code == 404 and bulk.json()["type"] == "urn:heliopsf:no-such-psf", bulk.text
+
+
+def test_a_body_of_lists_without_end_is_counted_before_it_is_parsed(
+    service: Keyed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def parse(*_: object, **__: object) -> None:
+        pytest.fail("it was parsed")
+
+    ann = service.client("ann")
+    with monkeypatch.context() as patched:
+        patched.setattr(json, "loads", parse)
+        for unit in (b"[],", b"{},", b'"":0,'):
+            answer = ann.post("/v1/bulk", content=b"[" + unit * 2**20, headers=JSON)
+    assert answer.status_code == 413 and answer.json()["type"] == "urn:heliopsf:too-many-values"
+    assert "expected JSON with at most" in answer.json()["detail"]
+
+
+def test_json_is_parsed_off_the_event_loop(service: Keyed, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: list[str] = []
+    loads = json.loads
+
+    def parse(content: bytes) -> Any:
+        threads.append(threading.current_thread().name)
+        return loads(content)
+
+    monkeypatch.setattr("service.http.bodies.json.loads", parse)
+    answer = service.client("ann").post("/v1/jobs", content=b'{"kind": "x"}', headers=JSON)
+    monkeypatch.undo()
+    assert answer.status_code == 422
+    assert len(threads) == 1 and "worker" in threads[0].lower(), threads
+
+
+def test_many_wrong_values_get_a_short_answer(service: Keyed) -> None:
+    ann = service.client("ann")
+    wrong = {"images": [f"{n:x}" for n in range(25_000)], "psf_id": "b" * 64}
+    answer = ann.post("/v1/bulk", json=wrong)
+    assert answer.status_code == 422 and len(answer.content) < 10_000
+    assert "body/images/0" in answer.json()["detail"]
+    names = ann.post("/v1/jobs", json={"kind": "psf-build", "parameters": {f"x{n}": n for n in range(5000)}})
+    assert names.status_code == 422 and len(names.content) < 50_000
+    assert len(names.json()["errors"]) == 20 and "more errors" in names.json()["detail"]
+
+
+# Time -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/images", "/uws/jobs"])
+def test_a_body_that_does_not_come_is_not_awaited_for_ever(live: Live, path: str) -> None:
+    kind = "application/x-www-form-urlencoded" if path == "/uws/jobs" else "application/json"
+    headers = {"Content-Type": kind, "Content-Length": "1000"} | bearer(live.service.key("ann"))
+    with live.begin("POST", path, headers, b"SIMPLE  =") as connection:
+        answer = live.answer(connection)
+    assert answer.startswith(b"HTTP/1.1 408") and b"expected more of the body" in answer
+
+
+def test_a_body_that_drips_is_not_awaited_either(live: Live) -> None:
+    headers = JSON | {"Content-Length": "1000"} | bearer(live.service.key("ann"))
+    with live.begin("POST", "/v1/jobs", headers) as connection:
+        connection.settimeout(0.05)
+        answer = b""
+        deadline = time.monotonic() + 10  # guards against a hang; the limit is 0.5 s
+        while not answer and time.monotonic() < deadline:
+            connection.sendall(b" ")
+            try:
+                answer = connection.recv(4000)
+            except TimeoutError:
+                continue
+    assert answer.startswith(b"HTTP/1.1 408")
+
+
+@pytest.mark.parametrize("declared", [10, 10**9])
+def test_a_body_that_nobody_reads_breaks_no_stream(
+    live: Live, caplog: pytest.LogCaptureFixture, declared: int
+) -> None:
+    """A stream of events waits for the end of the connection; a body that is late or long is none."""
+    job, _ = live.service.catalogue.jobs.submit("psf-build", {}, f"k{declared}", "ann")
+    headers = {"Content-Length": str(declared)} | bearer(live.service.key("ann"))
+    with (
+        live.begin("GET", f"/v1/jobs/{job.id}/events", headers) as connection,
+        connection.makefile("rb") as file,
+    ):
+
+        def until(event: bytes) -> list[bytes]:
+            return list(takewhile(lambda line: line not in (b"", event), iter(file.readline, None)))
+
+        assert until(b"event: progress\n")[0].startswith(b"HTTP/1.1 200")
+        time.sleep(0.7)  # longer than body_s
+        live.service.catalogue.jobs.cancel(job.id)
+        until(b"event: end\n")
+        assert file.readline().startswith(b"data:"), "the last event came"
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+
+def test_a_long_body_at_a_fair_speed_is_received(live: Live) -> None:
+    """It takes longer than ``body_s``, but it is faster than ``body_kib_per_s``."""
+    content = b'{"kind": "x", "parameters": {}}'.ljust(150 * KIB)
+    headers = JSON | {"Content-Length": str(len(content))} | bearer(live.service.key("ann"))
+    with live.begin("POST", "/v1/jobs", headers) as connection:
+        for at in range(0, len(content), 10 * KIB):
+            connection.sendall(content[at : at + 10 * KIB])
+            time.sleep(0.05)
+        assert connection.recv(100).startswith(b"HTTP/1.1 422")
+
+
+# At once --------------------------------------------------------------------------------------------
+
+
+def test_an_owner_sends_one_bulk_run_at_a_time(tmp_path: Path) -> None:
+    """Its body may be large; the others of the owner wait until it has come. Another owner's do not."""
+    body = json.dumps({"images": ["a" * 64], "psf_id": "b" * 64}).encode()
+    with running(tmp_path) as live, ExitStack() as open_:
+        ann, bob = (bearer(live.service.key(name)) for name in ("ann", "bob"))
+        at_work = live.service.api.app.state.heliopsf.requests._open  # type: ignore[attr-defined]
+
+        def begin(headers: dict[str, str], sent: bytes) -> socket.socket:
+            before = at_work.total()
+            length = {"Content-Length": str(len(body))}
+            connection = open_.enter_context(live.begin("POST", "/v1/bulk", JSON | length | headers, sent))
+            if headers is ann:
+                wait_for(lambda: at_work.total() > before, "the caller is let in", timeout_s=20)
+            return connection
+
+        first, second = begin(ann, body[:10]), begin(ann, body)
+        assert select.select([second], [], [], 0.2)[0] == [], "it waits"
+        assert live.answer(begin(bob, body)).startswith(b"HTTP/1.1 404")
+        first.sendall(body[10:])
+        for connection in (first, second):
+            assert live.answer(connection).startswith(b"HTTP/1.1 404")
+
+
+def test_a_caller_holds_only_so_many_requests(tmp_path_factory: pytest.TempPathFactory) -> None:
+    settings = Settings(
+        data_dir=tmp_path_factory.mktemp("held"),
+        database_url=None,
+        broker_url="filesystem://",
+        allowed_hosts="testserver",
+    )
+    with keyed(settings, requests_per_caller=2) as service:
+        ann, bob = service.client("ann"), service.client("bob")
+        held = service.api.app.state.heliopsf.requests  # type: ignore[attr-defined]
+        who = ann.headers["Authorization"].split("_")[1]
+        held.open(who), held.open(who)
+        refused = ann.get("/v1/jobs")
+        assert (refused.status_code, refused.json()["type"]) == (
+            429,
+            "urn:heliopsf:too-many-requests-at-once",
+        )
+        assert bob.get("/v1/jobs").status_code == 200
+        held.close(who)
+        for path in ("/v1/jobs", "/v1/jobs/x", "/v1/images/x", "/v1/jobs"):
+            assert ann.get(path).status_code in (200, 422)
+        held.close(who)
+        assert not held._open
