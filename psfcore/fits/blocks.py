@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol
 from psfcore.errors import HeaderError
 from psfcore.fits.cards import LARGEST_COUNT, card_count, card_flag, card_text, card_trouble
 from psfcore.fits.columns import check_counts
-from psfcore.fits.compression import compression_of
+from psfcore.fits.tiled.compression import compression_of
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header

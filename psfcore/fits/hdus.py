@@ -19,9 +19,9 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.compression import compression_of
 from psfcore.fits.header import HeaderSummary
-from psfcore.fits.tiles import check_tiles
+from psfcore.fits.tiled.compression import compression_of
+from psfcore.fits.tiled.tiles import check_tiles
 
 _CHECKSUM_COMMENT = "computed when the file was written"
 # Exceptions that astropy raises for a damaged data unit. The position of the damage decides which one it raises.

@@ -20,7 +20,7 @@ from psfcore.errors import DataError
 from psfcore.fits.cards import card_trouble
 from psfcore.fits.hdus import ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import FitsLimits, optional_exposure_s, optional_text, read_summary
-from psfcore.fits.planes import Meanings, check_plane, plane_hdu
+from psfcore.fits.product.planes import Meanings, check_plane, plane_hdu
 from psfcore.fits.saturation import card_levels, per_second
 from psfcore.image import Image, MaskBit
 
@@ -114,7 +114,7 @@ def write_image(
 
     Cards that say how the input file stores its pixels are removed. DATAMIN, DATAMAX and DATAMEAN are computed again;
     the cards with median, rms and percentiles of the input are removed.
-    planes: planes [y, x] by name (QUALITY, ERROR, PSF_ERROR), see `psfcore.fits.planes`. The image is the first HDU, and
+    planes: planes [y, x] by name (QUALITY, ERROR, PSF_ERROR), see `psfcore.fits.product.planes`. The image is the first HDU, and
     each plane is an image extension after it. plane_bits: for each plane of bits, what its bits mean.
     Raises DataError "bad-plane" for a wrong shape, a wrong type or a name that is used twice.
     """

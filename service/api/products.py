@@ -14,6 +14,7 @@ from service.http.problems import RESPONSES, Problem
 from service.http.state import Shared
 from workers.catalogue.tables import ProductRow
 from workers.contract.requests import Identity
+from workers.files.collection import remove_unnamed
 
 router = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)
 
@@ -123,8 +124,11 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
 @router.delete("/{product_id}", status_code=204, summary="Delete a product", response_class=Response)
 def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> Response:
     """Remove the product from the catalogue and from your quota. The same request makes it again."""
-    _find(state, caller, product_id)
+    row = _find(state, caller, product_id)
     state.catalogue.delete_product(product_id, caller.owner)
+    # The files go at once. Otherwise deletions and new jobs in turn would fill the disk beyond the quota.
+    named = (row.file_sha256, row.preview_sha256, row.details.get("changes_sha256"))
+    remove_unnamed(state.catalogue, state.store, [digest for digest in named if digest is not None])
     return Response(status_code=204)
 
 

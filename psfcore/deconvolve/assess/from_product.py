@@ -19,7 +19,7 @@ from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing.plots import binned
 from psfcore.fits.header import FitsLimits, optional_text
 from psfcore.fits.images import read_image
-from psfcore.fits.planes import read_planes
+from psfcore.fits.product.planes import read_planes
 
 DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
 

@@ -12,7 +12,7 @@ from astropy.io import fits
 
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.errors import DataError
-from psfcore.fits.planes import read_planes
+from psfcore.fits.product.planes import read_planes
 from service.cli.options import METHODS
 from service.client.http import ServiceError
 from service.local import LocalService

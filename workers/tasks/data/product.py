@@ -21,7 +21,7 @@ from psfcore.drawing import plots
 from psfcore.drawing.units import unit_label
 from psfcore.fits.header import optional_text
 from psfcore.fits.images import write_image
-from psfcore.fits.product_cards import described
+from psfcore.fits.product.cards import described
 from psfcore.image import Image, MaskBit
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.identities import product_identity

@@ -16,7 +16,7 @@ from psfcore.deconvolve.assess.quality import MEANINGS, QualityBit
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_image, write_image
-from psfcore.fits.planes import read_planes
+from psfcore.fits.product.planes import read_planes
 from tests.psfcore.fits.test_images import AIA, CARDS, ramp, save
 
 Find = Callable[[str], Path]

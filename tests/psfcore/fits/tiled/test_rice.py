@@ -11,7 +11,7 @@ from astropy.io import fits
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_image
-from psfcore.fits.rice import rice_is_complete
+from psfcore.fits.tiled.rice import rice_is_complete
 
 LIMITS = FitsLimits(max_pixels=10_000)
 RNG = np.random.default_rng(0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from astropy.io import fits
 
-from psfcore.fits.product_cards import described
+from psfcore.fits.product.cards import described
 
 SHA = "a" * 64
 

@@ -8,7 +8,7 @@ heap. The decoders of astropy trust these numbers and the content of the heap. T
   ZNAXISn declare. Each stream is first decompressed up to a limit.
 - Every tile must hold exactly its pixels, of 1, 2, 4 or 8 bytes. A scaled pixel may have 4 bytes at most: for 8 bytes,
   astropy 8.0 returns memory that it has not written.
-- A stream of RICE_1 must be complete, because the decoder reads on past its end (`psfcore.fits.rice`).
+- A stream of RICE_1 must be complete, because the decoder reads on past its end (`psfcore.fits.tiled.rice`).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.compression import COMPRESSED, GZIPPED, UNCOMPRESSED, Compression
-from psfcore.fits.rice import rice_is_complete
+from psfcore.fits.tiled.compression import COMPRESSED, GZIPPED, UNCOMPRESSED, Compression
+from psfcore.fits.tiled.rice import rice_is_complete
 
 _OVERHEAD_BYTES = 1024  # upper limit of the bytes that gzip adds to its content
 _PIXEL_BYTES, _SCALED_PIXEL_BYTES = (1, 2, 4, 8), (1, 2, 4)
