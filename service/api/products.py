@@ -127,7 +127,7 @@ def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> R
     row = _find(state, caller, product_id)
     state.catalogue.delete_product(product_id, caller.owner)
     # The files go at once. Otherwise deletions and new jobs in turn would fill the disk beyond the quota.
-    named = (row.file_sha256, row.preview_sha256, row.details.get("changes_sha256"))
+    named = (row.file_sha256, row.preview_sha256, row.details.get("changes_picture_sha256"))
     remove_unnamed(state.catalogue, state.store, [digest for digest in named if digest is not None])
     return Response(status_code=204)
 
