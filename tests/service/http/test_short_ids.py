@@ -143,3 +143,19 @@ def test_a_product_is_deleted_and_the_same_request_makes_it_again(
     assert remade["sha256"] == made["sha256"]
     assert api.post("/v1/jobs", json=asked).json()["id"] == again["id"], "shared as before"
     assert len(catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=9)) == 2
+
+
+def test_a_context_is_found_by_its_name_before_the_first_digits_of_its_id(
+    api: TestClient, psf_file: Path
+) -> None:
+    psf = upload(api, psf_file, "/v1/psfs?instrument=hri_euv&channel=174&kind=total")
+    certified = api.post(f"/v1/psfs/{psf[:8]}/status", json={"status": "certified", "version": "1.0.0"})
+    assert certified.status_code == 200, certified.text
+    one = api.post("/v1/contexts", json={"name": "one"}).json()
+    assert api.get(f"/v1/contexts/{one['id'][:8]}").json()["id"] == one["id"]
+    assert api.put("/v1/contexts/default", json={"context": one["id"][:12]}).json()["context"] == {
+        key: value for key, value in one.items() if key != "pins"
+    }
+    named = api.post("/v1/contexts", json={"name": one["id"][:8]}).json()
+    assert named["id"] != one["id"] and api.get(f"/v1/contexts/{one['id'][:8]}").json()["id"] == named["id"]
+    assert api.get("/v1/contexts/0123abcd").status_code == 404
