@@ -64,6 +64,7 @@ def compression_of(header: Header, nx: int, ny: int) -> Compression:
     if codec not in ALLOWED_CODECS:
         wanted = ", ".join(ALLOWED_CODECS)
         raise HeaderError("codec-not-allowed", f"expected compression by one of {wanted}; got {codec}")
+    _check_keywords(header)
     tile = _tile(header, nx, ny)
     bitpix = card_count(header, "ZBITPIX", smallest=-64, largest=64)
     settings = _settings(header)
@@ -72,6 +73,18 @@ def compression_of(header: Header, nx: int, ny: int) -> Compression:
     _check_dither(header)
     first, heap_bytes = _heap(header)
     return Compression(codec, (ny, nx), tile, items, first, heap_bytes, bytepix, blocksize, quantised)
+
+
+def _check_keywords(header: Header) -> None:
+    """Raise HeaderError "bad-card" for a keyword that astropy takes as a pattern when it removes the cards of the table.
+
+    A pattern may remove other cards, may be no valid expression, and may take long to compare.
+    """
+    for keyword in header:
+        if set("*?") & set(keyword) or keyword.endswith("..."):
+            raise HeaderError(
+                "bad-card", f"expected keywords without '*', '?' and '...'; got {keyword!r:.40}"
+            )
 
 
 def _tile(header: Header, nx: int, ny: int) -> tuple[int, int]:

@@ -74,6 +74,11 @@ BAD = {
     "ZDITHER0 negative": compressed(ZQUANTIZ="'SUBTRACTIVE_DITHER_2'", ZDITHER0=-5),
     "ZDITHER0 of 10001": compressed(ZQUANTIZ="'SUBTRACTIVE_DITHER_2'", ZDITHER0=10_001),
     "an unknown dither": compressed(ZQUANTIZ="'OTHER'"),
+    "a keyword that is a pattern": compressed(**{"ZTILE*": 1}),
+    "a keyword that is no pattern": compressed(**{"ZTIL?[J": 1}),
+    "a long pattern": compressed().replace(
+        b"ZCMPTYPE= ", b"HIERARCH TFORM" + b"*A" * 20 + b"B = 1" + b" " * 21 + b"HIERARCH TFORM" + b"A" * 40 + b" = 1" + b" " * 22 + b"ZCMPTYPE= "
+    ),
     "ZBLANK of 2^40": compressed(ZBLANK=2**40),
     "PCOUNT of a plain image": block(*image_cards(32, 16, 16, "PCOUNT  = 8"), data=bytes(2000)),
     "GCOUNT of a plain image": block(*image_cards(32, 16, 16, "GCOUNT  = 2"), data=bytes(4000)),
