@@ -52,7 +52,8 @@ class BodyLimits:
         Whoever reads the body gets ``Problem`` 413 if its declared length is too large, before anything is received, or as
         soon as it is too large; and 408 as soon as it is too slow.
         """
-        most = None if has_own_limit(path) else self.bulk_bytes if path == BULK else self.usual_bytes
+        own = has_own_limit(path, headers.get("content-type", ""))
+        most = None if own else self.bulk_bytes if path == BULK else self.usual_bytes
         declared = headers.get("content-length", "")
         got, waited_s, more = 0, 0.0, True
 

@@ -258,9 +258,10 @@ def _inspected(path: Path, expected: _Format[Found]) -> Found:
     return expected.inspect(path)
 
 
-def has_own_limit(address: str) -> bool:
-    """Whether the route at an address limits the size of its bodies itself, because they may contain files."""
-    return address in LARGE or re.fullmatch(r"/uws/jobs(/[^/]+/parameters)?", address) is not None
+def has_own_limit(address: str, content_type: str) -> bool:
+    """Whether the route at an address limits the size of such bodies itself, because they may contain files."""
+    form = content_type.lower().startswith("multipart/form-data")
+    return address in LARGE or (form and re.fullmatch(r"/uws/jobs(/[^/]+/parameters)?", address) is not None)
 
 
 def _too_large(max_bytes: int) -> Problem:

@@ -136,14 +136,15 @@ def test_two_workers_share_a_bulk_and_a_persons_job_goes_first(
 def test_the_command_line_from_submission_to_report(stack: Stack, psf_file: Path, tmp_path: Path) -> None:
     (tmp_path / "archive" / "zz.fits").write_text("no FITS\n" * 500)
 
-    def bulk(*arguments: str) -> str:
+    def bulk(*arguments: str, status: int = 0) -> str:
         answer = CliRunner().invoke(main, ["bulk", *arguments, "--server", stack.client.server])
-        assert answer.exit_code == 0, answer.output
+        assert answer.exit_code == status, answer.output
         return answer.output
 
     where = ["--where", "WAVELNTH=174", "--where", "XPOSURE>=1", "--where", "XPOSURE<3"]
     pattern = f"{tmp_path}/archive/*.fits"
-    said = bulk("submit", pattern, "--psf", str(psf_file), *where, "--steps", "2", "--name", "all", "--wait")
+    asked = ("submit", pattern, "--psf", str(psf_file), *where, "--steps", "2", "--name", "all", "--wait")
+    said = bulk(*asked, status=1)  # an image failed
     bulk_id = said.split()[1]
     assert f"COMPLETED: {IMAGES} of {IMAGES + 1} done, 1 failed" in said
     assert f"{bulk_id}  COMPLETED" in bulk("status")

@@ -22,7 +22,7 @@ import psutil
 import pytest
 
 from service.client.http import Client
-from tests.conftest import write_image
+from tests.conftest import write_image, write_psf
 from tests.service.keyed import ALL, bearer
 from tests.whole.stack import QUICK, wait_for
 from workers.catalogue.catalogue import Catalogue
@@ -237,10 +237,12 @@ def test_uploads_at_the_same_time_stay_on_the_disk(server: Server) -> None:
     assert server.peak_mib() - before < 40
 
 
-def test_cutouts_at_the_same_time_are_not_held_in_memory(server: Server) -> None:
+def test_cutouts_at_the_same_time_are_not_held_in_memory(server: Server, tmp_path: Path) -> None:
     """Eight whole PSFs of 16 MiB at once, taken slowly by their clients."""
     ann = bearer(server.key())
-    psf = httpx.post(f"{server.url}/v1/psfs", content=large_file(1), headers=ann, timeout=60).json()["id"]
+    write_psf(tmp_path / "psf.fits", size=2048)
+    content = (tmp_path / "psf.fits").read_bytes()
+    psf = httpx.post(f"{server.url}/v1/psfs", content=content, headers=ann, timeout=60).json()["id"]
     before = server.peak_mib()
     with ExitStack() as open_:
         answers = [

@@ -32,10 +32,6 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
         )
     _check_places(request, settings)
     asked = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
-    for name in ("again", "other_channel"):
-        if not asked["parameters"][name]:
-            # Without this, the keys of runs that were started before these parameters existed would change.
-            del asked["parameters"][name]
     now = time.time()
     row = BulkRow(
         id=new_id(),
@@ -82,8 +78,7 @@ def _check_places(request: BulkRequest, settings: Settings) -> None:
 
 def _key(asked: Mapping[str, Any], images: Sequence[str]) -> str:
     """The key of the request: requests that differ only in their names have the same key."""
-    # Runs that were started before other_channel existed keep their keys.
-    parameters = {
-        name: value for name, value in asked["parameters"].items() if name != "other_channel" or value
-    }
+    # Runs that were started before these parameters existed keep their keys.
+    newer = ("again", "other_channel")
+    parameters = {name: value for name, value in asked["parameters"].items() if name not in newer or value}
     return canonical_hash({**asked, "name": None, "parameters": parameters, "images": list(images)})

@@ -50,7 +50,7 @@ def no_psf(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> DataE
     return DataError(
         "no-psf-for-instrument",
         f"expected an image of an instrument whose PSF is known, or a PSF in the request; got an image of {seen} and no "
-        f"PSF. Could fit: {', '.join(could) or 'none that is known here'}. Name a PSF (--psf), upload a PSF or an instrument "
+        f"PSF. Could fit: {', '.join(could) or 'none that is known here'}. Name a PSF (psf_id in a request, --psf in a command), upload a PSF or an instrument "
         "file, or fit a PSF to a transit",
         {"instruments": instruments, "psfs": psfs, "ways": list(WAYS)},
     )

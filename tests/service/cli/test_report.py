@@ -114,7 +114,7 @@ def test_a_plot_alone_is_enough_and_noise_may_come_with_the_command(
         (["-o", "R.html", "--noise", "-1", "2"], "greater than or equal to 0"),
         (["-o", "R.html", "--seed", "-1"], "not in the range"),
         ([], "expected an output: -o PAGE.html, --json FILE or --plot FILE"),
-        (["-o", "R.html", "--shapes", "--psf", "x.fits"], "--shapes fits every shape to TRANSIT"),
+        (["-o", "R.html", "--shapes", "--psf", 64 * "a"], "--shapes fits every shape to TRANSIT"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(

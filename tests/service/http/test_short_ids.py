@@ -12,6 +12,7 @@ from tests.conftest import write_psf
 from tests.service.conftest import upload
 from tests.service.keyed import Keyed, keyed
 from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.owners import counted_bytes
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow
 from workers.contract.phases import Phase
 from workers.settings import Settings
@@ -129,10 +130,13 @@ def test_a_product_is_deleted_and_the_same_request_makes_it_again(
     run_jobs()
     made = api.get(api.get(f"/v1/jobs/{first}").json()["result"]).json()
     used = catalogue.owners.usage(DEFAULT_OWNER, 0).used_bytes
+    product = catalogue.get(ProductRow, made["id"], DEFAULT_OWNER)
+    assert product is not None
+    counted = counted_bytes(product)
     assert api.delete(f"/v1/products/{made['id'][:8]}").status_code == 204
     assert api.get(f"/v1/products/{made['id']}").status_code == 404
     assert api.delete(f"/v1/products/{made['id']}").status_code == 404
-    assert catalogue.owners.usage(DEFAULT_OWNER, 0).used_bytes == used - made["bytes"]
+    assert catalogue.owners.usage(DEFAULT_OWNER, 0).used_bytes == used - counted
     assert list(catalogue.owners.recount()) == []
     row = catalogue.jobs.get(first)
     assert row is not None and row.phase == Phase.COMPLETED, "the job stays"

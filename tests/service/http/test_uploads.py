@@ -78,20 +78,22 @@ def test_a_header_with_long_texts_is_cut(any_database: Settings) -> None:
 
 @pytest.mark.parametrize("where", PLACES)
 def test_the_file_of_a_row_that_fails_goes(
-    settings: Settings, image_file: Path, monkeypatch: pytest.MonkeyPatch, where: str
+    settings: Settings, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
+    file = psf_file if where == "/v1/psfs" else image_file
+
     def fail(*_: object) -> None:
         raise OperationalError("INSERT", {}, Exception("the disk is on fire"))
 
     with TestClient(create_app(settings), raise_server_exceptions=False) as api:
         with monkeypatch.context() as patched:
             patched.setattr(Catalogue, "add", fail)
-            assert api.post(where, content=image_file.read_bytes()).status_code == 503
+            assert api.post(where, content=file.read_bytes()).status_code == 503
         assert blobs(settings) == []
-        identity = upload(api, image_file, where)
+        identity = upload(api, file, where)
         with monkeypatch.context() as patched:
             patched.setattr(Catalogue, "add", fail)
-            assert api.post(where, content=image_file.read_bytes()).status_code == 503
+            assert api.post(where, content=file.read_bytes()).status_code == 503
         assert blobs(settings) == [identity], "it was there before"
 
 

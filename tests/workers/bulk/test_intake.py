@@ -14,7 +14,8 @@ def key(**parameters: object) -> str:
     return _key(asked, [IMAGE])
 
 
-def test_a_run_that_was_open_before_other_channel_existed_keeps_its_key() -> None:
+def test_a_run_that_was_open_before_newer_parameters_existed_keeps_its_key() -> None:
     """The value was computed by commit a8b3a2c."""
     assert key() == "18e7adbbdff5a8734007058e3c39eb5e13a4227b4b987a13fad0c42ef3293710"
-    assert key(other_channel=False) == key() != key(other_channel=True)
+    assert key(other_channel=False, again=False) == key() != key(other_channel=True)
+    assert key(again=True) != key()

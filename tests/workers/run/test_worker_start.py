@@ -26,6 +26,15 @@ def put_at(catalogue: Catalogue, revision: str | None) -> None:
             connection.execute(text("UPDATE alembic_version SET version_num = :one"), {"one": revision})
 
 
+def put_back(catalogue: Catalogue) -> None:
+    """Other tests use the same PostgreSQL database."""
+    with catalogue._engine.begin() as connection:
+        connection.execute(text("DELETE FROM alembic_version"))
+        connection.execute(
+            text("INSERT INTO alembic_version VALUES (:one)"), {"one": catalogue.schema.status().wanted}
+        )
+
+
 @pytest.mark.parametrize(
     ("revision", "said"),
     [
@@ -41,6 +50,7 @@ def test_what_is_wrong_with_a_revision_and_what_to_do(
     put_at(catalogue, revision)
     with pytest.raises(SchemaError) as refused:
         catalogue.schema.check()
+    put_back(catalogue)
     for words in said:
         assert words in str(refused.value)
     assert "\n" not in str(refused.value)

@@ -46,9 +46,11 @@ def reports(service: LocalService, transit: Path, tmp_path_factory: pytest.TempP
     out = tmp_path_factory.mktemp("reports")
     found = {}
     for scheme in ("shared", "exact"):
-        row = service.cross_validate(transit, out / "r.json", preview=out / "p.png", scheme=scheme, runs=2)
-        assert (out / "p.png").read_bytes().startswith(b"\x89PNG")
-        found[scheme] = json.loads((out / "r.json").read_text()) | {"row": row}
+        row = service.cross_validate(
+            transit, out / f"{scheme}.json", preview=out / f"{scheme}.png", scheme=scheme, runs=2
+        )
+        assert (out / f"{scheme}.png").read_bytes().startswith(b"\x89PNG")
+        found[scheme] = json.loads((out / f"{scheme}.json").read_text()) | {"row": row}
     return found
 
 

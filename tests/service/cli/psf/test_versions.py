@@ -82,9 +82,9 @@ def test_psfs_from_draft_to_deprecated(sun: Client, tmp_path: Path) -> None:
 def test_a_draft_is_deleted_by_the_first_digits_of_its_id(sun: Client, tmp_path: Path) -> None:
     first, second = uploaded(tmp_path, 32), uploaded(tmp_path, 48)
     for nothing in ("", "xyz"):
-        assert f"begins with '{nothing}': none" in ask("psf", "delete", nothing, code=1)
-    assert ask("psf", "delete", first[:8]).startswith(f"deleted {first}  p32")
-    assert [row["id"] for row in sun.psfs()] == [second]
+        assert "expected an id, or its first 8 or more" in ask("psf", "delete", nothing, code=2)
+    assert ask("psf", "delete", first[:8]).startswith(f"deleted {first[:12]}  p32")
+    assert [row["id"][:12] for row in sun.psfs()] == [second]
     ask("psf", "certify", second, "--version", "1.0.0")
     assert "never deleted" in ask("psf", "delete", second, code=1)
 
