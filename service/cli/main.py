@@ -8,7 +8,7 @@ from service.cli.lazy import Lazy, LazyGroup
 
 SECTIONS = {
     "Images": {
-        "deconvolve": Lazy("service.cli.deconvolve", "deconvolve", "Deconvolve one image."),
+        "deconvolve": Lazy("service.cli.deconvolve", "deconvolve", "Deconvolve images."),
         "changes": Lazy("service.cli.changes", "changes", "Deconvolve images and show what changed."),
         "product": Lazy("service.cli.results.product", "product", "List, download and delete products."),
     },

@@ -43,11 +43,11 @@ def rest_of(terminal: int) -> Iterator[str]:
 
 def started(stack: Stack, folder: Path) -> str:
     """A job that takes so long that something can happen meanwhile, at work."""
-    write_image(folder / "large.fits", shape=(1024, 1024), seed=len(list(stack.client.jobs())))
+    write_image(folder / "large.fits", shape=(2048, 2048), seed=len(list(stack.client.jobs())))
     write_psf(folder / "large-psf.fits")
     image = stack.client.upload_image(folder / "large.fits")["id"]
     psf = stack.client.upload_psf(folder / "large-psf.fits")["id"]
-    method = {"name": "richardson-lucy", "steps": 60}
+    method = {"name": "richardson-lucy", "steps": 150}
     job: str = stack.client.submit("deconvolve", image_id=image, psf_id=psf, method=method)["id"]
     wait_for(lambda: stack.client.job(job)["progress"]["step"] > 1, "the job is at work")
     return job
