@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 REPORT_EVERY_S = 0.3
+LOOK_EVERY_S = 0.1
 
 
 class TookTooLong(Exception):
@@ -50,6 +51,8 @@ class Attempt:
 
     child: the process, if it may be ended. It is ended if the job does not stop within ``cancel_s`` after it had to, and
     if the thread of the heartbeats cannot run for ``silent_s``.
+    run_short: runs one waiting job of at most so many seconds in this process, while this job pauses; False if no such
+    job waits. A job pauses only in its main thread, and at most as long as it worked before.
     """
 
     catalogue: Catalogue
@@ -61,7 +64,10 @@ class Attempt:
     child: Child | None = None
     cancel_s: float = math.inf
     silent_s: float = math.inf
+    run_short: Callable[[float], bool] | None = None
     started: float = field(default_factory=time.monotonic)
+    resumed: float = field(default_factory=time.monotonic)
+    paused: threading.Event = field(default_factory=threading.Event)
     stopped: threading.Event = field(default_factory=threading.Event)
     ended: threading.Event = field(default_factory=threading.Event)
     last_report: float = 0.0
@@ -107,15 +113,24 @@ class Attempt:
                 self.stopped.set()
                 self._end_if_deaf()
                 return
-            if time.monotonic() - self.started > self.limit_s + self.cancel_s:
+            late = time.monotonic() - self.started > self.limit_s + self.cancel_s
+            if late and not self.paused.is_set():
                 self._give_up(
                     lambda: self.catalogue.jobs.fail(self.lease, TookTooLong(self.limit_s).as_error())
                 )
 
     def _end_if_deaf(self) -> None:
-        """Wait until the task has noticed that it must stop. If it does not, end the process."""
-        if self.child is not None and not self.ended.wait(self.cancel_s):
-            self._give_up(lambda: self.catalogue.jobs.abort(self.lease))
+        """Wait until the task has noticed that it must stop. If it does not, end the process.
+
+        A paused task cannot notice it. Its time starts when it continues.
+        """
+        if self.child is None:
+            return
+        since = time.monotonic()
+        while self.paused.is_set() or time.monotonic() < max(since, self.resumed) + self.cancel_s:
+            if self.ended.wait(min(self.cancel_s, LOOK_EVERY_S)):
+                return
+        self._give_up(lambda: self.catalogue.jobs.abort(self.lease))
 
     def _give_up(self, record: Callable[[], bool]) -> None:
         """Record the outcome of a job whose task does not respond, and end the process."""
@@ -144,12 +159,35 @@ class Attempt:
             except SQLAlchemyError as error:
                 # The database may answer again soon, so the task continues: its work must not be lost.
                 log.warning("job %s: could not write the progress: %s", self.lease.job_id, error)
+            if step < steps:
+                self._let_short_jobs_run()
         if self.stopped.is_set():
             raise Cancelled(self.lease.job_id)
-        if now - self.started > self.limit_s:
+        if time.monotonic() - self.started > self.limit_s:
             raise TookTooLong(self.limit_s)
         if self.also_report is not None:
             self.also_report(stage, step, steps)
+
+    def _let_short_jobs_run(self) -> None:
+        """Run waiting jobs that need no longer than this job has worked since its last pause.
+
+        Therefore a short job waits for a long one at most about as long as it takes itself, and the long job is at most
+        delayed by the time that it needs.
+        """
+        if self.run_short is None or threading.current_thread() is not threading.main_thread():
+            return
+        paused_at = time.monotonic()
+        self.paused.set()
+        try:
+            ran = self.run_short(paused_at - self.resumed)
+        finally:
+            now = time.monotonic()
+            self.started += now - paused_at
+            self.paused.clear()
+        if ran:
+            self.resumed = now
+            if self.child is not None:
+                self.child.expect_news_within(self.silent_s)
 
 
 @dataclass

@@ -67,6 +67,7 @@ class Runner:
         self._call_for_help, self._submit = call_for_help, submit
         self._stopping = stopping or Stopping()
         self._child = child
+        self._pausing = False  # a job pauses while this process runs a short one
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
         """Run the job if it is queued. Otherwise do nothing: the message was delivered twice, or the job was cancelled or claimed."""
@@ -110,12 +111,52 @@ class Runner:
                 child=self._child,
                 cancel_s=settings.cancel_s,
                 silent_s=settings.silent_s,
+                run_short=self._short_jobs_beside(job),
             )
             try:
                 with attempt.beating():
                     self._attempt(job, lease, attempt)
             finally:
                 self._keep_times(job, attempt.times)
+
+    def _short_jobs_beside(self, job: JobRow) -> Callable[[float], bool] | None:
+        """A function that runs one short interactive job in this process; None if this job must not pause.
+
+        While an interactive job pauses, only other owners' jobs run: its owner's jobs wait for their turn. A short job
+        does not pause itself. A job whose worker was lost does not pause either, because the short job may have
+        been the reason.
+        """
+        if (
+            self._child is None
+            or self._pausing
+            or job.attempt > 1
+            or Queue.INTERACTIVE not in self._settings.queues
+        ):
+            return None
+        not_of = job.owner if job.queue == Queue.INTERACTIVE else None
+        free_mib = self._settings.max_job_memory_mib - self._estimate_mib(job)
+
+        def run_short(seconds: float) -> bool:
+            if self._stopping.asked:
+                return False
+            try:
+                lease = self._catalogue.turns.claim_short(
+                    Queue.INTERACTIVE, worker_name(), seconds=seconds, memory_mib=free_mib, not_of=not_of
+                )
+            except SQLAlchemyError as error:
+                log.warning("job %s: could not look for short jobs: %s", job.id, error)
+                return False
+            if lease is None:
+                return False
+            log.info("job %s: pauses for the short job %s", job.id, lease.job_id)
+            self._pausing = True
+            try:
+                self._run(lease)
+            finally:
+                self._pausing = False
+            return True
+
+        return run_short
 
     def assist(self, job_id: str) -> None:
         """Share the work of a job that another worker runs, until no part is left or the job ends."""

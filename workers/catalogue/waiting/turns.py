@@ -42,6 +42,26 @@ class Turns:
         self._database.change(update(JobRow).where(*blocked, received).values(submitted_at=None))
         return None
 
+    def claim_short(
+        self, queue: Queue, worker: str, *, seconds: float, memory_mib: int, not_of: str | None = None
+    ) -> Lease | None:
+        """Claim a short job of a queue, to be run while a longer job pauses; None if there is none.
+
+        seconds, memory_mib: the most that the job may need by its estimate. not_of: an owner whose jobs are not claimed.
+        The message of the claimed job has no effect when it arrives.
+        """
+        short = [
+            JobRow.owner != (not_of or ""),
+            JobRow.estimate["seconds"].as_float() <= seconds,
+            JobRow.estimate["memory_mib"].as_integer() <= memory_mib,
+        ]
+        with self._database.reading() as session:
+            for owner in session.scalars(_owners(queue).where(*short)).all():
+                found = session.scalars(_oldest(owner, "", queue).where(*short)).first()
+                if found is not None:
+                    return self._jobs.claim(found, worker)
+        return None
+
     def leave_next(self, told_id: str, queue: Queue) -> str | None:
         """Record that a worker took a message from the broker but starts no job; returns the id of the job that it leaves.
 

@@ -1,0 +1,240 @@
+"""A long job pauses for a short job of another owner, and then goes on as if nothing had happened."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import JobRow
+from workers.contract.phases import Phase
+from workers.contract.queues import Queue
+from workers.files.store import Store
+from workers.run import attempt
+from workers.run.attempt import Attempt
+from workers.run.child import Child
+from workers.run.runner import Runner
+from workers.run.stopping import Stopping
+from workers.settings import Settings
+from workers.tasks.context import Context
+
+STEPS, STEP_S = 20, 0.02
+FREE_MIB = 1000
+
+
+class Kept(Child):
+    """A child that notes its end instead of ending this process."""
+
+    def __init__(self) -> None:
+        super().__init__(threads=1)
+        self.ended = False
+
+    def end(self) -> None:
+        self.ended = True
+
+
+class Bench:
+    """A runner whose jobs work for STEPS steps. started, ended: the owners of the jobs, in this order."""
+
+    def __init__(self, folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(attempt, "REPORT_EVERY_S", 0.0)
+        monkeypatch.setattr("workers.tasks.psf_build.psf_build", self._task)
+        self.catalogue, self.child = catalogue, Kept()
+        self.started: list[str] = []
+        self.ended: list[str] = []
+        self.during: Callable[[str, int], None] = lambda owner, step: None
+        self._folder, self._number = folder, 0
+
+    def submit(
+        self, owner: str, *, seconds: float = 0.1, memory_mib: int = 100, queue: Queue = Queue.INTERACTIVE
+    ) -> JobRow:
+        """A waiting job that the broker has received."""
+        self._number += 1
+        needs = {"seconds": seconds, "memory_mib": memory_mib, "start_s": seconds}
+        job, _ = self.catalogue.jobs.submit(
+            "psf-build", {"number": self._number}, f"k{self._number}", owner, queue=queue, estimate=needs
+        )
+        self.catalogue.jobs.mark_submitted(job.id)
+        return job
+
+    def run(self, job: JobRow, **changes: Any) -> JobRow:
+        """The row of a job after its run."""
+        settings = Settings(
+            data_dir=self._folder / "data",
+            broker_url="filesystem://",
+            heartbeat_s=0.02,
+            max_job_memory_mib=FREE_MIB,
+            **changes,
+        )
+        runner = Runner(settings, self.catalogue, Store(settings.data_dir), child=self.child)
+        runner.run(job.id)
+        return self.row(job)
+
+    def row(self, job: JobRow) -> JobRow:
+        row = self.catalogue.jobs.get(job.id)
+        assert row is not None
+        return row
+
+    def _task(self, context: Context, _parameters: Mapping[str, Any]) -> str:
+        self.started.append(context.owner)
+        for step in range(STEPS):
+            time.sleep(STEP_S)
+            self.during(context.owner, step)
+            context.report("at work", step + 1, STEPS)
+        self.ended.append(context.owner)
+        return f"result of {context.owner}"
+
+
+@pytest.fixture
+def bench(tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return Bench(tmp_path, catalogue, monkeypatch)
+
+
+def test_a_long_job_pauses_for_the_short_job_of_another_owner(bench: Bench) -> None:
+    long = bench.submit("long", seconds=60)
+    short = bench.submit("short")
+    row = bench.run(long)
+    assert (bench.started, bench.ended) == (["long", "short"], ["short", "long"])
+    assert (row.phase, row.result_id, row.attempt) == (Phase.COMPLETED, "result of long", 1)
+    row = bench.row(short)
+    assert (row.phase, row.result_id, row.attempt) == (Phase.COMPLETED, "result of short", 1)
+
+
+def test_the_time_of_a_pause_counts_for_the_short_job_alone(bench: Bench) -> None:
+    long = bench.submit("long", seconds=60)
+    bench.submit("short")
+    since = time.perf_counter()
+    bench.run(long)
+    took_s = time.perf_counter() - since
+    spent = sum(stage.seconds for stage in bench.catalogue.stage_times.all().values())
+    assert 2 * STEPS * STEP_S <= spent <= took_s
+
+
+def test_a_pause_needs_as_much_work_since_the_last_one_as_the_short_job_takes(catalogue: Catalogue) -> None:
+    asked: list[tuple[float, float]] = []
+
+    def run_short(seconds: float) -> bool:
+        asked.append((seconds, time.monotonic()))
+        time.sleep(0.05)
+        return len(asked) == 2  # the second look finds a job
+
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", "long")
+    lease = catalogue.jobs.claim(job.id, "w")
+    assert lease is not None
+    began = time.monotonic()
+    one = Attempt(catalogue, lease, 1.0, Stopping(), None, 60.0, run_short=run_short)
+    for _ in range(3):
+        one._let_short_jobs_run()
+    (first, at_first), (second, at_second), (third, at_third) = asked
+    assert 0 <= first <= at_first - began
+    assert second >= 0.05, "a look without a job starts nothing anew"
+    assert third <= at_third - at_second - 0.05, "counted from the end of the pause"
+
+
+@pytest.mark.parametrize(
+    "waiting",
+    [
+        {"owner": "long"},
+        {"owner": "short", "seconds": 100.0},
+        {"owner": "short", "memory_mib": FREE_MIB - 99},
+        {"owner": "short", "queue": Queue.BULK},
+    ],
+    ids=["of the same owner", "too long", "too large", "not interactive"],
+)
+def test_other_jobs_wait_for_their_turn(bench: Bench, waiting: dict[str, Any]) -> None:
+    long = bench.submit("long", seconds=60)
+    other = bench.submit(**waiting)
+    assert bench.run(long).phase == Phase.COMPLETED
+    assert bench.row(other).phase == Phase.QUEUED
+
+
+def test_a_bulk_turn_pauses_for_its_own_owner_too(bench: Bench) -> None:
+    long = bench.submit("one", seconds=60, queue=Queue.BULK)
+    short = bench.submit("one")
+    bench.run(long)
+    assert bench.row(short).phase == Phase.COMPLETED
+
+
+def test_a_job_whose_worker_was_lost_does_not_pause(bench: Bench) -> None:
+    long = bench.submit("long", seconds=60)
+    lease = bench.catalogue.jobs.claim(long.id, "lost")
+    assert lease is not None and bench.catalogue.jobs.requeue(lease)
+    short = bench.submit("short")
+    assert bench.run(long).attempt == 2
+    assert bench.row(short).phase == Phase.QUEUED
+
+
+def test_a_worker_without_the_interactive_queue_does_not_pause(bench: Bench) -> None:
+    long = bench.submit("long", seconds=60, queue=Queue.BULK)
+    short = bench.submit("short")
+    bench.run(long, worker_queues="bulk")
+    assert bench.row(short).phase == Phase.QUEUED
+
+
+def test_a_job_cancelled_during_its_pause_ends_after_the_short_one(bench: Bench) -> None:
+    long = bench.submit("long", seconds=60)
+    short = bench.submit("short")
+
+    def cancel(owner: str, step: int) -> None:
+        if owner == "short" and step == 0:
+            bench.catalogue.jobs.cancel(long.id)
+
+    bench.during = cancel
+    # The rest of the short job takes longer than a task may ignore its cancellation.
+    row = bench.run(long, cancel_s=0.1)
+    assert (row.phase, bench.row(short).phase) == (Phase.ABORTED, Phase.COMPLETED)
+    assert not bench.child.ended, "the process was not ended"
+
+
+def test_a_short_job_that_fails_or_is_cancelled_does_not_concern_the_long_one(bench: Bench) -> None:
+    long = bench.submit("long", seconds=60)
+    fails, cancelled = bench.submit("fails"), bench.submit("cancelled", seconds=0.11)
+
+    def fail(owner: str, step: int) -> None:
+        if owner == "fails":
+            raise ValueError("of the test")
+        if owner == "cancelled" and step == 0:
+            bench.catalogue.jobs.cancel(cancelled.id)
+
+    bench.during = fail
+    assert bench.run(long).phase == Phase.COMPLETED
+    assert bench.row(fails).phase == Phase.ERROR
+    assert bench.row(cancelled).phase == Phase.ABORTED
+
+
+def test_the_time_limit_of_a_job_does_not_count_its_pause(catalogue: Catalogue) -> None:
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", "long")
+    lease = catalogue.jobs.claim(job.id, "w")
+    assert lease is not None
+
+    def run_short(seconds: float) -> bool:
+        time.sleep(0.3)
+        return True
+
+    one = Attempt(catalogue, lease, 1.0, Stopping(), None, limit_s=0.3, run_short=run_short)
+    began = one.started
+    one.last_report = 0.0
+    one.report("at work", 1, 2)  # no TookTooLong, although more than 0.3 s have passed
+    assert one.started >= began + 0.3
+
+
+def test_a_report_from_another_thread_does_not_pause(bench: Bench) -> None:
+    long = bench.submit("long", seconds=60)
+    short = bench.submit("short")
+    runner = threading.Thread(target=bench.run, args=(long,))
+    runner.start()
+    runner.join()
+    assert bench.row(long).phase == Phase.COMPLETED
+    assert bench.row(short).phase == Phase.QUEUED
+
+
+def test_the_message_of_a_job_that_ran_in_a_pause_has_no_effect(bench: Bench) -> None:
+    long = bench.submit("long", seconds=60)
+    short = bench.submit("short")
+    bench.run(long)
+    assert bench.catalogue.turns.claim_next(short.id, Queue.INTERACTIVE, "w") is None
