@@ -20,25 +20,15 @@ from matplotlib.text import Text
 from matplotlib.ticker import FixedFormatter, FuncFormatter
 from numpy.typing import NDArray
 
+from psfcore.drawing.colour_map import EUV_POINTS, NO_DATA
 from psfcore.psf import Psf, crop_centred, cumulative_curve, radial_profile
 
 PANEL_PX = 640
 CHANGE_LIMIT_PCT = 100.0
-_NO_DATA = "#3a4a5a"
-GOLD = LinearSegmentedColormap.from_list(
-    "euv_gold",
-    [
-        (0.0, "#000000"),
-        (0.18, "#2e1500"),
-        (0.40, "#7d4400"),
-        (0.62, "#c98612"),
-        (0.82, "#f3c34d"),
-        (1.0, "#fffbe8"),
-    ],
-).with_extremes(bad=_NO_DATA)
+GOLD = LinearSegmentedColormap.from_list("euv_gold", EUV_POINTS).with_extremes(bad=NO_DATA)
 CHANGE = LinearSegmentedColormap.from_list(
     "change", ["#123a7a", "#3f7fc1", "#b9d5ea", "#f7f7f4", "#f6c9a4", "#d5642f", "#7d1a12"]
-).with_extremes(bad=_NO_DATA)
+).with_extremes(bad=NO_DATA)
 # Colour, width and dashes of each component's curve; thin curves are drawn behind wide ones.
 _CURVES: dict[str, tuple[str, float, Any]] = {
     "TOTAL": ("#111111", 2.4, "-"),

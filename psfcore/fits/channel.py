@@ -25,6 +25,8 @@ _TO_ALLOW = "set other_channel (--other-channel)"
 def check_channel(psf: Psf, header: Header, *, other_channel: bool = False) -> str | None:
     """Compare a PSF with an image of this header. Returns a warning, or None if they are of one channel.
 
+    The warning does not name the PSF: it becomes a part of the product, which must not depend on the name of a file.
+
     other_channel: whether the PSF may be of another telescope, channel or filter than the image. Raises DataError
     "channel-mismatch" if it is and may not.
     """
@@ -36,17 +38,14 @@ def check_channel(psf: Psf, header: Header, *, other_channel: bool = False) -> s
             f"a PSF of the image's channel, or {_TO_ALLOW} to use this PSF",
         )
     if differences:
-        return f"PSF {psf.name} is of another channel than the image: {'; '.join(differences)}"
+        return f"the PSF is of another channel than the image: {'; '.join(differences)}"
     silent = [
         name
         for name, found in (("PSF", _psf_wavelength(psf)), ("image", _image_wavelength(header)))
         if not found
     ]
     if silent:
-        return (
-            f"the channels of image and PSF {psf.name} were not compared: {' and '.join(silent)} without wavelength "
-            "(WAVELNTH)"
-        )
+        return f"the channels of image and PSF were not compared: {' and '.join(silent)} without wavelength (WAVELNTH)"
     return None
 
 

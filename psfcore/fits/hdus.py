@@ -9,6 +9,8 @@ from __future__ import annotations
 import errno
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +45,23 @@ PIXEL_TROUBLE = (
 
 
 def read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.float64], fits.Header]:
-    """Pixels [y, x] (float64) and header of the image that `summary` describes.
+    """Pixels [y, x] (float64) and header of the image that `summary` describes. Raises the errors of `opened_image`."""
+    with opened_image(path, summary) as hdu:
+        header = hdu.header.copy()
+        data = hdu.data
+        pixels = np.array(data, dtype=np.float64)
+    if pixels.shape != summary.shape:
+        raise _other_shape(summary, pixels.shape)
+    return pixels, header
+
+
+@contextmanager
+def opened_image(path: str | Path, summary: HeaderSummary) -> Iterator[Any]:
+    """The HDU of the image that `summary` describes, opened and checked. Its pixels are read in the block.
 
     Raises DataError "unreadable-pixels", "bad-tile" or "tile-too-large", and OSError if the disk fails.
     """
-    try:
+    with readable_pixels(path, f"HDU {summary.hdu}"):
         if summary.codec is not None:
             _check_tiles(path, summary)
         # uint=False: otherwise astropy converts unsigned integers (BZERO 32768) before it applies BLANK.
@@ -57,18 +71,20 @@ def read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.fl
             hdu = hdus[summary.hdu]
             if hdu.shape != summary.shape:
                 raise _other_shape(summary, hdu.shape)
-            header = hdu.header.copy()
-            data = hdu.data
-            pixels = np.array(data, dtype=np.float64)
+            yield hdu
+
+
+@contextmanager
+def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
+    """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: what is read, for the message."""
+    try:
+        yield
     except DataError:
         raise
     except PIXEL_TROUBLE as error:
         _raise_if_storage(error)
-        message = f"expected readable pixels in HDU {summary.hdu} of {Path(path).name}; got: {error!s:.120}"
+        message = f"expected readable pixels in {part} of {Path(path).name}; got: {error!s:.120}"
         raise DataError("unreadable-pixels", message) from None
-    if pixels.shape != summary.shape:
-        raise _other_shape(summary, pixels.shape)
-    return pixels, header
 
 
 def _other_shape(summary: HeaderSummary, got: tuple[int, ...]) -> DataError:

@@ -58,7 +58,9 @@ def _printable(text: str) -> str:
     return text
 
 
-FileName = Annotated[str, AfterValidator(_plain)]
+# In the JSON schema the format marks names of files, so that a program can compare them with the files of a folder.
+FILE_NAME = "file-name"
+FileName = Annotated[str, AfterValidator(_plain), Field(json_schema_extra={"format": FILE_NAME})]
 # strict: the values "12.5" (a string) and true are not accepted as numbers.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Coordinate = Annotated[Number, Field(ge=-FARTHEST_PX, le=FARTHEST_PX)]

@@ -1,0 +1,112 @@
+"""Decoded planes of FITS files, kept for a while, so that a viewer's requests for one plane decode it once.
+
+A decoded plane is a file without a name in the folder of temporary files, and not an array in memory: many slow clients may
+read different planes at the same time. The system's page cache keeps the pixels in memory as long as there is room. The disk
+space is free again as soon as the plane is no longer kept and nobody reads it. This module loads no numerical libraries;
+decoding does.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+from weakref import WeakValueDictionary
+
+IMAGE = "image"
+PIXEL_BYTES = 4
+MOST_BYTES, MOST_PLANES = 2**27, 8
+
+Key = tuple[str, str]  # SHA-256 of the file, and name of the plane
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """The shape (ny, nx) of a decoded plane, and its unit (BUNIT), if the file gives one."""
+
+    shape: tuple[int, int]
+    unit: str | None
+
+
+class Plane:
+    """A decoded plane: little-endian float32, row 0 first. Any number of threads may read it."""
+
+    def __init__(self, path: Path, decoded: Decoded) -> None:
+        """path: the file of the pixels. It may be removed afterwards. Raises OSError."""
+        self.shape, self.unit = decoded.shape, decoded.unit
+        self._handle = os.open(path, os.O_RDONLY)
+        weakref.finalize(self, os.close, self._handle)
+
+    @property
+    def length(self) -> int:
+        """Number of bytes of the pixels."""
+        return self.shape[0] * self.shape[1] * PIXEL_BYTES
+
+    def rows(self, first: int, count: int) -> bytes:
+        """The pixels of ``count`` rows, starting at row ``first``. Raises EOFError if the file has become shorter."""
+        row_bytes = self.shape[1] * PIXEL_BYTES
+        read = os.pread(self._handle, count * row_bytes, first * row_bytes)
+        if len(read) < count * row_bytes:
+            raise EOFError(f"expected {count * row_bytes} bytes of a decoded plane; got {len(read)}")
+        return read
+
+
+class Planes:
+    """The planes that were used last: at most MOST_PLANES with together at most MOST_BYTES."""
+
+    def __init__(self, temporary: Callable[[], AbstractContextManager[Path]]) -> None:
+        """temporary: gives a path for a temporary file, which is removed at the end of the block."""
+        self._temporary = temporary
+        self._kept: OrderedDict[Key, Plane] = OrderedDict()
+        self._lock = threading.Lock()
+        self._turns: WeakValueDictionary[Key, _Turn] = WeakValueDictionary()
+
+    def kept(self, key: Key) -> Plane | None:
+        """The plane, if it is still kept."""
+        with self._lock:
+            plane = self._kept.get(key)
+            if plane is not None:
+                self._kept.move_to_end(key)
+            return plane
+
+    def decoded(self, key: Key, decode: Callable[[BinaryIO], Decoded]) -> Plane:
+        """The plane. If it is not kept, ``decode`` writes it to a file. Raises the errors of ``decode``.
+
+        If several threads ask for the same plane at the same time, one of them decodes it and the others wait.
+        """
+        with self._lock:
+            turn = self._turns.setdefault(key, _Turn())
+        with turn.lock:
+            plane = self.kept(key)
+            if plane is None:
+                plane = self._made(decode)
+                self._keep(key, plane)
+            return plane
+
+    def _made(self, decode: Callable[[BinaryIO], Decoded]) -> Plane:
+        with self._temporary() as path:
+            with path.open("wb") as target:
+                decoded = decode(target)
+            return Plane(path, decoded)
+
+    def _keep(self, key: Key, plane: Plane) -> None:
+        with self._lock:
+            self._kept[key] = plane
+            while len(self._kept) > MOST_PLANES or self._bytes() > MOST_BYTES:
+                self._kept.popitem(last=False)
+
+    def _bytes(self) -> int:
+        return sum(plane.length for plane in self._kept.values())
+
+
+class _Turn:
+    """The right to decode one plane."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
