@@ -127,6 +127,12 @@ class Settings(BaseSettings):
         None,
         description="who may use the service: `open`: everybody; `keys`: clients with a key; default: `open` on a loopback address, otherwise `keys`",
     )
+    session_days: float = Field(
+        30.0,
+        gt=0,
+        le=400,
+        description="longest time after which a person must log in again in a browser, days; a login never lasts longer than its key",
+    )
     allowed_hosts: str = Field(
         "",
         description="host names of the service besides localhost, separated by commas; *: any name",

@@ -247,6 +247,7 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
         "steps_done": details["steps_done"],
         "stopped_because": details["stopped_because"],
         "warnings": [one["code"] for one in details["warnings"]],
+        "has_thumbnail": details.get("thumbnail_sha256") is not None,
     }
 
 

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 
-from sqlalchemy import func, select, tuple_
+from sqlalchemy import exists, func, select, tuple_
 
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.database import Database
-from workers.catalogue.tables import ImageRow
+from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import OPEN, ItemState
 
 BATCH = 1000
+MOST_EXPLAINED = 10_000  # failed images of a run that are read to count their reasons
 # The pace is computed from the images of the last hour, but from 500 images at most.
 PACE_S, PACE_IMAGES = 3600.0, 500
 
@@ -25,6 +26,15 @@ class Pace:
 
     taken: int
     images_an_hour: float | None
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Failed images of a run whose errors have the same code. example: the first of them in the order of the run."""
+
+    code: str
+    images: int
+    example: BulkItemRow
 
 
 class BulkProgress:
@@ -82,6 +92,24 @@ class BulkProgress:
         with self._database.reading() as session:
             return session.scalars(query.order_by(BulkItemRow.position).limit(limit)).all()
 
+    def reasons(self, bulk_id: str) -> list[Reason]:
+        """The first ``MOST_EXPLAINED`` failed images by the code of their error, the most frequent code first."""
+        failed = (BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.FAILED)
+        code = BulkItemRow.error["code"].as_string().label("code")
+        # PostgreSQL groups by a column of a subquery, but not by an expression with a parameter.
+        first = select(code, BulkItemRow.position).where(*failed).order_by(BulkItemRow.position)
+        one = first.limit(MOST_EXPLAINED).subquery()
+        counted = select(one.c.code, func.count(), func.min(one.c.position)).group_by(one.c.code)
+        with self._database.reading() as session:
+            found = session.execute(counted).all()
+            query = select(BulkItemRow).where(
+                *failed, BulkItemRow.position.in_([first for *_, first in found])
+            )
+            examples = {row.position: row for row in session.scalars(query)}
+        # A retry between the two queries may have taken an example away.
+        reasons = [Reason(code, count, examples[first]) for code, count, first in found if first in examples]
+        return sorted(reasons, key=lambda reason: (-reason.images, reason.code))
+
     def worst(
         self, bulk_id: str, *, after: tuple[float, int] | None = None, limit: int = BATCH
     ) -> Sequence[BulkItemRow]:
@@ -93,6 +121,26 @@ class BulkProgress:
         query = query.order_by(BulkItemRow.score.desc(), BulkItemRow.position.desc()).limit(limit)
         with self._database.reading() as session:
             return session.scalars(query).all()
+
+    def without_product(self, owner: str, limit: int) -> Sequence[str]:
+        """Ids of the owner's newest uploaded images of which there is no product."""
+        made = exists().where(ProductRow.owner == ImageRow.owner, ProductRow.image_id == ImageRow.id)
+        query = select(ImageRow.id).where(ImageRow.owner == owner, ~made)
+        query = query.order_by(ImageRow.created_at.desc(), ImageRow.id.desc()).limit(limit)
+        with self._database.reading() as session:
+            return session.scalars(query).all()
+
+    def names_of_uploads(self, ids: Sequence[str], owner: str) -> dict[str, str]:
+        """The file names of those of these uploaded images that have one, by id."""
+        query = select(ImageRow.id, ImageRow.filename).where(ImageRow.owner == owner, ImageRow.id.in_(ids))
+        with self._database.reading() as session:
+            return {one: name for one, name in session.execute(query) if name}
+
+    def still_there(self, product_ids: Sequence[str], owner: str) -> frozenset[str]:
+        """Those of these products that have not been deleted."""
+        query = select(ProductRow.id).where(ProductRow.owner == owner, ProductRow.id.in_(product_ids))
+        with self._database.reading() as session:
+            return frozenset(session.scalars(query))
 
     def done_before(self, owner: str, product_id: str, output: str) -> BulkItemRow | None:
         """An image that is done and whose product ``product_id`` is in the file ``output``, in any bulk run of the owner.

@@ -44,6 +44,7 @@ class BulkRow(Base):
     __table_args__ = (
         Index("bulks_listed", "owner", "created_at", "id"),
         Index("bulks_by_phase", "phase"),
+        Index("bulks_ended", "owner", "ended_at", "id"),
         # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first run.
         Index(
             "one_open_bulk_a_request",

@@ -14,14 +14,16 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
+from workers.catalogue.access.keys import Keys
+from workers.catalogue.access.sessions import Sessions
 from workers.catalogue.affected import AffectedProducts
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
 from workers.catalogue.census import Census
 from workers.catalogue.contexts import Contexts
 from workers.catalogue.database import Database, begins_with
+from workers.catalogue.followed.rows import followed_bulks, followed_jobs
 from workers.catalogue.jobs import Jobs
-from workers.catalogue.keys import Keys
 from workers.catalogue.named_files import NamedFiles
 from workers.catalogue.owners import Owners, add_bytes, counted_bytes, hold_to_quota
 from workers.catalogue.parts import Parts
@@ -41,6 +43,7 @@ from workers.catalogue.tables import (
 )
 from workers.catalogue.uws_jobs import UwsJobs
 from workers.catalogue.waiting.again import Again
+from workers.catalogue.waiting.places import Places
 from workers.catalogue.waiting.turns import Turns
 from workers.contract.bulk import OPEN
 from workers.contract.identities import canonical_hash
@@ -66,15 +69,19 @@ class Catalogue:
         self.jobs = Jobs(self._database)
         self.again = Again(self._database)
         self.turns = Turns(self._database, self.jobs)
+        self.places = Places(self._database)
         self.uws = UwsJobs(self._database, self.jobs)
         self.parts = Parts(self._database)
         self.bulks = Bulks(self._database)
+        self.followed_jobs = followed_jobs(self._database)
+        self.followed_bulks = followed_bulks(self._database)
         self.psfs = Psfs(self._database)
         self.contexts = Contexts(self._database)
         self.affected = AffectedProducts(self._database)
         self.census = Census(self._database)
         self.stage_times = KeptStageTimes(self._database)
         self.keys = Keys(self._database)
+        self.sessions = Sessions(self._database, self.keys)
         self.owners = Owners(self._database)
         self.named_files = NamedFiles(self._database)
 

@@ -281,6 +281,7 @@ class JobRow(Base):
         Index("jobs_waiting", "phase", "queue", "created_at", "submitted_at", "owner"),
         _listed("jobs"),
         _listed("jobs", "phase"),
+        Index("jobs_ended", "owner", "ended_at", "id"),
         # This index contains all columns that tally() needs, so that tally() need not read the rows.
         Index("jobs_tallied", "kind", "phase", "attempt", "started_at", "ended_at"),
     )
@@ -393,3 +394,4 @@ class KeyRow(Base):
     expires_at: Mapped[float | None]
     revoked_at: Mapped[float | None]
     last_used_at: Mapped[float | None]
+    made_by: Mapped[str | None] = mapped_column(String(16))  # the key with which it was made over HTTP

@@ -14,6 +14,7 @@ NAMED_IN_DETAILS = (
     "page_sha256",
     "report_sha256",
     "tables_sha256",
+    "thumbnail_sha256",
 )
 
 

@@ -43,6 +43,13 @@ def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
     return (row is None or not intact(store, row)) and catalogue.again.reopen(job.id)
 
 
+def there(result: Result, identity: str, owner: str, catalogue: Catalogue, store: Store) -> bool:
+    """Whether the catalogue has the result with this identity, with all its files. Raises ``StoreAway``."""
+    table = TABLES.get(result)
+    row = None if table is None else catalogue.get(table, identity, owner)
+    return row is not None and intact(store, row)
+
+
 def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
     """Set damaged files aside, and queue the job that makes a result again; returns what was done or has to be done."""
     row = fault.row

@@ -21,8 +21,8 @@ MOST_SEARCHED = 500
 WAYS = (
     {
         "way": "name",
-        "text": "name a PSF: psf_id in the request, --psf ID on the command line; `heliopsf psf build` makes the PSF of an "
-        "instrument above",
+        "text": "name a PSF: psf_id in the request, --psf ID on the command line; `heliopsf psf build --instrument NAME -o "
+        "PSF.fits` makes the PSF of an instrument above, and prints its id",
     },
     {
         "way": "upload",
@@ -117,3 +117,8 @@ def _same(
 def _words(text: str | None) -> set[str]:
     """The words of a name that begin with a letter, such as "sdo" and "aia" of "SDO/AIA"."""
     return set(re.findall(r"(?<![a-z0-9])[a-z][a-z0-9]+", (text or "").lower()))
+
+
+def buildable() -> tuple[str, ...]:
+    """The names of the instruments whose PSF the service can build from a shipped instrument file."""
+    return instrument_names()

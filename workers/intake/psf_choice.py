@@ -91,7 +91,7 @@ def look_for_image(
 
     Raises ``DataError`` "no-instrument", "no-date" or "no-such-context".
     """
-    instrument, channel = _seen_through(header)
+    instrument, channel = seen_through(header)
     if instrument is None:
         raise DataError(
             "no-instrument",
@@ -115,7 +115,7 @@ def picked_for_image(
 
     Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
     """
-    instrument, channel = _seen_through(header)
+    instrument, channel = seen_through(header)
     series = series_of(instrument, channel, TOTAL)
     pinned = catalogue.contexts.asked_for(context, owner)
     if series is not None and pinned is not None and catalogue.contexts.any_pinned(pinned.id, series, owner):
@@ -130,7 +130,8 @@ def picked_for_image(
     return look_for_image(catalogue, header, owner, context) if certified else None
 
 
-def _seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
+def seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    """The instrument and the channel of an image. header: the header summary that is stored with the upload."""
     instrument = instrument_of(header)
     return instrument, channel_of(instrument, header["wavelnth"])
 

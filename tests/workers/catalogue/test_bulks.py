@@ -17,11 +17,12 @@ from psfcore.errors import DataError
 from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
 from workers.bulk import listing
+from workers.catalogue import bulk_progress
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.bulks import Listed, Taken, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import ImageRow, JobRow
+from workers.catalogue.tables import ImageRow, JobRow, ProductRow
 from workers.contract.bulk import BulkPhase, BulkWork, ItemState
 from workers.contract.phases import Fault, JobError
 from workers.files.store import Store
@@ -345,6 +346,58 @@ def test_images_are_sorted_by_artefact_score_over_pages(catalogue: Catalogue) ->
     assert catalogue.bulks.progress.to_look_at(bulk_id, 1.0) == 3
 
 
+def test_failed_images_are_counted_by_reason(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    bulk_id, lease = made(catalogue, 7), turn(catalogue)
+    assert catalogue.bulks.progress.reasons(bulk_id) == []
+    for code in ("bad", None, "worse", "bad", "bad", "also-bad"):
+        taken = catalogue.bulks.take(bulk_id, lease, 3)
+        assert taken is not None
+        if code is None:
+            catalogue.bulks.finish(taken, reused=False, **DONE)
+        else:
+            catalogue.bulks.fail(taken, BAD.model_copy(update={"code": code}))
+    found = catalogue.bulks.progress.reasons(bulk_id)
+    assert [(one.code, one.images, one.example.position) for one in found] == [
+        ("bad", 3, 0), ("also-bad", 1, 5), ("worse", 1, 2),
+    ]  # fmt: skip
+    monkeypatch.setattr(bulk_progress, "MOST_EXPLAINED", 2)
+    found = catalogue.bulks.progress.reasons(bulk_id)
+    assert [(one.code, one.images) for one in found] == [("bad", 1), ("worse", 1)], "of the first two"
+
+
+def test_images_without_a_product_are_the_newest_of_their_owner(catalogue: Catalogue) -> None:
+    for number in range(6):
+        owner = "other" if number == 5 else "o"
+        identity = f"{number:064x}"
+        name = f"{number}.fits" if number else None
+        catalogue.add(
+            ImageRow(owner=owner, id=identity, created_at=float(number), bytes=1, filename=name, summary={})
+        )
+    details = {
+        "owner": "o",
+        "kind": "deconvolve",
+        "psf_id": "b" * 64,
+        "psf_version": "1",
+        "bytes": 1,
+        "details": {},
+    }
+    files = {"file_sha256": "d" * 64, "preview_sha256": "e" * 64}
+    for owner, number in (("o", 3), ("other", 2)):
+        product = ProductRow(
+            **{**details, **files, "owner": owner},
+            id=f"{90 + number:064x}",
+            image_id=f"{number:064x}",
+            created_at=9.0,
+        )
+        catalogue.add(product)
+    progress = catalogue.bulks.progress
+    ids = [f"{number:064x}" for number in (4, 2, 1, 0)]
+    assert list(progress.without_product("o", 10)) == ids
+    assert list(progress.without_product("o", 2)) == ids[:2]
+    assert progress.names_of_uploads([ids[0], ids[3], f"{5:064x}"], "o") == {ids[0]: "4.fits"}
+    assert progress.still_there([f"{93:064x}", f"{92:064x}"], "o") == {f"{93:064x}"}
+
+
 def test_missing_uploads_are_named(catalogue: Catalogue) -> None:
     catalogue.add(ImageRow(owner="o", id="a" * 64, created_at=1.0, bytes=1, summary={}))
     assert catalogue.bulks.progress.first_not_uploaded(["a" * 64], "o") is None
@@ -433,6 +486,9 @@ def test_every_query_of_a_run_uses_an_index(catalogue: Catalogue) -> None:
         (
             bulks.progress.items(bulk_id, ItemState.DONE, after=3, limit=51),
             bulks.progress.worst(bulk_id, after=(1.0, 3), limit=51),
+            bulks.progress.without_product("o", 51),
+            bulks.progress.names_of_uploads(["a" * 64], "o"),
+            bulks.progress.still_there(["a" * 64], "o"),
         )
         bulks.progress.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
         catalogue.page(BulkRow, owner="o", limit=51, after=(1.0, "a"))

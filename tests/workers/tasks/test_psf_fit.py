@@ -162,7 +162,7 @@ def test_a_transit_of_one_pointing_states_a_limit(
 ) -> None:
     two = [image for image in images_of(transit) if image["fov"] < 3]
     psf = service.fit_psf(changed(transit, tmp_path / "t", images=two))
-    assert any(limit.startswith("2 pointings") for limit in psf["details"]["fit"]["limits"])
+    assert any(limit.startswith("with 2 pointings") for limit in psf["details"]["fit"]["limits"])
 
 
 def test_too_few_images(service: LocalService, transit: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
+from psfcore.drawing.thumbnail import write_thumbnail
 from psfcore.drawing.units import unit_label
 from psfcore.fits.header import optional_text
 from psfcore.fits.images import write_image
@@ -104,6 +105,7 @@ def keep(made: Made, path: Path) -> ProductRow:
     size_bytes = path.stat().st_size
     file_sha256 = context.store.keep(path)
     picture = _save_changes_picture(made) if inputs.request.changes_picture else None
+    thumbnail = _save_thumbnail(made)
     assert made.preview_sha256 is not None
     row = ProductRow(
         owner=context.owner,
@@ -116,7 +118,7 @@ def keep(made: Made, path: Path) -> ProductRow:
         file_sha256=file_sha256,
         bytes=size_bytes,
         preview_sha256=made.preview_sha256,
-        details=made.details | {"changes_picture_sha256": picture},
+        details=made.details | {"changes_picture_sha256": picture, "thumbnail_sha256": thumbnail},
     )
     return context.add(row)
 
@@ -127,6 +129,13 @@ def save_preview(inputs: Inputs, result: Deconvolved) -> str:
         image = inputs.image
         plots.preview_png(image.pixels, result.pixels, picture, title=_title(inputs), unit=unit_label(image))
         return inputs.context.store.keep(picture)
+
+
+def _save_thumbnail(made: Made) -> str:
+    store = made.inputs.context.store
+    with store.temporary() as picture:
+        write_thumbnail(made.result.pixels, picture)
+        return store.keep(picture)
 
 
 def _save_changes_picture(made: Made) -> str:

@@ -14,9 +14,11 @@ import time
 from collections.abc import Collection, Sequence
 from enum import StrEnum
 
-from sqlalchemy import Select, func, or_, select, update
+from sqlalchemy import Select, delete, func, or_, select, tuple_, update
+from sqlalchemy.orm import Session
 
 from workers.catalogue.database import Database
+from workers.catalogue.owners import add_bytes
 from workers.catalogue.tables import KeyRow
 
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
@@ -36,12 +38,25 @@ class Scope(StrEnum):
     ADMIN = "admin"
 
 
+MEANINGS = {
+    Scope.READ: "read and download the owner's data",
+    Scope.SUBMIT: "upload files, submit jobs, cancel them, make and revoke keys",
+    Scope.CERTIFY: "certify and deprecate PSFs, and change contexts",
+    Scope.BULK: "start bulk runs",
+    Scope.ADMIN: "read the metrics, act for any owner (header X-Owner), and manage the keys of all owners",
+}
+
+
 class KeyRefused(Exception):
     """A key is not valid. ``code`` and the message give the reason; they never contain the key."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code, self.message = code, message
+
+
+class TooManyKeys(Exception):
+    """An owner has the largest number of valid keys already."""
 
 
 class Keys:
@@ -51,9 +66,20 @@ class Keys:
         self._database = database
 
     def make(
-        self, owner: str, scopes: Collection[Scope], *, label: str = "", expires_at: float | None = None
+        self,
+        owner: str,
+        scopes: Collection[Scope],
+        *,
+        label: str = "",
+        expires_at: float | None = None,
+        made_by: str | None = None,
+        most: int | None = None,
     ) -> str:
-        """Make a key and return it; it cannot be shown again. Raises ValueError for a bad owner or without scopes."""
+        """Make a key and return it; it cannot be shown again. Raises ValueError for a bad owner or without scopes.
+
+        made_by: id of the key with which it is made. most: the largest number of valid keys of the owner. Raises ``TooManyKeys``
+        if the owner has as many. Of the revoked and expired keys, only as many of the newest are then kept.
+        """
         if not OWNER.fullmatch(owner):
             raise ValueError(
                 f"expected an owner of lower-case letters, digits, '.', '_' and '-'; got {owner!r}"
@@ -71,8 +97,11 @@ class Keys:
             label=label[:LABEL_LENGTH],
             created_at=time.time(),
             expires_at=expires_at,
+            made_by=made_by,
         )
         with self._database.writing.begin() as session:
+            if most is not None:
+                _make_room(session, owner, most)
             session.add(row)
         return f"hpsf_{identity}_{secret}"
 
@@ -91,44 +120,88 @@ class Keys:
                 "bad-key",
                 "expected a key of this service; this key is not known to the service: ask the operator for a key",
             )
+        self.check_valid(row)  # only a caller who knows the secret is told the reasons
+        return row
+
+    def check_valid(self, row: KeyRow) -> None:
+        """Check that a key is neither revoked nor expired, and record the time of its use. Raises ``KeyRefused``."""
         now = time.time()
-        # Only a caller who knows the secret is told these reasons.
         if row.revoked_at is not None:
             raise KeyRefused("key-revoked", f"key {row.id} was revoked: ask the operator for a new one")
         if row.expires_at is not None and row.expires_at <= now:
             raise KeyRefused("key-expired", f"key {row.id} has expired: ask the operator for a new one")
         if row.last_used_at is None or row.last_used_at < now - _USE_NOTED_EVERY_S:
             self._note_use(row.id, now)
-        return row
+
+    def get(self, identity: str) -> KeyRow | None:
+        """The row of a key, valid or not; None if there is no key with this id."""
+        with self._database.reading() as session:
+            return session.get(KeyRow, identity)
+
+    def page(
+        self, owner: str | None, *, limit: int, after: tuple[float, str] | None = None
+    ) -> Sequence[KeyRow]:
+        """A page of the keys of an owner, or of all owners (None), newest first. after: (created_at, id) of the last row before."""
+        query = select(KeyRow)
+        if owner is not None:
+            query = query.where(KeyRow.owner == owner)
+        if after is not None:
+            query = query.where(tuple_(KeyRow.created_at, KeyRow.id) < after)
+        with self._database.reading() as session:
+            return session.scalars(
+                query.order_by(KeyRow.created_at.desc(), KeyRow.id.desc()).limit(limit)
+            ).all()
 
     def all(self) -> Sequence[KeyRow]:
         """All keys, including revoked and expired ones, oldest first."""
         with self._database.reading() as session:
             return session.scalars(select(KeyRow).order_by(KeyRow.created_at, KeyRow.id)).all()
 
-    def revoke(self, identity: str) -> bool:
-        """Revoke a key. The next request with it is refused. Returns False if there is no key with this id."""
-        revoked = update(KeyRow).where(KeyRow.id == identity)
-        return bool(
-            self._database.change(revoked.values(revoked_at=func.coalesce(KeyRow.revoked_at, time.time())))
-        )
+    def revoke(self, identity: str, *, and_made: bool = False) -> bool:
+        """Revoke a key. The next request with it is refused. Returns False if there is no key with this id.
+
+        and_made: revoke also the keys that were made with it, and those that were made with these.
+        """
+        revoked_at = func.coalesce(KeyRow.revoked_at, time.time())
+        with self._database.writing.begin() as session:
+            found = session.scalars(select(KeyRow.id).where(KeyRow.id == identity)).all()
+            ids = set(found)
+            while and_made and found:
+                made = select(KeyRow.id).where(KeyRow.made_by.in_(found), KeyRow.id.not_in(ids))
+                found = session.scalars(made).all()
+                ids.update(found)
+            session.execute(update(KeyRow).where(KeyRow.id.in_(ids)).values(revoked_at=revoked_at))
+        return bool(ids)
 
     def any_good(self) -> bool:
         """Whether any key is valid now."""
         with self._database.reading() as session:
-            return session.scalars(_good().limit(1)).first() is not None
+            return session.scalars(good_keys().limit(1)).first() is not None
 
     def is_good(self, identity: str) -> bool:
         """Whether the key with this id is valid now: neither revoked nor expired."""
         with self._database.reading() as session:
-            return session.scalars(_good().where(KeyRow.id == identity)).first() is not None
+            return session.scalars(good_keys().where(KeyRow.id == identity)).first() is not None
 
     def _note_use(self, identity: str, now: float) -> None:
         unnoted = or_(KeyRow.last_used_at.is_(None), KeyRow.last_used_at < now - _USE_NOTED_EVERY_S)
         self._database.change(update(KeyRow).where(KeyRow.id == identity, unnoted).values(last_used_at=now))
 
 
-def _good() -> Select[str]:
+def _make_room(session: Session, owner: str, most: int) -> None:
+    """Raise ``TooManyKeys`` if an owner has so many valid keys; keep only so many of its other keys."""
+    add_bytes(
+        session, owner, 0
+    )  # locks the owner, so that requests at the same time are counted one after the other
+    good = good_keys().where(KeyRow.owner == owner)
+    if len(session.scalars(good.limit(most)).all()) >= most:
+        raise TooManyKeys
+    ended = select(KeyRow.id).where(KeyRow.owner == owner, KeyRow.id.not_in(good))
+    surplus = session.scalars(ended.order_by(KeyRow.created_at.desc()).offset(most)).all()
+    session.execute(delete(KeyRow).where(KeyRow.id.in_(surplus)))
+
+
+def good_keys() -> Select[str]:
     """The ids of all keys that are valid now."""
     return select(KeyRow.id).where(
         KeyRow.revoked_at.is_(None), or_(KeyRow.expires_at.is_(None), KeyRow.expires_at > time.time())

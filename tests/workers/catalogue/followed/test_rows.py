@@ -1,0 +1,102 @@
+"""What streams read of an owner's jobs and bulk runs, and that the database reads few rows for it."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from sqlalchemy import event, insert, text
+
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.bulks import new_id
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.followed import rows
+from workers.catalogue.followed.rows import Place
+from workers.catalogue.tables import JobRow
+from workers.contract.bulk import BulkPhase
+
+ANY = "0" * 32
+
+
+def job(number: int, owner: str = "ann", **values: object) -> dict[str, object]:
+    key = f"{number:064x}"
+    return {
+        "id": f"{number:032x}", "owner": owner, "kind": "psf-build", "parameters": {}, "request_key": key, "work_key": key,
+        "phase": "COMPLETED", "created_at": float(number), "ended_at": float(number), **values,
+    }  # fmt: skip
+
+
+def add_jobs(catalogue: Catalogue, *jobs: dict[str, object]) -> None:
+    with catalogue._database.writing.begin() as session:
+        for one in jobs:
+            session.execute(insert(JobRow), one)
+
+
+def test_rows_are_read_by_owner_phase_and_end(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rows, "MOST", 2)
+    add_jobs(
+        catalogue,
+        *(job(number) for number in (1, 2, 3, 4)),
+        *(job(number, phase="QUEUED", ended_at=None) for number in (5, 6, 7)),
+        job(8, phase="EXECUTING", ended_at=None),
+        job(9, "bob"),
+        job(10, "bob", phase="EXECUTING", ended_at=None),
+        job(11, kind="bulk", phase="EXECUTING", ended_at=None),
+        job(12, phase="PENDING", ended_at=None),
+    )
+    jobs = catalogue.followed_jobs
+    assert [int(one.id, 16) for one in jobs.open("ann")] == [8, 7, 6], "two of each phase, newest first"
+    assert [int(one.id, 16) for one in jobs.ended("ann", Place(2.0))] == [2, 3]
+    assert [int(one.id, 16) for one in jobs.ended("ann", Place(3.0, f"{3:032x}"))] == [4]
+    asked = [f"{number:032x}" for number in (1, 9, 11, 12, 99)]
+    assert sorted(int(one.id, 16) for one in jobs.among("ann", asked)) == [1, 12]
+    assert jobs.among("ann", []) == [] and jobs.rows("ann", []) == {}
+    found = jobs.rows("ann", asked)
+    assert {one: state for one, (state, _) in found.items()} == {
+        state.id: state for state in jobs.among("ann", asked)
+    }
+    assert jobs.now() == pytest.approx(time.time(), abs=5)
+
+
+def test_open_bulk_runs_are_followed_also_when_paused(catalogue: Catalogue) -> None:
+    ids = []
+    for number in range(3):
+        row = BulkRow(
+            id=new_id(), owner="ann", name="", phase=BulkPhase.RUNNING, request={}, request_key=new_id(), psf_id="p" * 64,
+            created_at=float(number), listed=True,
+        )  # fmt: skip
+        ids.append(catalogue.bulks.create(row, ["a" * 64])[0].id)
+    catalogue.bulks.pause(ids[0])
+    catalogue.bulks.cancel(ids[1])
+    bulks = catalogue.followed_bulks
+    assert [one.id for one in bulks.open("ann")] == [ids[2], ids[0]] and bulks.open("bob") == []
+    assert [one.id for one in bulks.ended("ann", Place(time.time() - 60))] == [ids[1]]
+
+
+def test_every_query_uses_an_index_on_what_it_asks_for(catalogue: Catalogue) -> None:
+    """With many ended jobs, and the statistics of PostgreSQL: no query reads all jobs of the owner."""
+    with catalogue._database.writing.begin() as session:
+        session.execute(insert(JobRow), [job(number) for number in range(5000)])
+    with catalogue._engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
+        connection.execute(text("ANALYZE"))
+    plans: list[str] = []
+
+    @event.listens_for(catalogue._engine, "before_cursor_execute")
+    def explain(_connection: object, cursor: object, statement: str, parameters: object, *_: object) -> None:
+        if not statement.startswith("SELECT"):
+            return
+        how = "EXPLAIN QUERY PLAN" if catalogue._database.sqlite else "EXPLAIN"
+        cursor.execute(f"{how} {statement}", parameters)  # type: ignore[attr-defined]
+        plans.append("\n".join(str(row) for row in cursor.fetchall()))  # type: ignore[attr-defined]
+
+    jobs = catalogue.followed_jobs
+    jobs.ended("ann", Place(4990.0))
+    jobs.open("ann")
+    jobs.among("ann", [ANY])
+    jobs.rows("ann", [ANY])
+    event.remove(catalogue._engine, "before_cursor_execute", explain)
+    ended, executing, queued, among, read = plans
+    assert "jobs_ended" in ended and "ended_at" in ended
+    assert all("USING INDEX jobs_" in plan or "Index Scan" in plan for plan in (executing, queued)), plans
+    assert not any("SCAN jobs" in plan or "Seq Scan" in plan for plan in plans), plans
+    assert all("id" in plan for plan in (among, read))

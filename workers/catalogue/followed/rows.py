@@ -1,0 +1,134 @@
+"""What streams of events read of the jobs and bulk runs of an owner.
+
+A stream asks every half second. Therefore no query reads more than ``MOST`` rows, each of them uses an index that begins
+with the owner, and only the few columns are read from which a change is seen. The whole rows are read after a change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from sqlalchemy import ColumnElement, select, tuple_
+
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.database import Database
+from workers.catalogue.tables import JobRow
+from workers.contract.bulk import OPEN
+from workers.contract.kinds import KINDS
+from workers.contract.phases import Phase
+
+MOST = 300
+
+Followable = TypeVar("Followable", bound=JobRow | BulkRow)
+
+
+@dataclass(frozen=True)
+class State:
+    """The state of a row; a row has changed if its state is another one. ended_at: None while it has not ended."""
+
+    id: str
+    ended_at: float | None
+    values: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place in the order in which an owner's rows ended: after the row ``id`` that ended at ``at`` (s since 1970)."""
+
+    at: float
+    id: str = ""
+
+
+class Followed(Generic[Followable]):
+    """The rows of a table, as streams of events need them; each method is one transaction."""
+
+    def __init__(
+        self,
+        database: Database,
+        table: type[Followable],
+        *,
+        columns: Sequence[str],
+        open_phases: Sequence[Collection[str]],
+        only: ColumnElement[bool] | None = None,
+    ) -> None:
+        """columns: their values make the state. open_phases: groups of phases; ``MOST`` rows of each group are followed.
+
+        only: a condition on the rows; None: all rows.
+        """
+        self._database, self._names = database, tuple(columns)
+        self._table: type[Followable] = table
+        self._columns = [table.id, table.ended_at, *(getattr(table, name) for name in columns)]
+        self._open_phases = [sorted(group) for group in open_phases]
+        self._conditions = [] if only is None else [only]
+
+    def now(self) -> float:
+        """The time of the database's clock, s since 1970."""
+        with self._database.reading() as session:
+            return float(session.execute(select(self._database.now)).scalar_one())
+
+    def open(self, owner: str) -> list[State]:
+        """Rows that have not ended; of each group of phases the ``MOST`` newest ones, newest first."""
+        table, found = self._table, []
+        with self._database.reading() as session:
+            for group in self._open_phases:
+                phase = table.phase == group[0] if len(group) == 1 else table.phase.in_(group)
+                query = select(*self._columns).where(table.owner == owner, phase, *self._conditions)
+                newest = query.order_by(table.created_at.desc(), table.id.desc()).limit(MOST)
+                found += _states(session.execute(newest))
+        return found
+
+    def ended(self, owner: str, after: Place) -> list[State]:
+        """The next ``MOST`` rows that ended after a place, in the order in which they ended."""
+        table = self._table
+        later = tuple_(table.ended_at, table.id) > (after.at, after.id)
+        query = select(*self._columns).where(table.owner == owner, later, *self._conditions)
+        with self._database.reading() as session:
+            return _states(session.execute(query.order_by(table.ended_at, table.id).limit(MOST)))
+
+    def among(self, owner: str, ids: Collection[str]) -> list[State]:
+        """Those of a few rows that the owner has, in any phase."""
+        if not ids:
+            return []
+        query = select(*self._columns).where(self._these(owner, ids))
+        with self._database.reading() as session:
+            return _states(session.execute(query))
+
+    def rows(self, owner: str, ids: Collection[str]) -> dict[str, tuple[State, Followable]]:
+        """The whole rows of a few ids, with their states, by id."""
+        if not ids:
+            return {}
+        with self._database.reading() as session:
+            rows = session.scalars(select(self._table).where(self._these(owner, ids))).all()
+        return {row.id: (self._state(row), row) for row in rows}
+
+    def _these(self, owner: str, ids: Collection[str]) -> ColumnElement[bool]:
+        given = self._table.id.in_(sorted(ids)) & (self._table.owner == owner)
+        for condition in self._conditions:
+            given &= condition
+        return given
+
+    def _state(self, row: Followable) -> State:
+        return State(row.id, row.ended_at, tuple(getattr(row, name) for name in self._names))
+
+
+def followed_jobs(database: Database) -> Followed[JobRow]:
+    """The jobs that clients submit, which are all except the turns of bulk runs."""
+    submitted = sorted(name for name, kind in KINDS.items() if kind.parameters is not None)
+    return Followed(
+        database,
+        JobRow,
+        columns=("phase", "attempt", "stage", "step", "steps", "cancel_requested", "queue"),
+        open_phases=({Phase.EXECUTING}, {Phase.QUEUED}),
+        only=JobRow.kind.in_(submitted),
+    )
+
+
+def followed_bulks(database: Database) -> Followed[BulkRow]:
+    """The bulk runs. Paused and failed ones are open too, because they can be resumed."""
+    return Followed(database, BulkRow, columns=("phase", "total", "done", "failed"), open_phases=(OPEN,))
+
+
+def _states(rows: Iterable[Any]) -> list[State]:
+    return [State(row_id, ended_at, tuple(values)) for row_id, ended_at, *values in rows]

@@ -1,0 +1,63 @@
+"""Says which PSF a deconvolution will use, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from psfcore.instruments.model import load_instrument
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import ImageRow, PsfRow
+from workers.contract.requests import Deconvolve
+from workers.contract.resolved import ResolvedDeconvolve
+from workers.intake.psf_choice import seen_through
+from workers.versions.series import TOTAL, series_of
+
+
+@dataclass(frozen=True)
+class ReasonedPsf:
+    """The PSF of a deconvolution. status None: the PSF is not built yet; name and version are then those of its instrument file."""
+
+    id: str
+    name: str
+    version: str
+    status: str | None
+    why: str
+
+
+def reasoned_psf(
+    wanted: Deconvolve, resolved: ResolvedDeconvolve, catalogue: Catalogue, owner: str
+) -> ReasonedPsf:
+    """The PSF that was chosen for a request, with a sentence that says why.
+
+    wanted: the parameters of the request. resolved: what ``workers.intake.requests.resolve`` made of them.
+    """
+    row = catalogue.get(PsfRow, resolved.psf_id, owner)
+    if row is not None:
+        why = _why(wanted, resolved, row, catalogue, owner)
+        return ReasonedPsf(row.id, row.name, row.version, row.status, why)
+    # resolve() has found the image and the PSF, or the recipe of the PSF
+    assert resolved.psf_recipe is not None and resolved.psf_recipe.instrument is not None
+    instrument = load_instrument(resolved.psf_recipe.instrument)
+    why = _why_built(wanted, catalogue, owner) + "; the job builds it first."
+    return ReasonedPsf(resolved.psf_id, instrument.name, instrument.version, None, why)
+
+
+def _why(
+    wanted: Deconvolve, resolved: ResolvedDeconvolve, row: PsfRow, catalogue: Catalogue, owner: str
+) -> str:
+    if wanted.psf_id is not None:
+        return "The request names this PSF."
+    if resolved.psf_recipe is not None:
+        return _why_built(wanted, catalogue, owner) + "."
+    seen = f"the images of {row.series} at the time of this image"
+    context = catalogue.contexts.asked_for(wanted.context, owner)
+    if context is None or resolved.context_id is None:
+        return f"This PSF is certified for {seen}."
+    which = "The default context" if wanted.context is None else "Context"
+    return f"{which} {context.name} pins this PSF for {seen}."
+
+
+def _why_built(wanted: Deconvolve, catalogue: Catalogue, owner: str) -> str:
+    image = catalogue.get(ImageRow, wanted.image_id, owner)
+    series = None if image is None else series_of(*seen_through(image.summary), TOTAL)
+    return f"No PSF of {series or 'this instrument'} is certified, so the PSF is built from the instrument file that heliopsf ships"
