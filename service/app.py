@@ -8,7 +8,22 @@ from contextlib import asynccontextmanager
 import anyio
 from fastapi import FastAPI
 
-from service.api import bulk, bulk_results, events, images, jobs, lineage, products, reports, transits
+from psfcore.fits.viewing.planes import Planes
+from service.api import (
+    bulk,
+    bulk_results,
+    estimates,
+    events,
+    images,
+    jobs,
+    keys,
+    lineage,
+    owner_events,
+    products,
+    reports,
+    transits,
+)
+from service.api.files import headers, pixels
 from service.api.psfs import affected, contexts
 from service.api.psfs import choice as psf_choice
 from service.api.psfs import curves as psf_queries
@@ -20,6 +35,19 @@ from service.http.bodies import BodyLimits
 from service.http.rates import AtOnce, Rates
 from service.http.state import State
 from service.operation import docs, health, metrics
+from service.pages import assets, login, visitors
+from service.pages import bulk as bulk_pages
+from service.pages import image as image_page
+from service.pages import images as image_pages
+from service.pages import jobs as job_pages
+from service.pages import keys as key_pages
+from service.pages import products as product_pages
+from service.pages import transits as transit_pages
+from service.pages.errors import problem_page
+from service.pages.psfs import comparison as psf_comparison
+from service.pages.psfs import listing as psf_listing
+from service.pages.psfs import version as psf_page
+from service.pages.reports import shown as report_page
 from service.uws import routes as uws
 from workers.catalogue.catalogue import Catalogue
 from workers.files.modes import private_folder
@@ -27,6 +55,7 @@ from workers.files.opened import open_store
 from workers.settings import Settings, software_version
 
 CUTOUTS_AT_ONCE = 2
+DECODED_AT_ONCE = 2
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
@@ -50,9 +79,18 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         reconciler = Reconciler(catalogue, queue.make_app(settings), settings)
         streams = AtOnce(settings.streams_per_caller, "too-many-streams", "streams of events")
         requests = AtOnce(settings.requests_per_caller, "too-many-requests-at-once", "requests")
-        cutouts = anyio.CapacityLimiter(CUTOUTS_AT_ONCE)
         app.state.heliopsf = State(
-            settings, catalogue, store, reconciler, access, rates, streams, requests, cutouts
+            settings,
+            catalogue,
+            store,
+            reconciler,
+            access,
+            rates,
+            streams,
+            requests,
+            cutouts=anyio.CapacityLimiter(CUTOUTS_AT_ONCE),
+            decoding=anyio.CapacityLimiter(DECODED_AT_ONCE),
+            planes=Planes(store.temporary),
         )
         reconciler.start()
         yield
@@ -67,7 +105,8 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         docs_url=None,  # FastAPI's pages load scripts from other hosts; service.operation.docs serves a page without them
         redoc_url=None,
     )
-    problems.install(app)
+    problems.install(app, problem_page)
+    visitors.install(app)
     description.install(app)
     guard.install(app, access, BodyLimits.of(settings))
     app.state.requests = observation.install(app)
@@ -78,17 +117,35 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         images,
         transits,
         jobs,
+        estimates,
         psfs,
         psf_queries,
         products,
+        pixels,
+        headers,
         reports,
         bulk,
         bulk_results,
         events,
+        owner_events,
+        keys,
         uws,
         health,
         metrics,
         docs,
+        assets,
+        image_pages,
+        image_page,
+        job_pages,
+        product_pages,
+        bulk_pages,
+        psf_listing,
+        psf_comparison,
+        psf_page,
+        transit_pages,
+        report_page,
+        login,
+        key_pages,
     ):
         app.include_router(part.router)
     return app

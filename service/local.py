@@ -36,6 +36,7 @@ from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRo
 from workers.contract.kinds import JobRequest
 from workers.contract.phases import Phase
 from workers.contract.suggestions import explained
+from workers.files.intact import files_of
 from workers.files.store import Store, sha256_of
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
@@ -202,9 +203,8 @@ class LocalService(Operations):
         """Delete a product from the temporary store. Otherwise its files would stay until the service is closed."""
         row = self._row(f"/v1/products/{product['id']}")
         self._catalogue.delete_product(row.id, DEFAULT_OWNER)
-        for digest in (row.file_sha256, row.preview_sha256, row.details.get("changes_picture_sha256")):
-            if digest is not None:
-                self._store.discard(digest)
+        for digest, _ in files_of(row):
+            self._store.discard(digest)
 
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
         """Add a job; ``wait`` runs it."""
@@ -252,6 +252,7 @@ class LocalService(Operations):
             "file": row.file_sha256,
             "preview": row.preview_sha256,
             "changes": row.details.get("changes_picture_sha256"),
+            "thumbnail": row.details.get("thumbnail_sha256"),
             "report": row.details.get("report_sha256"),
             "output": row.details.get("output_sha256"),
             "page": row.details.get("page_sha256"),

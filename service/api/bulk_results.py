@@ -42,6 +42,9 @@ class Result(BaseModel):
     file: str | None = Field(
         description="address of the product; null: the service does not keep the product"
     )
+    thumbnail: str | None = Field(
+        None, description="address of a small picture of the product; null: the service keeps none"
+    )
     output: str | None = Field(
         description="path of the product in the output folder; null: the run has no output folder"
     )
@@ -76,8 +79,10 @@ class Result(BaseModel):
         assert row.statistics is not None
         told: dict[str, Any] = {"seconds": None, "kernel_seconds": None, **row.statistics}
         own = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)}
-        file = f"/v1/products/{row.product_id}/file" if row.kept else None
-        return cls.model_validate({**told, **own, "file": file})
+        product = f"/v1/products/{row.product_id}"
+        file = f"{product}/file" if row.kept else None
+        thumbnail = f"{product}/thumbnail" if row.kept and told.get("has_thumbnail") else None
+        return cls.model_validate({**told, **own, "file": file, "thumbnail": thumbnail})
 
     def flat(self) -> dict[str, Any]:
         """The values of a CSV row."""

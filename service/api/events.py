@@ -27,7 +27,7 @@ from service.api.bulk import BulkId, BulkView
 from service.api.bulk import find as find_bulk
 from service.api.jobs import JobId, JobView
 from service.api.jobs import find as find_job
-from service.http.callers import Caller, Reading
+from service.http.callers import Caller, Reading, still_let_in
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from workers.contract.bulk import BULK_ENDED, BulkPhase
@@ -62,6 +62,17 @@ class Seen:
 Look = Callable[[], Seen | None]  # None: the row was deleted
 
 
+@dataclass(frozen=True)
+class Said:
+    """The next text of a stream, empty if there is no news. last: the stream ends after it."""
+
+    text: str
+    last: bool = False
+
+
+Say = Callable[[], Said]
+
+
 @router.get(
     "/v1/jobs/{job_id}/events",
     summary="The progress of a job as events",
@@ -81,7 +92,7 @@ async def follow_job(
         said = (row.phase, row.attempt, row.stage, row.step, row.steps, row.cancel_requested, row.queue)
         return Seen(_id(*said), lambda: JobView.of(row), Phase(row.phase).ended)
 
-    return await _stream(request, state, caller, look, last_id)
+    return await _follow(request, state, caller, look, last_id)
 
 
 @router.get(
@@ -103,15 +114,52 @@ async def follow_bulk(
         said = (row.phase, row.total, row.done, row.failed)
         return Seen(_id(*said), lambda: BulkView.of(row, state), BulkPhase(row.phase) in BULK_ENDED)
 
-    return await _stream(request, state, caller, look, last_id)
+    return await _follow(request, state, caller, look, last_id)
+
+
+async def _follow(
+    request: Request, state: Shared, caller: Caller, look: Look, last_id: str | None
+) -> Response:
+    """The stream of one row, until the row reaches its final state or is deleted."""
+    now = await run_in_threadpool(look)
+    if now is not None and now.ended and now.id == last_id:
+        return Response(status_code=204)  # 204 tells a browser not to reconnect
+
+    def say() -> Said:
+        nonlocal last_id
+        now = look()
+        text = _event(now, last_id)
+        last_id = last_id if now is None else now.id
+        return Said(text, now is None or now.ended)
+
+    return stream(request, state, caller, say)
+
+
+def stream(request: Request, state: Shared, caller: Caller, say: Say) -> Response:
+    """A stream of the texts of ``say``, which counts as a stream of the caller until it ends.
+
+    It ends after ``Said.last``, after ``stream_s``, when the server stops, and when the key is revoked or expires.
+    ``say`` is called every ``LOOK_EVERY_S`` seconds in a thread. If it raises SQLAlchemyError, it is called again later; so
+    it must not have forgotten anything.
+    """
+    state.streams.open(caller.name)
+    ends_at = time.monotonic() + state.settings.stream_s
+
+    def over() -> bool:
+        return time.monotonic() > ends_at or getattr(request.app.state, "stopping", False)
+
+    def may_read() -> bool:
+        return still_let_in(state, caller)
+
+    return _Stream(_texts(say, may_read, over), lambda: state.streams.close(caller.name))
 
 
 class _Stream(StreamingResponse):
     """A streaming response that calls ``close`` at its end, also after an error."""
 
-    def __init__(self, events: AsyncIterator[str], close: Callable[[], None]) -> None:
+    def __init__(self, texts: AsyncIterator[str], close: Callable[[], None]) -> None:
         # This header tells proxies not to buffer, because a buffer would delay events.
-        super().__init__(events, media_type=TYPE, headers={"X-Accel-Buffering": "no"})
+        super().__init__(texts, media_type=TYPE, headers={"X-Accel-Buffering": "no"})
         self._close = close
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -121,49 +169,29 @@ class _Stream(StreamingResponse):
             self._close()
 
 
-async def _stream(
-    request: Request, state: Shared, caller: Caller, look: Look, last_id: str | None
-) -> Response:
-    now = await run_in_threadpool(look)
-    if now is not None and now.ended and now.id == last_id:
-        return Response(status_code=204)  # 204 tells a browser not to reconnect
-    state.streams.open(caller.name)
-    ends_at = time.monotonic() + state.settings.stream_s
+async def _texts(say: Say, may_read: Callable[[], bool], over: Callable[[], bool]) -> AsyncIterator[str]:
+    """The texts of a stream, with comments that keep the connection open while nothing changes.
 
-    def over() -> bool:
-        return time.monotonic() > ends_at or getattr(request.app.state, "stopping", False)
-
-    def may_read() -> bool:
-        return not state.access.keys or state.catalogue.keys.is_good(caller.name)
-
-    events = _events(look, may_read, over, last_id)
-    return _Stream(events, lambda: state.streams.close(caller.name))
-
-
-async def _events(
-    look: Look, may_read: Callable[[], bool], over: Callable[[], bool], last_id: str | None
-) -> AsyncIterator[str]:
-    """The texts of a stream. It ends with the job or bulk run, when ``over``, and when the key is revoked or expires."""
+    It also ends when the key or the session of the caller ends.
+    """
     yield f"retry: {COME_BACK_MS}\n\n"
     said_at = time.monotonic()
     while not over():
         try:
             if not await run_in_threadpool(may_read):
                 return  # a client that connects again gets 401 with the reason
-            now = await run_in_threadpool(look)
-            text = await run_in_threadpool(_event, now, last_id)
+            said = await run_in_threadpool(say)
         except SQLAlchemyError as error:
             log.warning(
                 "an event stream cannot read the database; it waits and tries again: %s",
                 str(error).splitlines()[0],
             )
-            now, text = Seen(last_id or "", BaseModel, False), ""
-        if text or time.monotonic() - said_at > ALIVE_EVERY_S:
+            said = Said("")
+        if said.text or time.monotonic() - said_at > ALIVE_EVERY_S:
             said_at = time.monotonic()
-            yield text or ": still here\n\n"
-        if now is None or now.ended:
+            yield said.text or ": still here\n\n"
+        if said.last:
             return
-        last_id = now.id
         await asyncio.sleep(LOOK_EVERY_S)
 
 

@@ -58,6 +58,11 @@ class JobView(BaseModel):
     ended_at: float | None
     attempt: int
     cancel_requested: bool
+    waiting_before: int | None = Field(
+        description="number of waiting jobs that are expected to start before this job, of this queue by the turns of the owners "
+        "and of more urgent queues; 1000: 1000 or more; null: the job is not QUEUED. Only the answers to a submission and to "
+        "`GET /v1/jobs/{id}` count it; lists and events have null"
+    )
     progress: Progress
     estimate: Estimate | None = Field(
         description="expected time and memory of the job; null: a UWS job that has not been started"
@@ -69,8 +74,8 @@ class JobView(BaseModel):
     error: JobError | None
 
     @classmethod
-    def of(cls, row: JobRow) -> JobView:
-        """The view of a row of the catalogue."""
+    def of(cls, row: JobRow, waiting_before: int | None = None) -> JobView:
+        """The view of a row of the catalogue. waiting_before: None if it was not counted."""
         return cls(
             id=row.id,
             kind=row.kind,
@@ -81,6 +86,7 @@ class JobView(BaseModel):
             ended_at=row.ended_at,
             attempt=row.attempt,
             cancel_requested=row.cancel_requested,
+            waiting_before=waiting_before,
             progress=Progress(stage=row.stage, step=row.step, steps=row.steps, time_left_s=time_left_s(row)),
             estimate=Estimate.model_validate(row.estimate) if row.estimate else None,
             parameters=row.parameters,
@@ -110,14 +116,7 @@ class Identified(BaseModel):
 def submit_job(body: JobRequest, response: Response, caller: Submitting, state: Shared) -> JobView:
     """Put a job into its queue. If an identical request was made before, the answer is the existing job. If the result of that
     job was deleted or lost, the job is queued again."""
-    check_room(state, caller.owner)
-    try:
-        parameters, request_key = resolve(
-            body, state.catalogue, caller.owner, added_effects=state.settings.added_effects
-        )
-        estimate = estimates.checked(body.kind, parameters, state.catalogue, caller.owner, state.settings)
-    except DataError as error:
-        raise problem(error) from error
+    parameters, request_key, estimate = prepared(body, caller, state)
     queue = None if body.queue is None else Queue(body.queue)
     row, new = state.catalogue.jobs.submit(
         body.kind, parameters, request_key, caller.owner, queue=queue, estimate=estimate
@@ -133,7 +132,23 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
         state.reconciler.wake()
     response.status_code = 202 if new else 200
     response.headers["Location"] = f"/v1/jobs/{row.id}"
-    return JobView.of(row)
+    return JobView.of(row, state.catalogue.places.before(row))
+
+
+def prepared(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    """The resolved parameters of a request, the identity of its result, and its estimate as JSON.
+
+    Raises ``Problem`` if the request cannot be accepted.
+    """
+    check_room(state, caller.owner)
+    try:
+        parameters, identity = resolve(
+            body, state.catalogue, caller.owner, added_effects=state.settings.added_effects
+        )
+        estimate = estimates.checked(body.kind, parameters, state.catalogue, caller.owner, state.settings)
+    except DataError as error:
+        raise problem(error) from error
+    return parameters, identity, estimate
 
 
 @router.post("/identity", summary="The id that the result of a job has or would have")
@@ -160,7 +175,7 @@ def list_jobs(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[JobView]:
-    """Your jobs, newest first."""
+    """Your jobs, newest first. `waiting_before` is not counted here: it is null."""
     rows = state.catalogue.page(
         JobRow, owner=caller.owner, limit=limit + 1, after=position(cursor), phase=phase
     )
@@ -170,7 +185,8 @@ def list_jobs(
 @router.get("/{job_id}", summary="Show a job: phase, progress, result or error")
 def get_job(job_id: JobId, caller: Reading, state: Shared) -> JobView:
     """The present state of the job."""
-    return JobView.of(find(state, caller, job_id))
+    row = find(state, caller, job_id)
+    return JobView.of(row, state.catalogue.places.before(row))
 
 
 @router.delete("/{job_id}", status_code=202, summary="Cancel a job")

@@ -15,6 +15,7 @@ from service.http.state import Shared
 from workers.catalogue.tables import ProductRow
 from workers.contract.requests import Identity
 from workers.files.collection import remove_unnamed
+from workers.files.intact import files_of
 
 router = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)
 
@@ -35,6 +36,9 @@ class ProductView(BaseModel):
     )
     file: str = Field(description="address of the FITS file")
     preview: str = Field(description="address of a picture: the image before and after, and the change")
+    thumbnail: str | None = Field(
+        description="address of a small picture of the product; null: it was made before products had one"
+    )
     changes: str | None = Field(
         description="address of a picture of all changes; null: the request did not ask for it"
     )
@@ -55,6 +59,7 @@ class ProductView(BaseModel):
             details=row.details,
             file=f"{here}/file",
             preview=f"{here}/preview",
+            thumbnail=f"{here}/thumbnail" if row.details.get("thumbnail_sha256") else None,
             changes=f"{here}/changes" if row.details.get("changes_picture_sha256") else None,
         )
 
@@ -84,13 +89,13 @@ def list_products(
 @router.get("/{product_id}", summary="One product")
 def get_product(product_id: Identity, caller: Reading, state: Shared) -> ProductView:
     """A product's metadata, with links to its files."""
-    return ProductView.of(_find(state, caller, product_id))
+    return ProductView.of(find(state, caller, product_id))
 
 
 @router.get("/{product_id}/file", summary="The product as FITS", response_class=Response)
 def get_product_file(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the product; its hash is the ETag."""
-    row = _find(state, caller, product_id)
+    row = find(state, caller, product_id)
     # Products of earlier versions have no name of their own.
     name = row.details.get("filename", f"heliopsf-{product_id[:12]}.fits")
     return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name, size=row.bytes)
@@ -103,15 +108,27 @@ def get_product_file(product_id: Identity, request: Request, caller: Reading, st
 )
 def get_product_preview(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The picture as PNG."""
-    return files.send(
-        request, state.store, _find(state, caller, product_id).preview_sha256, "image/png", None
-    )
+    return files.send(request, state.store, find(state, caller, product_id).preview_sha256, "image/png", None)
+
+
+@router.get("/{product_id}/thumbnail", summary="Small picture of the product", response_class=Response)
+def get_product_thumbnail(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """A PNG of the deconvolved image, row 0 at the bottom, whose longer side has at most 192 px."""
+    digest = find(state, caller, product_id).details.get("thumbnail_sha256")
+    if digest is None:
+        raise Problem(
+            404,
+            "no-thumbnail",
+            "expected a product with a thumbnail; this one was made before products had one: use its preview, or delete the "
+            "product and submit the job again",
+        )
+    return files.send(request, state.store, digest, "image/png", None)
 
 
 @router.get("/{product_id}/changes", summary="Picture of all changes", response_class=Response)
 def get_product_changes(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """A PNG that shows the image before and after, the change, difference, ratio and histogram, if the job had `changes_picture` true."""
-    digest = _find(state, caller, product_id).details.get("changes_picture_sha256")
+    digest = find(state, caller, product_id).details.get("changes_picture_sha256")
     if digest is None:
         raise Problem(
             404,
@@ -124,16 +141,15 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
 @router.delete("/{product_id}", status_code=204, summary="Delete a product", response_class=Response)
 def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> Response:
     """Remove the product from the catalogue and from your quota. The same request makes it again."""
-    row = _find(state, caller, product_id)
+    row = find(state, caller, product_id)
     state.catalogue.delete_product(product_id, caller.owner)
     # The files go at once. Otherwise deletions and new jobs in turn would fill the disk beyond the quota.
-    named = (row.file_sha256, row.preview_sha256, row.details.get("changes_picture_sha256"))
-    remove_unnamed(state.catalogue, state.store, [digest for digest in named if digest is not None])
+    remove_unnamed(state.catalogue, state.store, [digest for digest, _ in files_of(row)])
     return Response(status_code=204)
 
 
-def _find(state: Shared, caller: Caller, product_id: str) -> ProductRow:
-    """The product's row. Raises ``Problem`` 404."""
+def find(state: Shared, caller: Caller, product_id: str) -> ProductRow:
+    """The row of a product. Raises ``Problem`` 404 if the caller has no such product."""
     row = state.catalogue.get(ProductRow, product_id, caller.owner)
     if row is None:
         raise Problem(

@@ -87,13 +87,13 @@ def list_reports(
 @router.get("/{report_id}", summary="One report")
 def get_report(report_id: Identity, caller: Reading, state: Shared) -> ReportView:
     """A report's metadata, with links to its files."""
-    return ReportView.of(_find(state, caller, report_id))
+    return ReportView.of(find(state, caller, report_id))
 
 
 @router.get("/{report_id}/file", summary="The report as JSON", response_class=Response)
 def get_report_file(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the report; its hash is the ETag."""
-    row = _find(state, caller, report_id)
+    row = find(state, caller, report_id)
     return files.send(
         request,
         state.store,
@@ -107,7 +107,7 @@ def get_report_file(report_id: Identity, request: Request, caller: Reading, stat
 @router.get("/{report_id}/preview", summary="The report's picture", response_class=Response)
 def get_report_preview(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The figures of the report as PNG."""
-    row = _find(state, caller, report_id)
+    row = find(state, caller, report_id)
     if row.preview_sha256 is None:
         raise Problem(
             404, "no-preview", "expected a report with a picture; this report has none: read its file"
@@ -118,7 +118,7 @@ def get_report_preview(report_id: Identity, request: Request, caller: Reading, s
 @router.get("/{report_id}/page", summary="The report as an HTML page", response_class=Response)
 def get_report_page(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The report as HTML with its figures inside. The headers of the answer forbid scripts and content from other addresses."""
-    digest = _find(state, caller, report_id).details.get("page_sha256")
+    digest = find(state, caller, report_id).details.get("page_sha256")
     if digest is None:
         raise Problem(404, "no-page", "expected a report with a page; this report has none: read its file")
     answer = files.send(request, state.store, digest, "text/html; charset=utf-8", None)
@@ -129,7 +129,7 @@ def get_report_page(report_id: Identity, request: Request, caller: Reading, stat
 @router.get("/{report_id}/output", summary="The file that a rerun made, as FITS", response_class=Response)
 def get_report_output(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The product or PSF that the rerun made."""
-    digest = _find(state, caller, report_id).details.get("output_sha256")
+    digest = find(state, caller, report_id).details.get("output_sha256")
     if digest is None:
         raise Problem(
             404, "no-output", "expected the report of a rerun; this is another report: read its file"
@@ -137,7 +137,8 @@ def get_report_output(report_id: Identity, request: Request, caller: Reading, st
     return files.send(request, state.store, digest, files.FITS_TYPE, f"again-{report_id[:12]}.fits")
 
 
-def _find(state: Shared, caller: Caller, report_id: str) -> ReportRow:
+def find(state: Shared, caller: Caller, report_id: str) -> ReportRow:
+    """The row of a report. Raises ``Problem`` 404."""
     row = state.catalogue.get(ReportRow, report_id, caller.owner)
     if row is None:
         raise Problem(

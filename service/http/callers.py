@@ -1,8 +1,17 @@
 """Identifies the caller of a request and checks its scopes. Each route names the scope that it needs.
 
-A request sends its key in ``Authorization``: as a bearer token, or as the password of HTTP Basic (with any user
-name), which browsers and clients of the Virtual Observatory support. An open service needs no key; everything
-in it belongs to one owner.
+A program sends its key in ``Authorization``: as a bearer token, or as the password of HTTP Basic (with any user name), which
+clients of the Virtual Observatory support. A browser sends the cookie of its session, which began with a key (``/login``), and
+may do what this key allows. If a request has both, the key counts. An open service needs no key; everything in it belongs
+to one owner.
+
+A browser adds the cookie by itself, so a page of another site could try to use it. Three rules prevent this:
+
+- The cookie has ``SameSite=Strict``: browsers do not send it with requests that another site causes.
+- ``service.http.guard`` refuses every change whose ``Sec-Fetch-Site`` or ``Origin`` names another site.
+- If a change by cookie has neither of the two headers, the request must contain the form token of the session, which only
+  pages of this service know: in the header ``X-Form-Token``. Pages also accept the field ``form_token`` of a form
+  (``service.pages.visitors``). All other routes, UWS included, look at headers alone and read no body for this check.
 """
 
 from __future__ import annotations
@@ -10,8 +19,9 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
+import hmac
 from collections.abc import Callable, Coroutine, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, get_type_hints
 from weakref import WeakValueDictionary
 
@@ -25,14 +35,18 @@ from fastapi.security.base import SecurityBase
 
 from service.http import short_ids
 from service.http.bodies import BULK, JsonRequest
+from service.http.guard import SAFE_METHODS
 from service.http.problems import Problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State, state_of
-from workers.catalogue.keys import OWNER, KeyRefused, Scope
-from workers.catalogue.tables import DEFAULT_OWNER
+from workers.catalogue.access.keys import OWNER, KeyRefused, Scope
+from workers.catalogue.access.sessions import SessionRow
+from workers.catalogue.tables import DEFAULT_OWNER, KeyRow
 
 ACT_FOR = "X-Owner"  # names the owner that an administrator acts for
-CHALLENGE = {"WWW-Authenticate": 'Bearer realm="heliopsf", Basic realm="heliopsf", charset="UTF-8"'}
+FORM_TOKEN = "X-Form-Token"
+SESSION_COOKIE = "heliopsf_session"
+BEARER, BASIC = 'Bearer realm="heliopsf"', 'Basic realm="heliopsf", charset="UTF-8"'
 
 
 @dataclass(frozen=True)
@@ -42,6 +56,7 @@ class Caller:
     owner: str
     scopes: frozenset[Scope]
     name: str  # for rate limits and logs: the id of the key, or the address
+    session: str | None = None  # the id of the browser's session, if a cookie let the request in
 
 
 class _Scheme(SecurityBase):
@@ -67,11 +82,16 @@ def _caller(
 ) -> Caller:
     """The caller of a request. Raises ``Problem`` if its key does not have a scope that the route needs, or if it reached its rate limit."""
     let_in: Caller | None = getattr(request.state, "let_in", None)  # set by KeyFirst
-    return let_in or _admit(request, state, needed.scopes)
+    return let_in or admit(request, state, needed.scopes)
 
 
-def _admit(request: Request, state: State, scopes: Iterable[str]) -> Caller:
-    caller = _let_in(request, state)
+def admit(request: Request, state: State, scopes: Iterable[str], form_token: str | None = None) -> Caller:
+    """The caller of a request, counted against its limits. It waits for the database, so call it in a thread.
+
+    form_token: the token that the request contains; default: that of its header. Raises ``Problem`` 401 without a valid key or
+    session, 403 if a scope or the form token is missing, and 429 if the caller has reached a limit.
+    """
+    caller = _let_in(request, state, form_token or request.headers.get(FORM_TOKEN, ""))
     request.state.caller = caller
     state.requests.open(caller.name)
     request.state.at_end = lambda: state.requests.close(caller.name)  # called by service.http.guard
@@ -90,22 +110,87 @@ def _admit(request: Request, state: State, scopes: Iterable[str]) -> Caller:
     return caller
 
 
-def _let_in(request: Request, state: State) -> Caller:
-    address = request.client.host if request.client is not None else "unknown"
+def address_of(request: Request) -> str:
+    """The address of a client, by which the limits count requests without a valid key."""
+    return request.client.host if request.client is not None else "unknown"
+
+
+def cookie_name(request: Request) -> str:
+    """The name of the cookie of a session.
+
+    Browsers accept the prefix ``__Host-`` over HTTPS alone, and then only from this host: no other host of the domain can set
+    the cookie.
+    """
+    return f"__Host-{SESSION_COOKIE}" if request.url.scheme == "https" else SESSION_COOKIE
+
+
+def still_let_in(state: State, caller: Caller) -> bool:
+    """Whether the key of a caller, and the session if there is one, are valid now. Long answers ask this again and again."""
     if not state.access.keys:
-        return Caller(DEFAULT_OWNER, frozenset(Scope), address)
+        return True
+    if caller.session is not None:
+        return state.catalogue.sessions.is_open(caller.session)
+    return state.catalogue.keys.is_good(caller.name)
+
+
+def _let_in(request: Request, state: State, form_token: str) -> Caller:
+    if not state.access.keys:
+        return Caller(DEFAULT_OWNER, frozenset(Scope), address_of(request))
     try:
-        row = state.catalogue.keys.check(_sent_key(request))
+        session, row = _session_and_key(request, state)
     except KeyRefused as refused:
-        state.rates.take(Bucket.READS, address)  # this limits attempts to guess keys
-        raise Problem(401, refused.code, refused.message, headers=CHALLENGE) from refused
+        state.rates.take(Bucket.READS, address_of(request))  # this limits attempts to guess keys
+        raise Problem(401, refused.code, refused.message, headers=_challenge(request)) from refused
     caller = Caller(row.owner, frozenset(map(Scope, row.scopes)), row.id)
+    if session is not None:
+        _check_form_token(request, session, form_token)
+        request.state.form_token = session.form_token  # the forms of pages contain it
+        caller = replace(caller, session=session.id)
     owner = request.headers.get(ACT_FOR)
     if owner is None or owner == caller.owner:
         return caller
     if Scope.ADMIN not in caller.scopes or not OWNER.fullmatch(owner):
         raise Problem(403, "scope-missing", f"{ACT_FOR}: expected a key with the scope '{Scope.ADMIN}'")
-    return Caller(owner, caller.scopes, caller.name)
+    return replace(caller, owner=owner)
+
+
+def _session_and_key(request: Request, state: State) -> tuple[SessionRow | None, KeyRow]:
+    """The key that lets a request in, and the session if it came by cookie. Raises ``KeyRefused``."""
+    token = request.cookies.get(cookie_name(request))
+    if token is None or "authorization" in request.headers:
+        return None, state.catalogue.keys.check(_sent_key(request))
+    return state.catalogue.sessions.find(token)
+
+
+def names_its_site(request: Request) -> bool:
+    """Whether a request says from which site it comes, so that ``service.http.guard`` has decided about it."""
+    return "sec-fetch-site" in request.headers or "origin" in request.headers
+
+
+def _check_form_token(request: Request, session: SessionRow, sent: str) -> None:
+    if request.method in SAFE_METHODS or names_its_site(request):
+        return
+    if not hmac.compare_digest(sent.encode(), session.form_token.encode()):
+        raise Problem(
+            403,
+            "form-token-missing",
+            f"expected the form token of your session in the field form_token or the header {FORM_TOKEN}, because the request "
+            "does not say from which site it comes; got none or another one: load the page again, and send the form from there",
+        )
+
+
+def _challenge(request: Request) -> dict[str, str]:
+    """The ways to send a key. Pages are not offered Basic, because the browser would ask for a password in a window of its own.
+
+    Browsers ask for XHTML when a person opens an address. Clients of the Virtual Observatory that are written in Java accept
+    ``text/html`` too, but not XHTML, and they need the offer.
+    """
+    page = (
+        request.headers.get("sec-fetch-site") == "same-origin"
+        or cookie_name(request) in request.cookies
+        or "application/xhtml+xml" in request.headers.get("accept", "")
+    )
+    return {"WWW-Authenticate": BEARER if page else f"{BEARER}, {BASIC}"}
 
 
 def _sent_key(request: Request) -> str:
@@ -120,7 +205,8 @@ def _sent_key(request: Request) -> str:
         except (binascii.Error, UnicodeDecodeError) as error:
             raise KeyRefused("bad-key", "expected HTTP Basic as base64 of user:key") from error
     raise KeyRefused(
-        "no-key", "expected a key: 'Authorization: Bearer hpsf_...', or as the password of Basic"
+        "no-key",
+        "expected a key: 'Authorization: Bearer hpsf_...', or as the password of Basic; in a browser, log in at /login",
     )
 
 
@@ -137,7 +223,7 @@ class KeyFirst(APIRoute):
         turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
         async def answer(request: Request) -> Response:
-            caller = await run_in_threadpool(_admit, request, state_of(request), scopes)
+            caller = await run_in_threadpool(admit, request, state_of(request), scopes)
             request.state.let_in = caller
             reading = JsonRequest(request.scope, request.receive)
             if self.path != BULK or self.methods != {"POST"}:

@@ -15,6 +15,7 @@ from workers.files.store import BadFile, Store, lost
 log = logging.getLogger(__name__)
 
 FITS_TYPE = "application/fits"
+GZIP_TYPE = "application/gzip"
 KEPT = "private, max-age=31536000, immutable"  # the content at an address never changes
 
 

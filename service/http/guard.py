@@ -39,7 +39,7 @@ class _Guard:
             self._check_host(headers)
             _check_origin(scope["method"], headers)
         except problems.Problem as problem:
-            refusal = problems.answer(problem.status, problem.code, problem.detail)
+            refusal = problems.document(problem.status, problem.code, problem.detail)
             await refusal(scope, receive, kept)
             return
         # Nobody reads the body of a request that changes nothing. A stream of events receives only to learn when its client
@@ -72,7 +72,7 @@ class _Guard:
 
 
 def _check_origin(method: str, headers: Headers) -> None:
-    """Refuse changes that a web page of another site requests, because the browser would add its stored HTTP Basic password."""
+    """Refuse changes that a web page of another site requests, because the browser would add its stored HTTP Basic password or cookie."""
     if method in SAFE_METHODS:
         return
     site, origin = headers.get("sec-fetch-site"), headers.get("origin")
@@ -102,6 +102,7 @@ def _keep(headers: MutableHeaders, scope: Scope) -> None:
         headers.setdefault(name, value)
     if "etag" in headers:
         headers.add_vary_header("Authorization")
+        headers.add_vary_header("Cookie")
     else:
         headers.setdefault("Cache-Control", "no-store")
     allowance = scope.get("state", {}).get("allowance")

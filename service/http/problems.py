@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import errno
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from typing import Any, cast
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import ErrorDetails
 from sqlalchemy.exc import DatabaseError, InterfaceError, OperationalError, SQLAlchemyError
@@ -32,6 +32,7 @@ STATUS_OF = {
     "no-psf-fits": 404,
     "no-such-context": 404,
     "no-such-image": 404,
+    "no-such-plane": 404,
     "no-such-product": 404,
     "no-such-psf": 404,
     "no-such-transit": 404,
@@ -106,7 +107,7 @@ def problem(error: DataError, **more: Any) -> Problem:
     return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **{**error.fields, **more})
 
 
-def answer(
+def document(
     status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
 ) -> JSONResponse:
     """The response for a problem."""
@@ -137,15 +138,37 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 
 
-def install(app: FastAPI) -> None:
-    """Make the application answer every error with a problem document."""
+AsPage = Callable[[Request, int, str, str, Mapping[str, Any]], Response]
+
+
+def install(app: FastAPI, as_page: AsPage) -> None:
+    """Make the application answer every error with a problem document, or with a page if a page was asked for.
+
+    as_page(request, status, code, detail, fields): makes the page.
+    """
+
+    def answer(
+        request: Request,
+        status: int,
+        code: str,
+        detail: str,
+        *,
+        headers: Mapping[str, str] | None = None,
+        **more: Any,
+    ) -> Response:
+        if not wants_page(request):
+            return document(status, code, detail, headers=headers, **more)
+        made = as_page(request, status, code, detail, more)
+        for name, value in (headers or {}).items():
+            made.headers.setdefault(name, value)  # a page has a policy of its own
+        return made
 
     @app.exception_handler(Problem)
-    def _problem(_request: Request, found: Problem) -> JSONResponse:
-        return answer(found.status, found.code, found.detail, headers=found.headers, **found.more)
+    def _problem(request: Request, found: Problem) -> Response:
+        return answer(request, found.status, found.code, found.detail, headers=found.headers, **found.more)
 
     @app.exception_handler(RequestValidationError)
-    def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+    def _invalid(request: Request, error: RequestValidationError) -> Response:
         body = getattr(request.scope.get("route"), "body_field", None)
         model = None if body is None else body.field_info.annotation
         errors = []
@@ -157,10 +180,10 @@ def install(app: FastAPI) -> None:
         detail = "; ".join(f"{e['at']}: {e['message']}" for e in errors)
         if len(error.errors()) > MOST_ERRORS:
             detail += f"; and {len(error.errors()) - MOST_ERRORS} more errors"
-        return answer(422, "invalid-request", detail, errors=errors)
+        return answer(request, 422, "invalid-request", detail, errors=errors)
 
     @app.exception_handler(HTTPException)
-    def _http(request: Request, error: HTTPException) -> JSONResponse:
+    def _http(request: Request, error: HTTPException) -> Response:
         detail = str(error.detail)
         if error.status_code == 404:
             detail = f"expected an address of this service; nothing is at {request.url.path}: /docs lists all addresses"
@@ -168,16 +191,17 @@ def install(app: FastAPI) -> None:
             detail = (
                 f"expected a method that {request.url.path} accepts; got {request.method}: /docs lists them"
             )
-        return answer(error.status_code, f"http-{error.status_code}", detail, headers=error.headers)
+        return answer(request, error.status_code, f"http-{error.status_code}", detail, headers=error.headers)
 
     @app.exception_handler(OperationalError)
     @app.exception_handler(InterfaceError)
     @app.exception_handler(PoolTimeoutError)
-    def _database(_request: Request, error: SQLAlchemyError) -> JSONResponse:
+    def _database(request: Request, error: SQLAlchemyError) -> Response:
         log.error("database: %s", error)
         if _disk_full(error):
-            return answer(507, "storage-full", NO_ROOM)
+            return answer(request, 507, "storage-full", NO_ROOM)
         return answer(
+            request,
             503,
             "database-away",
             "the database of the service does not answer; try again in a moment",
@@ -185,27 +209,29 @@ def install(app: FastAPI) -> None:
         )
 
     @app.exception_handler(DatabaseError)
-    def _damaged(request: Request, error: DatabaseError) -> JSONResponse:
+    def _damaged(request: Request, error: DatabaseError) -> Response:
         if not checks.damaged(error):
             raise error
         log.error("database: %s", error)
         return answer(
+            request,
             503,
             "database-damaged",
             "the database of the service is damaged; tell the operator, who must restore a copy",
         )
 
     @app.exception_handler(OSError)
-    def _system(_request: Request, error: OSError) -> JSONResponse:
+    def _system(request: Request, error: OSError) -> Response:
         if error.errno not in FULL:
             raise error  # it is answered as an internal error
         log.error("storage: %s", error)
-        return answer(507, "storage-full", NO_ROOM)
+        return answer(request, 507, "storage-full", NO_ROOM)
 
     @app.exception_handler(StoreAway)
-    def _store(_request: Request, error: StoreAway) -> JSONResponse:
+    def _store(request: Request, error: StoreAway) -> Response:
         log.error("storage: %s", error)
         return answer(
+            request,
             503,
             "storage-away",
             "the file storage of the service does not answer; try again in a moment",
@@ -213,13 +239,20 @@ def install(app: FastAPI) -> None:
         )
 
     @app.exception_handler(Exception)
-    def _ours(_request: Request, _error: Exception) -> JSONResponse:
+    def _ours(request: Request, _error: Exception) -> Response:
         # After this answer Starlette logs the traceback and passes the error on to the server. No middleware sets the
         # headers of this answer, so they are set here.
         headers = {**SECURITY_HEADERS, "X-Request-ID": logs.about().get("request", "")}
         return answer(
+            request,
             500,
             "internal-error",
             "the service failed and logged the error; send the X-Request-ID of this answer to the operator",
             headers=headers,
         )
+
+
+def wants_page(request: Request) -> bool:
+    """Whether a person asked for a page: a browser accepts HTML, and addresses of the interfaces are for programs."""
+    for_programs = ("/v1/", "/uws", "/openapi.json", "/metrics", "/health")
+    return "text/html" in request.headers.get("accept", "") and not request.url.path.startswith(for_programs)

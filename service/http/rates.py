@@ -136,6 +136,11 @@ class AtOnce:
                 )
             self._open[who] += 1
 
+    def total(self) -> int:
+        """The number of all that is open."""
+        with self._lock:
+            return self._open.total()
+
     def close(self, who: str) -> None:
         """Count one fewer."""
         with self._lock:

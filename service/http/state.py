@@ -9,6 +9,7 @@ import anyio
 from fastapi import Depends, Request
 
 from psfcore.fits.header import FitsLimits
+from psfcore.fits.viewing.planes import Planes
 from service.http.access import Access
 from service.http.rates import AtOnce, Rates
 from workers.catalogue.catalogue import Catalogue
@@ -33,6 +34,9 @@ class State:
     requests: AtOnce
     # Cut-outs wait here and not in the threads that all requests share: a cut-out keeps a core busy.
     cutouts: anyio.CapacityLimiter
+    # The same for planes and headers that are decoded.
+    decoding: anyio.CapacityLimiter
+    planes: Planes
 
     @property
     def limits(self) -> FitsLimits:

@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
 FORM_BYTES = 2**16  # largest number of bytes that a form may add to the file
-LARGE = frozenset({"/v1/images", "/v1/psfs", "/v1/transits"})  # upload addresses; they have their own limits
+LARGE = frozenset(
+    {f"{root}/{kind}" for root in ("", "/v1") for kind in ("images", "psfs", "transits")}
+)  # upload addresses; they have their own limits
 UNDECLARED_BYTES = 2**20  # bytes that are counted in one step if the request does not declare its length
 Take = Callable[[int], object]
 

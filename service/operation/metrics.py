@@ -52,11 +52,14 @@ class _Catalogued(Collector):
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics of database and storage. If the database does not answer, only the free space and the metric that says so."""
+        """The metrics of database, storage and streams. If the database does not answer, only those that need none, and the one that says so."""
         yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
         room = GaugeMetricFamily("heliopsf_storage_free_bytes", "Free space where files are stored")
         room.add_metric([], checks.free_bytes(self._state.settings.data_dir))
         yield room
+        streams = GaugeMetricFamily("heliopsf_event_streams", "Streams of events that this process sends now")
+        streams.add_metric([], self._state.streams.total())
+        yield streams
         up = GaugeMetricFamily("heliopsf_database_up", "1 if the database answers, else 0")
         try:
             found = [*self._jobs(), *self._stages(), *self._waiting(), *self._files()]

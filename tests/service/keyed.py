@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from workers.catalogue.access.keys import Scope
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.keys import Scope
 from workers.settings import Settings
 
 ALL = frozenset(Scope)

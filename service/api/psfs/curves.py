@@ -23,7 +23,7 @@ from psfcore.tables import lookup as psf_lookup
 from service.http import downloads as files
 from service.http.callers import Caller, Reading
 from service.http.problems import RESPONSES, Problem, problem
-from service.http.state import Shared
+from service.http.state import Shared, State
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
 
@@ -180,6 +180,12 @@ async def get_cutout(
     headers["Content-Disposition"] = f'attachment; filename="psf-{psf_id[:12]}-{size}px.fits"'
     headers["Content-Length"] = str(made.length)
     return StreamingResponse(made.pieces(), media_type=files.FITS_TYPE, headers=headers)
+
+
+def tables_of(state: State, caller: Caller, psf_id: str) -> Mapping[str, Any]:
+    """The tables of a PSF. Raises ``Problem`` 404 if there is no such PSF, 409 "no-tables" if it has no tables yet."""
+    row = _find(state, caller, psf_id)
+    return _read(state, row, _tables_of(row))
 
 
 def _answer(

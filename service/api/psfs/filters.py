@@ -30,7 +30,7 @@ InContext = Annotated[
 ]
 
 
-def _filter(
+def psf_filter(
     instrument: Text = None,
     channel: Annotated[
         str | None,
@@ -49,6 +49,7 @@ def _filter(
     status: PsfStatus | None = None,
     valid_at: Time = None,
 ) -> PsfFilter:
+    """The filter with these values. Raises ``Problem`` 422 if they exclude each other or if the time is wrong."""
     if valid_at is not None and status not in (None, PsfStatus.CERTIFIED):
         raise Problem(
             422,
@@ -62,4 +63,4 @@ def _filter(
     return PsfFilter(instrument, channel, kind, name, version, None, status, at)
 
 
-Filters = Annotated[PsfFilter, Depends(_filter)]
+Filters = Annotated[PsfFilter, Depends(psf_filter)]

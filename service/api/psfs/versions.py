@@ -121,11 +121,19 @@ async def upload_psf(
     """Upload a PSF: one 2-D image with its centre at [n//2, n//2] and a sum of at most 1.
 
     Header and weights are checked at upload; compressed weights are checked by the jobs that use the PSF. Nothing is kept of a
-    file that is refused.
+    file that is refused. If the file is that of a PSF of the catalogue, and no other name or version is given, the answer is
+    that PSF.
     """
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
     async with uploads.receive_psf(request, state.store, state.limits, limit, take) as upload:
+        if not any((name, version, instrument, channel, kind)):
+            # Otherwise a PSF that was built here, downloaded and sent again would have a second id.
+            made_here = await run_in_threadpool(_made_here, state, caller, upload.sha256)
+            if made_here is not None:
+                response.status_code = 200
+                response.headers["Location"] = f"/v1/psfs/{made_here.id}"
+                return PsfView.of(made_here)
         row = uploaded_psf_row(
             caller.owner,
             upload.sha256,
@@ -142,6 +150,13 @@ async def upload_psf(
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/psfs/{row.id}"
     return PsfView.of(row)
+
+
+def _made_here(state: Shared, caller: Caller, digest: str) -> PsfRow | None:
+    """The caller's PSF that a job made and whose file has this SHA-256; None if there is none."""
+    # At most two PSFs have one file: that of the job, and an upload.
+    rows = state.catalogue.page(PsfRow, owner=caller.owner, limit=2, file_sha256=digest)
+    return next((row for row in rows if row.id != digest), None)
 
 
 @router.get("", summary="List PSFs")

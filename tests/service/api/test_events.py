@@ -5,94 +5,31 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import httpx
 import pytest
-import uvicorn
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import update
 
 from service.api import events
 from service.app import create_app
-from service.client.http import Client, ServiceError
+from service.client.http import ServiceError
+from tests.service.api.live import Following, Live, running
 from tests.service.keyed import bearer, keyed
-from tests.whole.stack import free_port, wait_for
+from tests.whole.stack import wait_for
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
-from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, KeyRow
 from workers.contract.bulk import BulkPhase
 from workers.settings import Settings
 
 
-@dataclass
-class Live:
-    """A server in a thread of this process."""
-
-    url: str
-    app: FastAPI
-    client: Client
-
-    @property
-    def catalogue(self) -> Catalogue:
-        found = self.app.state.heliopsf.catalogue
-        assert isinstance(found, Catalogue)
-        return found
-
-    def streams(self) -> int:
-        return sum(self.app.state.heliopsf.streams._open.values())
-
-    def job(self) -> tuple[str, Lease]:
-        """A job that is at work."""
-        row, _ = self.catalogue.jobs.submit("psf-build", {}, new_id(), DEFAULT_OWNER)
-        lease = self.catalogue.jobs.claim(row.id, "w")
-        assert lease is not None
-        return row.id, lease
-
-
 @pytest.fixture
 def live(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
     monkeypatch.setattr(events, "LOOK_EVERY_S", 0.05)
-    port = free_port()
-    app = create_app(settings.model_copy(update={"streams_per_caller": 2}))
-    server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", timeout_graceful_shutdown=1))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    url = f"http://127.0.0.1:{port}"
-    with Client(url) as client:
-        client.wait_until_up()
-        yield Live(url, app, client)
-    server.should_exit = True
-    thread.join()
-
-
-class Following(threading.Thread):
-    """What a stream says, gathered beside the test."""
-
-    def __init__(self, url: str, **headers: str) -> None:
-        super().__init__(daemon=True)
-        self.url, self.headers = url, headers
-        self.lines: list[str] = []
-        self.status = 0
-        self.start()
-
-    def run(self) -> None:
-        with (
-            suppress(httpx.TransportError),  # the test may end before the stream
-            httpx.stream("GET", self.url, headers=self.headers, timeout=30) as answer,
-        ):
-            self.status = answer.status_code
-            self.type = answer.headers.get("content-type", "")
-            for line in answer.iter_lines():
-                self.lines.append(line)
-
-    def said(self, start: str) -> list[str]:
-        return [line.removeprefix(start).strip() for line in self.lines if line.startswith(start)]
+    with running(settings.model_copy(update={"streams_per_caller": 2})) as server:
+        yield server
 
 
 def test_a_job_is_followed_to_its_end(live: Live) -> None:

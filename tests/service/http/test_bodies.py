@@ -22,7 +22,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from tests.service.keyed import Keyed, bearer, keyed
 from tests.whole.stack import free_port, wait_for
-from workers.catalogue.keys import Scope
+from workers.catalogue.access.keys import Scope
 from workers.settings import Settings
 
 JSON = {"Content-Type": "application/json"}

@@ -22,8 +22,8 @@ from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from workers.bulk import image as bulk_image
 from workers.bulk.turns import keep_turns
+from workers.catalogue.access.keys import Scope
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.keys import Scope
 from workers.contract.queues import Queue
 from workers.files import beneath
 from workers.files.store import Store
@@ -130,6 +130,8 @@ def test_uploads_become_products_and_a_manifest(
         assert line["score"] == product["details"]["changes"]["artefacts"]["score"]
         assert line["flux_change_pct"] == product["details"]["flux_change_pct"]
         assert product["details"]["job_id"] == bulk["id"]
+        assert line["thumbnail"] == product["thumbnail"] == f"/v1/products/{line['product_id']}/thumbnail"
+        assert api.get(line["thumbnail"]).headers["Content-Type"] == "image/png"
         assert line["psf_id"] == psf_id and line["seconds"] >= line["kernel_seconds"] > 0
     ordinary = api.post(
         "/v1/jobs",

@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from tests.service.conftest import upload
 from tests.service.keyed import Keyed, keyed
 from workers.bulk.turns import keep_turns
-from workers.catalogue.keys import Scope
+from workers.catalogue.access.keys import Scope
 from workers.catalogue.tables import JobRow
 from workers.contract.phases import Phase
 from workers.settings import Settings

@@ -14,8 +14,8 @@ from httpx import Response
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
+from workers.catalogue.access.keys import Scope
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.keys import Scope
 from workers.catalogue.owners import OverQuota
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.settings import Settings
@@ -170,3 +170,17 @@ def test_only_the_owner_deletes_and_only_with_the_scope(settings: Settings, psf_
         assert kept.status_code == 200 and kept.content == psf_file.read_bytes()
         assert bob.delete(f"/v1/psfs/{psf_id}").status_code == 200
         assert blobs(settings) == set()
+
+
+def test_a_psf_that_was_built_here_and_is_sent_again_keeps_its_id(
+    api: TestClient, run_jobs: Callable[[], None]
+) -> None:
+    body = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 64}}
+    job = api.post("/v1/jobs", json=body).json()
+    run_jobs()
+    built = api.get(api.get(f"/v1/jobs/{job['id']}").json()["result"]).json()
+    file = api.get(f"/v1/psfs/{built['id']}/file").content
+    again = api.post("/v1/psfs", content=file)
+    assert again.status_code == 200 and again.json()["id"] == built["id"]
+    renamed = api.post("/v1/psfs", params={"name": "mine"}, content=file)
+    assert renamed.status_code == 201 and renamed.json()["id"] != built["id"]

@@ -1,0 +1,1 @@
+"""What the files of images and products hold: pixels and headers."""

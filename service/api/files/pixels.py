@@ -1,0 +1,174 @@
+"""Pixels of images and products, ``.../pixels``: raw numbers, so that a viewer shows and reads exact values.
+
+The first request for a plane decodes it; the next ones read the decoded plane (``psfcore.fits.viewing``). The numerical
+libraries are loaded by the first request for pixels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, BinaryIO, Literal
+
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+
+from psfcore.errors import DataError
+from psfcore.fits.viewing.planes import Decoded, Plane
+from service.api.images import find as find_image
+from service.api.products import find as find_product
+from service.http import downloads as files
+from service.http.callers import Reading
+from service.http.problems import RESPONSES, problem
+from service.http.quotas import check_disk
+from service.http.state import Shared
+from workers.contract.requests import Identity
+
+# This number is part of every ETag. Increase it when a new version of the code answers differently from the same file.
+ANSWERS_VERSION = 1
+MEDIA_TYPE = "application/octet-stream"
+QUALITY = "quality"
+LARGEST = 2**31 - 1
+router = APIRouter(tags=["pixels"], responses=RESPONSES)
+
+
+@dataclass(frozen=True)
+class Part:
+    """The window of a request, px, and its step. None: to the end of the plane."""
+
+    x: int
+    y: int
+    width: int | None
+    height: int | None
+    step: int
+
+
+def _part(
+    x: Annotated[int, Query(ge=0, le=LARGEST, description="first column of the window, counted from 0")] = 0,
+    y: Annotated[
+        int, Query(ge=0, le=LARGEST, description="first row of the window, counted from 0 as in FITS")
+    ] = 0,
+    width: Annotated[
+        int | None, Query(ge=1, le=LARGEST, description="columns of the window; default: all further ones")
+    ] = None,
+    height: Annotated[
+        int | None, Query(ge=1, le=LARGEST, description="rows of the window; default: all further ones")
+    ] = None,
+    step: Annotated[
+        int,
+        Query(
+            ge=1,
+            le=LARGEST,
+            description="n: each number of the answer stands for n x n pixels: the mean of the finite ones, of `quality` the "
+            "bitwise OR. Blocks at the upper edges of the window may be smaller",
+        ),
+    ] = 1,
+) -> Part:
+    return Part(x, y, width, height, step)
+
+
+Asked = Annotated[Part, Depends(_part)]
+SHAPE = {"type": "string", "pattern": r"^\d+,\d+$"}
+DESCRIBED: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "float32 numbers, little-endian, row after row, row 0 of the window first; NaN: no value",
+        "content": {MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+        "headers": {
+            "X-Plane-Shape": {"description": "NY,NX: rows and columns of the whole plane", "schema": SHAPE},
+            "X-Pixels-Shape": {"description": "ny,nx: rows and columns of this answer", "schema": SHAPE},
+            "X-Pixels-Unit": {
+                "description": "unit of the pixels (BUNIT), if the file gives one",
+                "schema": {"type": "string"},
+            },
+        },
+    },
+}
+
+
+@router.get(
+    "/v1/images/{image_id}/pixels",
+    summary="The pixels of an uploaded image",
+    response_class=Response,
+    responses=DESCRIBED,
+)
+async def get_image_pixels(
+    image_id: Identity,
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    asked: Asked,
+    plane: Annotated[Literal["image"], Query(description="an uploaded image has one plane")] = "image",
+) -> Response:
+    """The pixel values of the file, in DN or DN/s as they are stored (BSCALE and BZERO applied). Saturated pixels are not marked."""
+    await run_in_threadpool(find_image, state, caller, image_id)
+    return await _pixels(request, state, image_id, plane, asked)
+
+
+@router.get(
+    "/v1/products/{product_id}/pixels",
+    summary="The pixels of a product",
+    response_class=Response,
+    responses=DESCRIBED,
+)
+async def get_product_pixels(
+    product_id: Identity,
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    asked: Asked,
+    plane: Annotated[
+        Literal["image", "error", "quality"],
+        Query(
+            description="the deconvolved image, or its plane ERROR or QUALITY; `error` needs a job with `error_draws`"
+        ),
+    ] = "image",
+) -> Response:
+    """The pixel values of a plane of the product. Values of `quality` are whole numbers, as in the file. 404: the product does not
+    have this plane."""
+    row = await run_in_threadpool(find_product, state, caller, product_id)
+    return await _pixels(request, state, row.file_sha256, plane, asked)
+
+
+async def _pixels(request: Request, state: Shared, digest: str, name: str, asked: Part) -> Response:
+    """A part of a plane of a stored file, or 304 if the client already has it."""
+    tag = hashlib.sha256(f"{ANSWERS_VERSION} {digest} pixels {name} {asked}".encode()).hexdigest()
+    headers = {"ETag": f'"{tag}"', "Cache-Control": files.KEPT}
+    if files.known(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    plane = state.planes.kept((digest, name))
+    try:
+        if plane is None:
+            plane = await anyio.to_thread.run_sync(_decoded, state, digest, name, limiter=state.decoding)
+        shape, length, pieces = await run_in_threadpool(_cut, plane, asked, name == QUALITY)
+    except DataError as error:
+        raise problem(error) from error
+    headers["X-Plane-Shape"] = "{},{}".format(*plane.shape)
+    headers["X-Pixels-Shape"] = "{},{}".format(*shape)
+    headers["Content-Length"] = str(length)
+    if plane.unit is not None:
+        headers["X-Pixels-Unit"] = plane.unit
+    return StreamingResponse(pieces, media_type=MEDIA_TYPE, headers=headers)
+
+
+def _decoded(state: Shared, digest: str, name: str) -> Plane:
+    from psfcore.fits.viewing.decode import decode_plane  # loads the numerical libraries
+
+    def decode(target: BinaryIO) -> Decoded:
+        check_disk(state)
+        # The whole file is checked: browsers keep the pixels for long.
+        return decode_plane(files.found(state.store, digest), name, state.limits, target)
+
+    return state.planes.decoded((digest, name), decode)
+
+
+def _cut(plane: Plane, asked: Part, bits: bool) -> tuple[tuple[int, int], int, Iterator[bytes]]:
+    """Shape, number of bytes and bytes of the answer. Raises DataError "window-outside"."""
+    from psfcore.fits.viewing.windows import pixels, window_of
+
+    window = window_of(
+        plane.shape, x=asked.x, y=asked.y, width=asked.width, height=asked.height, step=asked.step
+    )
+    return window.shape, window.length, pixels(plane, window, bits=bits)

@@ -1,0 +1,241 @@
+"""The keys of an owner: ``/v1/keys``.
+
+A key can make others for its owner. They allow no more than it does and do not last longer: whoever has a key cannot get more
+from it than it gives. A key with the scope ``admin`` makes keys of any owner, with any scopes and for any time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from service.http.callers import Caller, KeyFirst, Reading, Submitting
+from service.http.paging import Cursor, Limit, Page, page, position
+from service.http.problems import RESPONSES, Problem
+from service.http.state import Shared
+from workers.catalogue.access.keys import LABEL_LENGTH, OWNER, Scope, TooManyKeys
+from workers.catalogue.tables import KeyRow
+
+MOST_KEYS = 100  # valid keys of one owner that this interface makes
+DAY_S = 86_400.0
+LATEST = 253_402_300_799  # the end of the year 9999, seconds since 1970
+EVERYBODY = "*"
+
+router = APIRouter(prefix="/v1/keys", tags=["keys"], responses=RESPONSES, route_class=KeyFirst)
+KeyId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", description="the id of a key: the part after `hpsf_`")]
+OwnerName = Annotated[str, Field(pattern=f"^{OWNER.pattern}$")]
+
+
+class NewKey(BaseModel):
+    """A key to make."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    label: str = Field(
+        "", max_length=LABEL_LENGTH, description="a note for lists, such as the purpose of the key"
+    )
+    scopes: list[Scope] = Field(
+        min_length=1, max_length=len(Scope), description="what the key allows; scopes of your own key alone"
+    )
+    expires_at: float | None = Field(
+        None,
+        ge=0,
+        le=LATEST,
+        description="end of the key, seconds since 1970; default: the end of your own key",
+    )
+    lasts_days: float | None = Field(
+        None, gt=0, le=36_500, description="lifetime of the key, days, in place of expires_at"
+    )
+    owner: OwnerName | None = Field(
+        None, description="owner of the key; another owner than your own needs the scope admin"
+    )
+
+    @model_validator(mode="after")
+    def _one_end(self) -> NewKey:
+        if self.expires_at is not None and self.lasts_days is not None:
+            raise ValueError("expected expires_at or lasts_days; got both: leave one out")
+        return self
+
+    def end(self, now: float) -> float | None:
+        """The end of the key, seconds since 1970; None if no end is asked for."""
+        return self.expires_at if self.lasts_days is None else now + self.lasts_days * DAY_S
+
+
+class KeyView(BaseModel):
+    """A key, without its secret."""
+
+    id: str
+    owner: str
+    label: str
+    scopes: list[Scope]
+    state: Literal["valid", "expired", "revoked"]
+    created_at: float
+    expires_at: float | None = Field(description="null: it is valid until it is revoked")
+    revoked_at: float | None
+    last_used_at: float | None = Field(description="to the minute; null: never")
+    made_by: str | None = Field(
+        description="id of the key with which it was made; null: the operator made it"
+    )
+
+    @classmethod
+    def of(cls, row: KeyRow) -> KeyView:
+        """The view of a row."""
+        names = ("id", "owner", "label", "created_at", "expires_at", "revoked_at", "last_used_at", "made_by")
+        shown = {name: getattr(row, name) for name in names}
+        return cls(scopes=list(map(Scope, row.scopes)), state=_state(row), **shown)
+
+
+class MadeKey(KeyView):
+    """A new key with its secret."""
+
+    key: str = Field(description="the whole key; this is the only answer that contains it")
+
+
+@router.get("", summary="List keys")
+def list_keys(
+    request: Request,
+    caller: Reading,
+    state: Shared,
+    owner: Annotated[
+        str | None,
+        Query(max_length=64, description="list the keys of this owner, `*`: of all; needs the scope admin"),
+    ] = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[KeyView]:
+    """Your keys, newest first, with those that have expired or are revoked."""
+    _check_used(state)
+    owner = owner or caller.owner
+    _check_for(caller, owner)
+    rows = state.catalogue.keys.page(
+        None if owner == EVERYBODY else owner, limit=limit + 1, after=position(cursor)
+    )
+    return page(request, rows, limit, KeyView.of)
+
+
+@router.post("", status_code=201, summary="Make a key")
+def make_key(body: NewKey, response: Response, caller: Submitting, state: Shared) -> MadeKey:
+    """Make a key. The answer shows it this once. It allows no more than your own key, and does not last longer, unless your key
+    has the scope admin."""
+    _check_used(state)
+    owner = body.owner or caller.owner
+    _check_for(caller, owner)
+    _check_scopes(caller, body.scopes, "make a key with fewer scopes, or ask the operator")
+    expires_at = _end(state, caller, body)
+    try:
+        key = state.catalogue.keys.make(
+            owner,
+            set(body.scopes),
+            label=body.label,
+            expires_at=expires_at,
+            made_by=caller.name,
+            most=MOST_KEYS,
+        )
+    except TooManyKeys as error:
+        raise Problem(
+            409,
+            "too-many-keys",
+            f"expected at most {MOST_KEYS} valid keys of an owner; {owner} has as many: revoke one that is not used",
+        ) from error
+    row = state.catalogue.keys.get(key.split("_")[1])
+    assert row is not None
+    response.headers["Cache-Control"] = "no-store"
+    response.headers["Location"] = f"/v1/keys/{row.id}"
+    return MadeKey(key=key, **KeyView.of(row).model_dump())
+
+
+@router.get("/{key_id}", summary="Show a key")
+def get_key(key_id: KeyId, caller: Reading, state: Shared) -> KeyView:
+    """A key without its secret."""
+    return KeyView.of(_find(state, caller, key_id))
+
+
+@router.delete("/{key_id}", summary="Revoke a key")
+def revoke_key(
+    key_id: KeyId,
+    caller: Submitting,
+    state: Shared,
+    and_made: Annotated[
+        bool,
+        Query(description="revoke also all keys that were made with it, for example after it was stolen"),
+    ] = False,
+) -> KeyView:
+    """Revoke a key. Requests with it are refused from now on, and its logins in browsers and its streams of events end. Jobs that
+    were submitted with it continue. A key that allows more than your own can only be revoked with the scope admin."""
+    row = _find(state, caller, key_id)
+    _check_scopes(caller, map(Scope, row.scopes), "use a key with these scopes, or ask the operator")
+    state.catalogue.keys.revoke(key_id, and_made=and_made)
+    state.catalogue.sessions.sweep()
+    return KeyView.of(_find(state, caller, key_id))
+
+
+def _state(row: KeyRow) -> Literal["valid", "expired", "revoked"]:
+    if row.revoked_at is not None:
+        return "revoked"
+    return "expired" if row.expires_at is not None and row.expires_at <= time.time() else "valid"
+
+
+def _find(state: Shared, caller: Caller, key_id: str) -> KeyRow:
+    """The row of a key. Raises ``Problem`` 404 if the caller has no such key and is no administrator."""
+    _check_used(state)
+    row = state.catalogue.keys.get(key_id)
+    if row is None or (row.owner != caller.owner and Scope.ADMIN not in caller.scopes):
+        raise Problem(
+            404, "no-such-key", f"expected the id of one of your keys; got {key_id}: list your keys"
+        )
+    return row
+
+
+def _check_used(state: Shared) -> None:
+    if not state.access.keys:
+        raise Problem(
+            409,
+            "keys-not-used",
+            "expected a service that requires keys; this one is open to everybody, so keys are not used: nothing needs to be done",
+        )
+
+
+def _check_for(caller: Caller, owner: str) -> None:
+    if owner != caller.owner and Scope.ADMIN not in caller.scopes:
+        raise Problem(
+            403,
+            "scope-missing",
+            f"expected your own name as the owner, or a key with the scope '{Scope.ADMIN}'; got {owner[:64]!a}",
+        )
+
+
+def _check_scopes(caller: Caller, scopes: Iterable[Scope], advice: str) -> None:
+    lacking = set(scopes) - caller.scopes
+    if lacking and Scope.ADMIN not in caller.scopes:
+        raise Problem(
+            403,
+            "scope-missing",
+            f"expected scopes of your own key ({', '.join(sorted(caller.scopes))}); got also {', '.join(sorted(lacking))}: "
+            f"{advice}",
+        )
+
+
+def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
+    """The end of a new key. Raises ``Problem`` 422 if it is over, and 403 if the key would last longer than that of the caller."""
+    now = time.time()
+    asked = body.end(now)
+    if asked is not None and asked <= now:
+        raise Problem(
+            422, "end-in-the-past", f"expected an end in the future; got {asked:.0f}: choose a later one"
+        )
+    own = state.catalogue.keys.get(caller.name)
+    latest = None if own is None or Scope.ADMIN in caller.scopes else own.expires_at
+    if latest is None:
+        return asked
+    if asked is not None and asked > latest:
+        raise Problem(
+            403,
+            "outlives-its-maker",
+            f"expected an end that is not later than that of your own key ({latest:.0f}); got {asked:.0f}: choose an earlier end, "
+            "or ask the operator for a key",
+        )
+    return latest if asked is None else asked

@@ -1,0 +1,194 @@
+"""Pixels over HTTP are those of the file."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from fastapi.testclient import TestClient
+from httpx import Response
+
+from psfcore.fits.viewing import decode
+from service.http.state import State
+from tests.conftest import write_image
+from tests.service.conftest import upload
+from workers.files.store import Store
+from workers.settings import Settings
+
+
+@pytest.fixture
+def decodings(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """The names of the planes that were decoded."""
+    names: list[str] = []
+    really = decode.decode_plane
+
+    def counted(path: Any, name: str, *given: Any) -> Any:
+        names.append(name)
+        return really(path, name, *given)
+
+    monkeypatch.setattr(decode, "decode_plane", counted)
+    yield names
+
+
+def numbers(answer: Response) -> np.ndarray:
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "application/octet-stream"
+    shape = tuple(map(int, answer.headers["x-pixels-shape"].split(",")))
+    return np.frombuffer(answer.content, "<f4").reshape(shape)
+
+
+def refusal(answer: Response, status: int, code: str) -> str:
+    assert (answer.status_code, answer.json()["type"]) == (status, f"urn:heliopsf:{code}"), answer.text
+    return str(answer.json()["detail"])
+
+
+def test_overview_all_pixels_and_a_window_decode_once(
+    api: TestClient, image_file: Path, decodings: list[str]
+) -> None:
+    where = f"/v1/images/{upload(api, image_file)}/pixels"
+    stored = fits.getdata(image_file)
+    overview = api.get(where, params={"step": 4})
+    expected = stored.astype(float).reshape(24, 4, 32, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(numbers(overview), expected, rtol=2**-23)
+    assert overview.headers["x-plane-shape"] == "96,128" and overview.headers["x-pixels-unit"] == "DN/s"
+    whole = api.get(where)
+    np.testing.assert_array_equal(numbers(whole), stored)
+    assert int(whole.headers["content-length"]) == stored.nbytes
+    window = api.get(where, params={"x": 100, "y": 90, "width": 20, "height": 5})
+    np.testing.assert_array_equal(numbers(window), stored[90:95, 100:120])
+    odd = api.get(where, params={"x": 1, "y": 3, "step": 40})
+    assert odd.headers["x-pixels-shape"] == "3,4", "incomplete blocks at the upper edges are kept"
+    np.testing.assert_allclose(numbers(odd)[-1, -1], stored[83:, 121:].astype(float).mean(), rtol=1e-6)
+    assert decodings == ["image"]
+
+
+def test_an_answer_is_kept_by_the_client(api: TestClient, image_file: Path, decodings: list[str]) -> None:
+    where = f"/v1/images/{upload(api, image_file)}/pixels"
+    first = api.get(where, params={"step": 2})
+    tag = first.headers["etag"]
+    assert "immutable" in first.headers["cache-control"]
+    again = api.get(where, params={"step": 2}, headers={"If-None-Match": tag})
+    assert (again.status_code, again.content) == (304, b"") and again.headers["etag"] == tag
+    others = [{}, {"step": 3}, {"step": 2, "x": 1}, {"step": 2, "height": 9}]
+    assert len({tag, *(api.get(where, params=one).headers["etag"] for one in others)}) == 5
+
+
+def test_a_compressed_image_with_missing_pixels(api: TestClient, tmp_path: Path) -> None:
+    pixels = np.random.default_rng(1).normal(10, 2, (70, 90)).astype("f4")
+    pixels[:4, :4], pixels[8, 9] = np.nan, np.nan
+    hdu = fits.CompImageHDU(pixels, compression_type="GZIP_2", quantize_level=0, tile_shape=(16, 90))
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "c.fits")
+    where = f"/v1/images/{upload(api, tmp_path / 'c.fits')}/pixels"
+    whole = api.get(where)
+    np.testing.assert_array_equal(numbers(whole), pixels)
+    assert "x-pixels-unit" not in whole.headers
+    overview = numbers(api.get(where, params={"step": 4}))
+    assert np.isnan(overview[0, 0]) and np.isfinite(overview).sum() == overview.size - 1
+    np.testing.assert_allclose(overview[2, 2], np.nanmean(pixels[8:12, 8:12].astype(float)), rtol=1e-6)
+
+
+@pytest.fixture
+def product_id(api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]) -> str:
+    parameters = {
+        "image_id": upload(api, image_file),
+        "psf_id": upload(api, psf_file, "/v1/psfs"),
+        "noise": {"photon_gain_dn": 2.0, "read_noise_dn": 1.0},
+        "error_draws": 2,
+    }
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
+    run_jobs()
+    done = api.get(f"/v1/jobs/{job['id']}").json()
+    assert done["phase"] == "COMPLETED", done
+    return str(done["result"].rpartition("/")[2])
+
+
+def test_the_planes_of_a_product(api: TestClient, product_id: str, tmp_path: Path) -> None:
+    (tmp_path / "p.fits").write_bytes(api.get(f"/v1/products/{product_id}/file").content)
+    where = f"/v1/products/{product_id}/pixels"
+    quality = fits.getdata(tmp_path / "p.fits", "QUALITY")
+    assert len(np.unique(quality)) > 1
+    for plane, stored in (
+        ("image", fits.getdata(tmp_path / "p.fits", 0)),
+        ("error", fits.getdata(tmp_path / "p.fits", "ERROR")),
+        ("quality", quality),
+    ):
+        answer = api.get(where, params={"plane": plane})
+        np.testing.assert_array_equal(numbers(answer), stored)
+        assert answer.headers.get("x-pixels-unit") == (None if plane == "quality" else "DN/s")
+    union = np.bitwise_or.reduce(quality.reshape(24, 4, 32, 4), axis=(1, 3))
+    np.testing.assert_array_equal(numbers(api.get(where, params={"plane": "quality", "step": 4})), union)
+
+
+def test_requests_that_cannot_be_answered(
+    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
+) -> None:
+    image_id = upload(api, image_file)
+    where = f"/v1/images/{image_id}/pixels"
+    detail = refusal(api.get(where, params={"x": 100, "width": 29}), 422, "window-outside")
+    assert "plane of 128 x 96 px" in detail and "x 100, y 0, width 29, height 96" in detail
+    refusal(api.get(where, params={"y": 96}), 422, "window-outside")
+    assert "'image'" in refusal(api.get(where, params={"plane": "quality"}), 422, "invalid-request")
+    for wrong in ({"step": 0}, {"x": -1}, {"width": 0}, {"height": "all"}):
+        refusal(api.get(where, params=wrong), 422, "invalid-request")
+    refusal(api.get(f"/v1/images/{'f' * 64}/pixels"), 404, "no-such-image")
+    refusal(api.get(f"/v1/products/{'f' * 64}/pixels"), 404, "no-such-product")
+    parameters = {"image_id": image_id, "psf_id": upload(api, psf_file, "/v1/psfs")}
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
+    run_jobs()
+    product = api.get(f"/v1/jobs/{job['id']}").json()["result"]
+    detail = refusal(api.get(f"{product}/pixels", params={"plane": "error"}), 404, "no-such-plane")
+    assert "(image, quality); got error: submit the deconvolution with error_draws" in detail
+
+
+def test_a_file_whose_pixels_cannot_be_decoded(api: TestClient, tmp_path: Path) -> None:
+    """The header is good, so the upload is accepted; the tiles are not."""
+    write_compressed_then_break(tmp_path / "b.fits")
+    answer = api.get(f"/v1/images/{upload(api, tmp_path / 'b.fits')}/pixels")
+    assert answer.status_code == 422
+    assert answer.json()["type"] in ("urn:heliopsf:bad-tile", "urn:heliopsf:unreadable-pixels")
+
+
+def write_compressed_then_break(path: Path) -> None:
+    hdu = fits.CompImageHDU(np.arange(4096, dtype="i2").reshape(64, 64), compression_type="GZIP_1")
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path)
+    content = path.read_bytes()
+    assert content.count(b"\x1f\x8b\x08") >= 64
+    path.write_bytes(content.replace(b"\x1f\x8b\x08", b"\x00\x00\x00"))
+
+
+def test_a_damaged_file_is_not_decoded(api: TestClient, image_file: Path, settings: Settings) -> None:
+    image_id = upload(api, image_file)
+    path = Store(settings.data_dir).path(image_id)
+    content = bytearray(path.read_bytes())
+    content[-3000] ^= 1  # the same size
+    path.write_bytes(content)
+    refusal(api.get(f"/v1/images/{image_id}/pixels"), 410, "file-damaged")
+
+
+def test_clients_at_once_get_the_same_pixels_of_one_decoding(
+    api: TestClient, tmp_path: Path, decodings: list[str]
+) -> None:
+    write_image(tmp_path / "i.fits", shape=(512, 512))
+    plain = (tmp_path / "i.fits").read_bytes()
+    (tmp_path / "i.fits.gz").write_bytes(gzip.compress(plain))
+    image_id = upload(api, tmp_path / "i.fits.gz")
+    stored = fits.getdata(tmp_path / "i.fits")
+    with ThreadPoolExecutor(8) as pool:
+        for answer in pool.map(lambda _: api.get(f"/v1/images/{image_id}/pixels"), range(8)):
+            np.testing.assert_array_equal(numbers(answer), stored)
+    assert decodings == ["image"]
+    state: State = api.app.state.heliopsf  # type: ignore[attr-defined]
+    assert state.decoding.borrowed_tokens == 0
+    assert list((state.settings.data_dir / "tmp").iterdir()) == []
+
+
+def test_pixels_count_as_a_read(api: TestClient, image_file: Path) -> None:
+    where = f"/v1/images/{upload(api, image_file)}/pixels"
+    left = [int(api.get(where).headers["ratelimit"].split("r=")[1].split(";")[0]) for _ in range(2)]
+    assert left[0] - left[1] == 1

@@ -1,0 +1,136 @@
+"""What a job would cost, and which PSF it would use, without a job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fastapi.testclient import TestClient
+
+from tests.conftest import write_image, write_psf
+from tests.service.conftest import upload
+from workers.catalogue.tables import PsfRow
+
+HEADER = {
+    "TELESCOP": "SOLO/EUI/HRI_EUV",
+    "DETECTOR": "HRI_EUV",
+    "WAVELNTH": 174,
+    "DATE-BEG": "2022-04-01T10:30:05",
+}
+
+
+def asked(
+    api: TestClient, kind: str = "deconvolve", queue: str | None = None, **given: Any
+) -> dict[str, Any]:
+    """The estimate of a job. Nothing is submitted by it."""
+    before = len(api.get("/v1/jobs").json()["items"])
+    answer = api.post("/v1/estimates", json={"kind": kind, "parameters": given, "queue": queue})
+    assert answer.status_code == 200, answer.text
+    assert len(api.get("/v1/jobs").json()["items"]) == before
+    return dict(answer.json())
+
+
+def test_an_estimate_is_what_the_job_then_gets(
+    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
+) -> None:
+    parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    told = asked(api, **parameters)
+    assert told["existing"] is None and told["waiting_before"] == 0 and told["queue"] == "interactive"
+    psf = api.get(f"/v1/psfs/{parameters['psf_id']}").json()
+    assert told["psf"] == {
+        "id": psf["id"], "name": psf["name"], "version": psf["version"], "status": "draft",
+        "why": "The request names this PSF.",
+    }  # fmt: skip
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
+    assert job["waiting_before"] == 0
+    assert (told["parameters"], told["estimate"]) == (job["parameters"], job["estimate"])
+    run_jobs()
+    done = api.get(f"/v1/jobs/{job['id']}").json()
+    assert done["result"] == f"/v1/products/{told['result_id']}" and done["waiting_before"] is None
+    assert asked(api, **parameters)["existing"] == done["result"]
+    api.delete(done["result"])
+    assert asked(api, **parameters)["existing"] is None
+
+
+def test_the_place_in_the_queue(api: TestClient) -> None:
+    for place, size in enumerate((64, 66, 68)):
+        told = asked(api, "psf-build", instrument="hri_euv", size=size)
+        assert told["waiting_before"] == place and told["psf"] is None
+        body = {"kind": "psf-build", "parameters": {"instrument": "hri_euv", "size": size}}
+        job = api.post("/v1/jobs", json=body).json()
+        assert job["waiting_before"] == place
+        assert api.get(f"/v1/jobs/{job['id']}").json()["waiting_before"] == place
+    bulk = asked(api, "psf-build", queue="bulk", instrument="hri_euv", size=70)
+    assert (bulk["queue"], bulk["waiting_before"]) == ("bulk", 3)
+    assert {one["waiting_before"] for one in api.get("/v1/jobs").json()["items"]} == {None}
+
+
+def test_why_a_psf_is_chosen(api: TestClient, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", **HEADER)
+    image_id = upload(api, tmp_path / "i.fits")
+    built = asked(api, image_id=image_id)["psf"]
+    assert (built["name"], built["status"]) == ("hri_euv", None)
+    assert built["why"] == (
+        "No PSF of hri_euv/174/total is certified, so the PSF is built from the instrument file that heliopsf ships; the job "
+        "builds it first."
+    )
+    write_psf(tmp_path / "p.fits")
+    where = "/v1/psfs?name=fitted&instrument=hri_euv&channel=174&kind=total"
+    psf_id = upload(api, tmp_path / "p.fits", where)
+    certified = {"status": "certified", "version": "1.0.0"}
+    assert api.post(f"/v1/psfs/{psf_id}/status", json=certified).status_code == 200
+    seen = "for the images of hri_euv/174/total at the time of this image."
+    found = asked(api, image_id=image_id)["psf"]
+    assert found == {
+        "id": psf_id, "name": "fitted", "version": "1.0.0", "status": "certified",
+        "why": f"This PSF is certified {seen}",
+    }  # fmt: skip
+    assert api.post("/v1/contexts", json={"name": "release", "reason": "x"}).status_code == 201
+    pinned = asked(api, image_id=image_id, context="release")["psf"]
+    assert pinned["why"] == f"Context release pins this PSF {seen}"
+
+
+def test_a_psf_that_was_built_before_is_told_with_its_status(api: TestClient, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", **HEADER)
+    image_id = upload(api, tmp_path / "i.fits")
+    psf_id = asked(api, image_id=image_id)["psf"]["id"]
+    catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    catalogue.add(
+        PsfRow(
+            owner="local", id=psf_id, created_at=0.0, name="hri_euv", version="1.0.0+abc", instrument="hri_euv", kind="total",
+            series="hri_euv/174/total", status="draft", origin="built", file_sha256="0" * 64, bytes=1,
+            details={"shape": [2048, 2048]},
+        )
+    )  # fmt: skip
+    found = asked(api, image_id=image_id)["psf"]
+    assert (found["version"], found["status"]) == ("1.0.0+abc", "draft")
+    assert found["why"].endswith("the instrument file that heliopsf ships.")
+
+
+def test_errors_are_those_of_a_job(api: TestClient, image_file: Path) -> None:
+    image_id = upload(api, image_file)
+    bodies: list[dict[str, Any]] = [
+        {"kind": "deconvolve", "parameters": {"image_id": image_id}},  # no PSF for this instrument
+        {"kind": "deconvolve", "parameters": {"image_id": "f" * 64}},
+        {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": "f" * 64}},
+        {"kind": "deconvolve", "parameters": {"image_id": image_id, "context": "none"}},
+        {"kind": "deconvolve", "parameters": {}},
+        {"kind": "unknown", "parameters": {}},
+    ]
+    for body in bodies:
+        estimate, job = (api.post(f"/v1/{where}", json=body) for where in ("estimates", "jobs"))
+        assert estimate.status_code == job.status_code >= 400
+        assert estimate.json() == job.json()
+    assert "psfs" in api.post("/v1/estimates", json=bodies[0]).json(), "with the fields of the error"
+
+
+def test_a_kind_that_always_makes_a_new_result_has_none_yet(
+    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
+) -> None:
+    parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
+    run_jobs()
+    (product,) = api.get("/v1/products").json()["items"]
+    first, second = (asked(api, "rerun", of="product", id=product["id"]) for _ in range(2))
+    assert first["result_id"] != second["result_id"] and first["existing"] is None

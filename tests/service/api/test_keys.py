@@ -1,0 +1,201 @@
+"""Keys over HTTP: who makes, sees and revokes which."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.api.keys import MOST_KEYS
+from service.app import create_app
+from tests.conftest import SMALL_INSTRUMENT
+from tests.service.keyed import Keyed, bearer, keyed
+from workers.catalogue.access.keys import Scope
+from workers.settings import Settings
+
+DAY_S = 86_400
+
+
+@pytest.fixture
+def service(settings: Settings) -> Iterator[Keyed]:
+    with keyed(settings) as running:
+        yield running
+
+
+def made(client: TestClient, **body: Any) -> dict[str, Any]:
+    answer = client.post("/v1/keys", json={"scopes": ["read"]} | body)
+    assert answer.status_code == 201, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def refused(client: TestClient, **body: Any) -> str:
+    answer = client.post("/v1/keys", json={"scopes": ["read"]} | body)
+    assert answer.status_code in (403, 409, 422), answer.text
+    code: str = answer.json()["type"]
+    return code.removeprefix("urn:heliopsf:")
+
+
+def test_a_key_makes_a_key_that_is_shown_once(service: Keyed) -> None:
+    ann = service.client("ann")
+    answer = ann.post("/v1/keys", json={"scopes": ["read", "read"], "label": "laptop", "lasts_days": 2})
+    assert answer.status_code == 201 and answer.headers["Cache-Control"] == "no-store"
+    new = answer.json()
+    assert (new["owner"], new["scopes"], new["label"], new["state"]) == ("ann", ["read"], "laptop", "valid")
+    assert new["expires_at"] == pytest.approx(time.time() + 2 * DAY_S, abs=60)
+    shown = ann.get(answer.headers["Location"]).json()
+    assert shown == {name: value for name, value in new.items() if name != "key"} | {
+        "last_used_at": shown["last_used_at"]
+    }
+    listed = ann.get("/v1/keys")
+    assert [one["id"] for one in listed.json()["items"]] == [new["id"], new["made_by"]]
+    assert new["key"].split("_", 2)[2] not in listed.text
+    with_it = service.api.get("/v1/keys", headers=bearer(new["key"]))
+    assert with_it.status_code == 200
+    assert service.api.post("/v1/keys", json={}, headers=bearer(new["key"])).status_code == 403
+
+
+def test_a_key_gives_no_more_than_it_has(service: Keyed) -> None:
+    ann = service.client("ann", Scope.READ, Scope.SUBMIT)
+    for scope in (Scope.ADMIN, Scope.BULK, Scope.CERTIFY):
+        assert refused(ann, scopes=["read", scope]) == "scope-missing"
+    assert refused(ann, owner="bob") == "scope-missing"
+    assert ann.post("/v1/keys", json={"scopes": ["read"]}, headers={"X-Owner": "bob"}).status_code == 403
+    assert made(ann, owner="ann")["owner"] == "ann"
+
+
+def test_a_key_does_not_outlive_its_maker(service: Keyed) -> None:
+    short = TestClient(service.api.app, headers=bearer(service.key("ann", lasts_s=DAY_S)))
+    assert made(short)["expires_at"] == pytest.approx(time.time() + DAY_S, abs=60)
+    assert made(short, lasts_days=0.5)["expires_at"] == pytest.approx(time.time() + DAY_S / 2, abs=60)
+    assert refused(short, lasts_days=2) == "outlives-its-maker"
+    assert refused(short, expires_at=time.time() + 2 * DAY_S) == "outlives-its-maker"
+    assert refused(short, expires_at=time.time() - 1) == "end-in-the-past"
+    assert made(service.client("ann"))["expires_at"] is None
+
+
+def test_an_administrator_is_bound_by_none_of_this(service: Keyed) -> None:
+    key = service.catalogue.keys.make(
+        "root", {Scope.ADMIN, Scope.READ, Scope.SUBMIT}, expires_at=time.time() + DAY_S
+    )
+    root = TestClient(service.api.app, headers=bearer(key))
+    new = made(root, owner="ann", scopes=["bulk"], lasts_days=400)
+    assert new["owner"] == "ann" and new["scopes"] == ["bulk"]
+    assert {one["owner"] for one in root.get("/v1/keys?owner=*").json()["items"]} == {"ann", "root"}
+    assert [one["id"] for one in root.get("/v1/keys?owner=ann").json()["items"]] == [new["id"]]
+    assert root.delete(f"/v1/keys/{new['id']}").json()["state"] == "revoked"
+    for owner in ("bob", "*"):
+        assert service.client("ann").get("/v1/keys", params={"owner": owner}).status_code == 403
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"scopes": []},
+        {"scopes": ["all"]},
+        {"scopes": ["read"], "lasts_days": 1, "expires_at": 9e9},
+        {"scopes": ["read"], "lasts_days": 0},
+        {"scopes": ["read"], "expires_at": 1e300},
+        {"scopes": ["read"], "owner": "A B"},
+        {"scopes": ["read"], "label": "x" * 81},
+        {"scopes": ["read"], "days": 3},
+    ],
+)
+def test_wrong_requests_make_nothing(service: Keyed, body: dict[str, Any]) -> None:
+    answer = service.client("root", *Scope).post("/v1/keys", json=body)
+    assert answer.status_code == 422, answer.text
+    assert len(service.catalogue.keys.all()) == 1
+
+
+def test_keys_of_others_are_not_there(service: Keyed) -> None:
+    ann, bob = service.client("ann"), service.client("bob")
+    new = made(ann)
+    for method in ("GET", "DELETE"):
+        there = bob.request(method, f"/v1/keys/{new['id']}")
+        nothing = bob.request(method, f"/v1/keys/{'f' * 16}")
+        assert there.status_code == nothing.status_code == 404
+        assert there.text.replace(new["id"], "f" * 16) == nothing.text
+    assert {one["owner"] for one in bob.get("/v1/keys").json()["items"]} == {"bob"}
+    assert ann.get(f"/v1/keys/{new['id']}").json()["state"] == "valid"
+
+
+def test_a_key_is_not_revoked_by_one_that_allows_less(service: Keyed) -> None:
+    strong, weak = service.client("ann"), service.client("ann", Scope.READ, Scope.SUBMIT)
+    both = {row.id: set(row.scopes) for row in service.catalogue.keys.all()}
+    strongest = max(both, key=lambda identity: len(both[identity]))
+    assert weak.delete(f"/v1/keys/{strongest}").status_code == 403
+    assert strong.get("/v1/jobs").status_code == 200
+
+
+def test_a_stolen_key_goes_with_what_was_made_with_it(service: Keyed) -> None:
+    ann = service.client("ann")
+    first = made(ann, scopes=["read", "submit"])
+    thief = TestClient(service.api.app, headers=bearer(first["key"]))
+    second = made(thief)
+    assert ann.delete(f"/v1/keys/{first['id']}").json()["state"] == "revoked"
+    assert ann.get(f"/v1/keys/{second['id']}").json()["state"] == "valid"
+    ann.delete(f"/v1/keys/{first['id']}?and_made=true")
+    assert service.api.get("/v1/jobs", headers=bearer(second["key"])).status_code == 401
+
+
+def test_an_owner_makes_a_bounded_number(service: Keyed) -> None:
+    ann = service.client("ann")
+    ids = [made(ann)["id"] for _ in range(MOST_KEYS - 1)]
+    assert refused(ann) == "too-many-keys"
+    ann.delete(f"/v1/keys/{ids[0]}")
+    made(ann)
+
+
+def test_keys_count_as_submissions(settings: Settings) -> None:
+    with keyed(settings, submissions_per_minute=2) as service:
+        ann = service.client("ann")
+        tried = [ann.post("/v1/keys", json={"scopes": ["read"]}).status_code for _ in range(3)]
+        assert tried == [201, 201, 429]
+
+
+def test_an_open_service_uses_no_keys(settings: Settings) -> None:
+    with TestClient(create_app(settings)) as api:
+        for method, address in (
+            ("GET", ""),
+            ("POST", ""),
+            ("GET", "/" + 16 * "0"),
+            ("DELETE", "/" + 16 * "0"),
+        ):
+            body = {"json": {"scopes": ["read"]}} if method == "POST" else {}
+            answer = api.request(method, f"/v1/keys{address}", **body)  # type: ignore[arg-type]
+            assert answer.status_code == 409 and answer.json()["type"] == "urn:heliopsf:keys-not-used"
+
+
+@pytest.mark.parametrize("how", ["logout", "revoke"])
+def test_the_stream_of_a_session_ends_with_it(service: Keyed, how: str, psf_job: dict[str, Any]) -> None:
+    key = service.key("ann")
+    client = TestClient(service.api.app, headers={"Sec-Fetch-Site": "same-origin"})
+    client.post("/login", data={"key": key}, follow_redirects=False)
+    job_id = client.post("/v1/jobs", json=psf_job).raise_for_status().json()["id"]
+    got: list[str] = []
+
+    def follow() -> None:
+        got.append(client.get(f"/v1/jobs/{job_id}/events").text)
+
+    thread = threading.Thread(target=follow)
+    thread.start()
+    streams, deadline = service.api.app.state.heliopsf.streams, time.monotonic() + 20  # type: ignore[attr-defined]
+    while not streams._open and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert streams._open and thread.is_alive(), "the job waits, so the stream stays open"
+    if how == "logout":
+        assert client.post("/logout", follow_redirects=False).status_code == 303
+    else:
+        assert client.delete(f"/v1/keys/{key.split('_')[1]}").status_code == 200
+    thread.join(20)
+    assert len(got) == 1, "it would last an hour"
+    assert not streams._open
+
+
+@pytest.fixture
+def psf_job() -> dict[str, Any]:
+    return {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
