@@ -1,0 +1,109 @@
+"""Times of the viewer in a browser, beside their goals. It needs Chromium, and no other program on the machine.
+
+The first sight of a product of 2048 px and all of its pixels are timed from the begin of the navigation to the first frame after
+they were drawn; the service has decoded no plane before. A blink is timed from the key to the end of the drawing on the card. Without a
+graphics card Chromium draws with the processor. The memory of a product of 4096 px in a window of 390 px is the resident memory
+that the tab's process does not share with others (USS), after zooming to 100 % and moving; the graphics process is listed beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import statistics
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import psutil
+from playwright.sync_api import Page, sync_playwright
+
+from tests.service.pages.browser.conftest import CANDIDATES, SOFTWARE_GL, VARIABLE
+from tests.service.pages.browser.products import made
+from tests.whole import stack as stacks
+
+BLINKS = 20
+GOALS_S = {"first sight, 2048 px": 1.0, "all pixels, 2048 px": 3.0, "a blink": 0.05}
+GOAL_MB = 300
+TIME_OF = "(name) => performance.getEntriesByName(name)[0]?.startTime ?? null"
+BLINK_MS = """async () => {
+  const canvas = document.getElementById("canvas"), gl = canvas.getContext("webgl2"), end = new Uint8Array(4);
+  await new Promise(requestAnimationFrame);
+  const start = performance.now();
+  canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "b" }));
+  await new Promise(requestAnimationFrame);
+  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, end);
+  return performance.now() - start;
+}"""
+
+
+def moment(page: Page, name: str) -> float:
+    """When the page noted this, seconds after the begin of the navigation."""
+    for _ in range(600):
+        found = page.evaluate(TIME_OF, name)
+        if found is not None:
+            return float(found) / 1000
+        page.wait_for_timeout(50)
+    raise SystemExit(f"expected the viewer to show {name!r} within 30 s; it did not")
+
+
+def own_mb(kind: str) -> float:
+    """The largest unshared memory, MB, of a process of this kind that the browser started."""
+    children = psutil.Process().children(recursive=True)
+    found = [one for one in children if f"--type={kind}" in one.cmdline()]
+    return max(one.memory_full_info().uss for one in found) / 1e6
+
+
+def subfolder(folder: str, name: str) -> Path:
+    """A new folder in a folder."""
+    made_folder = Path(folder) / name
+    made_folder.mkdir()
+    return made_folder
+
+
+def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    chromium = os.environ.get(VARIABLE) or next(filter(None, map(shutil.which, CANDIDATES)), None)
+    if chromium is None:
+        raise SystemExit(
+            f"expected Chromium on this machine; found none: install it, or name one in {VARIABLE}"
+        )
+    with TemporaryDirectory(prefix="heliopsf-viewer-") as folder, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=list(SOFTWARE_GL))
+        large: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}}
+        small: dict[str, Any] = {"viewport": {"width": 390, "height": 844}}
+        with stacks.embedded(Path(folder)) as site:
+            product = made(site, subfolder(folder, "2048"), (2048, 2048))
+            page = browser.new_page(**large)
+            page.goto("about:blank")
+            page.goto(f"{site.client.server}{product.page}#mode=blink")
+            times = {
+                "first sight, 2048 px": moment(page, "overview"),
+                "all pixels, 2048 px": moment(page, "all pixels"),
+            }
+            page.wait_for_load_state("networkidle")
+            blinks = [page.evaluate(BLINK_MS) / 1000 for _ in range(BLINKS)]
+            times["a blink"] = statistics.median(blinks)
+            for what, took_s in times.items():
+                note = "" if took_s <= GOALS_S[what] else "  slower than its goal"
+                print(f"{what:<24} {took_s:6.3f} s (goal {GOALS_S[what]:g} s){note}", flush=True)
+            print(f"{'the slowest blink':<24} {max(blinks):6.3f} s of {BLINKS}", flush=True)
+            page.close()
+            product = made(site, subfolder(folder, "4096"), (4096, 4096))
+            page = browser.new_page(**small)
+            page.goto(f"{site.client.server}{product.page}")
+            moment(page, "overview")
+            page.focus("#canvas")
+            for key in ("1", "ArrowRight", "ArrowUp", "ArrowLeft", "-", "b", "b", "f", "1"):
+                page.keyboard.press(key)
+                page.wait_for_timeout(600)
+            tab_mb = own_mb("renderer")
+            note = "" if tab_mb <= GOAL_MB else "  more than its goal"
+            print(f"memory of a tab, 4096 px {tab_mb:6.0f} MB (goal {GOAL_MB} MB){note}")
+            print(f"memory of the graphics process {own_mb('gpu-process'):.0f} MB")
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""Errors as pages: what happened, what to do, and what was kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import Request, Response
+
+from service.pages.rendering import page
+
+TITLES = {
+    403: "This key does not allow that",
+    404: "There is nothing here",
+    410: "The file is lost",
+    413: "This is too large",
+    415: "This is no file that the service reads",
+    421: "This host name is not served",
+    429: "Too many requests",
+    503: "The service cannot answer now",
+    507: "The disk of the service is full",
+}
+# The image was stored before these errors, or its page still shows it.
+KEPT = "Nothing is lost: what you uploaded before is kept, and need not be chosen again."
+
+
+def problem_page(
+    request: Request, status: int, code: str, detail: str, _fields: Mapping[str, Any]
+) -> Response:
+    """The page of an error."""
+    title = TITLES.get(status) or (
+        "The service failed" if status >= 500 else "The service cannot do that: " + HTTPStatus(status).phrase
+    )
+    kept = KEPT if status in (429, 500, 503, 507) else ""
+    return page(
+        request,
+        "problem.html",
+        status=status,
+        told_status=status,
+        title=title,
+        detail=detail,
+        code=code,
+        kept=kept,
+    )

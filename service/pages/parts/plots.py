@@ -1,0 +1,126 @@
+"""Curves of a page. A page shows a plot as a table; a script draws the curves from the numbers in this table.
+
+Therefore a page holds each number once, and shows the same numbers with and without scripts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, Literal
+
+DIGITS = 5
+FINE_TO_PX = 10.0  # up to this radius a table shows every radius
+RATIO = 1.05  # farther out: the least ratio of two successive radii
+
+Numbers = Sequence[float | None]
+Draw = Literal["line", "points"]
+
+
+@dataclass(frozen=True)
+class Series:
+    """A curve or points. low, high: ends of the band or of the error bars; both or neither; None in them: no band there."""
+
+    label: str
+    values: Numbers
+    low: Numbers | None = None
+    high: Numbers | None = None
+    draw: Draw = "line"
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Curves over one quantity. x: ascending, or the table has no order that a plot needs (points). names: names of the rows.
+
+    Raises ValueError if a row of numbers does not have the length of x.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    x: Sequence[float]
+    series: Sequence[Series]
+    x_log: bool = False
+    y_log: bool = False
+    names: Sequence[str] | None = None
+    names_label: str = "Image"
+
+    def __post_init__(self) -> None:
+        rows = [row for one in self.series for row in (one.values, one.low, one.high) if row is not None]
+        for row in [*rows, *([] if self.names is None else [self.names])]:
+            if len(row) != len(self.x):
+                raise ValueError(f"{self.title}: expected {len(self.x)} numbers in each row; got {len(row)}")
+
+    @property
+    def columns(self) -> list[tuple[str, str, str, Numbers]]:
+        """The columns of the table after x: heading, label of the series, role (line, points, low, high), numbers."""
+        found: list[tuple[str, str, str, Numbers]] = []
+        for one in self.series:
+            found.append((one.label, one.label, one.draw, one.values))
+            if one.low is not None and one.high is not None:
+                found.append((f"{one.label}, low", one.label, "low", one.low))
+                found.append((f"{one.label}, high", one.label, "high", one.high))
+        return found
+
+    @property
+    def rows(self) -> list[tuple[str | None, list[str]]]:
+        """The rows of the table: the name or None, and the numbers as text, x first."""
+        columns = [self.x, *(numbers for _, _, _, numbers in self.columns)]
+        names: Sequence[str | None] = self.names if self.names is not None else [None] * len(self.x)
+        return [
+            (name, [written(number) for number in row]) for name, *row in zip(names, *columns, strict=True)
+        ]
+
+
+def written(value: float | None) -> str:
+    """A number as the table shows it; empty if there is none."""
+    return "" if value is None or not isfinite(value) else f"{value:.{DIGITS}g}"
+
+
+def around(values: Sequence[float], sigma: Sequence[float] | None) -> tuple[Numbers | None, Numbers | None]:
+    """The ends of a band of one standard error around values; None without errors."""
+    if sigma is None:
+        return None, None
+    pairs = list(zip(values, sigma, strict=True))
+    return [value - error for value, error in pairs], [value + error for value, error in pairs]
+
+
+def shown_radii(radii: Sequence[float], least: float = 0.0) -> list[int]:
+    """The places of the radii that a table shows: all of them near the centre, farther out in equal ratios.
+
+    least: smaller radii are left out.
+    """
+    chosen: list[int] = []
+    for place, radius in enumerate(radii):
+        if radius < least:
+            continue
+        last = radii[chosen[-1]] if chosen else None
+        if last is None or radius <= FINE_TO_PX or radius >= last * RATIO:
+            chosen.append(place)
+    if radii and chosen and chosen[-1] != len(radii) - 1:
+        chosen.append(len(radii) - 1)
+    return chosen
+
+
+def light_beyond_plot(curves: Mapping[str, Mapping[str, Any]], title: str = "Light beyond a radius") -> Plot:
+    """1 - encircled energy of components or PSFs, in percent.
+
+    curves: by label, each with ``radii_px``, ``pct`` and ``sigma`` (a list or None); all with the same radii.
+    """
+    radii = next(iter(curves.values()))["radii_px"]
+    places = shown_radii(radii)
+    series = []
+    for label, one in curves.items():
+        values = [one["pct"][at] for at in places]
+        sigma = None if one["sigma"] is None else [one["sigma"][at] for at in places]
+        series.append(Series(label, values, *around(values, sigma)))
+    return Plot(
+        title,
+        "radius (px)",
+        "1 - encircled energy (%)",
+        [radii[at] for at in places],
+        series,
+        x_log=True,
+        y_log=True,
+    )

@@ -1,0 +1,119 @@
+"""The page of a product: the viewer, what the deconvolution changed, how the product was made, and what can be done with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import RedirectResponse
+
+from service.api.lineage import get_product_lineage, rerun_product
+from service.api.products import ProductView, delete_product, find
+from service.http import downloads
+from service.http.problems import Problem
+from service.http.state import Shared, State
+from service.pages.rendering import number, page, short
+from service.pages.visitors import PageReading, PageSubmitting
+from workers.catalogue.tables import ImageRow, PsfRow, ReportRow
+from workers.contract.requests import Identity
+
+MOST_RERUNS = 10
+router = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
+
+
+@router.get("")
+def product(product_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The product. It says so if its file or the uploaded image is gone."""
+    row = find(state, caller, product_id)
+    image = state.catalogue.get(ImageRow, row.image_id, row.owner)
+    psf = state.catalogue.get(PsfRow, row.psf_id, row.owner)
+    reruns = state.catalogue.page(ReportRow, owner=row.owner, limit=MOST_RERUNS, about_id=row.id)
+    return page(
+        request,
+        "product.html",
+        product=ProductView.of(row),
+        name=(image and image.filename) or row.details.get("filename") or short(row.id),
+        image=image,
+        psf=psf,
+        lost=_lost(state, row.file_sha256, row.bytes),
+        image_lost=None if image is None else _lost(state, image.id, image.bytes),
+        warnings=[one["message"] for one in row.details.get("warnings", [])],
+        changed=_changed(row.details),
+        made=_made(row.details),
+        lineage=get_product_lineage(product_id, caller, state),
+        reruns=[one for one in reruns if one.kind == "rerun"],
+    )
+
+
+@router.post("/rerun")
+def rerun(product_id: Identity, response: Response, caller: PageSubmitting, state: Shared) -> Response:
+    """Make the product again, and go to the job."""
+    job = rerun_product(product_id, response, caller, state)
+    return RedirectResponse(f"/jobs/{job.id}", 303)
+
+
+@router.post("/delete")
+def delete(product_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
+    """Delete the product, and go to the page of its image, or to the first page if the image was deleted."""
+    row = find(state, caller, product_id)
+    delete_product(product_id, caller, state)
+    there = state.catalogue.get(ImageRow, row.image_id, row.owner) is not None
+    return RedirectResponse(f"/images/{row.image_id}" if there else "/", 303)
+
+
+def _lost(state: State, digest: str, size: int) -> str | None:
+    """Why a file cannot be shown; None if it can."""
+    try:
+        downloads.found(state.store, digest, size)
+    except Problem as problem:
+        return problem.detail
+    return None
+
+
+def _changed(details: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the deconvolution changed in the image. Products of earlier versions lack some figures."""
+    artefacts = (details.get("changes") or {}).get("artefacts") or {}
+    shown = {
+        "Total flux": _percent(details.get("flux_change_pct")),
+        "Brightest 1 % of the pixels": _percent(details.get("bright_change_pct")),
+        "Darkest 1 % of the pixels": _percent(details.get("dark_change_pct")),
+        "Noise, compared with the input": _factor(details.get("noise_amplification")),
+        "Chi-squared per pixel": number(details.get("chi2_per_pixel")),
+        "Negative pixels": _count(details.get("negative_pixels")),
+        "Saturated pixels": _count((details.get("masked_pixels") or {}).get("saturated")),
+        "Score of artefacts": number(artefacts.get("score")),
+    }
+    return [(name, text) for name, text in shown.items() if text != "-"]
+
+
+def _made(details: dict[str, Any]) -> list[tuple[str, str]]:
+    """How the product was made."""
+    method = details.get("method") or {}
+    own = {
+        name: value
+        for name, value in method.items()
+        if value is not None and name not in ("name", "algorithm_version")
+    }
+    shown = {
+        "Method": str(method.get("name", "-")),
+        "Options": ", ".join(f"{name} {value}" for name, value in own.items()) or "-",
+        "Steps": str(details.get("steps_done", "-")),
+        "Stopped because": str(details.get("stopped_because", "-")),
+        "Edges": f"{details['edges']}, a band of {details.get('edge_band_px')} px depends on them"
+        if details.get("edges")
+        else "-",
+        "Software": str(details.get("software_version", "-")),
+    }
+    return [(name, text) for name, text in shown.items() if text != "-"]
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.3g} %"
+
+
+def _factor(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g} times"
+
+
+def _count(value: int | None) -> str:
+    return "-" if value is None else f"{value:,}".replace(",", " ")

@@ -1,0 +1,1 @@
+"""The pages of PSFs: their list, one PSF, and two PSFs compared."""

@@ -1,0 +1,138 @@
+"""Makes pages from templates.
+
+A page may load scripts and styles from this service alone, and no script may turn text into markup
+(``require-trusted-types-for``). Therefore templates hold no inline scripts or styles, and scripts build elements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from functools import cache
+from typing import Any
+
+from fastapi import Request
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
+
+from service.http.callers import Caller
+from service.http.state import state_of
+from service.pages import assets
+from workers.settings import software_version
+
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+    "form-action 'self'; frame-ancestors 'none'; base-uri 'none'; require-trusted-types-for 'script'"
+)
+SHORT = 12  # letters of an id that a page shows
+
+
+def page(
+    request: Request,
+    template: str,
+    *,
+    status: int = 200,
+    headers: Mapping[str, str] | None = None,
+    **shown: Any,
+) -> HTMLResponse:
+    """A page. template: its file name. shown: the variables of the template."""
+    caller: Caller | None = getattr(request.state, "caller", None)
+    token: str = getattr(request.state, "form_token", "")
+    field = Markup('<input type="hidden" name="form_token" value="{}">').format(token) if token else ""
+    state = getattr(request.app.state, "heliopsf", None)
+    text = (
+        _environment()
+        .get_template(template)
+        .render(
+            caller=caller,
+            keys_used=state is not None and state_of(request).access.keys,
+            form_token=field,
+            here=request.url.path,
+            **shown,
+        )
+    )
+    # A page may contain what belongs to its reader alone.
+    said = {
+        "Content-Security-Policy": POLICY,
+        "Cache-Control": "no-store",
+        "Vary": "Cookie",
+        # Without a referrer policy of their own, forms would say "Origin: null", and the guard would refuse them.
+        "Referrer-Policy": "same-origin",
+        **(headers or {}),
+    }
+    return HTMLResponse(text, status_code=status, headers=said)
+
+
+@cache
+def _environment() -> Environment:
+    made = Environment(
+        loader=PackageLoader(__package__, "templates"),
+        autoescape=select_autoescape(default=True),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.globals |= {"asset": assets.address, "version": software_version()}
+    made.filters |= {
+        "short": short,
+        "date": date,
+        "size": size,
+        "duration": duration,
+        "number": number,
+        "percent": percent,
+        "page_of": page_of,
+    }
+    return made
+
+
+def short(identity: str) -> str:
+    """The beginning of an id."""
+    return identity[:SHORT]
+
+
+def date(seconds: float | None) -> Markup | str:
+    """A time, seconds since 1970, as a date of UTC; a script may show it in the reader's zone."""
+    if seconds is None:
+        return "-"
+    moment = datetime.fromtimestamp(seconds, UTC)
+    return Markup('<time datetime="{}">{}</time>').format(
+        moment.isoformat(timespec="seconds"), moment.strftime("%Y-%m-%d %H:%M:%S UTC")
+    )
+
+
+def size(count: float) -> str:
+    """A number of bytes."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} GB"
+
+
+def duration(seconds: float | None) -> str:
+    """A time span."""
+    if seconds is None:
+        return "unknown"
+    if seconds < 1:
+        return "less than 1 s"
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    if seconds < 6000:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number with so many significant digits."""
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+def percent(value: float | None) -> str:
+    """A change in percent, with its sign."""
+    return "-" if value is None else f"{value:+.3g}\N{NO-BREAK SPACE}%"
+
+
+def page_of(address: str) -> str:
+    """The page of a thing at an address of the interface: ``/v1/products/ID`` has the page ``/products/ID``."""
+    return address.removeprefix("/v1")

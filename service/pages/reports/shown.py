@@ -1,0 +1,116 @@
+"""The page of a report: the sentence, the sections of the stored page, and curves from the stored numbers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+
+from service.api.reports import ReportView, find
+from service.http import downloads
+from service.http.problems import Problem
+from service.http.state import Shared, State
+from service.pages.jobs import TITLES
+from service.pages.parts import readings
+from service.pages.rendering import page
+from service.pages.reports.stored import StoredPage, read_stored
+from service.pages.visitors import PageReading
+from workers.catalogue.tables import ReportRow
+from workers.contract.requests import Identity
+
+KIND_TITLES = {
+    "report": TITLES["report"],
+    "cross-validation": TITLES["cross-validate"],
+    "gap": TITLES["gap-diagnose"],
+    "rerun": TITLES["rerun"],
+}
+router = APIRouter(prefix="/reports/{report_id}", include_in_schema=False)
+
+
+@router.get("")
+def report(report_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The report. Its sections are those of the HTML page that can be downloaded."""
+    row = find(state, caller, report_id)
+    stored = _stored(state, row)
+    said = _said(state, row)
+    view = ReportView.of(row)
+    return page(
+        request,
+        "report.html",
+        report=view,
+        title=stored.title if stored is not None else KIND_TITLES.get(row.kind, row.kind),
+        sentence=stored.lead if stored is not None else row.details.get("sentence", ""),
+        sections=[] if stored is None else stored.sections,
+        footer="" if stored is None else stored.footer,
+        gap=readings.gap_map(said) if row.kind == "gap" else None,
+        plots=_plots(row.kind, said),
+        tables=_tables(row.kind, said),
+        about=_about(said, row),
+    )
+
+
+@router.get("/figures/{number}")
+def figure(
+    report_id: Identity, number: int, request: Request, caller: PageReading, state: Shared
+) -> Response:
+    """A figure of the report as PNG; the first has the number 1."""
+    stored = _stored(state, find(state, caller, report_id))
+    figures = () if stored is None else stored.figures
+    if not 1 <= number <= len(figures):
+        raise Problem(
+            404, "no-such-figure", f"expected a figure from 1 to {len(figures)} of the report; got {number}"
+        )
+    png = figures[number - 1]
+    headers = {"ETag": f'"{hashlib.sha256(png).hexdigest()}"', "Cache-Control": downloads.KEPT}
+    if downloads.known(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(png, media_type="image/png", headers=headers)
+
+
+def _stored(state: State, row: ReportRow) -> StoredPage | None:
+    """The stored page; None if the report has none. Raises ``Problem`` 410 if it is lost."""
+    digest = row.details.get("page_sha256")
+    if digest is None:
+        return None
+    return read_stored(downloads.found(state.store, digest), f"/reports/{row.id}/figures")
+
+
+def _said(state: State, row: ReportRow) -> Mapping[str, Any]:
+    said: dict[str, Any] = json.loads(downloads.found(state.store, row.file_sha256, row.bytes).read_bytes())
+    return said
+
+
+def _plots(kind: str, said: Mapping[str, Any]) -> list[readings.Plot]:
+    if kind == "cross-validation":
+        return readings.cross_validation_plots(said)
+    if kind == "report" and "fit" in said:
+        return readings.fit_plots(said["fit"])
+    return []
+
+
+def _tables(kind: str, said: Mapping[str, Any]) -> list[tuple[str, tuple[str, ...], list[readings.Row]]]:
+    """Tables from the numbers of a report without a stored page: title, headings, rows."""
+    if kind == "cross-validation":
+        heads = ("Parameter", "Median", "One standard deviation", "Two standard deviations")
+        return [("Parameters over all folds", heads, readings.band_parameters(said))]
+    if kind == "rerun":
+        return [
+            ("Arrays", ("Array", "Values", "Largest difference"), readings.rerun_arrays(said)),
+            ("What differed when they were made", ("Property", "First", "New"), readings.rerun_makers(said)),
+        ]
+    return []
+
+
+def _about(said: Mapping[str, Any], row: ReportRow) -> list[tuple[str, str]]:
+    """Addresses of the things that the report is about or that its job made: name and address."""
+    found = [("Transit", f"/transits/{row.transit_id}")] if row.transit_id else []
+    if row.kind == "rerun" and row.about_id:
+        of = said["of"]
+        found.append((f"The {'PSF' if of == 'psf' else of} that was made again", f"/{of}s/{row.about_id}"))
+    for name, title in (("psf_id", "PSF of the request"), ("corrected_psf_id", "Corrected PSF")):
+        if row.details.get(name):
+            found.append((title, f"/psfs/{row.details[name]}"))
+    return found

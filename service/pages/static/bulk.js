@@ -1,0 +1,70 @@
+// Keeps the bulk runs that a page shows up to date. Elements with data-bulk hold parts with data-part.
+import { listen } from "./events.js";
+import { duration, json, moment } from "./page.js";
+
+const AT_WORK = ["LISTING", "RUNNING"];
+const OPEN = [...AT_WORK, "PAUSED", "ERROR"];
+const places = new Map([...document.querySelectorAll("[data-bulk]")].map((place) => [place.dataset.bulk, place]));
+const one = document.getElementById("bulk");
+const lost = document.getElementById("lost");
+const newer = document.getElementById("newer");
+const doneAtFirst = one === null ? 0 : Number(one.querySelector('[data-part="done"]').textContent);
+
+function show(place, run) {
+  const tell = (name, text) => {
+    const part = place.querySelector(`[data-part="${name}"]`);
+    if (part !== null && part.textContent !== text) part.textContent = text;
+  };
+  const phase = place.querySelector('[data-part="phase"]');
+  phase.className = `phase ${run.phase}`;
+  tell("phase", run.phase);
+  for (const [name, count] of Object.entries(run.images)) tell(name, String(count));
+  const pace = place === one || AT_WORK.includes(run.phase) ? run.images_an_hour : null;
+  const unknown = place === one ? "unknown" : "";
+  tell("pace", pace === null ? unknown : `${Number(pace.toPrecision(3))} an hour`);
+  if (!OPEN.includes(run.phase)) tell("left", place === one ? "none" : "");
+  else tell("left", run.time_left_s === null ? unknown : duration(run.time_left_s));
+  if (place === one) showOne(run);
+}
+
+function showOne(run) {
+  const part = (name) => one.querySelector(`[data-part="${name}"]`);
+  const { total, done, failed } = run.images;
+  part("bar").max = total || 1;
+  part("bar").value = done + failed;
+  part("error").hidden = run.error === null;
+  part("error").textContent = run.error === null ? "" : run.error.message;
+  part("ended").textContent = moment(run.ended_at);
+  for (const change of one.querySelectorAll("[data-phases]")) {
+    change.hidden = !change.dataset.phases.split(" ").includes(run.phase) || (change.hasAttribute("data-failed") && failed === 0);
+  }
+  const more = done - doneAtFirst;
+  newer.hidden = more <= 0;
+  newer.firstElementChild.textContent = more === 1 ? "One more image is done." : `${more} more images are done.`;
+}
+
+/** Read the runs again whose events this page may have missed. */
+async function look() {
+  for (const [id, place] of places) {
+    if (!OPEN.includes(place.querySelector('[data-part="phase"]').textContent)) continue;
+    try {
+      show(place, await json(`/v1/bulk/${id}`));
+    } catch (error) {
+      if (!(error instanceof TypeError)) throw error;
+      return; // the stream tells when the service answers again
+    }
+  }
+}
+
+listen(({ name, data }) => {
+  if (name === "bulk" && places.has(data.id)) show(places.get(data.id), data);
+  if (lost !== null && name === "lost") {
+    lost.hidden = false;
+    lost.textContent = "The service does not answer. The run continues when the service is back, and so does this page.";
+  }
+  if (name === "found") {
+    if (lost !== null) lost.hidden = true;
+    look();
+  }
+});
+look(); // a run may have changed since this page was made

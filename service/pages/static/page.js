@@ -1,0 +1,87 @@
+// What the scripts of all pages share: elements, requests and their errors.
+
+/** An element. attributes: `on...` names add listeners, `class` and others are set as attributes; null ones are left out. */
+export function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else made.setAttribute(name, value === true ? "" : String(value));
+  }
+  made.append(...children.filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+/** An error that the service told: `status`, `code` (its stable short name) and `fields` of the problem document. */
+export class ServiceError extends Error {
+  constructor(status, problem) {
+    super(problem.detail || `the service answered ${status}`);
+    this.status = status;
+    this.code = (problem.type || "").replace("urn:heliopsf:", "");
+    this.fields = problem;
+  }
+}
+
+/** An answer of the service. Throws `ServiceError`; a lost server is a TypeError of `fetch`. */
+export async function request(address, options = {}) {
+  const answer = await fetch(address, { credentials: "same-origin", ...options });
+  if (answer.ok) return answer;
+  throw await serviceError(answer.status, await answer.text());
+}
+
+/** The JSON of an answer. `body`: sent as JSON by POST. */
+export async function json(address, body = undefined, options = {}) {
+  const sent = body === undefined ? {} : { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
+  return (await request(address, { ...sent, ...options })).json();
+}
+
+/** The error of an answer that is not good. After the end of a session, the login page comes back to this page. */
+export function serviceError(status, text) {
+  if (status === 401 && document.body.hasAttribute("data-keys")) {
+    location.assign(`/login?ended=1&next=${encodeURIComponent(location.pathname + location.search)}`);
+  }
+  let problem = {};
+  try {
+    problem = JSON.parse(text);
+  } catch {
+    problem = { detail: text.slice(0, 500) };
+  }
+  return new ServiceError(status, problem);
+}
+
+/** What to say of an error. */
+export function told(error) {
+  if (error instanceof TypeError) return "The service does not answer. Nothing is lost: wait a moment, then try again.";
+  return error.message;
+}
+
+/** Show a message in an element with the role status or alert; null hides it. */
+export function say(place, text, kind = "note") {
+  place.hidden = text === null;
+  place.className = kind;
+  place.textContent = text ?? "";
+}
+
+/** A time span, s, in words. */
+export function duration(seconds) {
+  if (seconds === null || seconds === undefined) return "unknown";
+  if (seconds < 1) return "less than 1 s";
+  if (seconds < 100) return `${Math.round(seconds)} s`;
+  if (seconds < 6000) return `${Math.round(seconds / 60)} min`;
+  return `${(seconds / 3600).toFixed(1)} h`;
+}
+
+/** A time, s since 1970, as a date of UTC. */
+export function moment(seconds) {
+  return seconds === null ? "-" : `${new Date(1000 * seconds).toISOString().slice(0, 19).replace("T", " ")} UTC`;
+}
+
+/** A number of bytes in words. */
+export function size(count) {
+  const units = ["B", "kB", "MB"];
+  for (const unit of units) {
+    if (count < 1000) return `${Number(count.toPrecision(3))} ${unit}`;
+    count /= 1000;
+  }
+  return `${Number(count.toPrecision(3))} GB`;
+}

@@ -1,0 +1,38 @@
+// Sends a file and shows how much has arrived, in the elements sending, sending-name, sending-done, sending-bar and stop.
+import { say, serviceError, size } from "./page.js";
+
+const part = (name) => document.getElementById(name);
+
+/** Send a file. said: the element for messages. arrived: called with the description of what was uploaded. */
+export function send(file, name, address, type, said, arrived) {
+  const sending = part("sending");
+  const done = part("sending-done");
+  const post = new XMLHttpRequest();
+  post.open("POST", `${address}?filename=${encodeURIComponent(name)}`);
+  post.setRequestHeader("Content-Type", type);
+  post.upload.onprogress = (event) => {
+    part("sending-bar").max = event.total || file.size;
+    part("sending-bar").value = event.loaded;
+    done.textContent = `${size(event.loaded)} of ${size(file.size)}`;
+  };
+  post.upload.onload = () => {
+    done.textContent = "received; the service reads it";
+  };
+  post.onload = () => {
+    sending.hidden = true;
+    if (post.status < 300) arrived(JSON.parse(post.responseText));
+    else say(said, serviceError(post.status, post.responseText).message, "error");
+  };
+  post.onerror = () => {
+    sending.hidden = true;
+    say(said, `The connection to the service ended before all of ${name} had arrived. Nothing was kept of it. The file is still chosen: send it again.`, "error");
+  };
+  post.onabort = () => {
+    sending.hidden = true;
+    say(said, `The upload of ${name} was stopped. Nothing was kept of it.`, "note");
+  };
+  part("sending-name").textContent = name;
+  part("stop").onclick = () => post.abort();
+  sending.hidden = false;
+  post.send(file);
+}

@@ -1,0 +1,137 @@
+"""Bulk runs in a browser: started by the form, followed live, changed by the buttons, and shown as a contact sheet."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.conftest import write_image, write_psf
+from tests.service.pages.browser.checks import good
+from tests.whole.stack import Stack, wait_for
+
+LONG_MS = 120_000
+MARK = "window.notReloaded = true"
+
+
+@pytest.fixture(scope="module")
+def psf_id(site: Stack, tmp_path_factory: pytest.TempPathFactory) -> str:
+    file = tmp_path_factory.mktemp("psf") / "psf.fits"
+    write_psf(file, size=128)
+    identity: str = site.client.upload_psf(file)["id"]
+    return identity
+
+
+def uploaded(site: Stack, folder: Path, count: int, *, side: int, seed: int) -> list[str]:
+    found = []
+    for number in range(count):
+        path = folder / f"sun {seed + number}.fits"
+        write_image(path, shape=(side, side), seed=seed + number)
+        found.append(str(site.client.upload_image(path)["id"]))
+    return found
+
+
+def test_a_run_started_by_the_form_is_followed_to_its_end_without_a_reload(
+    page: Page, site: Stack, psf_id: str, tmp_path: Path
+) -> None:
+    uploaded(site, tmp_path, 3, side=256, seed=500)
+    page.goto("/bulk")
+    good(page)
+    page.get_by_label("PSF").select_option(f"psf:{psf_id}")
+    page.get_by_label("Name").fill("quiet Sun")
+    page.get_by_role("button", name="Start").focus()
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(re.compile("/bulk/[0-9a-f]{32}$"))
+    page.evaluate(MARK)
+    expect(page.locator("[data-part=phase]")).to_have_text("COMPLETED", timeout=LONG_MS)
+    total = int(page.locator("[data-part=total]").inner_text())
+    assert total >= 3, "the images of other tests may be among them"
+    expect(page.locator("[data-part=left]")).to_have_text("none")
+    expect(page.locator("[data-part=ended]")).to_contain_text("UTC")
+    expect(page.get_by_role("button", name="Pause")).to_be_hidden()
+    assert page.evaluate("window.notReloaded"), "the script showed all this"
+
+    page.get_by_role("link", name="Show them").click()
+    cards = page.locator(".sheet li")
+    done = int(page.locator("[data-part=done]").inner_text())
+    assert done >= 3
+    expect(cards).to_have_count(min(done, 24))
+    for picture in cards.locator("img").all():
+        picture.scroll_into_view_if_needed()
+        wait_for(lambda: picture.evaluate("(one) => one.complete"), "the picture is loaded")  # noqa: B023
+        width, height = picture.evaluate("(one) => [one.naturalWidth, one.naturalHeight]")
+        assert max(width, height) == 192
+    expect(cards.locator("a").first).to_have_attribute("href", re.compile("^/products/[0-9a-f]{64}$"))
+    good(page)
+    page.goto("/bulk")
+    expect(page.get_by_role("link", name="quiet Sun")).to_be_visible()
+    good(page)
+
+
+@pytest.mark.slow  # half a minute: it runs real jobs
+def test_a_run_is_paused_resumed_and_cancelled_and_another_tab_sees_it(
+    page: Page, site: Stack, psf_id: str, tmp_path: Path
+) -> None:
+    images = uploaded(site, tmp_path, 4, side=1024, seed=600)
+    method = {"name": "richardson-lucy", "steps": 60}
+    run = site.client.submit_bulk(images=images, psf_id=psf_id, name="long", method=method)
+    other = page.context.new_page()
+    other.goto("/bulk")
+    other.evaluate(MARK)
+    line = other.locator(f"[data-bulk='{run['id']}']")
+    page.goto(f"/bulk/{run['id']}")
+    page.evaluate(MARK)
+    expect(page.locator("[data-part=at_work]")).to_have_text("1", timeout=LONG_MS)
+    expect(page.locator("[data-part=pace]")).to_contain_text("an hour", timeout=LONG_MS)
+    expect(page.locator("#newer")).to_contain_text("image is done")
+    assert page.evaluate("window.notReloaded")
+    expect(line.locator("[data-part=pace]")).to_contain_text("an hour")
+
+    page.get_by_role("button", name="Pause").click()
+    expect(page.locator("[data-part=phase]")).to_have_text("PAUSED")
+    expect(line.locator("[data-part=phase]")).to_have_text("PAUSED")
+    expect(page.get_by_role("button", name="Resume")).to_be_visible()
+    good(page)
+    page.get_by_role("button", name="Resume").click()
+    expect(page.locator("[data-part=phase]")).to_have_text("RUNNING")
+    page.get_by_text("Cancel", exact=True).click()
+    page.get_by_role("button", name="Cancel the run").click()
+    expect(page.locator("[data-part=phase]")).to_have_text("CANCELLED")
+    expect(line.locator("[data-part=phase]")).to_have_text("CANCELLED")
+    assert other.evaluate("window.notReloaded")
+
+
+@pytest.mark.slow  # half a minute: it runs real jobs
+def test_failures_are_grouped_and_retried(page: Page, site: Stack, psf_id: str, tmp_path: Path) -> None:
+    # Without --again a product is not deconvolved: all these images fail for one reason.
+    path = tmp_path / "<b>product.fits"
+    images = []
+    for number in range(3):
+        write_image(path, seed=700 + number, PSFID="0" * 64)
+        images.append(str(site.client.upload_image(path)["id"]))
+        path.unlink()
+    good_one = uploaded(site, tmp_path, 1, side=128, seed=720)
+    run = site.client.submit_bulk(images=[*images, *good_one], psf_id=psf_id, name="mixed")
+    site.client.wait_for_bulk(run["id"])
+    page.goto(f"/bulk/{run['id']}")
+    row = page.get_by_role("region", name="Failures by reason").locator("tbody tr")
+    expect(row).to_have_count(1)
+    expect(row.locator("td").first).to_have_text("3")
+    expect(row).to_contain_text("<b>product.fits")
+    good(page)
+    page.get_by_role("link", name="All failed images").click()
+    expect(page.locator("tbody tr")).to_have_count(3)
+    good(page)
+    page.goto(f"/bulk/{run['id']}")
+    before = time.time()
+    page.get_by_role("button", name="Retry the failed images").click()
+    wait_for(
+        lambda: all((one["ended_at"] or 0) > before for one in site.client.bulk_failures(run["id"])),
+        "no failure is older than the retry",
+    )
+    expect(page.locator("[data-part=phase]")).to_have_text("COMPLETED")
+    expect(page.locator("[data-part=failed]")).to_have_text("3")
+    assert len(list(site.client.bulk_failures(run["id"]))) == 3

@@ -1,0 +1,144 @@
+"""Logging in with a real browser: the headers and cookies are its own."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Iterator
+from urllib.parse import urlsplit
+
+import pytest
+import uvicorn
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, BrowserType, Page, Route, expect
+
+from service.app import create_app
+from tests.service.pages.browser.conftest import Watch
+from workers.catalogue.access.keys import Scope
+from workers.catalogue.catalogue import Catalogue
+from workers.settings import Settings
+
+ELSEWHERE = "http://elsewhere.test/"
+PLAIN_NAME = "sun.test"  # a name that browsers do not take for this machine, so HTTP is not secure there
+
+
+@pytest.fixture(scope="session")
+def keyed_settings(tmp_path_factory: pytest.TempPathFactory) -> Settings:
+    folder = tmp_path_factory.mktemp("keyed") / "data"
+    return Settings(
+        data_dir=folder, database_url=None, broker_url="filesystem://", access="keys", allowed_hosts="*"
+    )
+
+
+@pytest.fixture(scope="session")
+def base_url(keyed_settings: Settings) -> Iterator[str]:
+    """A service that requires keys, in place of the open one of the other tests."""
+    server = uvicorn.Server(uvicorn.Config(create_app(keyed_settings), port=0, log_level="error"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    deadline = time.monotonic() + 30
+    while not server.started and time.monotonic() < deadline:
+        time.sleep(0.02)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join(20)
+
+
+@pytest.fixture
+def key(keyed_settings: Settings, base_url: str) -> Iterator[str]:
+    assert base_url, "the running service has made the tables"
+    catalogue = Catalogue(keyed_settings.catalogue_url)
+    yield catalogue.keys.make("ann", {Scope.READ, Scope.SUBMIT})
+    catalogue.close()
+
+
+def log_in(page: Page, key: str) -> None:
+    page.get_by_label("Your key").fill(key)
+    page.get_by_role("button", name="Log in").click()
+
+
+def test_a_person_logs_in_makes_a_key_and_logs_out(page: Page, key: str) -> None:
+    page.goto("/jobs?phase=ERROR")
+    expect(page.get_by_role("heading", level=1)).to_have_text("Log in")
+    assert Axe().run(page).violations_count == 0
+    log_in(page, key)
+    expect(page).to_have_url(re.compile(r"/jobs\?phase=ERROR$"))
+    page.get_by_role("link", name="ann").click()
+    page.get_by_text("Make a key").click()
+    assert Axe().run(page).violations_count == 0
+    page.get_by_label("Purpose").fill("for a script")
+    page.get_by_role("button", name="Make the key").click()
+    expect(page.get_by_label("Key", exact=True)).to_have_value(re.compile(r"hpsf_[0-9a-f]{16}_[\w-]{43}"))
+    assert Axe().run(page).violations_count == 0
+    row = page.get_by_role("row").filter(has_text="for a script")
+    row.get_by_text("Revoke", exact=True).click()
+    row.get_by_role("button", name="Revoke").click()
+    expect(page.get_by_role("row").filter(has_text="for a script")).to_contain_text("revoked")
+    page.get_by_role("button", name="Log out").click()
+    page.goto("/jobs")
+    expect(page.get_by_role("heading", level=1)).to_have_text("Log in")
+
+
+def test_a_wrong_key_is_told(page: Page, watch: Watch) -> None:
+    watch.allowed.append("401")
+    page.goto("/login")
+    log_in(page, "hpsf_nonsense")
+    expect(page.get_by_role("alert")).to_contain_text("hpsf_ID_SECRET")
+
+
+def test_the_api_answers_401_without_a_window_of_the_browser(page: Page, watch: Watch) -> None:
+    watch.allowed.append("401")
+    answer = page.goto("/v1/jobs")
+    assert answer is not None and answer.status == 401
+    page.goto("/login")
+    assert page.evaluate("async () => (await fetch('/v1/jobs')).status") == 401
+
+
+def test_a_page_of_another_site_can_link_and_cannot_change(browser: Browser, base_url: str, key: str) -> None:
+    context = browser.new_context(base_url=base_url)
+    page = context.new_page()
+    page.goto("/login")
+    log_in(page, key)
+    expect(page.get_by_role("button", name="Log out")).to_be_visible()
+    forms = "".join(
+        f'<form method="post" action="{base_url}{address}" id="{name}"><button>{name}</button></form>'
+        for name, address in (("leave", "/logout"), ("make", "/keys"), ("sample", "/images/sample"))
+    )
+
+    def foreign(route: Route) -> None:
+        link = f'<a href="{base_url}/jobs?phase=QUEUED">to the jobs</a>'
+        route.fulfill(content_type="text/html", body=f"<!doctype html><title>x</title>{link}{forms}")
+
+    context.route(ELSEWHERE, foreign)
+    for name in ("leave", "make", "sample"):
+        page.goto(ELSEWHERE)
+        with page.expect_response(lambda answer: answer.request.method == "POST") as answered:
+            page.get_by_role("button", name=name).click()
+        assert answered.value.status == 403, name
+    page.goto(ELSEWHERE)
+    page.get_by_role("link", name="to the jobs").click()
+    expect(page).to_have_url(re.compile(r"/jobs\?phase=QUEUED$"))
+    expect(page.get_by_role("button", name="Log out")).to_be_visible()
+    context.close()
+
+
+def test_forms_work_over_http_where_browsers_do_not_name_the_site(
+    browser_type: BrowserType, browser_type_launch_args: dict[str, list[str]], base_url: str, key: str
+) -> None:
+    """There is no Sec-Fetch-Site, and Origin is all that tells the service's own forms from those of others."""
+    rule = f"--host-resolver-rules=MAP {PLAIN_NAME} 127.0.0.1"
+    options = browser_type_launch_args | {"args": [*browser_type_launch_args["args"], rule]}
+    browser = browser_type.launch(**options)  # type: ignore[arg-type]
+    page = browser.new_page(base_url=f"http://{PLAIN_NAME}:{urlsplit(base_url).port}")
+    sent: list[dict[str, str]] = []
+    page.on(
+        "request", lambda request: sent.append(request.all_headers()) if request.method == "POST" else None
+    )
+    page.goto("/login")
+    log_in(page, key)
+    page.get_by_role("button", name="Log out").click()
+    expect(page.get_by_role("heading", level=1)).to_have_text("Log in")
+    assert len(sent) == 2 and all("sec-fetch-site" not in headers for headers in sent)
+    assert {headers["origin"] for headers in sent} == {f"http://{PLAIN_NAME}:{urlsplit(base_url).port}"}
+    browser.close()

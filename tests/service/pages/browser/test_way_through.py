@@ -1,0 +1,83 @@
+"""The way of a person who has read nothing: an image, its page, its job, its product."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.conftest import write_image, write_psf
+from tests.service.pages.browser.checks import good
+from tests.whole.stack import Stack
+
+LONG_MS = 120_000
+
+
+@pytest.fixture
+def image_file(tmp_path: Path) -> Path:
+    write_image(tmp_path / "sun.fits", shape=(128, 96), seed=11)
+    return tmp_path / "sun.fits"
+
+
+@pytest.fixture
+def psf_id(site: Stack, tmp_path: Path) -> str:
+    write_psf(tmp_path / "psf.fits", size=64)
+    identity: str = site.client.upload_psf(tmp_path / "psf.fits")["id"]
+    return identity
+
+
+def test_an_image_without_a_psf_says_what_to_do_and_goes_on_with_one(
+    page: Page, image_file: Path, psf_id: str
+) -> None:
+    page.goto("/")
+    good(page)
+    page.set_input_files("#file", image_file)
+    page.get_by_role("button", name="Upload").click()
+    expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
+    expect(page.get_by_role("alert")).to_contain_text("This image cannot be deconvolved yet")
+    expect(page.get_by_role("button", name="Start")).to_be_disabled()
+    good(page)
+
+    page.locator("select[name=psf_id]").select_option(psf_id)
+    page.get_by_role("button", name="Check these options").click()
+    expect(page.get_by_text("The request names this PSF.")).to_be_visible()
+    page.get_by_role("button", name="Start").click()
+    expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
+
+
+def test_a_dropped_file_is_sent(page: Page, image_file: Path) -> None:
+    page.goto("/")
+    sent = list(image_file.read_bytes())
+    page.evaluate(
+        """(bytes) => {
+            const transfer = new DataTransfer();
+            transfer.items.add(new File([new Uint8Array(bytes)], "dropped.fits"));
+            document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, bubbles: true }));
+        }""",
+        sent,
+    )
+    expect(page.get_by_role("heading", level=1)).to_have_text(re.compile("sun.fits|dropped.fits"))
+
+
+def test_the_header_of_an_image_is_searched(page: Page) -> None:
+    page.goto("/")
+    page.get_by_role("button", name="Use the sample image").click()
+    expect(page.get_by_text("the job builds it first")).to_be_visible()
+    good(page)
+    page.get_by_label("Search the header").fill("wavelnth")
+    expect(page.get_by_role("cell", name="174", exact=True)).to_be_visible()
+    expect(page.get_by_role("rowheader", name="TELESCOP")).to_have_count(0)
+
+
+def test_the_keyboard_alone_starts_a_job(page: Page, image_file: Path, psf_id: str) -> None:
+    page.goto("/")
+    page.set_input_files("#file", image_file)  # the system's own dialog is no part of the page
+    page.get_by_role("button", name="Upload").focus()
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(re.compile("/images/"))
+    page.goto(f"{page.url}?psf_id={psf_id}&steps=3")
+    page.get_by_role("button", name="Start").focus()
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(re.compile("/jobs/|/products/"))

@@ -1,0 +1,44 @@
+"""A real gap report in the catalogue, from the small diagnosis that the tests of the gap share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from psfcore.gap.report import plot
+from psfcore.gap.report.page import gap_page
+from psfcore.gap.report.report import gap_report
+from tests.psfcore.gap import small_gaps
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import DEFAULT_OWNER
+from workers.files.store import Store
+from workers.settings import Settings
+from workers.tasks.context import Context
+from workers.tasks.data.reports import keep_report, write_json
+
+GAP_ID = "9a" * 32
+
+
+def keep_gap_report(settings: Settings) -> dict[str, Any]:
+    """Add the report GAP_ID to the catalogue, as the job gap-diagnose does; returns its JSON."""
+    found = small_gaps.found()
+    said = gap_report(found)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(plot, "PLOT_DPI", 40)  # quicker to draw
+        html = gap_page(found, said).html()
+    catalogue, store = Catalogue(settings.catalogue_url), Store(settings.data_dir)
+    context = cast(Context, SimpleNamespace(owner=DEFAULT_OWNER, store=store, add=catalogue.add))
+    with store.temporary() as text, store.temporary() as page:
+        write_json(text, said)
+        page.write_text(html, "utf-8")
+        keep_report(context, GAP_ID, "gap", text=text, page=page, details={"sentence": said["sentence"]})
+    catalogue.close()
+    return said
+
+
+def settings_of(data_dir: Path) -> Settings:
+    """The settings of a local service in this folder."""
+    return Settings(data_dir=data_dir, database_url=None, broker_url="filesystem://")

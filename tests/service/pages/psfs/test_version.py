@@ -1,0 +1,127 @@
+"""The page of a PSF: curves, status, deletion, and who may do what."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from tests.conftest import write_psf
+from tests.service.conftest import upload
+from tests.service.keyed import keyed
+from tests.service.pages.test_login import OWN_PAGE, PERSON, browser
+from workers.catalogue.access.keys import Scope
+from workers.settings import Settings
+
+SERIES = {"instrument": "hri_euv", "channel": "174", "kind": "total"}
+
+
+@pytest.fixture
+def psf_id(api: TestClient, psf_file: Path) -> str:
+    return upload(api, psf_file, "/v1/psfs")
+
+
+def certify(api: TestClient, psf_id: str, version: str, **more: object) -> int:
+    data = {
+        "status": "certified",
+        "version": version,
+        "with_range": "1",
+        "reason": "tested",
+        **SERIES,
+        **more,
+    }
+    status: int = api.post(
+        f"/psfs/{psf_id}/status", data=data, headers=PERSON, follow_redirects=False
+    ).status_code
+    return status
+
+
+def test_an_uploaded_psf_gets_its_curves_by_a_job(
+    api: TestClient, run_jobs: Callable[[], None], psf_id: str
+) -> None:
+    page = api.get(f"/psfs/{psf_id}").text
+    assert "has no curves and no picture yet" in page and "data-plot" not in page
+    started = api.post(f"/psfs/{psf_id}/tables", follow_redirects=False)
+    assert started.status_code == 303 and started.headers["location"].startswith("/jobs/")
+    run_jobs()
+    page = api.get(f"/psfs/{psf_id}").text
+    assert page.count("data-plot") == 2 and f"/v1/psfs/{psf_id}/preview" in page and "no curves" not in page
+    # The numbers of the table are those of the API.
+    profile = api.get(f"/v1/psfs/{psf_id}/profile").json()["mean_weight"]["TOTAL"]
+    shown = re.findall(r'<td class="number">0</td><td class="number">([^<]+)</td>', page)
+    assert float(shown[0]) == pytest.approx(profile[0], rel=1e-4)
+
+
+def test_certify_change_the_range_supersede_and_deprecate(
+    api: TestClient, psf_id: str, tmp_path: Path
+) -> None:
+    page = api.get(f"/psfs/{psf_id}").text
+    assert "Certify" in page and "Reject: delete this draft" in page
+    assert certify(api, psf_id, "1.0.0", valid_from="2024-01-01T00:00:00Z", valid_to="") == 303
+    page = api.get(f"/psfs/{psf_id}").text
+    assert "draft to certified" in page and "tested" in page and "from 2024-01-01T00:00:00" in page
+    assert "Reject" not in page and "Change the range" in page
+    bounded = {"status": "certified", "with_range": "1", "valid_from": "2023-01-01T00:00:00Z"}
+    assert api.post(f"/psfs/{psf_id}/status", data=bounded).status_code == 200
+    assert api.get(f"/v1/psfs/{psf_id}").json()["valid_from"].startswith("2023-01-01")
+
+    write_psf(tmp_path / "next.fits", scale=0.9)
+    following = upload(api, tmp_path / "next.fits", "/v1/psfs")
+    assert certify(api, following, "2.0.0") == 409, "the ranges overlap"
+    assert certify(api, following, "2.0.0", supersedes=psf_id) == 303
+    old = api.get(f"/v1/psfs/{psf_id}").json()
+    assert (old["status"], old["successor"]) == ("deprecated", following)
+    assert f"/psfs/{following}" in api.get(f"/psfs/{psf_id}").text
+    gone = {"status": "deprecated", "reason": "wrong mesh"}
+    assert "wrong mesh" in api.post(f"/psfs/{following}/status", data=gone).text
+    assert api.get(f"/v1/psfs/{following}").json()["status"] == "deprecated"
+
+
+def test_an_error_of_a_form_is_a_page_that_names_the_field(api: TestClient, psf_id: str) -> None:
+    data = {"status": "certified", "with_range": "1", "valid_from": "yesterday"}
+    answer = api.post(f"/psfs/{psf_id}/status", data=data, headers=PERSON)
+    assert answer.status_code == 422 and "valid_from" in answer.text
+    assert answer.headers["content-type"].startswith("text/html")
+    assert api.get(f"/psfs/{psf_id}/cutout?size=4000", headers=PERSON).status_code == 422
+    assert api.get(f"/psfs/{'0' * 64}", headers=PERSON).status_code == 404
+    cut = api.get(f"/psfs/{psf_id}/cutout?size=9")
+    assert cut.status_code == 200 and cut.content.startswith(b"SIMPLE")
+
+
+def test_a_draft_is_deleted_and_a_certified_psf_is_not(api: TestClient, psf_id: str, tmp_path: Path) -> None:
+    write_psf(tmp_path / "kept.fits", scale=0.8)
+    kept = upload(api, tmp_path / "kept.fits", "/v1/psfs")
+    assert certify(api, kept, "1.0.0") == 303
+    gone = api.post(f"/psfs/{psf_id}/delete", follow_redirects=False)
+    assert gone.status_code == 303 and gone.headers["location"] == "/psfs"
+    assert api.get(f"/v1/psfs/{psf_id}").status_code == 404
+    assert api.post(f"/psfs/{kept}/delete", headers=PERSON).status_code == 409
+
+
+def test_forms_are_shown_by_scope(settings: Settings, psf_file: Path) -> None:
+    with keyed(settings) as service:
+        psf_id = upload(service.client("ann"), psf_file, "/v1/psfs")
+        reader = browser(service, service.key("ann", Scope.READ))
+        page = reader.get(f"/psfs/{psf_id}").text
+        assert "/status" not in page and "/delete" not in page and "/tables" not in page
+        refused = reader.post(f"/psfs/{psf_id}/status", data={"status": "certified"}, headers=OWN_PAGE)
+        assert refused.status_code == 403 and "certify" in refused.text
+        certifier = browser(service, service.key("ann", Scope.READ, Scope.CERTIFY))
+        page = certifier.get(f"/psfs/{psf_id}").text
+        assert f"/psfs/{psf_id}/status" in page and "/delete" not in page
+        assert browser(service, service.key("bob")).get(f"/psfs/{psf_id}").status_code == 404
+
+
+def test_the_products_of_a_psf_are_listed(
+    api: TestClient, run_jobs: Callable[[], None], psf_id: str, image_file: Path
+) -> None:
+    assert "No product was made" in api.get(f"/psfs/{psf_id}/products").text
+    image_id = upload(api, image_file)
+    parameters = {"image_id": image_id, "psf_id": psf_id, "method": {"name": "linear"}}
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
+    run_jobs()
+    product = api.get(f"/v1/jobs/{job['id']}").json()["result"].removeprefix("/v1")
+    assert product in api.get(f"/psfs/{psf_id}/products").text

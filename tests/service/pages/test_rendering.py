@@ -1,0 +1,181 @@
+"""What is true of every page: its policy, that it is not kept, that names are text, and errors as pages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from astropy.io import fits
+from fastapi.testclient import TestClient
+from httpx import Response
+from sqlalchemy.exc import OperationalError
+
+from service.app import create_app
+from service.pages.rendering import POLICY, date, duration, percent, size
+from tests.conftest import write_image, write_psf
+from tests.service.conftest import upload
+from workers.settings import Settings
+
+PERSON = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
+SCRIPT = "<script>alert(1)</script>"
+ESCAPED = "&lt;script&gt;alert(1)&lt;/script&gt;"
+NOTHING = "0" * 32
+
+
+# Headers --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("address", ["/", "/jobs", "/bulk", "/login", "/keys", "/nothing"])
+def test_a_page_has_the_policy_and_is_not_kept(api: TestClient, address: str) -> None:
+    answer = api.get(address, headers=PERSON)
+    assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
+    assert answer.headers["Content-Security-Policy"] == POLICY
+    assert answer.headers["Cache-Control"] == "no-store" and answer.headers["Vary"] == "Cookie"
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    assert answer.headers["X-Frame-Options"] == "DENY"
+
+
+def test_the_policy_allows_no_other_host_and_nothing_inline() -> None:
+    rules = dict(rule.strip().split(" ", 1) for rule in POLICY.split(";"))
+    assert rules["default-src"] == "'none'" and rules["require-trusted-types-for"] == "'script'"
+    for kind in ("script-src", "style-src", "connect-src", "form-action"):
+        assert rules[kind] == "'self'"
+    assert "unsafe" not in POLICY and "http" not in POLICY and "*" not in POLICY
+
+
+def test_scripts_and_styles_are_kept_for_ever_under_their_version_alone(api: TestClient) -> None:
+    page = api.get("/", headers=PERSON).text
+    address = page.split('<link rel="stylesheet" href="')[1].split('"')[0]
+    kept = api.get(address)
+    assert kept.status_code == 200 and "immutable" in kept.headers["Cache-Control"]
+    earlier = api.get("/static/000000000000/heliopsf.css")
+    assert earlier.headers["Cache-Control"] == "no-cache" and earlier.content == kept.content
+    assert api.get("/static/000000000000/passwd.css").status_code == 404
+
+
+# Hostile names --------------------------------------------------------------------------------------
+
+
+def test_names_that_people_and_files_choose_are_shown_as_text(
+    api: TestClient, tmp_path: Path, run_jobs: Callable[[], None]
+) -> None:
+    write_image(tmp_path / "image.fits", TELESCOP=SCRIPT, **{"DATE-OBS": SCRIPT})
+    body = (tmp_path / "image.fits").read_bytes()
+    image = api.post("/v1/images", params={"filename": f"{SCRIPT}.fits"}, content=body).json()["id"]
+    write_psf(tmp_path / "psf.fits")
+    with fits.open(tmp_path / "psf.fits", mode="update") as file:
+        file[0].header["PSFNAME"] = SCRIPT
+        file[0].header["PSFVERS"] = '"><img src=x>'
+    psf = upload(api, tmp_path / "psf.fits", "/v1/psfs")
+    asked = {"image_id": image, "psf_id": psf, "method": {"name": "richardson-lucy", "steps": 2}}
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": asked}).json()["id"]
+    bulk = api.post("/v1/bulk", json={"images": [image], "psf_id": psf, "name": SCRIPT}).json()["id"]
+    run_jobs()
+    product = api.get(f"/v1/jobs/{job}").json()["result"].removeprefix("/v1")
+    shown = ""
+    for address in (
+        "/",
+        f"/images/{image}?psf_id={psf}",
+        "/jobs",
+        f"/jobs/{job}",
+        product,
+        "/bulk",
+        f"/bulk/{bulk}",
+    ):
+        answer = api.get(address, headers=PERSON)
+        assert answer.status_code == 200, address
+        assert "<script>alert" not in answer.text and "<img src=x>" not in answer.text, address
+        shown += answer.text
+    assert ESCAPED in shown and "&lt;img src=x&gt;" in shown, "they are shown, and not left out"
+
+
+def test_an_error_shows_what_was_asked_as_text(api: TestClient) -> None:
+    for address in (f"/{SCRIPT}", f"/jobs/{SCRIPT}", f"/images/{SCRIPT}", f"/jobs?cursor={SCRIPT}"):
+        answer = api.get(address, headers=PERSON)
+        assert answer.status_code in (404, 422), address
+        assert "<script>alert" not in answer.text, address
+    write = {"filename": f"{SCRIPT}.fits"}
+    refused = api.post("/images", files={"file": (write["filename"], b"Dear editor" * 500)}, headers=PERSON)
+    assert refused.status_code == 415 and "<script>alert" not in refused.text
+
+
+# Errors ---------------------------------------------------------------------------------------------
+
+
+def _away(*_: object, **__: object) -> None:
+    raise OperationalError("SELECT 1", {}, Exception("the server closed the connection"))
+
+
+def _broken(*_: object, **__: object) -> None:
+    raise RuntimeError("secret of the service")
+
+
+def _answer(
+    api: TestClient, status: int, headers: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> Response:
+    """The answer to a request that has an error of this status."""
+    catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    send: dict[str, object] = {"headers": headers}
+    with monkeypatch.context() as patched:
+        if status in (500, 503):
+            patched.setattr(catalogue, "page", _broken if status == 500 else _away)
+        if status in (413, 415):
+            body = b"SIMPLE  =" + bytes(3 * 2**20) if status == 413 else b"Dear editor,\n" * 500
+            found = api.post("/images", files={"file": ("sun.fits", body)}, **send)  # type: ignore[arg-type]
+        else:
+            address = {404: f"/jobs/{NOTHING}", 422: "/jobs?cursor=none"}.get(status, "/jobs")
+            found = api.get(address, **send)  # type: ignore[arg-type]
+            while status == 429 and found.status_code == 200:
+                found = api.get(address, **send)  # type: ignore[arg-type]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("status", "told", "kept"),
+    [
+        (404, "There is nothing here", False),
+        (413, "This is too large", False),
+        (415, "This is no file that the service reads", False),
+        (422, "The service cannot do that", False),
+        (429, "Too many requests", True),
+        (500, "The service failed", True),
+        (503, "The service cannot answer now", True),
+    ],
+)
+def test_an_error_is_a_page_for_people_and_a_document_for_programs(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch, status: int, told: str, kept: bool
+) -> None:
+    few = settings.model_copy(update={"reads_per_minute": 5}) if status == 429 else settings
+    with TestClient(create_app(few), raise_server_exceptions=False) as api:
+        answer = _answer(api, status, PERSON, monkeypatch)
+        assert (answer.status_code, answer.headers["Content-Type"]) == (status, "text/html; charset=utf-8")
+        assert answer.headers["Content-Security-Policy"] == POLICY
+        assert answer.headers["Cache-Control"] == "no-store"
+        page = answer.text
+        assert f"<h1>{told}" in page and f"Status {status}" in page and 'role="alert"' in page
+        assert ("Nothing is lost" in page) == kept
+        assert "secret" not in page and "Traceback" not in page
+        answer = _answer(api, status, {"Accept": "*/*"}, monkeypatch)
+        assert (answer.status_code, answer.headers["Content-Type"]) == (status, "application/problem+json")
+        assert answer.json()["status"] == status and answer.json()["detail"]
+
+
+def test_addresses_of_the_interface_never_answer_with_pages(api: TestClient) -> None:
+    for address in (f"/v1/jobs/{NOTHING}", "/v1/nothing", "/openapi.json/x"):
+        answer = api.get(address, headers=PERSON)
+        assert answer.status_code == 404
+        assert answer.headers["Content-Type"] == "application/problem+json"
+
+
+# Words ----------------------------------------------------------------------------------------------
+
+
+def test_numbers_are_written_with_their_units() -> None:
+    assert [size(count) for count in (999, 1000, 2.5e6, 3e9)] == ["999 B", "1 kB", "2.5 MB", "3 GB"]
+    assert [duration(s) for s in (None, 0.2, 42.0, 600.0, 7200.0)] == [
+        "unknown", "less than 1 s", "42 s", "10 min", "2.0 h",
+    ]  # fmt: skip
+    assert [percent(value) for value in (None, 3.716, -0.5)] == ["-", "+3.72\u00a0%", "-0.5\u00a0%"]
+    assert date(None) == "-"
+    assert date(0.0) == '<time datetime="1970-01-01T00:00:00+00:00">1970-01-01 00:00:00 UTC</time>'

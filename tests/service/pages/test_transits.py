@@ -1,0 +1,99 @@
+"""The pages of transits: upload, the schema of transit.json, and the jobs that a form starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from psfcore.transit.archive import pack
+from psfcore.transit.manifest import FILE_NAME, ImageEntry, TransitManifest
+from tests.service.conftest import upload
+from tests.service.keyed import keyed
+from tests.service.pages.test_login import PERSON, browser
+from tests.transit_files import write_transit
+from workers.catalogue.access.keys import Scope
+from workers.settings import Settings
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    pack(write_transit(tmp_path / "mercury", images=4), tmp_path / "mercury.tar")
+    return tmp_path / "mercury.tar"
+
+
+@pytest.fixture
+def transit_id(api: TestClient, archive: Path) -> str:
+    return upload(api, archive, "/v1/transits")
+
+
+def test_an_upload_by_the_form_leads_to_the_page_of_the_transit(api: TestClient, archive: Path) -> None:
+    assert "There are no transits yet" in api.get("/transits").text
+    answer = api.post(
+        "/transits", files={"file": ("mercury.tar", archive.read_bytes())}, follow_redirects=False
+    )
+    assert answer.status_code == 303
+    page = api.get(answer.headers["location"]).text
+    assert "<h1>mercury.tar</h1>" in page and "4 in 2 pointings" in page and "read noise 2 DN" in page
+    assert "003.fits" in page and "mercury.tar" in api.get("/transits").text
+    refused = api.post("/transits", files={"file": ("x.zip", b"no archive")}, headers=PERSON)
+    assert refused.status_code == 415 and refused.headers["content-type"].startswith("text/html")
+
+
+def test_the_schema_is_that_of_the_model_and_marks_the_names_of_files(api: TestClient) -> None:
+    schema = api.get("/transits/manifest.schema.json").json()
+    assert set(schema["required"]) == {"schema", "images"}
+    assert set(schema["properties"]) == {
+        field.alias or name for name, field in TransitManifest.model_fields.items()
+    }
+    entry = schema["$defs"][ImageEntry.__name__]
+    assert set(entry["required"]) == {"file", "fov", "x", "y", "r"}
+    assert entry["properties"]["file"]["format"] == FILE_NAME
+    assert {"format": FILE_NAME, "type": "string"} in schema["properties"]["known_psf"]["anyOf"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "form", "expected"),
+    [
+        ("psf-fit", {"shape": "core", "seed": "7"}, {"shape": "core", "seed": 7, "as_published": False}),
+        ("cross-validate", {"runs": "3", "scheme": "exact"}, {"runs": 3, "scheme": "exact"}),
+        ("report", {"psf_id": "", "shapes": "1"}, {"shapes": True, "dark_offsets": False, "psf_id": None}),
+        (
+            "gap-diagnose",
+            {"correct": "1", "photon_gain_dn": "5", "read_noise_dn": "1.5"},
+            {"correct": True, "noise": {"photon_gain_dn": 5.0, "read_noise_dn": 1.5}},
+        ),
+    ],
+)
+def test_a_form_starts_a_job_with_its_options(
+    api: TestClient, transit_id: str, kind: str, form: dict[str, str], expected: dict[str, object]
+) -> None:
+    assert f'action="/transits/{transit_id}/jobs/{kind}"' in api.get(f"/transits/{transit_id}").text
+    answer = api.post(f"/transits/{transit_id}/jobs/{kind}", data=form, follow_redirects=False)
+    assert answer.status_code == 303, answer.text
+    job = api.get("/v1" + answer.headers["location"]).json()
+    assert job["kind"] == kind and job["parameters"]["transit_id"] == transit_id
+    assert {name: job["parameters"].get(name) for name in expected} == expected
+
+
+def test_wrong_options_and_kinds_are_told_on_a_page(api: TestClient, transit_id: str) -> None:
+    for kind, form, told, status in (
+        ("psf-fit", {"seed": "soon"}, "seed: ", 422),
+        ("psf-fit", {"photon_gain_dn": "six"}, "noise: expected numbers", 422),
+        ("cross-validate", {"runs": "999"}, "runs: ", 422),
+        ("deconvolve", {}, "expected one of psf-fit", 404),
+    ):
+        answer = api.post(f"/transits/{transit_id}/jobs/{kind}", data=form, headers=PERSON)
+        assert answer.status_code == status and told in answer.text, kind
+        assert answer.headers["content-type"].startswith("text/html")
+
+
+def test_readers_see_no_forms_and_other_owners_nothing(settings: Settings, archive: Path) -> None:
+    with keyed(settings) as service:
+        transit_id = upload(service.client("ann"), archive, "/v1/transits")
+        page = browser(service, service.key("ann", Scope.READ)).get(f"/transits/{transit_id}")
+        assert page.status_code == 200 and "/jobs/psf-fit" not in page.text
+        bob = browser(service, service.key("bob"))
+        assert bob.get(f"/transits/{transit_id}").status_code == 404
+        assert transit_id not in bob.get("/transits").text
