@@ -35,6 +35,7 @@ bench: $(DEV)
 	$(BIN)/python -m benchmarks.fit
 	$(BIN)/python -m benchmarks.cross_validation
 	$(BIN)/python -m benchmarks.bulk --images 24
+	$(BIN)/python -m benchmarks.viewer
 
 # Other programs in their own environment, timed in turn with heliopsf on the same data.
 bench-peers: $(DEV)

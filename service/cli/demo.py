@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -22,6 +25,7 @@ from service.client.http import Client
 from service.client.outputs import check_outputs
 from service.client.versions import Progress
 
+DATA = "data"
 LOG = "server.log"  # by this file a later demo recognises the folder of an earlier one
 
 
@@ -63,7 +67,7 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
                 "--port",
                 "0",
                 "--data",
-                str(output / "data"),
+                str(output / DATA),
             ],
             # The demo uses its own service, even if the environment names another service.
             env={key: value for key, value in os.environ.items() if not key.startswith("HELIOPSF_")},
@@ -84,6 +88,11 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
         finally:
             server.terminate()
             server.wait(60)
+    return said(output, image, product_file, picture, product)
+
+
+def said(output: Path, image: Path, product_file: Path, picture: Path, product: dict[str, Any]) -> list[str]:
+    """What the demo prints at its end: its files, what changed, and how to look at the product in a browser."""
     change = product["details"]
     return [
         f"image    {image}",
@@ -92,7 +101,20 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
         f"PSF      {product['psf_version']} (id {product['psf_id'][:12]}, in the product's header)",
         f"change   brightest 1 % of pixels {percent(change['bright_change_pct'])}, "
         f"flux of the frame {percent(change['flux_change_pct'], 3)}",
+        "",
+        "To look at the product in a browser, start the service of the demo again:",
+        f"    {_command()} serve --data {shlex.quote(str(output / DATA))}",
+        f"and open its address with this path: /products/{product['id']}",
     ]
+
+
+def _command() -> str:
+    """How to call heliopsf: by its name if the shell finds it, otherwise by its path beside Python, as after ``make demo``."""
+    beside = Path(sys.executable).with_name("heliopsf")
+    if shutil.which("heliopsf") or not beside.exists():
+        return "heliopsf"
+    here = Path.cwd()
+    return shlex.quote(str(beside.relative_to(here) if beside.is_relative_to(here) else beside))
 
 
 def _results_for(image: Path, output: Path) -> tuple[Path, Path]:

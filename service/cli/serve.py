@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
+from urllib.parse import urlsplit
 
 import click
 
@@ -25,7 +26,7 @@ def serve(host: str, port: int, data: Path | None) -> None:
     """
     from sqlalchemy.exc import SQLAlchemyError
 
-    from service.http.access import NoKeyYet
+    from service.http.access import Access, NoKeyYet
     from service.server import serve as run
     from workers import checks
     from workers.catalogue.schema import SchemaError
@@ -40,14 +41,28 @@ def serve(host: str, port: int, data: Path | None) -> None:
             pass
     except OSError as error:
         raise click.ClickException(f"cannot keep data in {where}: {error.strerror or error}") from error
+    log_in = " and log in with a key" if Access.of(settings, host).keys else ""
+
+    def announce(url: str) -> None:
+        click.echo(
+            f"heliopsf serves {url} (data in {where})\nOpen {browser_address(url)} in a browser{log_in}."
+        )
+
     try:
-        run(settings, host, port, lambda url: click.echo(f"heliopsf serves {url} (data in {where})"))
+        run(settings, host, port, announce)
     except (SchemaError, NoKeyYet) as error:
         raise click.ClickException(str(error)) from error
     except SQLAlchemyError as error:
         raise click.ClickException(f"the database: {checks.database_said(error)}") from error
     except OSError as error:
         raise click.ClickException(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+
+
+def browser_address(url: str) -> str:
+    """The address at which a browser on this machine reaches a service that listens at ``url``."""
+    parts = urlsplit(url)
+    everywhere = parts.hostname in ("0.0.0.0", "::")  # every address of the machine: no browser opens that
+    return f"http://localhost:{parts.port}" if everywhere else url
 
 
 @click.command()

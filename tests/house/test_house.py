@@ -94,7 +94,9 @@ def test_what_people_import_stands_on_the_core_and_the_client_alone() -> None:
 LIGHT = (
     "psfcore.fits.header",
     "psfcore.fits.cutout",
+    "psfcore.fits.viewing",  # its modules of pixels are loaded by the first request for pixels
     "psfcore.fits.weights",
+    "psfcore.instruments.files",
     "psfcore.tables.lookup",
     "psfcore.errors",
     "psfcore.noise_figures",
@@ -136,7 +138,9 @@ def test_the_web_process_carries_no_numerics_and_no_task() -> None:
         "workers.run.registry",
         "workers.run.runner",
         "psfcore.convolution.convolver",
-        "psfcore.fits.hdus",  # only workers read pixels
+        "psfcore.fits.hdus",
+        "psfcore.fits.viewing.decode",  # loaded by the first request for pixels
+        "psfcore.fits.viewing.windows",
         "psfcore.fits.images",
         "psfcore.fits.psfs",
         "service.local",

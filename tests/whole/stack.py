@@ -46,9 +46,10 @@ class Stack:
         self.redis: Redis | None = None
         self.client = Client()
 
-    def start_server(self) -> None:
+    def start_server(self, port: int = 0) -> None:
+        """Start the service at a port; 0: any free one."""
         self.server = subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "serve", "--port", "0"],
+            [sys.executable, "-m", "service.cli", "serve", "--port", str(port)],
             env=self.environment,
             stdout=subprocess.PIPE,
             stderr=(self.data.parent / "server.log").open("a"),

@@ -45,7 +45,7 @@ def kill_worker_of(stack: Stack, job_id: str, *, own: bool) -> None:
     row = catalogue.jobs.get(job_id)
     catalogue.close()
     assert row is not None and row.worker is not None
-    pid = int(row.worker.rsplit(":", 1)[1])
+    pid = int(row.worker.split(":")[1])  # host:process:random
     for worker in stack.workers:
         root = psutil.Process(worker.pid)
         processes = [root, *root.children(recursive=True)]

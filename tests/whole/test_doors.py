@@ -25,8 +25,8 @@ from service.client.http import Client
 from tests.conftest import write_image, write_psf
 from tests.service.keyed import ALL, bearer
 from tests.whole.stack import QUICK, wait_for
+from workers.catalogue.access.keys import Scope
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.keys import Scope
 from workers.settings import Settings
 
 DESCRIPTORS = 160

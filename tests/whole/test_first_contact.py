@@ -6,6 +6,7 @@ import json
 import os
 import pty
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -14,9 +15,11 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 from astropy.io import fits
 
+from service.cli import demo
 from service.client.http import Client
 from tests.conftest import REPOSITORY, write_image, write_psf
 from tests.whole import stack as stacks
@@ -29,6 +32,43 @@ COMMAND = (sys.executable, "-m", "service.cli")
 def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
     with stacks.embedded(tmp_path_factory.mktemp("first")) as running:
         yield running
+
+
+def test_the_service_says_what_to_open_in_a_browser(stack: Stack) -> None:
+    assert stack.server is not None and stack.server.stdout is not None
+    told = stack.server.stdout.readline()
+    assert told == f"Open {stack.client.server} in a browser.\n"
+
+
+def test_the_command_that_the_demo_tells_shows_its_product(tmp_path: Path) -> None:
+    output = tmp_path / "a demo"
+    output.mkdir()
+    with stacks.embedded(output) as running:
+        write_image(tmp_path / "image.fits")
+        write_psf(tmp_path / "psf.fits")
+        client, files = running.client, (tmp_path / "product.fits", tmp_path / "picture.png")
+        psf = client.upload_psf(tmp_path / "psf.fits")["id"]
+        product = client.deconvolve(tmp_path / "image.fits", files[0], psf_id=psf, preview=files[1])
+    told = demo.said(output, tmp_path / "image.fits", *files, product)
+    (command,) = [line for line in told if " serve " in line]
+    (path,) = re.findall(r"this path: (/products/\w+)$", "\n".join(told))
+    server = subprocess.Popen(
+        [*COMMAND, *shlex.split(command)[1:], "--port", "0"],
+        env=running.environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert server.stdout is not None
+    try:
+        _, line = server.stdout.readline(), server.stdout.readline()
+        (address,) = re.findall(r"^Open (\S+) in a browser\.$", line)
+        with Client(address) as client:
+            client.wait_until_up()
+        answer = httpx.get(address + path, headers={"Accept": "text/html"}, timeout=60)
+        assert answer.status_code == 200 and "image.fits" in answer.text
+    finally:
+        server.terminate()
+        server.wait(60)
 
 
 def rest_of(terminal: int) -> Iterator[str]:
@@ -56,7 +96,7 @@ def started(stack: Stack, folder: Path) -> str:
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is missing")
 def test_the_curl_lines_of_the_readme_work(stack: Stack, tmp_path: Path) -> None:
     [lines] = re.findall(r"```sh\n(.+?)```", (REPOSITORY / "README.md").read_text("utf-8"), flags=re.S)
-    assert lines.count("curl ") == 6 and lines.startswith("S=http://127.0.0.1:8765\n")
+    assert lines.count("curl ") == 6 and lines.startswith("S=http://127.0.0.1:8765 ")
     write_psf(tmp_path / "psf.fits", size=256)
     psf = stack.client.upload_psf(tmp_path / "psf.fits", instrument="hri_euv", channel="174", kind="total")
     stack.client.certify_psf(psf["id"], "1.0.0")

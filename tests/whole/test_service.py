@@ -76,7 +76,7 @@ def test_a_killed_worker_loses_nothing_and_nothing_is_done_twice(
     assert done["attempt"] == 2
     assert len(list(stack.client.products())) == 1
     blobs = [p for p in (stack.data / "blobs").rglob("*") if p.is_file()]
-    assert len(blobs) == 4, "image, PSF, product, picture"
+    assert len(blobs) == 5, "image, PSF, product, picture of the changes, thumbnail"
 
 
 @pytest.mark.parametrize("living", EMBEDDED_FIRST, indirect=True)

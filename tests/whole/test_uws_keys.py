@@ -17,8 +17,8 @@ from service.client.http import Client
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.whole import stack as stacks
 from tests.whole.stack import Stack, wait_for
+from workers.catalogue.access.keys import Scope
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.keys import Scope
 from workers.settings import Settings
 
 BUILD = {"KIND": "psf-build", "instrument_file": SMALL_INSTRUMENT, "size": "128"}

@@ -13,18 +13,11 @@ from sqlalchemy import make_url
 
 from service.cli.operator.database import opened_catalogue
 from service.cli.options import DATA, read_settings
-from workers.catalogue.keys import OWNER, Scope
+from workers.catalogue.access.keys import MEANINGS, OWNER, Scope
 from workers.catalogue.tables import KeyRow
 
 UNITS_S = {"h": 3600, "d": 86_400, "w": 604_800}
 DEFAULT_SCOPES = (Scope.READ, Scope.SUBMIT)
-MEANINGS = {
-    Scope.READ: "read and download the owner's data",
-    Scope.SUBMIT: "upload files, submit jobs, cancel them",
-    Scope.CERTIFY: "certify and deprecate PSFs, and change contexts",
-    Scope.BULK: "start bulk runs",
-    Scope.ADMIN: "read the metrics, and act for any owner (header X-Owner)",
-}
 
 
 class Duration(click.ParamType):

@@ -10,7 +10,7 @@ from typing import get_args
 
 import click
 
-from service.cli.connection import LOCAL, SERVER, connection
+from service.cli.connection import LOCAL, SERVER, connection, short
 from service.cli.options import (
     FILE,
     JSON,
@@ -37,7 +37,10 @@ SHAPE = click.option(
 
 @click.command("build")
 @click.option(
-    "--instrument", required=True, metavar="NAME|FILE", help="hri_euv, or an instrument file (TOML)"
+    "--instrument",
+    required=True,
+    metavar="NAME|FILE",
+    help="An instrument that `psf instruments` lists, such as hri_euv, or an instrument file (TOML)",
 )
 @click.option("--size", default=2048, show_default=True, help="Width and height of the array, px")
 @click.option(
@@ -77,7 +80,7 @@ def build(
             progress=report,
             overwrite=overwrite,
         )
-    click.echo(f"{output}: {built['name']} {built['version']} ({built['status']})")
+    click.echo(f"{output}: {built['name']} {built['version']} ({built['status']}), id {short(built['id'])}")
     for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
         click.echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
 

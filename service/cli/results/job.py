@@ -17,10 +17,10 @@ from workers.contract.phases import Phase
 
 # How to get the result of a job, by the part of its address that names the type of the result.
 NEXT = {
-    "products": "product {id}: heliopsf product get {id} -o FILE",
-    "psfs": "PSF {id}: heliopsf psf download {id} -o FILE",
+    "products": "product {id}: heliopsf product get {id} -o FILE{at}",
+    "psfs": "PSF {id}: heliopsf psf download {id} -o FILE{at}",
     "reports": "report {id}: repeat the command that started the job; it ends at once and writes its files",
-    "bulk": "bulk run {id}: heliopsf bulk status {id}",
+    "bulk": "bulk run {id}: heliopsf bulk status {id}{at}",
 }
 MOST = click.option(
     "--most",
@@ -49,7 +49,7 @@ def list_jobs(phase: str | None, most: int, server: str | None) -> None:
         click.echo("no job yet" if phase is None else f"no job in phase {phase}")
     for row in rows:
         click.echo(
-            f"{short(row['id'])}  {row['phase']:<9}  {row['kind']:<14}  {moment(row['created_at'])}  {_state(row)}".rstrip()
+            f"{short(row['id'])}  {row['phase']:<9}  {row['kind']:<14}  {moment(row['created_at'])}  {_state(row, server)}".rstrip()
         )
 
 
@@ -62,7 +62,7 @@ def show(identity: str, json_file: Path | None, server: str | None, overwrite: b
     """Show the phase, progress, and result or error of a job."""
     with user_errors(), remote(server) as service:
         found = service.job(identity)
-    click.echo("\n".join(_lines(found)))
+    click.echo("\n".join(_lines(found, server)))
     write_json(json_file, found, overwrite=overwrite)
 
 
@@ -85,7 +85,7 @@ def wait(identities: tuple[str, ...], server: str | None) -> None:
                 ended = Phase.ABORTED if error.code == "cancelled" else error
                 click.echo(f"job {short(found['id'])}: {ended}", err=True)
                 continue
-            click.echo(f"job {short(found['id'])}: {_state(found)}")
+            click.echo(f"job {short(found['id'])}: {_state(found, server)}")
     if failed:
         raise click.exceptions.Exit(1)
 
@@ -110,13 +110,14 @@ def moment(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
 
 
-def _state(found: dict[str, Any]) -> str:
-    """The progress, result or error of a job in one line; empty for a job that waits."""
+def _state(found: dict[str, Any], server: str | None) -> str:
+    """The progress, result or error of a job in one line; empty for a job that waits. server: as the command was given it."""
     if found["error"] is not None:
         return str(found["error"]["message"])
     if found["result"] is not None:
         things, identity = found["result"].split("/")[-2:]
-        return NEXT[things].format(id=short(identity))
+        at = "" if server is None else f" --server {server}"
+        return NEXT[things].format(id=short(identity), at=at)
     now = found["progress"]
     if not now["steps"]:
         return ""
@@ -124,7 +125,7 @@ def _state(found: dict[str, Any]) -> str:
     return f"{now['stage']}: step {now['step']} of {now['steps']}{left}"
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
+def _lines(found: dict[str, Any], server: str | None) -> list[str]:
     lines = [
         f"job {found['id']}: {found['kind']}, {found['phase']}",
         f"  queue {found['queue']}, attempt {found['attempt']}",
@@ -133,7 +134,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         if found[key] is not None:
             lines.append(f"  {name:<8} {moment(found[key])}")
     lines += [f"  {name} {_value(value)}" for name, value in found["parameters"].items() if value is not None]
-    state = _state(found)
+    state = _state(found, server)
     return [*lines, f"  {state}"] if state else lines
 
 

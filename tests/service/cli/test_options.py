@@ -137,4 +137,4 @@ def test_warnings_of_a_product_are_printed(tmp_path: Path) -> None:
     refused = CliRunner().invoke(main, arguments)
     assert refused.exit_code == 1 and "--other-channel" in refused.output
     taken = CliRunner().invoke(main, [*arguments, "--other-channel"])
-    assert taken.exit_code == 0 and "warning: PSF" in taken.stderr and "193 angstrom" in taken.stderr
+    assert taken.exit_code == 0 and "warning: the PSF" in taken.stderr and "193 angstrom" in taken.stderr

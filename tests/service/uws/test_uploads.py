@@ -16,7 +16,7 @@ from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from tests.service.uws.test_uws import JOBS, document, parameters
 from tests.transit_files import write_transit
-from workers.catalogue.keys import Scope
+from workers.catalogue.access.keys import Scope
 from workers.catalogue.owners import counted_bytes
 from workers.catalogue.tables import ImageRow
 from workers.files.store import sha256_of
