@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
+
+from tests.service.pages.browser.checks import good
 
 
 def test_the_first_page_says_what_to_do(page: Page) -> None:
@@ -12,7 +13,7 @@ def test_the_first_page_says_what_to_do(page: Page) -> None:
         "See the Sun without the smear of the telescope"
     )
     expect(page.get_by_label("Drop a FITS image")).to_be_visible()
-    assert Axe().run(page).violations_count == 0
+    good(page)
 
 
 def test_a_file_that_is_no_image_is_refused_before_it_is_sent(page: Page) -> None:
