@@ -26,6 +26,7 @@ POLICY = (
     "form-action 'self'; frame-ancestors 'none'; base-uri 'none'; require-trusted-types-for 'script'"
 )
 SHORT = 12  # letters of an id that a page shows
+PLAIN_BELOW = 1e6  # larger numbers are shown with a power of ten
 
 
 def page(
@@ -124,8 +125,11 @@ def duration(seconds: float | None) -> str:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A number with so many significant digits."""
-    return "-" if value is None else f"{value:.{digits}g}"
+    """A number with so many significant digits; below a million without a power of ten."""
+    if value is None:
+        return "-"
+    said = f"{value:.{digits}g}"
+    return f"{float(said):.0f}" if "e+" in said and abs(value) < PLAIN_BELOW else said
 
 
 def percent(value: float | None) -> str:

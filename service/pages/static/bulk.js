@@ -21,7 +21,7 @@ function show(place, run) {
   for (const [name, count] of Object.entries(run.images)) tell(name, String(count));
   const pace = place === one || AT_WORK.includes(run.phase) ? run.images_an_hour : null;
   const unknown = place === one ? "unknown" : "";
-  tell("pace", pace === null ? unknown : `${Number(pace.toPrecision(3))} an hour`);
+  tell("pace", pace === null ? unknown : `${Number(pace.toPrecision(3))} images an hour`);
   if (!OPEN.includes(run.phase)) tell("left", place === one ? "none" : "");
   else tell("left", run.time_left_s === null ? unknown : duration(run.time_left_s));
   if (place === one) showOne(run);

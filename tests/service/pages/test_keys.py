@@ -26,7 +26,7 @@ def test_a_key_is_made_shown_once_and_revoked(service: Keyed) -> None:
     data = {"scopes": ["read", "submit"], "label": "cluster <1>", "lasts_days": "30", "owner": "ann"}
     answer = client.post("/keys", data=data, headers=OWN_PAGE)
     assert answer.status_code == 201 and answer.headers["Cache-Control"] == "no-store"
-    (key,) = re.findall(r'value="(hpsf_[^"]+)"', answer.text)
+    (key,) = re.findall(r">(hpsf_[^<]+)</textarea>", answer.text)
     assert "cluster &lt;1&gt;" in answer.text and "cluster <1>" not in answer.text
     assert service.api.get("/v1/jobs", headers=bearer(key)).status_code == 200
     listed = client.get("/keys").text
@@ -41,7 +41,7 @@ def test_revoking_the_key_of_the_login_ends_the_login(service: Keyed) -> None:
     key = service.key("ann")
     client = browser(service, key)
     made = client.post("/keys", data={"scopes": "read"}, headers=OWN_PAGE)
-    (other,) = re.findall(r'value="(hpsf_[^"]+)"', made.text)
+    (other,) = re.findall(r">(hpsf_[^<]+)</textarea>", made.text)
     data = {"and_made": "true"}
     client.post(f"/keys/{key.split('_')[1]}/revoke", data=data, headers=OWN_PAGE)
     assert client.get("/keys").headers["location"].startswith("/login")

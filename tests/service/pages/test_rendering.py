@@ -12,7 +12,7 @@ from httpx import Response
 from sqlalchemy.exc import OperationalError
 
 from service.app import create_app
-from service.pages.rendering import POLICY, date, duration, percent, size
+from service.pages.rendering import POLICY, date, duration, number, percent, size
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
 from workers.settings import Settings
@@ -177,5 +177,8 @@ def test_numbers_are_written_with_their_units() -> None:
         "unknown", "less than 1 s", "42 s", "10 min", "2.0 h",
     ]  # fmt: skip
     assert [percent(value) for value in (None, 3.716, -0.5)] == ["-", "+3.72\u00a0%", "-0.5\u00a0%"]
+    assert [number(value, 3) for value in (None, 11_497.0, 999_600.0, 2.5e6, 0.123456, 2e-7)] == [
+        "-", "11500", "1000000", "2.5e+06", "0.123", "2e-07",
+    ]  # fmt: skip
     assert date(None) == "-"
     assert date(0.0) == '<time datetime="1970-01-01T00:00:00+00:00">1970-01-01 00:00:00 UTC</time>'
