@@ -31,6 +31,8 @@ from service.http.callers import Caller
 from service.http.paging import Cursor, following, number, place
 from service.http.problems import Problem
 from service.http.state import Shared, State
+from service.pages.parts import methods
+from service.pages.parts.forms import wrong_fields
 from service.pages.rendering import page, short
 from service.pages.visitors import PageBulk, PageReading
 from workers.catalogue.access.keys import Scope
@@ -71,6 +73,7 @@ def bulk_list(request: Request, caller: PageReading, state: Shared, cursor: Curs
         more=len(without) > MOST_STARTED,
         psfs=state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_CHOICES),
         contexts=state.catalogue.page(PsfContextRow, owner=caller.owner, limit=MOST_CHOICES),
+        methods=methods.choices(),
         may=Scope.BULK in caller.scopes,
     )
 
@@ -82,6 +85,8 @@ def start(
     state: Shared,
     choice: Annotated[str, Form()] = "",
     name: Annotated[str, Form()] = "",
+    method: Annotated[str, Form()] = "",
+    steps: Annotated[str, Form()] = "",
 ) -> Response:
     """Start a run of the uploaded images that have no product, and show it. choice: ``psf:ID`` or ``context:ID``."""
     kind, _, identity = choice.partition(":")
@@ -96,10 +101,14 @@ def start(
             "nothing-to-deconvolve",
             "expected uploaded images without a product; each of your images has one: upload other images first",
         )
+    parameters = {"method": methods.chosen({"method": method, "steps": steps})}
+    wanted = {CHOICES[kind]: identity, "images": list(images), "name": name, "parameters": parameters}
     try:
-        body = BulkRequest.model_validate({CHOICES[kind]: identity, "images": list(images), "name": name})
+        body = BulkRequest.model_validate(wanted)
     except ValidationError as error:
         wrong = {str(found["loc"][0]) for found in error.errors() if found["loc"]}
+        if "parameters" in wrong:
+            raise wrong_fields(error, BulkRequest, above=len(("parameters",))) from error
         advice = "a name of at most 80 letters in one line" if "name" in wrong else "a PSF of the list"
         raise Problem(422, "invalid-request", f"expected {advice}: go back and correct the form") from error
     made = submit_bulk(body, response, caller, state)

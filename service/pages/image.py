@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -15,13 +15,13 @@ from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.images import image_line
+from service.pages.parts import methods
 from service.pages.parts.forms import Sent, text, wanted_job
 from service.pages.rendering import page
 from service.pages.visitors import PageReading, PageSubmitting
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.kinds import JobRequest
-from workers.contract.methods import Method, RichardsonLucy
 from workers.contract.requests import Identity
 
 MOST_PSFS = MOST_PRODUCTS = 50
@@ -49,8 +49,7 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
         problem=problem,
         psfs=psfs,
         products=[ProductView.of(product) for product in products],
-        methods=_methods(),
-        usual_steps=RichardsonLucy().steps,
+        methods=methods.choices(),
         asked=_shown(asked),
     )
 
@@ -67,13 +66,10 @@ async def start(
 
 def _wanted(image_id: str, asked: Sent) -> JobRequest:
     """The request for a job from the options of a form. Raises ``Problem`` 422 for a wrong option."""
-    method: dict[str, Any] = {"name": text(asked, "method") or RichardsonLucy().name}
-    if steps := text(asked, "steps"):
-        method["steps"] = steps
     parameters = {
         "image_id": image_id,
         "psf_id": text(asked, "psf_id") or None,
-        "method": method,
+        "method": methods.chosen(asked),
         "error_draws": text(asked, "error_draws") or 0,
         "other_channel": bool(text(asked, "other_channel")),
         "again": bool(text(asked, "again")),
@@ -86,12 +82,6 @@ def _shown(asked: Sent) -> dict[str, Any]:
     names = ("psf_id", "method", "steps", "error_draws", "other_channel", "again")
     shown = {name: text(asked, name) for name in names}
     return shown | {"error_draws": shown["error_draws"] or "0", "changed": any(shown.values())}
-
-
-def _methods() -> list[str]:
-    """The names of the methods, the usual one first."""
-    models = get_args(get_args(Method)[0])
-    return [get_args(model.model_fields["name"].annotation)[0] for model in models]
 
 
 def _facts(row: ImageRow) -> list[tuple[str, str]]:

@@ -56,7 +56,7 @@ def checked(model: type[BaseModel], values: Mapping[str, Any]) -> Any:
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
-        raise wrong_fields(error) from error
+        raise wrong_fields(error, model) from error
 
 
 def wanted_job(kind: str, parameters: Mapping[str, Any]) -> JobRequest:
@@ -64,7 +64,7 @@ def wanted_job(kind: str, parameters: Mapping[str, Any]) -> JobRequest:
     try:
         found: JobRequest = _REQUEST.validate_python({"kind": kind, "parameters": dict(parameters)})
     except ValidationError as error:
-        raise wrong_fields(error, above=len(("kind", "parameters"))) from error
+        raise wrong_fields(error, JobRequest, above=len(("kind", "parameters"))) from error
     return found
 
 
@@ -80,10 +80,10 @@ async def fields(request: Request) -> Sent:
     return await request.form()
 
 
-def wrong_fields(error: ValidationError, *, above: int = 0) -> Problem:
-    """The problem that names each wrong field. above: number of levels of the model above the fields of the form."""
+def wrong_fields(error: ValidationError, model: Any, *, above: int = 0) -> Problem:
+    """The problem that names each wrong field. model: what was validated. above: its levels above the fields of the form."""
     said = [
         f"{'.'.join(map(str, found['loc'][above:])) or 'the form'}: {told}"
-        for found, told in explained(error.errors(), None)
+        for found, told in explained(error.errors(), model)
     ]
     return Problem(422, "invalid-request", "; ".join(said))

@@ -76,4 +76,4 @@ def _wanted(asked: dict[str, str]) -> PsfFilter:
     try:
         return _filter(**{name: asked[name] for name in FILTERS if name in asked})
     except ValidationError as error:
-        raise wrong_fields(error) from error
+        raise wrong_fields(error, PsfFilter) from error

@@ -106,6 +106,23 @@ def test_a_run_of_all_images_without_a_product_is_started_followed_and_shown(
     assert second["images"]["total"] == 1 and newest not in first
 
 
+def test_a_run_from_the_form_uses_its_method_and_steps(api: TestClient, psf_id: str, tmp_path: Path) -> None:
+    uploaded(api, tmp_path, 1)
+    page = api.get("/bulk").text
+    names = re.findall(r"<option[^>]*>([a-z-]+)</option>", page)
+    assert names[0] == "richardson-lucy" and "linear" in names and 'max="200"' in page
+    for number, (fields, expected) in enumerate(
+        (
+            ({}, {"name": "richardson-lucy", "steps": 20}),
+            ({"method": "linear", "steps": ""}, {"name": "linear", "steps": 5}),
+            ({"method": "basic-iterative", "steps": "7"}, {"name": "basic-iterative", "steps": 7}),
+        )
+    ):
+        place = started(api, psf_id, name=str(number), **fields)
+        method = api.get(f"/v1{place}").json()["request"]["parameters"]["method"]
+        assert {key: method[key] for key in expected} == expected
+
+
 def test_a_run_from_the_form_takes_a_limited_number_of_images(
     api: TestClient, psf_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,6 +220,9 @@ def test_a_run_is_paused_resumed_retried_and_cancelled_by_its_buttons(
         ({"choice": f"psf:{'0' * 64}"}, "the id of a PSF in the catalogue"),
         ({"choice": "context:none"}, "none"),
         ({"choice": f"psf:{'0' * 64}", "name": "two\nlines"}, "in one line"),
+        ({"choice": f"psf:{'0' * 64}", "steps": "many"}, "steps: Input should be a valid integer"),
+        ({"choice": f"psf:{'0' * 64}", "steps": "201"}, "steps: Input should be less than or equal to 200"),
+        ({"choice": f"psf:{'0' * 64}", "method": "magic"}, "expected name to be one of richardson-lucy"),
     ],
 )
 def test_a_wrong_form_says_what_was_expected(

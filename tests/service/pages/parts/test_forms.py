@@ -29,3 +29,5 @@ def test_a_wrong_parameter_is_named() -> None:
     with pytest.raises(Problem, match="size: Input should be") as refused:
         wanted_job("psf-build", {"instrument": "hri_euv", "size": "wide"})
     assert refused.value.status == 422
+    with pytest.raises(Problem, match=r"method: expected name to be one of richardson-lucy, .*; got 'magic'"):
+        wanted_job("deconvolve", {"image_id": "0" * 64, "method": {"name": "magic"}})

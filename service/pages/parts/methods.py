@@ -1,0 +1,31 @@
+"""The fields of a form that choose the method of deconvolution and its steps."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+from annotated_types import Ge, Le
+
+from service.pages.parts.forms import Sent, text
+from workers.contract.methods import Method, RichardsonLucy
+
+USUAL = RichardsonLucy()
+
+
+def choices() -> dict[str, Any]:
+    """What the fields offer: the names of the methods, the usual one first, and the usual, least and largest number of steps."""
+    models = get_args(get_args(Method)[0])
+    limits = RichardsonLucy.model_fields["steps"].metadata
+    return {
+        "names": [get_args(model.model_fields["name"].annotation)[0] for model in models],
+        "usual_steps": USUAL.steps,
+        "least_steps": next(one.ge for one in limits if isinstance(one, Ge)),
+        "most_steps": next(one.le for one in limits if isinstance(one, Le)),
+    }
+
+
+def chosen(form: Sent) -> dict[str, str]:
+    """The parameter ``method`` of a request. A method without a number of steps has its own default."""
+    method = {"name": text(form, "method") or USUAL.name}
+    steps = text(form, "steps")
+    return method | ({"steps": steps} if steps else {})
