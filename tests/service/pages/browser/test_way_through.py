@@ -6,13 +6,14 @@ import re
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.conftest import write_image, write_psf
 from tests.service.pages.browser.checks import good
 from tests.whole.stack import Stack
 
 LONG_MS = 120_000
+MOST_TABS = 60
 
 
 @pytest.fixture
@@ -71,13 +72,54 @@ def test_the_header_of_an_image_is_searched(page: Page) -> None:
     expect(page.get_by_role("rowheader", name="TELESCOP")).to_have_count(0)
 
 
-def test_the_keyboard_alone_starts_a_job(page: Page, image_file: Path, psf_id: str) -> None:
+def tab_to(page: Page, place: Locator) -> None:
+    """Press the tabulator key until a place has the focus."""
+    for _ in range(MOST_TABS):
+        page.keyboard.press("Tab")
+        if place.evaluate("(one) => one === document.activeElement"):
+            return
+    raise AssertionError(f"{place} was not reached in {MOST_TABS} steps")
+
+
+def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
+    page: Page, image_file: Path, psf_id: str
+) -> None:
     page.goto("/")
-    page.set_input_files("#file", image_file)  # the system's own dialog is no part of the page
-    page.get_by_role("button", name="Upload").focus()
+    tab_to(page, page.locator("#file"))
+    with page.expect_file_chooser() as chooser:
+        page.keyboard.press("Enter")
+    chooser.value.set_files(image_file)  # the system's own dialog is no part of the page
+    tab_to(page, page.get_by_role("button", name="Upload"))
     page.keyboard.press("Enter")
-    expect(page).to_have_url(re.compile("/images/"))
-    page.goto(f"{page.url}?psf_id={psf_id}&steps=3")
-    page.get_by_role("button", name="Start").focus()
+    expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
+    psfs = page.locator("select[name=psf_id]")
+    tab_to(page, psfs)
+    for _ in range(psfs.locator("option").count()):
+        if psfs.input_value() == psf_id:
+            break
+        page.keyboard.press("ArrowDown")
+    expect(psfs).to_have_value(psf_id)
+    tab_to(page, page.locator("input[name=steps]"))
+    page.keyboard.type("3")
+    tab_to(page, page.get_by_role("button", name="Check these options"))
     page.keyboard.press("Enter")
-    expect(page).to_have_url(re.compile("/jobs/|/products/"))
+    expect(page).to_have_url(re.compile("steps=3"))
+    tab_to(page, page.get_by_role("button", name="Start"))
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
+    expect(page.locator("#zoom")).to_contain_text("%")
+    modes = page.locator("#mode")
+    tab_to(page, modes)
+    for _ in range(modes.locator("option").count()):
+        if modes.input_value() == "blink":
+            break
+        page.keyboard.press("ArrowDown")
+    expect(modes).to_have_value("blink")
+    tab_to(page, page.locator("#canvas"))
+    shown = page.locator("#tag-left")
+    first = shown.inner_text()
+    assert first in ("before", "after")
+    page.keyboard.press("b")
+    expect(shown).to_have_text("after" if first == "before" else "before")
+    page.keyboard.press("b")
+    expect(shown).to_have_text(first)
