@@ -108,7 +108,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     problems.install(app, problem_page)
     visitors.install(app)
     description.install(app)
-    guard.install(app, access, BodyLimits.of(settings))
+    guard.install(app, access, BodyLimits.of(settings), problem_page)
     app.state.requests = observation.install(app)
     # psf_choice comes before psfs, so that "best" is not taken for an id.
     versions = (psf_choice, psf_status, contexts, affected, lineage)

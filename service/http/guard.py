@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from urllib.parse import urlsplit
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request, Response
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -13,16 +13,18 @@ from service.http.access import Access
 from service.http.bodies import BodyLimits
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
+# Style sheets and pictures of pages, which hold nothing of anybody. The page of a refusal needs them.
+FOR_EVERYBODY = "/static/"
 
 
-def install(app: FastAPI, access: Access, bodies: BodyLimits) -> None:
-    """Guard every request of the application."""
-    app.add_middleware(_Guard, access=access, bodies=bodies)
+def install(app: FastAPI, access: Access, bodies: BodyLimits, as_page: problems.AsPage) -> None:
+    """Guard every request of the application. as_page: makes the page of a refusal, for browsers."""
+    app.add_middleware(_Guard, access=access, bodies=bodies, as_page=as_page)
 
 
 class _Guard:
-    def __init__(self, app: ASGIApp, access: Access, bodies: BodyLimits) -> None:
-        self._app, self._access, self._bodies = app, access, bodies
+    def __init__(self, app: ASGIApp, access: Access, bodies: BodyLimits, as_page: problems.AsPage) -> None:
+        self._app, self._access, self._bodies, self._as_page = app, access, bodies, as_page
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -36,11 +38,11 @@ class _Guard:
 
         headers = Headers(scope=scope)
         try:
-            self._check_host(headers)
+            if scope["method"] not in SAFE_METHODS or not scope["path"].startswith(FOR_EVERYBODY):
+                self._check_host(headers)
             _check_origin(scope["method"], headers)
         except problems.Problem as problem:
-            refusal = problems.document(problem.status, problem.code, problem.detail)
-            await refusal(scope, receive, kept)
+            await self._refusal(Request(scope), problem)(scope, receive, kept)
             return
         # Nobody reads the body of a request that changes nothing. A stream of events receives only to learn when its client
         # leaves, so no limit may end it.
@@ -52,6 +54,11 @@ class _Guard:
             at_end = scope.get("state", {}).get("at_end")
             if at_end is not None:
                 at_end()
+
+    def _refusal(self, request: Request, problem: problems.Problem) -> Response:
+        if problems.wants_page(request):
+            return self._as_page(request, problem.status, problem.code, problem.detail, {})
+        return problems.document(problem.status, problem.code, problem.detail)
 
     def _check_host(self, headers: Headers) -> None:
         """Refuse unknown host names. Otherwise a web page of another site could reach an open service by DNS rebinding.
@@ -84,7 +91,8 @@ def _check_origin(method: str, headers: Headers) -> None:
         raise problems.Problem(
             403,
             "cross-site",
-            "expected a request from a program or from a page of this service; got a request from a page of another site",
+            "expected a request from a program or from a page of this service; got a request from a page of another site: "
+            "open the page of this service, and send its own form",
         )
 
 

@@ -21,6 +21,12 @@ TITLES = {
     503: "The service cannot answer now",
     507: "The disk of the service is full",
 }
+TITLES_OF_CODES = {
+    "cross-site": "This request came from another site",
+    "form-token-missing": "This form is too old",
+}
+# Other pages of this address would be refused too.
+WITHOUT_LINKS = {421}
 # The image was stored before these errors, or its page still shows it.
 KEPT = "Nothing is lost: what you uploaded before is kept, and need not be chosen again."
 
@@ -29,8 +35,14 @@ def problem_page(
     request: Request, status: int, code: str, detail: str, _fields: Mapping[str, Any]
 ) -> Response:
     """The page of an error."""
-    title = TITLES.get(status) or (
-        "The service failed" if status >= 500 else "The service cannot do that: " + HTTPStatus(status).phrase
+    title = (
+        TITLES_OF_CODES.get(code)
+        or TITLES.get(status)
+        or (
+            "The service failed"
+            if status >= 500
+            else "The service cannot do that: " + HTTPStatus(status).phrase
+        )
     )
     kept = KEPT if status in (429, 500, 503, 507) else ""
     return page(
@@ -42,4 +54,5 @@ def problem_page(
         detail=detail,
         code=code,
         kept=kept,
+        linked=status not in WITHOUT_LINKS,
     )

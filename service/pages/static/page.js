@@ -12,13 +12,15 @@ export function element(tag, attributes = {}, ...children) {
   return made;
 }
 
-/** An error that the service told: `status`, `code` (its stable short name) and `fields` of the problem document. */
+/** An error that the service told: `status`, `code` (its stable short name) and `fields` of the problem document. `shown`: the
+ * page says already what to do. */
 export class ServiceError extends Error {
   constructor(status, problem) {
     super(problem.detail || `the service answered ${status}`);
     this.status = status;
     this.code = (problem.type || "").replace("urn:heliopsf:", "");
     this.fields = problem;
+    this.shown = false;
   }
 }
 
@@ -35,18 +37,37 @@ export async function json(address, body = undefined, options = {}) {
   return (await request(address, { ...sent, ...options })).json();
 }
 
-/** The error of an answer that is not good. After the end of a session, the login page comes back to this page. */
+/** The error of an answer that is not good. After the end of a session, the person is led to the login. */
 export function serviceError(status, text) {
-  if (status === 401 && document.body.hasAttribute("data-keys")) {
-    location.assign(`/login?ended=1&next=${encodeURIComponent(location.pathname + location.search)}`);
-  }
   let problem = {};
   try {
     problem = JSON.parse(text);
   } catch {
     problem = { detail: text.slice(0, 500) };
   }
-  return new ServiceError(status, problem);
+  const error = new ServiceError(status, problem);
+  if (status === 401 && document.body.hasAttribute("data-keys")) {
+    leadToLogin();
+    error.shown = true;
+  }
+  return error;
+}
+
+/** Go to the login page, which comes back to this page. A page with a chosen file stays, because the file would be forgotten. */
+function leadToLogin() {
+  const chosen = [...document.querySelectorAll("input[type=file]")].some((input) => input.files.length > 0);
+  if (!chosen) return location.assign(`/login?ended=1&next=${encodeURIComponent(location.pathname + location.search)}`);
+  forgetEndOfSession();
+  const link = element("a", { href: "/login?ended=1", target: "_blank" }, "Log in in a new tab");
+  const note = element("p", { id: "session-ended", class: "error", role: "alert" },
+    "Your login has ended, so nothing was kept of what was sent. ", link, ", come back to this tab and send the file again. It is still chosen.");
+  document.querySelector("main h1").after(note);
+  note.scrollIntoView({ block: "nearest" });
+}
+
+/** Remove the note about the end of the session, before a new try. */
+export function forgetEndOfSession() {
+  document.getElementById("session-ended")?.remove();
 }
 
 /** What to say of an error. */

@@ -1,5 +1,5 @@
 // Sends a file and shows how much has arrived, in the elements sending, sending-name, sending-done, sending-bar and stop.
-import { say, serviceError, size } from "./page.js";
+import { forgetEndOfSession, request, say, serviceError, size } from "./page.js";
 
 const part = (name) => document.getElementById(name);
 
@@ -8,6 +8,9 @@ export function send(file, name, address, type, said, arrived) {
   const sending = part("sending");
   const done = part("sending-done");
   const post = new XMLHttpRequest();
+  const refused = (error) => error.shown || say(said, error.message, "error");
+  const lost = () => say(said, `The connection to the service ended before all of ${name} had arrived. Nothing was kept of it. The file is still chosen: send it again.`, "error");
+  forgetEndOfSession();
   post.open("POST", `${address}?filename=${encodeURIComponent(name)}`);
   post.setRequestHeader("Content-Type", type);
   post.upload.onprogress = (event) => {
@@ -21,11 +24,12 @@ export function send(file, name, address, type, said, arrived) {
   post.onload = () => {
     sending.hidden = true;
     if (post.status < 300) arrived(JSON.parse(post.responseText));
-    else say(said, serviceError(post.status, post.responseText).message, "error");
+    else refused(serviceError(post.status, post.responseText));
   };
   post.onerror = () => {
     sending.hidden = true;
-    say(said, `The connection to the service ended before all of ${name} had arrived. Nothing was kept of it. The file is still chosen: send it again.`, "error");
+    // A refusal that comes before the end of a large file ends the connection, and its answer may be lost.
+    request("/v1/jobs?limit=1").then(lost, (error) => error.shown || lost());
   };
   post.onabort = () => {
     sending.hidden = true;

@@ -16,6 +16,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.http.access import Access
+from service.pages import assets
 from tests.service.conftest import upload
 from tests.service.keyed import Keyed, bearer, keyed
 from tests.whole.stack import Missing, Redis, free_port
@@ -95,6 +96,35 @@ def test_a_page_of_another_site_changes_nothing(
         assert (answer.status_code == 403) == foreign, answer.text
         assert not foreign or answer.json()["type"] == "urn:heliopsf:cross-site"
     assert api.get("/v1/jobs", headers=headers).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("method", "headers", "status", "title", "code"),
+    [
+        ("GET", {"Host": "evil.example"}, 421, "This host name is not served", "host-not-served"),
+        ("POST", {"Origin": "http://evil.example"}, 403, "This request came from another site", "cross-site"),
+    ],
+)
+def test_a_refusal_is_a_page_for_browsers_and_json_for_programs(
+    api: TestClient, method: str, headers: dict[str, str], status: int, title: str, code: str
+) -> None:
+    browser = headers | {"Accept": "text/html,application/xhtml+xml;q=0.9,*/*;q=0.8"}
+    page = api.request(method, "/images/sample", headers=browser)
+    assert page.status_code == status and page.headers["Content-Type"].startswith("text/html")
+    assert f"<h1>{title}</h1>" in page.text and code in page.text and "expected" in page.text
+    assert "style-src 'self'" in page.headers["Content-Security-Policy"]
+    assert ("To the images" in page.text) == (status == 403), "no link to a page that is refused too"
+    for address, sent in (("/images/sample", headers), ("/v1/jobs", browser)):
+        told = api.request(method, address, headers=sent)
+        assert told.status_code == status
+        assert told.headers["Content-Type"] == "application/problem+json"
+        assert told.json()["type"] == f"urn:heliopsf:{code}"
+
+
+def test_the_files_of_pages_are_served_under_any_name(api: TestClient) -> None:
+    there = assets.address("heliopsf.css")
+    assert api.get(there, headers={"Host": "evil.example"}).status_code == 200
+    assert api.post(there, headers={"Host": "evil.example"}).status_code == 421
 
 
 # Rates ----------------------------------------------------------------------------------------------

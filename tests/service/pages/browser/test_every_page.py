@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import BrowserType, Page, expect
 
 from psfcore.transit.archive import pack
 from tests.conftest import write_image, write_psf
@@ -20,6 +21,7 @@ from tests.service.pages.gap_report import GAP_ID, keep_gap_report, settings_of
 from tests.transit_files import write_simulated, write_transit
 from tests.whole.stack import Stack
 
+UNSERVED = "unserved.test"
 # Each page and a text of its contents.
 PAGES = {
     "home": "Your latest products",
@@ -103,6 +105,23 @@ def test_a_page_of_an_error_is_good(page: Page, watch: Watch, address: str, stat
     assert answer is not None and answer.status == status
     expect(page.get_by_role("alert")).to_contain_text(told)
     good(page)
+
+
+def test_the_page_of_a_name_that_is_not_served_is_good(
+    browser_type: BrowserType, browser_type_launch_args: dict[str, Any], site: Stack
+) -> None:
+    rule = f"--host-resolver-rules=MAP {UNSERVED} 127.0.0.1"
+    options = browser_type_launch_args | {"args": [*browser_type_launch_args["args"], rule]}
+    with browser_type.launch(**options) as browser:
+        page = browser.new_page()
+        refused: list[str] = []
+        page.on("response", lambda answer: refused.append(answer.url) if answer.status != 200 else None)
+        address = f"http://{UNSERVED}:{urlsplit(site.client.server).port}/jobs"
+        page.goto(address)
+        expect(page.get_by_role("heading", level=1)).to_have_text("This host name is not served")
+        expect(page.get_by_role("alert")).to_contain_text("use another address")
+        good(page)
+        assert refused == [address], "its style and pictures are there"
 
 
 @pytest.mark.slow  # 20 s: it diagnoses a gap

@@ -22,6 +22,7 @@ from tests.whole.stack import Stack, wait_for
 
 LONG_MS = 120_000
 TABS = 20
+UPLOAD_BYTES_PER_S = 200_000
 # Each noise realisation takes as long as one deconvolution.
 LONG = {"error_draws": 16, "noise": {"photon_gain_dn": 1.0, "read_noise_dn": 1.0}}
 MARK = "window.notReloaded = true"
@@ -174,6 +175,34 @@ def test_the_page_continues_after_the_service_was_killed(
     expect(page.locator("[data-part=phase]")).to_have_text("EXECUTING")
     wait_for(lambda: step(page) > 1, "the bar moves again")
     assert page.evaluate(NOT_RELOADED)
+
+
+def test_a_service_that_is_lost_during_an_upload_is_told_and_the_file_is_kept(
+    page: Page, watch: Watch, site: Stack, tmp_path: Path
+) -> None:
+    watch.allowed += ["ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE", "ERR_FAILED"]
+    write_image(tmp_path / "long.fits", shape=(1024, 1024), seed=77)
+    page.goto("/")
+    page.set_input_files("#file", tmp_path / "long.fits")
+    slowed = page.context.new_cdp_session(page)
+    slowed.send("Network.enable")
+    slow = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": UPLOAD_BYTES_PER_S}
+    slowed.send("Network.emulateNetworkConditions", slow)
+    page.get_by_role("button", name="Upload").click()
+    bar = page.locator("#sending-bar")
+    wait_for(lambda: bar.evaluate("(bar) => bar.value > 0"), "a part was sent")
+    assert site.server is not None
+    site.server.kill()
+    site.server.wait()
+    told = page.get_by_role("alert")
+    expect(told).to_contain_text("The connection to the service ended before all of long.fits had arrived")
+    expect(told).to_contain_text("The file is still chosen: send it again.")
+    expect(page.locator("#sending")).to_be_hidden()
+    good(page)
+    slowed.detach()
+    site.start_server(int(site.client.server.rpartition(":")[2]))
+    page.get_by_role("button", name="Upload").click()
+    expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"), timeout=20_000)
 
 
 @pytest.mark.slow  # half a minute: it runs real jobs

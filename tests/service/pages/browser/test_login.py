@@ -6,17 +6,25 @@ import re
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 import uvicorn
 from playwright.sync_api import Browser, BrowserType, Page, Route, expect
+from sqlalchemy import create_engine, update
 
 from service.app import create_app
+from tests.conftest import write_image, write_psf
 from tests.service.pages.browser.checks import good
 from tests.service.pages.browser.conftest import Watch
 from workers.catalogue.access.keys import Scope
+from workers.catalogue.access.sessions import SessionRow
 from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import JobRow
+from workers.contract.phases import Phase
+from workers.files.store import Store
+from workers.run.runner import Runner
 from workers.settings import Settings
 
 ELSEWHERE = "http://elsewhere.test/"
@@ -81,6 +89,93 @@ def test_a_person_logs_in_makes_a_key_and_logs_out(page: Page, key: str) -> None
     page.get_by_role("button", name="Log out").click()
     page.goto("/jobs")
     expect(page.get_by_role("heading", level=1)).to_have_text("Log in")
+
+
+def test_a_person_with_a_key_comes_from_the_login_to_a_product(
+    page: Page, key: str, keyed_settings: Settings, tmp_path: Path
+) -> None:
+    write_image(tmp_path / "sun.fits", shape=(96, 128))
+    write_psf(tmp_path / "psf.fits")
+    page.goto("/psfs")
+    log_in(page, key)
+    page.set_input_files("#psf-file", tmp_path / "psf.fits")
+    page.get_by_role("button", name="Upload a PSF of unknown kind").click()
+    expect(page).to_have_url(re.compile("/psfs/[0-9a-f]{64}$"))
+    psf_id = urlsplit(page.url).path.rpartition("/")[2]
+    page.goto("/")
+    page.set_input_files("#file", tmp_path / "sun.fits")
+    page.get_by_role("button", name="Upload").click()
+    expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
+    page.goto(f"{page.url}?psf_id={psf_id}&steps=3")
+    page.get_by_role("button", name="Start").click()
+    expect(page).to_have_url(re.compile("/jobs/[0-9a-f]{32}$"))
+    good(page)
+    work(keyed_settings)
+    expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=20_000)
+    expect(page.locator("#zoom")).to_contain_text("%")
+    good(page)
+
+
+@pytest.mark.parametrize(
+    ("address", "place", "button", "size"),
+    [
+        ("/", "#file", "Upload", 96),
+        # A refusal that comes before the end of the file.
+        ("/", "#file", "Upload", 2400),
+        ("/psfs", "#psf-file", "Upload a whole PSF", 96),
+    ],
+)
+def test_after_the_end_of_a_session_a_chosen_file_is_kept(
+    page: Page,
+    key: str,
+    watch: Watch,
+    keyed_settings: Settings,
+    tmp_path: Path,
+    address: str,
+    place: str,
+    button: str,
+    size: int,
+) -> None:
+    watch.allowed += ["401", "ERR_CONNECTION"]
+    if address == "/psfs":
+        write_psf(tmp_path / "one.fits", size=size, scale=0.7)
+    else:
+        write_image(tmp_path / "one.fits", shape=(size, size), seed=size)
+    page.goto(address)
+    log_in(page, key)
+    page.set_input_files(place, tmp_path / "one.fits")
+    end_sessions(keyed_settings)
+    page.get_by_role("button", name=button).click()
+    note = page.locator("#session-ended")
+    expect(note).to_contain_text("Your login has ended", timeout=20_000)
+    expect(page.get_by_role("alert")).to_have_count(1)
+    good(page)
+    with page.expect_popup() as opened:
+        note.get_by_role("link", name="Log in in a new tab").click()
+    other = opened.value
+    expect(other.get_by_role("heading", level=1)).to_have_text("Log in")
+    log_in(other, key)
+    expect(other.get_by_role("button", name="Log out")).to_be_visible()
+    other.close()
+    page.get_by_role("button", name=button).click()
+    expect(page).to_have_url(re.compile("/(images|psfs)/[0-9a-f]{64}$"), timeout=20_000)
+
+
+def work(settings: Settings) -> None:
+    """Run the queued jobs, in place of a worker."""
+    catalogue = Catalogue(settings.catalogue_url)
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    for row in catalogue.page(JobRow, owner="ann", limit=9, phase=Phase.QUEUED):
+        runner.run(row.id)
+    catalogue.close()
+
+
+def end_sessions(settings: Settings) -> None:
+    """End all sessions, as time does."""
+    engine = create_engine(settings.catalogue_url)
+    with engine.begin() as connection:
+        connection.execute(update(SessionRow).values(expires_at=time.time() - 1))
+    engine.dispose()
 
 
 def test_a_wrong_key_is_told(page: Page, watch: Watch) -> None:
