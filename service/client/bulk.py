@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -153,22 +153,41 @@ class BulkClient(ABC):
         The iteration ends when the job or bulk run ends. If the service does not answer for some minutes, for example during a
         restart, the client tries again.
         """
+        with closing(self._told(f"{address}/events")) as events:
+            for event in events:
+                if event["event"] == "gone":
+                    return
+                yield json.loads(event["data"])
+                if event["event"] == "end":
+                    return
+
+    def events(
+        self, *, jobs: Sequence[str] = (), bulks: Sequence[str] = ()
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield all news of your jobs and bulk runs: ("job", description), ("bulk", description), ("gone", {"kind", "id"}).
+
+        First come those that have not ended and those that are named by their ids, then each one that changes. The iteration
+        does not end by itself. It continues after the service did not answer for some minutes.
+        """
+        with closing(self._told("/v1/events", params={"job": list(jobs), "bulk": list(bulks)})) as events:
+            for event in events:
+                yield event["event"], json.loads(event["data"])
+
+    def _told(self, address: str, **options: Any) -> Generator[dict[str, str], None, None]:
+        """The events of a stream, which is opened again after it was lost. It ends when the service has no more events (204)."""
         last_id: str | None = None
         wait_s, heard_at, lost = FIRST_WAIT_S, time.monotonic(), False
         while True:
             headers = {} if last_id is None else {"Last-Event-ID": last_id}
             try:
-                with self._streamed(f"{address}/events", headers=headers, timeout=QUIET_S) as answer:
+                with self._streamed(address, headers=headers, timeout=QUIET_S, **options) as answer:
                     for event in _events(answer.iter_lines()):
                         if lost:
                             self.say("the service answers again")
                         last_id, lost = event.get("id", last_id), False
                         wait_s, heard_at = FIRST_WAIT_S, time.monotonic()
-                        if event["event"] == "gone":
-                            return
-                        yield json.loads(event["data"])
-                        if event["event"] == "end":
-                            return
+                        if "data" in event:
+                            yield event
                     if answer.status_code == 204:
                         return
             except ServiceError as error:
@@ -189,14 +208,12 @@ def still_waiting(error: ServiceError) -> str:
 
 
 def _events(lines: Iterator[str]) -> Iterator[dict[str, str]]:
-    """The events of a stream. A blank line ends an event; an event without data is dropped."""
+    """The events of a stream. A blank line ends an event, which has no data if it only tells its id."""
     event: dict[str, str] = {}
     for line in lines:
         if line:
             field, _, value = line.partition(":")
             event[field] = value.removeprefix(" ")
-        elif "data" in event:
+        elif event:
             yield event
-            event = {}
-        else:
             event = {}

@@ -21,9 +21,11 @@ from psfcore.transit.archive import pack
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS, service_address
 from service.client.bulk import FIRST_WAIT_S, LONGEST_WAIT_S, PASSING, PATIENCE_S, BulkClient, still_waiting
 from service.client.errors import ServiceError, WaitInterrupted
+from service.client.keys import KeysClient
 from service.client.operations import Operations
 from service.client.outputs import written
 from service.client.versions import Progress, VersionedPsfs
+from service.client.viewing import Viewing
 
 _STANDARD_FIELDS = ("type", "title", "status", "detail", "instance")  # of a problem document, RFC 9457
 QUEUED_S = 10.0  # time in the queue after which a client that waits for a job says so
@@ -33,7 +35,7 @@ def _silent(_line: str) -> None:
     """Say nothing."""
 
 
-class Client(VersionedPsfs, BulkClient, Operations):
+class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
     """A heliopsf service, over HTTP."""
 
     def __init__(
@@ -119,6 +121,15 @@ class Client(VersionedPsfs, BulkClient, Operations):
         """
         body = {"kind": kind, "queue": queue, "parameters": parameters}
         return self._json("POST", "/v1/jobs", json=body)
+
+    def estimate(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
+        """What such a job would cost; no job is started. The arguments and the errors are those of ``submit``.
+
+        "estimate" has the expected ``seconds`` and ``memory_mib``, "psf" says which PSF a deconvolution would use and why, and
+        "existing" is the address of the result if there is one already.
+        """
+        body = {"kind": kind, "queue": queue, "parameters": parameters}
+        return self._json("POST", "/v1/estimates", json=body)
 
     def result_id(self, kind: str, **parameters: Any) -> str:
         """The id that the result of such a job has or would have. No job is started."""
