@@ -13,12 +13,14 @@ USUAL = RichardsonLucy()
 
 
 def choices() -> dict[str, Any]:
-    """What the fields offer: the names of the methods, the usual one first, and the usual, least and largest number of steps."""
+    """What the fields offer: the usual steps of each method, the usual method first, and the least and largest number of steps."""
     models = get_args(get_args(Method)[0])
     limits = RichardsonLucy.model_fields["steps"].metadata
     return {
-        "names": [get_args(model.model_fields["name"].annotation)[0] for model in models],
-        "usual_steps": USUAL.steps,
+        "usual_steps": {
+            get_args(model.model_fields["name"].annotation)[0]: model.model_fields["steps"].default
+            for model in models
+        },
         "least_steps": next(one.ge for one in limits if isinstance(one, Ge)),
         "most_steps": next(one.le for one in limits if isinstance(one, Le)),
     }

@@ -60,7 +60,7 @@ function leadToLogin() {
   forgetEndOfSession();
   const link = element("a", { href: "/login?ended=1", target: "_blank" }, "Log in in a new tab");
   const note = element("p", { id: "session-ended", class: "error", role: "alert" },
-    "Your login has ended, so nothing was kept of what was sent. ", link, ", come back to this tab and send the file again. It is still chosen.");
+    "Your login has ended, and the service has not stored the file. ", link, ", come back to this tab and send the file. It is still chosen.");
   document.querySelector("main h1").after(note);
   note.scrollIntoView({ block: "nearest" });
 }
