@@ -6,7 +6,9 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
+from starlette.background import BackgroundTasks
 
+from service.api.files.pixels import prepare_image
 from service.api.lineage import get_product_lineage, rerun_product
 from service.api.products import ProductView, delete_product, find
 from service.http import downloads
@@ -28,21 +30,31 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
     image = state.catalogue.get(ImageRow, row.image_id, row.owner)
     psf = state.catalogue.get(PsfRow, row.psf_id, row.owner)
     reruns = state.catalogue.page(ReportRow, owner=row.owner, limit=MOST_RERUNS, about_id=row.id)
-    return page(
+    lost = _lost(state, row.file_sha256, row.bytes)
+    image_lost = None if image is None else _lost(state, image.id, image.bytes)
+    answer = page(
         request,
         "product.html",
         product=ProductView.of(row),
         name=(image and image.filename) or row.details.get("filename") or short(row.id),
         image=image,
         psf=psf,
-        lost=_lost(state, row.file_sha256, row.bytes),
-        image_lost=None if image is None else _lost(state, image.id, image.bytes),
+        lost=lost,
+        image_lost=image_lost,
         warnings=[one["message"] for one in row.details.get("warnings", [])],
         changed=_changed(row.details),
         made=_made(row.details),
         lineage=get_product_lineage(product_id, caller, state),
         reruns=[one for one in reruns if one.kind == "rerun"],
     )
+    # The viewer of this page asks for both images as soon as its scripts are loaded.
+    soon = BackgroundTasks()
+    if lost is None:
+        soon.add_task(prepare_image, state, row.file_sha256)
+    if image is not None and image_lost is None:
+        soon.add_task(prepare_image, state, image.id)
+    answer.background = soon
+    return answer
 
 
 @router.post("/rerun")

@@ -6,6 +6,7 @@ libraries are loaded by the first request for pixels.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,15 +23,15 @@ from service.api.images import find as find_image
 from service.api.products import find as find_product
 from service.http import downloads as files
 from service.http.callers import Reading
-from service.http.problems import RESPONSES, problem
+from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_disk
-from service.http.state import Shared
+from service.http.state import Shared, State
 from workers.contract.requests import Identity
 
 # This number is part of every ETag. Increase it when a new version of the code answers differently from the same file.
 ANSWERS_VERSION = 1
 MEDIA_TYPE = "application/octet-stream"
-QUALITY = "quality"
+IMAGE, QUALITY = "image", "quality"
 LARGEST = 2**31 - 1
 router = APIRouter(tags=["pixels"], responses=RESPONSES)
 
@@ -153,7 +154,17 @@ async def _pixels(request: Request, state: Shared, digest: str, name: str, asked
     return StreamingResponse(pieces, media_type=MEDIA_TYPE, headers=headers)
 
 
-def _decoded(state: Shared, digest: str, name: str) -> Plane:
+async def prepare_image(state: State, digest: str) -> None:
+    """Decode the image of a stored file before it is asked for, so that its pixels are answered at once.
+
+    A file that cannot be decoded is told to the request for its pixels.
+    """
+    if state.planes.kept((digest, IMAGE)) is None:
+        with contextlib.suppress(DataError, Problem):
+            await anyio.to_thread.run_sync(_decoded, state, digest, IMAGE, limiter=state.decoding)
+
+
+def _decoded(state: State, digest: str, name: str) -> Plane:
     from psfcore.fits.viewing.decode import decode_plane  # loads the numerical libraries
 
     def decode(target: BinaryIO) -> Decoded:
