@@ -158,15 +158,8 @@ def diagnose_solution(
 ) -> Diagnosis:
     """Diagnose an existing fit. noise: the measured noise, if any. The other arguments and the errors are those of `diagnose`."""
     view = View(solution)
-    expected = expected_gap(view, seed=seed, floor=FLOOR, progress=progress)
-    evidence = gather(solution, library, view=view, progress=progress)
-    model = LinearModel(
-        evidence,
-        FLOOR,
-        disc_scale=float(np.clip(expected.disc_scale, SMALLEST_SCALE, LARGEST_SCALE)),
-        unocculted_scale=float(np.clip(expected.unocculted_scale, SMALLEST_SCALE, LARGEST_SCALE)),
-        scale_error=expected.scale_error,
-    )
+    model, expected = linear_model_of(view, library, seed=seed, progress=progress)
+    evidence = model.evidence
     refits = _Refits(view, model, progress)
     found = judge(model, refits.model, refits.beyond) if refit else judge(model)
     fits = refits.of(found) if refit else ()
@@ -195,6 +188,29 @@ def diagnose_solution(
         residual_after=after if gone else None,
         cautions=(*_cautions(solution, noise, evidence), *refits.failures, *_rejected(found)),
     )
+
+
+def linear_model_of(
+    view: View,
+    library: Sequence[Effect],
+    *,
+    seed: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> tuple[LinearModel, ExpectedGap]:
+    """The linear model of a fit with a library of effects, and the expected gap. seed: of the simulation.
+
+    Raises the errors of `expected_gap` and `gather`.
+    """
+    expected = expected_gap(view, seed=seed, floor=FLOOR, progress=progress)
+    evidence = gather(view.solution, library, view=view, progress=progress)
+    model = LinearModel(
+        evidence,
+        FLOOR,
+        disc_scale=float(np.clip(expected.disc_scale, SMALLEST_SCALE, LARGEST_SCALE)),
+        unocculted_scale=float(np.clip(expected.unocculted_scale, SMALLEST_SCALE, LARGEST_SCALE)),
+        scale_error=expected.scale_error,
+    )
+    return model, expected
 
 
 def _likely(found: Judgement) -> tuple[str, ...]:

@@ -49,7 +49,7 @@ class UnoccultedBlocks:
     (DN/s)^2. free: whether a block is away from the disc and from filled pixels. means: the mean of each block in the mean
     image of the pointing. errors: (columns, images, blocks), the change by one unit of the parameter of each column.
     pointing: (images,). kind: (images,), one number for each combination of pointing, gain mode and exposure. part:
-    (images,), whether an image is used.
+    (images,), whether an image is used. across: the number of blocks in a row of blocks.
     """
 
     levels: Matrix
@@ -60,6 +60,7 @@ class UnoccultedBlocks:
     pointing: NDArray[np.int64]
     kind: NDArray[np.int64]
     part: NDArray[np.bool_]
+    across: int
 
     def with_flickering_blocks(self) -> UnoccultedBlocks:
         """The same blocks, with the variance of flickering blocks raised to their observed variance."""
@@ -242,4 +243,5 @@ def unocculted_blocks(view: View, columns: int, progress: Progress) -> Unocculte
         pointing=np.array([f.pointing for f in transit.frames]),
         kind=np.array([number[kind] for kind in kinds]),
         part=np.ones(len(transit.frames), dtype=bool),
+        across=transit.shape[1] // block_px(transit.shape),
     )

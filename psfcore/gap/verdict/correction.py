@@ -37,8 +37,9 @@ WORSE_SHARE = 0.05
 class Corrected:
     """A full refit with effects in the model.
 
-    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. model: the linear
-    model at the refit. rounds: number of rounds made.
+    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. subtracted: by effect,
+    what was subtracted from the images in the last round, by parameter. model: the linear model at the refit. rounds: number
+    of rounds made.
     """
 
     effects: tuple[Effect, ...]
@@ -46,6 +47,7 @@ class Corrected:
     evidence: Evidence
     model: LinearModel
     values: dict[str, tuple[float, float, str]]
+    subtracted: dict[str, tuple[float, ...]]
     rounds: int
 
     @property
@@ -112,6 +114,7 @@ def add_to_model(
             if taken is None:
                 raise
             break  # the step was too long: the fit failed, or the images no longer constrain the effect
+        gone = np.where(in_images, theta, 0.0)
         steps, theta, start = seen.theta - theta, seen.theta, seen.start
         # A parameter that must be positive is dropped if its fitted value is not positive.
         acts = ~(_positive(held) & (theta <= 0))
@@ -136,12 +139,23 @@ def add_to_model(
                 name: (float(value), float(sigma), unit)
                 for name, value, sigma, unit in zip(names, theta, seen.sigma, units, strict=True)
             },
+            subtracted=_by_effect(held, gone),
             rounds=rounds,
         )
         if float(np.abs(steps / np.maximum(seen.sigma, 1e-300)).max()) < SETTLED:
             break
     assert taken is not None
     return taken
+
+
+def _by_effect(effects: Sequence[Effect], values: Vector) -> dict[str, tuple[float, ...]]:
+    """Values of the parameters of some effects, by the name of the effect."""
+    found, first = {}, 0
+    for effect in effects:
+        last = first + len(effect.parameters)
+        found[effect.name] = tuple(float(value) for value in values[first:last])
+        first = last
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,13 +254,28 @@ def beyond(
 
     Raises DataError "bad-effects" if an added effect fails.
     """
+    whole = with_library(added, library, model, progress=progress)
+    evidence, names = whole.evidence, {effect.name for effect in added.effects}
+    base = len(evidence.base) + sum(len(evidence.columns.get(name, ())) for name in names)
+    effects = tuple(effect for effect in evidence.effects if effect.name not in names)
+    return replace(whole, evidence=replace(evidence, base=tuple(range(base)), effects=effects))
+
+
+def with_library(
+    added: Corrected,
+    library: Sequence[Effect],
+    model: LinearModel,
+    *,
+    progress: Progress = lambda stage, step, steps: None,
+) -> LinearModel:
+    """The linear model at a full refit, with all effects of a library. Only the PSF is always fitted.
+
+    Raises DataError "bad-effects" if an added effect fails.
+    """
     names = {effect.name for effect in added.effects}
     others = [effect for effect in library if effect.name not in names]
     evidence = gather(added.solution, (*added.effects, *others), progress=progress)
-    evidence = _with_noise_of(model.evidence, evidence)
-    base = len(evidence.base) + sum(len(evidence.columns.get(name, ())) for name in names)
-    effects = tuple(effect for effect in evidence.effects if effect.name not in names)
-    return replace(model, evidence=replace(evidence, base=tuple(range(base)), effects=effects))
+    return replace(model, evidence=_with_noise_of(model.evidence, evidence))
 
 
 def hold(effect: Effect, view: View) -> Effect:

@@ -1,0 +1,377 @@
+"""The likelihood of a hypothesis: how probable the data are if some effects act, whatever their strengths.
+
+    y = J theta + delta * (J theta) + noise                                             Eq. (1)
+
+y are the residuals in the cells of the discs and the levels of the unocculted blocks. theta are the coordinates of the PSF
+and the parameters of the effects. No template is exact: delta is its relative error, a Gaussian of width TEMPLATE_ERROR.
+One delta is common to all cells of a disc (or all blocks of an image) and one belongs to each cell (or block); their
+variance is added to that of the noise. The scene and the brightness of each image are parameters of the unocculted blocks,
+as in `unocculted_blocks`.
+
+ln det of the covariance, which the template error raises, counts as a part of chi2.
+
+The noise itself is known only to the relative error scale_error of one simulation, and no hypothesis describes a changing
+Sun completely. Let chi2 be that of the n numbers of the discs, or of the blocks. With nu = 2 / scale_error^2,
+
+    s = (nu + chi2) / (nu + n),    ln L = (nu + n) (s^-k - 1) / (2 k),  k = CORRELATED    Eq. (2)
+
+For s near 1 this is -chi2 / 2 plus a constant. What a hypothesis leaves far beyond the noise is not independent from block
+to block; Eq. (2) therefore counts it less, and a misfit that every hypothesis has decides nothing.
+
+The strengths are integrated out. Near the best fit ln L is a quadratic form with the normal matrix N, and a parameter has a
+Gaussian prior of width w, its likely size times one of SCALES with equal probability:
+
+    ln E = ln L + ln det(1 + w N w)^-1/2 + terms of the prior                             Eq. (3)
+
+The integral is that of Laplace. A parameter that cannot be negative has a half Gaussian. A hypothesis whose template was
+chosen among many pays the logarithm of their number. Each number that was measured in the blocks to build a template adds
+MEASURED to their chi2: it gains 1 from noise alone, and nothing is known of its likely size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, logsumexp
+
+from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
+from psfcore.gap.evidence.unocculted_blocks import LEAST_IMAGES
+from psfcore.least_squares import scaled_inverse
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Planes = NDArray[np.float64]
+
+TEMPLATE_ERROR = 0.03
+CORRELATED = 0.5
+MEASURED = 2.0
+SCALES = (0.1, 1.0, 10.0)
+ROUNDS = 3  # the template error depends on the fitted strengths
+SETTLED = 0.01
+SMALLEST_SCALE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """Further columns: changes of the data that no effect of the library makes.
+
+    discs: (discs, cells, columns), DN/s, with the cells of `LinearModel.evidence`, padded with zeros. unocculted: (columns,
+    images, blocks), DN/s. width: of their prior.
+    """
+
+    discs: Planes
+    unocculted: Planes
+    width: float
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A hypothesis after its fit.
+
+    log_evidence: ln E of Eq. (3), up to a constant that all hypotheses of one model share; minus infinity if no parameter can
+    act. columns: of the parameters that act, without those of the PSF. values: their best values. visible_error: chi2 that
+    a template error of TEMPLATE_ERROR would add in all data: above 1, first order is not enough.
+    """
+
+    log_evidence: float
+    columns: tuple[int, ...]
+    values: Vector
+    visible_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Normal equations of the discs or of the blocks.
+
+    bordered: [[N, score], [score^T, y^T C^-1 y]]. count: n of Eq. (2). more: an addition to chi2: ln det C, which the
+    template error raises, and the cost of measured numbers.
+    """
+
+    bordered: Matrix
+    count: int
+    more: float
+
+    def chi2(self, theta: Vector) -> float:
+        """chi2 at some parameters."""
+        long = np.append(-theta, 1.0)
+        return max(float(long @ self.bordered @ long), 0.0) + self.more
+
+
+class Likelihood:
+    """The likelihood of hypotheses about the data of a linear model. further: columns that follow those of the evidence."""
+
+    def __init__(self, model: LinearModel, further: Directions | None = None) -> None:
+        evidence = model.evidence
+        self._model, self._evidence = model, evidence
+        self._base = list(evidence.base)
+        cells = max(disc.residual.size for disc in evidence.discs)
+        count = len(evidence.discs)
+        self._cells = sum(disc.residual.size for disc in evidence.discs)
+        self._residual = np.zeros((count, cells, 1))
+        self._covariance = np.tile(np.eye(cells), (count, 1, 1))  # unit noise for cells that a disc lacks
+        self._jacobian = np.zeros((count, cells, evidence.size))
+        for k, disc in enumerate(evidence.discs):
+            n = disc.residual.size
+            level = disc.expected
+            self._residual[k, :n, 0] = disc.residual
+            self._jacobian[k, :n] = disc.jacobian.T
+            self._covariance[k, :n, :n] = disc.covariance * model.disc_scale + model.floor**2 * np.outer(
+                level, level
+            )
+        errors = evidence.unocculted.errors
+        if further is not None:
+            self._jacobian = np.concatenate([self._jacobian, further.discs], axis=2)
+            errors = np.concatenate([errors, further.unocculted])
+        self._further = 0.0 if further is None else further.width
+        self._blocks = list(_pointings(model, errors))
+        self._log_det = (0.0, 0.0)  # of discs and blocks without any effect
+        self._parts((), np.zeros(len(self._base)), np.zeros(0))
+        self._stiffness = 2 / max(model.scale_error, 1e-3) ** 2
+
+    def weigh(
+        self, effects: Sequence[Sequence[int]], *, trials: float = 1.0, subtracted: Sequence[float] = ()
+    ) -> Weighed:
+        """Weigh the hypothesis that some effects act. effects: the columns of each effect.
+
+        trials: the number of templates among which those of the effects were chosen. subtracted: what a full refit subtracted
+        from the images, by column; the fitted values are then those of the remainder.
+        """
+        groups = [list(group) for group in effects]
+        out = dict(zip((c for g in groups for c in g), subtracted, strict=True)) if len(subtracted) else {}
+        theta = np.zeros(len(self._base) + sum(len(group) for group in groups))
+        parts: tuple[_Part, _Part] | None = None
+        for _ in range(ROUNDS + sum(len(group) for group in groups)):
+            columns = [c for group in groups for c in group]
+            taken = np.array([out.get(c, 0.0) for c in columns])
+            parts = self._parts(groups, theta, taken)
+            after, scales = self._fit(parts, columns, taken)
+            acting = after[len(self._base) :] + taken
+            below = [
+                (value, c)
+                for value, c in zip(acting, columns, strict=True)
+                if value <= 0 and self._positive[c]
+            ]
+            if below:
+                gone = min(below)[1]
+                theta = np.delete(after, len(self._base) + columns.index(gone))
+                groups = [[c for c in group if c != gone] for group in groups]
+                if not all(groups):
+                    return Weighed(-math.inf, (), np.zeros(0), 0.0)
+                continue
+            settled = np.allclose(after, theta, rtol=SETTLED)
+            theta = after
+            if settled:
+                break
+        assert parts is not None
+        return self._weighed(parts, theta, scales, columns, taken, trials)
+
+    @cached_property
+    def _positive(self) -> NDArray[np.bool_]:
+        out = np.zeros(self._jacobian.shape[2], dtype=np.bool_)
+        for effect in self._evidence.effects:
+            for column, parameter in zip(
+                self._evidence.columns[effect.name], effect.parameters, strict=False
+            ):
+                out[column] = parameter.positive
+        return out
+
+    @cached_property
+    def _widths(self) -> tuple[Vector, NDArray[np.bool_]]:
+        """Two results by column: the likely size; whether this size is fixed, because the column belongs to a random field."""
+        size = np.full(self._jacobian.shape[2], self._further)
+        fixed = np.zeros(size.shape, dtype=np.bool_)
+        for effect in self._evidence.effects:
+            for column, parameter in zip(
+                self._evidence.columns[effect.name], effect.parameters, strict=False
+            ):
+                size[column], fixed[column] = parameter.likely, effect.field
+        return size, fixed
+
+    def _prior(self, columns: Sequence[int], scale: float) -> Vector:
+        """1 / variance of the prior of the coordinates of the PSF (0: no prior) and of some columns."""
+        size, fixed = (one[list(columns)] for one in self._widths)
+        return np.append(np.zeros(len(self._base)), (size * np.where(fixed, 1.0, scale)) ** -2.0)
+
+    def _fit(
+        self, parts: tuple[_Part, _Part], columns: Sequence[int], taken: Vector
+    ) -> tuple[Vector, tuple[float, float]]:
+        """The best parameters, and s of Eq. (2) for discs and blocks."""
+        prior = self._prior(columns, SCALES[-1])
+        pull = prior * np.append(np.zeros(len(self._base)), taken)
+        scales = (1.0, 1.0)
+        for _ in range(6):
+            normal, score = _together(parts, scales)
+            theta = scaled_inverse(normal + np.diag(prior), weakest=WEAKEST) @ (score - pull)
+            after = self._scale(parts[0], theta), self._scale(parts[1], theta)
+            done = max(abs(a / b - 1) for a, b in zip(after, scales, strict=True)) < SETTLED
+            scales = after
+            if done:
+                break
+        return theta, scales
+
+    def _scale(self, part: _Part, theta: Vector) -> float:
+        found = (self._stiffness + part.chi2(theta)) / (self._stiffness + part.count)
+        return max(found, SMALLEST_SCALE)
+
+    def _weighed(
+        self,
+        parts: tuple[_Part, _Part],
+        theta: Vector,
+        scales: tuple[float, float],
+        columns: list[int],
+        taken: Vector,
+        trials: float,
+    ) -> Weighed:
+        base = len(self._base)
+        normal, score = _together(parts, scales)
+        gradient = score - normal @ theta
+        best = sum(
+            (self._stiffness + part.count) * (s**-CORRELATED - 1) / (2 * CORRELATED)
+            for part, s in zip(parts, scales, strict=True)
+        )
+        whole = theta + np.append(np.zeros(base), taken)
+        positive = self._positive[columns]
+        found = []
+        for scale in SCALES if columns else (1.0,):
+            # Around theta, ln L is quadratic with the matrix N; with this prior its maximum is a step away.
+            prior = self._prior(columns, scale)
+            inverse = scaled_inverse(normal + np.diag(prior), weakest=WEAKEST)
+            step = inverse @ (gradient - prior * whole)
+            size, log_det = np.sqrt(np.diag(normal) + prior), 0.0
+            log_det = float(np.linalg.slogdet((normal + np.diag(prior)) / np.outer(size, size))[1])
+            log_det += 2 * float(np.log(size).sum())
+            quadratic = float(step @ normal @ step - 2 * gradient @ step + prior @ (whole + step) ** 2)
+            above = (whole + step)[base:][positive] / np.sqrt(np.diag(inverse)[base:][positive])
+            half = float(np.sum(math.log(2) + log_ndtr(above)))
+            found.append(best - (quadratic + log_det - np.log(prior[base:]).sum()) / 2 + half)
+        return Weighed(
+            float(logsumexp(found)) - math.log(len(found)) - math.log(trials),
+            tuple(columns),
+            theta[base:],
+            self._visible_error(columns, whole),
+        )
+
+    def _visible_error(self, columns: Sequence[int], whole: Vector) -> float:
+        if not columns:
+            return 0.0
+        values = whole[len(self._base) :]
+        change = TEMPLATE_ERROR * (self._jacobian[:, :, columns] @ values)
+        seen = float(np.sum(change * np.linalg.solve(self._covariance, change[..., None])[..., 0]))
+        for pointing in self._blocks:
+            seen += float(
+                np.sum(
+                    pointing.free
+                    * (TEMPLATE_ERROR * pointing.errors[..., columns] @ values) ** 2
+                    / pointing.variance
+                )
+            )
+        return seen
+
+    def _parts(self, groups: Sequence[Sequence[int]], theta: Vector, taken: Vector) -> tuple[_Part, _Part]:
+        columns = [*self._base, *(c for group in groups for c in group)]
+        whole = theta + np.append(np.zeros(len(self._base)), taken)
+        spans, first = [], len(self._base)
+        for group in groups:
+            spans.append((list(group), whole[first : first + len(group)]))
+            first += len(group)
+        covariance = self._covariance
+        changes = [self._jacobian[:, :, group] @ values for group, values in spans]
+        if any(change.any() for change in changes):
+            covariance = covariance.copy()
+            diagonal = np.arange(covariance.shape[1])
+            for change in changes:
+                covariance += TEMPLATE_ERROR**2 * change[:, :, None] * change[:, None, :]
+                covariance[:, diagonal, diagonal] += (TEMPLATE_ERROR * change) ** 2
+        lower = np.linalg.cholesky(covariance)
+        design = np.concatenate([self._jacobian[:, :, columns], self._residual], axis=2)
+        white = np.linalg.solve(lower, design).reshape(-1, design.shape[2])
+        log_det = 2 * float(np.log(np.einsum("dcc->dc", lower)).sum())
+        blocks = [pointing.part(columns, spans) for pointing in self._blocks]
+        size = len(columns) + 1
+        measured = self._evidence.numbers_of(columns)
+        in_blocks = sum(part.more for part in blocks)
+        if not groups:
+            self._log_det = log_det, in_blocks
+        return _Part(white.T @ white, self._cells, log_det - self._log_det[0]), _Part(
+            sum((part.bordered for part in blocks), np.zeros((size, size))),
+            sum(part.count for part in blocks),
+            in_blocks - self._log_det[1] + MEASURED * measured,
+        )
+
+
+def _together(parts: tuple[_Part, _Part], scales: tuple[float, float]) -> tuple[Matrix, Vector]:
+    """Normal matrix and score of Eq. (2) near the best fit."""
+    both = sum(
+        (part.bordered / s ** (1 + CORRELATED) for part, s in zip(parts, scales, strict=True)),
+        np.zeros_like(parts[0].bordered),
+    )
+    return both[:-1, :-1], both[:-1, -1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pointing:
+    """The unocculted blocks of one pointing: arrays (images, blocks), and `errors` (images, blocks, columns).
+
+    brightness: the change by one standard deviation of the brightness of an image, DN/s.
+    """
+
+    level: Matrix
+    variance: Matrix
+    free: NDArray[np.bool_]
+    brightness: Matrix
+    errors: Planes
+
+    def part(self, columns: Sequence[int], effects: Sequence[tuple[list[int], Vector]]) -> _Part:
+        """Normal equations of some columns. effects: the columns of each effect, and the values that set its template error."""
+        images, blocks = self.level.shape
+        changes = [TEMPLATE_ERROR * (self.errors[..., group] @ values) for group, values in effects]
+        changes = [change for change in changes if change.any()]
+        variance = self.variance + sum((change**2 for change in changes), np.zeros_like(self.variance))
+        weight = np.where(self.free, 1 / variance, 0.0)
+        total = weight.sum(axis=0)
+        nuisances = [self.brightness, *changes]
+        kept, own = len(columns), images * len(nuisances)
+        design = np.zeros((images, blocks, kept + 1 + own))
+        design[..., :kept] = self.errors[..., columns]
+        design[..., kept] = self.level
+        each = np.arange(images)
+        for k, change in enumerate(nuisances):
+            design[each, :, kept + 1 + k * images + each] = change
+        design -= np.einsum("nb,nbc->bc", weight, design) / total[:, None]  # the scene is free
+        flat = (design * np.sqrt(weight)[..., None]).reshape(images * blocks, -1)
+        normal = flat.T @ flat
+        lower = np.linalg.cholesky(normal[kept + 1 :, kept + 1 :] + np.eye(own))
+        across = np.linalg.solve(lower, normal[kept + 1 :, : kept + 1])
+        log_det = 2 * np.log(np.diag(lower)).sum() - np.log(weight[self.free]).sum() + np.log(total).sum()
+        return _Part(
+            normal[: kept + 1, : kept + 1] - across.T @ across,
+            int(self.free.sum()) - blocks,
+            float(log_det),
+        )
+
+
+def _pointings(model: LinearModel, errors: Planes) -> list[_Pointing]:
+    """The blocks of every pointing in which at least LEAST_IMAGES images show a block."""
+    blocks = model.evidence.unocculted
+    found = []
+    for pointing in np.unique(blocks.pointing):
+        here = np.flatnonzero((blocks.pointing == pointing) & blocks.part)
+        shown = blocks.free[here].sum(axis=0) >= LEAST_IMAGES
+        if here.size < LEAST_IMAGES or not shown.any():
+            continue
+        at = np.ix_(here, np.flatnonzero(shown))
+        found.append(
+            _Pointing(
+                level=blocks.levels[at],
+                variance=blocks.variance[at] * model.unocculted_scale,
+                free=blocks.free[at],
+                brightness=blocks.means[at] * blocks.gain_width,
+                errors=np.moveaxis(errors[:, here][:, :, shown], 0, -1),
+            )
+        )
+    return found

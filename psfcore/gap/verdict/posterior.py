@@ -1,0 +1,197 @@
+"""The posterior: a probability for every hypothesis about the cause of the gap.
+
+The hypotheses are: no effect acts (`NONE`), one effect of the library acts, two act together, or something acts that is
+not in the library (`UNKNOWN`, `evidence.discrepancy`). The evidence of each is that of `evidence.likelihood`:
+
+    p(h) ~ prior(kind of h) / (number of hypotheses of this kind) * E(h)              Eq. (1)
+
+The linear model holds only for a small effect. A full refit replaces the evidence of a hypothesis by that at the refit, and
+the evidence of all pairs with a refitted effect by that of the library at the refit.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.special import logsumexp
+
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.discrepancy import ALTERNATIVES, discrepancy
+from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.likelihood import Likelihood, Weighed
+from psfcore.gap.evidence.linear_model import LinearModel
+
+Names = tuple[str, ...]
+Kind = Literal["none", "single", "pair", "unknown"]
+
+NONE: Names = ()
+UNKNOWN: Names = ("unknown",)  # no effect may have this name
+KINDS: tuple[Kind, ...] = ("none", "single", "pair", "unknown")
+# Prior probabilities of the kinds: as often as not there is no gap or one that the library does not contain.
+PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.1, "unknown": 0.15}
+
+
+def kind_of(names: Names) -> Kind:
+    """The kind of a hypothesis."""
+    if names == UNKNOWN:
+        return "unknown"
+    return KINDS[min(len(names), 2)]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The weights of all hypotheses.
+
+    log_weights: ln of prior times evidence of each hypothesis, up to a common constant. visible_error: `Weighed.visible_error`
+    by hypothesis. orders: the probability of each alternative of the discrepancy if the cause is unknown.
+    """
+
+    log_weights: dict[Names, float]
+    visible_error: dict[Names, float]
+    orders: dict[Names, float]
+
+    def probabilities(self, temperature: float = 1.0) -> dict[Names, float]:
+        """The probability of each hypothesis, the most probable first. temperature: divides the logarithms of the weights."""
+        names = list(self.log_weights)
+        weights = np.array([self.log_weights[name] for name in names]) / temperature
+        shares = np.exp(weights - logsumexp(weights))
+        return _sorted(dict(zip(names, shares.tolist(), strict=True)))
+
+    def with_evidence(self, evidence: Mapping[Names, Weighed], effects: int) -> Posterior:
+        """The same posterior with another evidence of some hypotheses. effects: the number of effects in the library."""
+        weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in evidence.items()}
+        errors = dict.fromkeys(evidence, 0.0)
+        return replace(
+            self, log_weights=self.log_weights | weights, visible_error=self.visible_error | errors
+        )
+
+
+def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
+    """The probabilities after every pair that is less probable than one of its effects alone is counted to that effect.
+
+    The data then do not show the second effect. A single effect therefore stands for this effect, alone or with another
+    effect that these data do not show.
+    """
+    out = dict(probabilities)
+    for names, share in probabilities.items():
+        if kind_of(names) == "pair":
+            alone = max(((name,) for name in names), key=lambda one: probabilities.get(one, 0.0))
+            if share <= probabilities.get(alone, 0.0):
+                out[alone] += out.pop(names)
+    return _sorted(out)
+
+
+def _sorted(probabilities: Mapping[Names, float]) -> dict[Names, float]:
+    return dict(sorted(probabilities.items(), key=lambda one: -one[1]))
+
+
+def posterior(model: LinearModel) -> Posterior:
+    """The posterior in the linear model, without any full refit."""
+    evidence = _without_probes(model.evidence)
+    further = discrepancy(evidence)
+    likelihood = Likelihood(model, further.directions)
+    weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
+    orders = {
+        orders: likelihood.weigh([columns]).log_evidence
+        for orders in ALTERNATIVES
+        if (columns := further.columns(orders, evidence.size))
+    }
+    logs = np.array(list(orders.values()))
+    whole = float(logsumexp(logs))
+    count = len(evidence.effects)
+    return Posterior(
+        {names: w.log_evidence + _log_prior(names, count) for names, w in weighed.items()}
+        | {UNKNOWN: whole - math.log(logs.size) + _log_prior(UNKNOWN, count)},
+        {names: w.visible_error for names, w in weighed.items()},
+        dict(zip(orders, np.exp(logs - whole).tolist(), strict=True)),
+    )
+
+
+def _without_probes(evidence: Evidence) -> Evidence:
+    """The evidence with only those effects that a verdict may name."""
+    return replace(evidence, effects=tuple(effect for effect in evidence.effects if effect.named))
+
+
+def at_refit(
+    refit: LinearModel,
+    before: LinearModel,
+    names: Names,
+    taken: Mapping[str, Sequence[float]],
+    effects: Sequence[Effect],
+) -> dict[Names, Weighed]:
+    """The evidence at a full refit: of the refitted hypothesis, and of the pairs that contain a single refitted effect.
+
+    refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect. taken: by
+    effect, what the refit subtracted from the images, by parameter.
+    """
+    after = _with_blocks_of(before.evidence, _without_probes(refit.evidence), taken)
+    refit = replace(refit, evidence=after)
+    likelihood = Likelihood(refit)
+    others = [e.name for e in effects if e.name not in names] if len(names) == 1 else []
+    pairs = [_in_order((*names, other), effects) for other in others]
+    return {one: weigh(likelihood, refit.evidence, one, taken) for one in (names, *pairs)}
+
+
+def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]) -> Evidence:
+    """The evidence of a refit, with the blocks from before it, from which the change by the effects is subtracted.
+
+    The images of a refit have less noise if a smooth change that follows each image was subtracted, for example a halo: the
+    blocks would show less noise, and this would count for the effect.
+    """
+    first = {effect.name: effect for effect in before.effects}
+    blocks = before.unocculted
+    errors = np.zeros((after.size, *blocks.levels.shape))
+    levels = blocks.levels.copy()
+    for effect in after.effects:
+        columns = dict(
+            zip((p.name for p in first[effect.name].parameters), before.columns[effect.name], strict=False)
+        )
+        own = [p.name for p in effect.parameters]
+        values = taken.get(effect.name, (0.0,) * len(own))
+        for name, column, value in zip(own, after.columns[effect.name], values, strict=False):
+            errors[column] = blocks.errors[columns[name]]
+            levels -= value * errors[column]
+    return replace(after, unocculted=replace(blocks, errors=errors, levels=levels))
+
+
+def weigh(
+    likelihood: Likelihood,
+    evidence: Evidence,
+    names: Names,
+    taken: Mapping[str, Sequence[float]] | None = None,
+) -> Weighed:
+    """Weigh the hypothesis that some effects act. taken: as for `at_refit`."""
+    by_name = {effect.name: effect for effect in evidence.effects}
+    # An effect that is fitted for each pointing may have fewer or more changes than parameters.
+    columns = [
+        [c for c, _ in zip(evidence.columns[name], by_name[name].parameters, strict=False)] for name in names
+    ]
+    before = taken or {}
+    subtracted = [
+        value
+        for name, some in zip(names, columns, strict=True)
+        for value in before.get(name, (0.0,) * len(some))
+    ]
+    return likelihood.weigh(
+        columns, trials=math.prod(by_name[name].trials for name in names), subtracted=subtracted
+    )
+
+
+def _hypotheses(effects: Sequence[Effect]) -> list[Names]:
+    names = [effect.name for effect in effects]
+    return [NONE, *((name,) for name in names), *itertools.combinations(names, 2)]
+
+
+def _in_order(names: Names, effects: Sequence[Effect]) -> Names:
+    return tuple(effect.name for effect in effects if effect.name in names)
+
+
+def _log_prior(names: Names, effects: int) -> float:
+    count = {"none": 1, "single": effects, "pair": math.comb(effects, 2), "unknown": 1}
+    kind = kind_of(names)
+    return math.log(PRIOR[kind] / max(count[kind], 1))

@@ -1,0 +1,52 @@
+"""The settled posterior: the linear model is replaced by full refits where it is not exact enough.
+
+A plausible hypothesis is refitted if an error of its template (`likelihood.TEMPLATE_ERROR`) would be visible in the data. The most
+probable one comes first. The refits end when no plausible hypothesis needs one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from psfcore.gap.evidence.likelihood import Weighed
+from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.verdict.posterior import Names, Posterior, posterior
+
+MOST_REFITS = 4  # a pair, its two effects, and a rival
+VISIBLE = 9.0  # a template error is visible if it adds this much to chi2
+PLAUSIBLE = 0.02
+
+# A function that makes a full refit of a hypothesis. It returns the evidence at the refit, of this hypothesis and of the
+# others that the refit also tests; None if the refit failed.
+Refit = Callable[[Names], "Mapping[Names, Weighed] | None"]
+
+
+def settled_posterior(model: LinearModel, refit: Refit) -> tuple[Posterior, tuple[Names, ...]]:
+    """Two results: the posterior after the full refits; the hypotheses whose refit failed, which are left out."""
+    effects = sum(effect.named for effect in model.evidence.effects)
+    found = posterior(model)
+    failed: list[Names] = []
+    done: set[Names] = set()
+    for _ in range(MOST_REFITS):
+        chosen = _to_refit(found, done)
+        if chosen is None:
+            break
+        done.add(chosen)
+        real = refit(chosen)
+        if real is None:  # the images do not contain the effects as the linear fit states them
+            failed.append(chosen)
+            weights = {names: weight for names, weight in found.log_weights.items() if names != chosen}
+            found = replace(found, log_weights=weights)
+        else:
+            found = found.with_evidence(real, effects)
+    return found, tuple(failed)
+
+
+def _to_refit(found: Posterior, done: set[Names]) -> Names | None:
+    for names, share in found.probabilities().items():
+        if share < PLAUSIBLE:
+            return None
+        if names not in done and found.visible_error.get(names, 0.0) > VISIBLE:
+            return names
+    return None

@@ -1,0 +1,111 @@
+"""The likelihood of hypotheses, compared with dense Gaussian integrals, and what a template error changes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, null_space
+from scipy.stats import multivariate_normal
+
+from psfcore.gap.evidence import likelihood as likelihoods
+from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.likelihood import Likelihood
+from psfcore.gap.evidence.linear_model import LinearModel
+from tests.psfcore.gap.linear_models import with_residuals
+
+EXACT = 1e-4  # relative error of the noise scale: so small that the likelihood is Gaussian
+
+
+def sigma_of(evidence: Evidence, name: str) -> float:
+    """The error of the first parameter of an effect."""
+    plain = with_residuals(evidence, {})
+    return float(np.sqrt(plain.fit([evidence.columns[name][0]]).covariance[-1, -1]))
+
+
+def gain(model: LinearModel, *names: str) -> float:
+    """ln of the evidence of some effects over that of no effect."""
+    likelihood = Likelihood(model)
+    columns = [list(model.evidence.columns[name]) for name in names]
+    return likelihood.weigh(columns).log_evidence - likelihood.weigh([]).log_evidence
+
+
+def test_the_evidence_is_the_gaussian_integral(evidence: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(likelihoods, "TEMPLATE_ERROR", 0.0)
+    monkeypatch.setattr(likelihoods, "SCALES", (1.0,))
+    noisy = replace(with_residuals(evidence, {"dark_offset": 0.3}, noise=1.0), scale_error=EXACT)
+    (column,) = evidence.columns["dark_offset"]
+    width = next(e for e in evidence.effects if e.name == "dark_offset").parameters[0].likely
+
+    covariance = block_diag(
+        *(
+            disc.covariance + noisy.floor**2 * np.outer(disc.expected, disc.expected)
+            for disc in evidence.discs
+        )
+    )
+    white = np.linalg.inv(np.linalg.cholesky(covariance))
+    jacobian = white @ np.concatenate([disc.jacobian.T for disc in evidence.discs])
+    residual = white @ np.concatenate([disc.residual for disc in noisy.evidence.discs])
+    # The coordinates of the PSF are free: only the part of the data that they cannot change counts.
+    unchanged = null_space(jacobian[:, list(evidence.base)].T).T
+    change, seen = width * unchanged @ jacobian[:, column], unchanged @ residual
+    with_effect = multivariate_normal(cov=np.eye(seen.size) + np.outer(change, change))
+    wanted = float(with_effect.logpdf(seen) - multivariate_normal(cov=np.eye(seen.size)).logpdf(seen))
+    assert gain(noisy, "dark_offset") == pytest.approx(wanted, abs=1e-3)
+
+
+def test_a_parameter_that_cannot_be_negative_excludes_a_loss_of_light(evidence: Evidence) -> None:
+    sigma = sigma_of(evidence, "column_smear")
+    columns = [list(evidence.columns["column_smear"])[:1]]
+    lost = Likelihood(with_residuals(evidence, {"column_smear": -8 * sigma})).weigh(columns)
+    assert lost.log_evidence == -math.inf and lost.columns == ()
+    added = Likelihood(with_residuals(evidence, {"column_smear": 8 * sigma})).weigh(columns)
+    assert added.values[0] == pytest.approx(8 * sigma, rel=0.2)
+
+
+def test_what_an_error_of_the_first_template_explains_is_not_credited_to_a_second_effect(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sigma = sigma_of(evidence, "column_smear")
+    weak = with_residuals(evidence, {"dark_offset": 3.0, "column_smear": 8 * sigma})
+    strong = with_residuals(evidence, {"dark_offset": 3000.0, "column_smear": 8 * sigma})
+    both = ("dark_offset", "column_smear")
+    assert gain(weak, *both) > gain(weak, "dark_offset") + 5
+    assert gain(strong, *both) < gain(strong, "dark_offset") + 1
+    seen = [Likelihood(one).weigh([list(evidence.columns["dark_offset"])]) for one in (weak, strong)]
+    assert seen[0].visible_error < seen[1].visible_error
+    assert seen[1].visible_error > 9
+    monkeypatch.setattr(likelihoods, "TEMPLATE_ERROR", 0.0)
+    assert gain(strong, *both) > gain(strong, "dark_offset") + 5
+
+
+def test_a_misfit_that_every_hypothesis_has_decides_less(evidence: Evidence) -> None:
+    """An offset beside residuals that no column describes: the larger these are, the less the offset counts."""
+    rng = np.random.default_rng(2)
+    sigma = sigma_of(evidence, "dark_offset")
+    gains = []
+    for noise in (1.0, 4.0):
+        model = replace(with_residuals(evidence, {"dark_offset": 8 * sigma}), scale_error=0.1)
+        discs = tuple(
+            replace(
+                disc,
+                residual=disc.residual
+                + noise * rng.multivariate_normal(0 * disc.residual, disc.covariance, check_valid="ignore"),
+            )
+            for disc in model.evidence.discs
+        )
+        gains.append(gain(replace(model, evidence=replace(model.evidence, discs=discs)), "dark_offset"))
+    assert gains[0] > 15 and gains[1] < gains[0] / 3
+
+
+def test_what_a_refit_subtracted_counts_as_a_part_of_the_strength(evidence: Evidence) -> None:
+    """Whether the change was subtracted from the images or not, the hypothesis has the same evidence."""
+    sigma = sigma_of(evidence, "dark_offset")
+    columns = [list(evidence.columns["dark_offset"])]
+    whole = Likelihood(with_residuals(evidence, {"dark_offset": 10 * sigma})).weigh(columns)
+    rest = Likelihood(with_residuals(evidence, {"dark_offset": 4 * sigma}))
+    part = rest.weigh(columns, subtracted=[6 * sigma])
+    assert part.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
+    assert part.values[0] == pytest.approx(whole.values[0] - 6 * sigma, rel=0.02)
