@@ -22,12 +22,14 @@ from sqlalchemy.exc import OperationalError
 from service.client.http import Client
 
 POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
-# A lost worker is noticed soon, so that tests need not wait as long as an operator would.
+# A lost worker is noticed soon, so that tests need not wait as long as an operator would. What a test sets goes first.
 QUICK = {
     "HELIOPSF_RESUBMIT_S": "3",
     "HELIOPSF_LEASE_S": "3",
     "HELIOPSF_HEARTBEAT_S": "0.5",
     "HELIOPSF_RECONCILE_S": "0.5",
+    # Tests run side by side: more threads would only burn more of the cores until a job at work is killed or cancelled.
+    "HELIOPSF_WORKER_THREADS": "1",
 }
 
 
