@@ -43,9 +43,7 @@ def real() -> Callable[[str], Path]:
 @pytest.fixture(scope="session")
 def hri_psf(tmp_path_factory: pytest.TempPathFactory) -> Psf:
     """The PSF of HRI_EUV in full, with its components."""
-    return once_a_run(
-        lambda: build_psf(load_instrument("hri_euv"), threads=2), "hri_psf", tmp_path_factory
-    )
+    return once_a_run(lambda: build_psf(load_instrument("hri_euv"), threads=2), "hri_psf", tmp_path_factory)
 
 
 def gaussian(size: int, sigma_px: float) -> NDArray[np.float64]:
