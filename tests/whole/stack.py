@@ -22,7 +22,7 @@ from sqlalchemy.exc import OperationalError
 from service.client.http import Client
 
 POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
-# A lost worker is noticed soon, so that tests need not wait as long as an operator would. What a test sets goes first.
+# A lost worker is noticed soon, so that tests need not wait as long as an operator would.
 QUICK = {
     "HELIOPSF_RESUBMIT_S": "3",
     "HELIOPSF_LEASE_S": "3",
