@@ -16,6 +16,7 @@ from psfcore.fits.header import FitsLimits
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
 from psfcore.psf import Psf
+from tests.once_a_run import once_a_run
 
 LIMITS = FitsLimits(max_pixels=4096 * 4096)
 
@@ -40,8 +41,9 @@ def real() -> Callable[[str], Path]:
 
 
 @pytest.fixture(scope="session")
-def hri_psf() -> Psf:
-    return build_psf(load_instrument("hri_euv"), threads=2)
+def hri_psf(tmp_path_factory: pytest.TempPathFactory) -> Psf:
+    """The PSF of HRI_EUV in full, with its components."""
+    return once_a_run(lambda: build_psf(load_instrument("hri_euv"), threads=2), "hri_psf", tmp_path_factory)
 
 
 def gaussian(size: int, sigma_px: float) -> NDArray[np.float64]:

@@ -9,6 +9,8 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from tests.blank_figures import blank_unless_told
+from tests.shared_routes import shared_routes
 from tests.tables import copied_tables
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
@@ -22,6 +24,17 @@ from workers.settings import Settings
 def _tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with copied_tables(tmp_path_factory.mktemp("tables")):
         yield
+
+
+@pytest.fixture(scope="package", autouse=True)
+def _routes() -> Iterator[None]:
+    with shared_routes():
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _figures(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield from blank_unless_told(request)
 
 
 @pytest.fixture

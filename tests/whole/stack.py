@@ -28,6 +28,8 @@ QUICK = {
     "HELIOPSF_LEASE_S": "3",
     "HELIOPSF_HEARTBEAT_S": "0.5",
     "HELIOPSF_RECONCILE_S": "0.5",
+    # Tests run side by side: more threads would only burn more of the cores until a job at work is killed or cancelled.
+    "HELIOPSF_WORKER_THREADS": "1",
 }
 
 

@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy import text
 
 from service.local import LocalService
+from tests.blank_figures import blank_unless_told
 from tests.tables import copied_tables
 from tests.whole.stack import Missing, postgres_database
 from workers.catalogue.catalogue import Catalogue
@@ -21,6 +22,11 @@ from workers.settings import Settings
 def _tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with copied_tables(tmp_path_factory.mktemp("tables")):
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _figures(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield from blank_unless_told(request)
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ from schemathesis.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
+from schemathesis.schemas import BaseSchema
 
 from service.app import create_app
 from service.openapi import description
@@ -52,15 +53,36 @@ CHECKS = [
     response_schema_conformance,
     ignored_auth,
 ]
-SCHEMA = schemathesis.openapi.from_dict(json.loads(description()))
-# A list with far too many members is refused for its size, before they are counted.
-SCHEMA.config.checks.negative_data_rejection.expected_statuses = [
-    *SCHEMA.config.checks.negative_data_rejection.expected_statuses,
-    "413",
-]
+# The requests are made when the test runs. Made while tests are collected, they take each worker of xdist ten seconds.
+DESCRIBED = schemathesis.pytest.from_fixture("described")
+# Their bodies are those of POST /v1/jobs: the same models check them.
+SAME_BODIES = r"^/v1/(estimates|jobs/identity)$"
 LONGEST_ADDRESS = 60_000  # characters
 KNOWN: dict[str, str] = {}
 FILES: dict[str, bytes] = {}
+
+
+def openapi(*, coverage: bool) -> BaseSchema:
+    """The description of the interface.
+
+    coverage: whether requests are also derived from each property of a schema, hundreds for a large body.
+    """
+    schema = schemathesis.openapi.from_dict(json.loads(description()))
+    # A list with far too many members is refused for its size, before they are counted.
+    refusals = schema.config.checks.negative_data_rejection
+    refusals.expected_statuses = [*refusals.expected_statuses, "413"]
+    schema.config.phases.coverage.enabled = coverage
+    return schema
+
+
+@pytest.fixture(scope="module")
+def described() -> BaseSchema:
+    return openapi(coverage=True)
+
+
+@pytest.fixture(scope="module")
+def described_without_coverage() -> BaseSchema:
+    return openapi(coverage=False)
 
 
 @pytest.fixture(scope="module")
@@ -151,14 +173,20 @@ def ask(case: Any, service: dict[str, Any]) -> None:
     )
 
 
-@SCHEMA.parametrize()
+@DESCRIBED.exclude(path_regex=SAME_BODIES).parametrize()
 @settings(max_examples=3, **STEADY)  # few, because there are many operations; the slow test makes 100 of each
 def test_the_service_is_as_it_is_described(case: Any, service: dict[str, Any]) -> None:
     ask(case, service)
 
 
+@schemathesis.pytest.from_fixture("described_without_coverage").include(path_regex=SAME_BODIES).parametrize()
+@settings(max_examples=20, **STEADY)  # the slow test derives requests from each property of these bodies too
+def test_operations_with_the_bodies_of_a_job_are_as_described(case: Any, service: dict[str, Any]) -> None:
+    ask(case, service)
+
+
 @pytest.mark.slow
-@SCHEMA.parametrize()
+@DESCRIBED.parametrize()
 @settings(max_examples=100, **STEADY)
 def test_the_service_is_as_it_is_described_for_long(case: Any, service: dict[str, Any]) -> None:
     ask(case, service)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -39,9 +40,15 @@ def psf() -> Psf:
     return make_psf(np.maximum(linear_convolve(scatter, gaussian(31, 0.8), size), 0))
 
 
+@cache
+def scene() -> Plane:
+    """A corner of a simulated scene: disc, coronal hole and corona. To simulate it takes four seconds."""
+    return solar_scene((1024, 1024), 3)[200 : 200 + SIZE_PX, 560 : 560 + SIZE_PX]
+
+
 def cut(light: float) -> Plane:
-    """A corner of a simulated scene: disc, coronal hole and corona, at `light` times the usual brightness."""
-    return light * solar_scene((1024, 1024), 3)[200 : 200 + SIZE_PX, 560 : 560 + SIZE_PX]
+    """The same corner at `light` times the usual brightness."""
+    return light * scene()
 
 
 def see(scene: Plane, psf: Psf, seed: int | None) -> Image:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -19,6 +20,7 @@ from psfcore.gap.report.page import gap_page, interval_words, unit_words
 from psfcore.gap.report.plot import cell_means, draw_cells, draw_map, gap_png, simulated_of
 from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict.judge import fitted
+from tests.blank_figures import blank_figures
 from tests.html_page import Tag, check_stands_alone, read_page
 from tests.psfcore.gap.small_gaps import OFFSET_DN, found
 
@@ -41,6 +43,13 @@ def html() -> str:
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small figures, which are quicker to draw."""
     monkeypatch.setattr(gap_plot, "PLOT_DPI", 40)
+
+
+@pytest.fixture
+def blank() -> Iterator[None]:
+    """Figures without content, for tests of the texts."""
+    with blank_figures():
+        yield
 
 
 def judged(verdict: Any, *answer: str) -> Diagnosis:
@@ -134,7 +143,7 @@ def test_images_inputs_and_provenance_are_listed() -> None:
     ],
 )
 def test_every_verdict_is_explained_on_its_page(
-    verdict: str, answer: tuple[str, ...], told: str, coarse: None
+    verdict: str, answer: tuple[str, ...], told: str, blank: None
 ) -> None:
     diagnosis = judged(verdict, *answer)
     page = gap_page(diagnosis, report_of(diagnosis)).html()
@@ -153,7 +162,7 @@ def test_every_verdict_is_explained_on_its_page(
     assert ("a patch of added light" in text) is (verdict in ("unknown", "inconclusive"))
 
 
-def test_an_unexplained_gap_in_the_discs_is_reported_separately(coarse: None) -> None:
+def test_an_unexplained_gap_in_the_discs_is_reported_separately(blank: None) -> None:
     diagnosis = judged("inconclusive")
     diagnosis = replace(diagnosis, judgement=replace(diagnosis.judgement, discs_unexplained=True))
     report = report_of(diagnosis)
@@ -179,7 +188,7 @@ def test_a_tie_names_the_certain_and_the_tied_effects(coarse: None) -> None:
     assert [bars._chosen(row, report) for row in rows] == [False, False, True, False]
 
 
-def test_effects_of_a_pair_come_before_effects_that_explain_more_alone(coarse: None) -> None:
+def test_effects_of_a_pair_come_before_effects_that_explain_more_alone(blank: None) -> None:
     judgement = found().judgement
     alone = [one for one in judgement.tried if one.label != "dark_offset"]
     last = alone[-1].label
